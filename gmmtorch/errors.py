@@ -1,0 +1,36 @@
+"""One family of errors. Every message names the argument or file, its value, and the remedy."""
+
+from __future__ import annotations
+
+from sklearn.exceptions import NotFittedError as _SklearnNotFittedError
+
+
+class GmmTorchError(Exception):
+    """Base of every error that gmmtorch raises on purpose."""
+
+
+class InvalidArgumentError(GmmTorchError, ValueError):
+    """An argument has a value that cannot be worked with."""
+
+
+class DataError(GmmTorchError, ValueError):
+    """A file or an array does not hold what it should."""
+
+
+class MissingDataError(GmmTorchError, FileNotFoundError):
+    """A file or folder that was asked for does not exist."""
+
+    def __str__(self) -> str:  # FileNotFoundError would print a bare tuple
+        return str(self.args[0]) if self.args else ""
+
+
+class MemoryLimitError(GmmTorchError, MemoryError):
+    """What was asked for does not fit into the memory allowed for it."""
+
+
+class NotFittedError(GmmTorchError, _SklearnNotFittedError):
+    """A model was used before it was fitted."""
+
+
+class NumericalError(GmmTorchError, ArithmeticError):
+    """A matrix could not be factorised, even with the largest permitted jitter."""

@@ -1,0 +1,72 @@
+"""Small symmetric matrices in batches: packing, and a Cholesky that mends what can be mended."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import NumericalError
+
+_JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
+
+
+def triangle_indices(dim: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Row and column indices (i ≤ j) of the D(D+1)/2 distinct entries of a symmetric D×D matrix."""
+    rows, cols = torch.triu_indices(dim, dim, device=device)
+    return rows, cols
+
+
+def pack_symmetric(matrices: Tensor) -> Tensor:
+    """Distinct entries (…, D(D+1)/2) of symmetric matrices (…, D, D), upper triangle by rows."""
+    rows, cols = triangle_indices(matrices.shape[-1], matrices.device)
+    return matrices[..., rows, cols]
+
+
+def unpack_symmetric(packed: Tensor, dim: int) -> Tensor:
+    """Symmetric matrices (…, D, D) from their packed entries; the inverse of `pack_symmetric`."""
+    rows, cols = triangle_indices(dim, packed.device)
+    matrices = packed.new_empty((*packed.shape[:-1], dim, dim))
+    matrices[..., rows, cols] = packed
+    matrices[..., cols, rows] = packed
+    return matrices
+
+
+def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
+    """Lower Cholesky factors (K, D, D) of symmetric matrices (K, D, D).
+
+    Jitter, growing from 1e-12 to 1e-6 of the mean of the diagonal, is added only to the matrices
+    whose factorisation failed. Raises `NumericalError`, naming the first bad matrix, when that
+    does not help or when a matrix holds NaN or infinite entries.
+    """
+    factors, info = torch.linalg.cholesky_ex(matrices)
+    finite = torch.isfinite(factors).flatten(1).all(1)
+    bad = (info != 0) | ~finite
+    if not bool(bad.any()):
+        return factors
+    if not bool(torch.isfinite(matrices).all()):
+        first = int((~torch.isfinite(matrices).flatten(1).all(1)).nonzero()[0])
+        raise NumericalError(f"{name}[{first}] holds NaN or infinite entries; check the input points.")
+    factors = factors.clone()
+    eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device)
+    for jitter in _JITTERS:
+        index = bad.nonzero().squeeze(1)
+        scale = matrices[index].diagonal(dim1=-2, dim2=-1).mean(-1).abs()
+        scale = scale.clamp_min(torch.finfo(matrices.dtype).tiny ** 0.5)
+        mended, info = torch.linalg.cholesky_ex(matrices[index] + (jitter * scale)[:, None, None] * eye)
+        good = info == 0
+        factors[index[good]] = mended[good]
+        bad[index[good]] = False
+        if not bool(bad.any()):
+            return factors
+    first = int(bad.nonzero()[0])
+    raise NumericalError(
+        f"{name}[{first}] is not positive definite: {matrices[first].tolist()}; "
+        "raise reg_covar, or check that the covariances are symmetric."
+    )
+
+
+def inverse_factor(factors: Tensor) -> Tensor:
+    """L⁻ᵀ (K, D, D) of lower Cholesky factors L: the columns that whiten, ‖(x−μ)ᵀ L⁻ᵀ‖² = Mahalanobis²."""
+    eye = torch.eye(factors.shape[-1], dtype=factors.dtype, device=factors.device)
+    inverse = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)
+    return inverse.transpose(-2, -1)

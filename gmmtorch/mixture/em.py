@@ -1,0 +1,141 @@
+"""Expectation–maximisation of a Gaussian mixture as two matrix products.
+
+With features φ(x) = [1, x, x_i x_j (i ≤ j)] the log-density plus log-weight of every component is
+linear in φ: L = φ Wᵀ, W the natural parameters. One iteration is Γ = softmax(L), S = Γᵀ diag(p) φ,
+and S (K × F) holds all sufficient statistics: N_k, Σ γ x and Σ γ xxᵀ.
+
+A row of features need not be one point. The mean feature of a cell of points, with their number as
+its weight, gives the cell's expected log-density exactly; EM then shares one responsibility among
+the points of a cell, the M-step stays exact, and Σ_c n_c logsumexp_k bounds the log-likelihood from
+below and never falls (Verbeek, Nunnink & Vlassis, 2006).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
+
+CHUNK_ELEMENTS = 1 << 17
+"""Entries of the N×K block worked on at once, so that it stays in a core's cache."""
+
+_LOG_2PI = 1.8378770664093453
+_MIN_LOG_WEIGHT = -1e30  # stands for log 0: finite, so that products stay free of NaN
+
+
+class Parameters(NamedTuple):
+    """Mixture parameters in the frame of the features: weights (K,), means (K, D), covariances (K, D, D)."""
+
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+
+
+@dataclass(frozen=True)
+class EMResult:
+    """What a run of EM found: the parameters, and the lower bound (mean log-likelihood, nats) of each iteration."""
+
+    parameters: Parameters
+    lower_bounds: list[float]
+    converged: bool
+
+    @property
+    def n_iter(self) -> int:
+        return len(self.lower_bounds)
+
+
+def quadratic_features(points: Tensor) -> Tensor:
+    """φ(x) = [1, x, x_i x_j (i ≤ j)]: (N, D) → (N, 1 + D + D(D+1)/2)."""
+    rows, cols = triangle_indices(points.shape[1], points.device)
+    return torch.cat([points.new_ones(points.shape[0], 1), points, points[:, rows] * points[:, cols]], 1)
+
+
+def natural_parameters(parameters: Parameters) -> Tensor:
+    """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
+    weights, means, covariances = parameters
+    dim = means.shape[1]
+    factors = safe_cholesky(covariances)
+    whiten = inverse_factor(factors)
+    precision = whiten @ whiten.transpose(-2, -1)
+    linear = (precision @ means[:, :, None]).squeeze(-1)
+    log_weight = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT)
+    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
+    constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
+    rows, cols = triangle_indices(dim, means.device)
+    doubled = torch.where(rows == cols, 0.5, 1.0).to(means.dtype)  # off-diagonal products occur once in φ
+    return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
+
+
+def expectation(
+    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype = torch.float32
+) -> tuple[Tensor, Tensor]:
+    """One E-step: sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar).
+
+    The products run in the features' dtype (float64: in float32 the quadratic form cancels by
+    many digits), the exponentials in `softmax_dtype`, after the row's maximum is taken off.
+    """
+    n, k = features.shape[0], natural.shape[0]
+    rows = max(64, CHUNK_ELEMENTS // k)
+    # exp of less would be denormal: it weighs nothing, and is ten times slower to compute.
+    floor = -80.0 if softmax_dtype == torch.float32 else -700.0
+    statistics = torch.zeros_like(natural.T, memory_format=torch.contiguous_format)
+    total = features.new_zeros(())
+    transposed = natural.T.contiguous()
+    block = features.new_empty(min(rows, n), k)
+    for begin in range(0, n, rows):
+        part, p = features[begin : begin + rows], sample_weight[begin : begin + rows]
+        logits = torch.mm(part, transposed, out=block[: part.shape[0]])
+        peak = logits.amax(1)
+        gamma = logits.sub_(peak[:, None]).to(softmax_dtype).clamp_(min=floor).exp_()
+        norm = gamma.sum(1)
+        total += torch.dot(p, peak + norm.to(p.dtype).log())
+        gamma.mul_((p / norm).to(softmax_dtype)[:, None])
+        statistics.addmm_(part.T, gamma.to(part.dtype))
+    return statistics.T, total
+
+
+def maximization(statistics: Tensor, reg_covar: float) -> Parameters:
+    """M-step: parameters from sufficient statistics; `reg_covar` (m²) is added to each variance."""
+    dim = _dimension(statistics.shape[1])
+    count = statistics[:, 0] + 10 * torch.finfo(statistics.dtype).eps
+    means = statistics[:, 1 : 1 + dim] / count[:, None]
+    second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
+    covariances = second - means[:, :, None] * means[:, None, :]
+    covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(reg_covar)
+    return Parameters(count / count.sum(), means, covariances)
+
+
+def _dimension(n_features: int) -> int:
+    return {3: 1, 6: 2, 10: 3}.get(n_features) or int(((8 * n_features + 1) ** 0.5 - 3) / 2)
+
+
+def run_em(
+    features: Tensor,
+    sample_weight: Tensor,
+    parameters: Parameters,
+    *,
+    tol: float = 1e-3,
+    max_iter: int = 100,
+    reg_covar: float = 1e-6,
+    softmax_dtype: torch.dtype = torch.float32,
+    on_iteration: Callable[[int, float], None] | None = None,
+) -> EMResult:
+    """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations."""
+    total = sample_weight.sum()
+    bounds: list[float] = []
+    converged = False
+    for iteration in range(max_iter):
+        statistics, value = expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
+        parameters = maximization(statistics, reg_covar)
+        bounds.append(float(value / total))
+        if on_iteration is not None:
+            on_iteration(iteration + 1, bounds[-1])
+        if iteration and abs(bounds[-1] - bounds[-2]) < tol:
+            converged = True
+            break
+    return EMResult(parameters, bounds, converged)

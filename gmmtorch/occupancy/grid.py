@@ -1,0 +1,124 @@
+"""VoxelGrid: a regular grid of cubes (squares in 2D) with any origin, resolution and shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+
+BYTES_PER_CELL = 16
+"""Hits and misses of one cell, float64 each."""
+
+MEMORY_LIMIT = 4 << 30
+"""Bytes of evidence a grid may hold unless the caller says otherwise."""
+
+
+def check_resolution(resolution: float) -> float:
+    """The resolution as a float; raises unless it is finite and above zero."""
+    value = float(resolution)
+    if not (math.isfinite(value) and value > 0):
+        raise InvalidArgumentError(
+            f"resolution={resolution} is not a cell size; give metres above zero, such as 0.1."
+        )
+    return value
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """A grid of `shape` cells of side `resolution` (m) whose lowest corner is `origin` (m, world frame).
+
+    Cell (i, j[, k]) is the half-open cube origin + resolution·[i, i+1) × …; flat indices are row-major.
+
+    Raises:
+        InvalidArgumentError: a resolution that is not above zero, a shape with no cells, or an
+            origin that is not finite or has another dimension than the shape.
+    """
+
+    origin: tuple[float, ...]
+    resolution: float
+    shape: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        values = self.origin.tolist() if isinstance(self.origin, Tensor) else self.origin
+        object.__setattr__(self, "origin", tuple(float(x) for x in values))
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "resolution", check_resolution(self.resolution))
+        if len(self.origin) != len(self.shape) or len(self.shape) not in (2, 3):
+            raise InvalidArgumentError(
+                f"origin={self.origin} and shape={self.shape} must both have 2 or both have 3 entries."
+            )
+        if not all(math.isfinite(x) for x in self.origin):
+            raise InvalidArgumentError(f"origin={self.origin} must be finite metres.")
+        if min(self.shape) < 1:
+            raise InvalidArgumentError(f"shape={self.shape} must have at least one cell along each axis.")
+
+    @property
+    def dim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def n_cells(self) -> int:
+        return math.prod(self.shape)
+
+    @classmethod
+    def covering(
+        cls,
+        low: Sequence[float] | Tensor,
+        high: Sequence[float] | Tensor,
+        resolution: float,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> VoxelGrid:
+        """The smallest grid over the box [low, high] (m) whose planes are multiples of `resolution`.
+
+        Raises `MemoryLimitError`, with the bytes it would take and the finest resolution that
+        fits, when its evidence would need more than `memory_limit` bytes.
+        """
+        resolution = check_resolution(resolution)
+        low, high = [float(x) for x in low], [float(x) for x in high]
+        if not all(math.isfinite(x) for x in (*low, *high)) or any(
+            b < a for a, b in zip(low, high, strict=True)
+        ):
+            raise InvalidArgumentError(f"low={low}, high={high} is not a box of finite metres.")
+        first = [math.floor(x / resolution) for x in low]
+        shape = tuple(
+            max(1, math.floor(x / resolution) + 1 - i) for x, i in zip(high, first, strict=True)
+        )
+        n_bytes = math.prod(shape) * BYTES_PER_CELL
+        if n_bytes > memory_limit:
+            factor = (n_bytes / memory_limit) ** (1 / len(shape))
+            raise MemoryLimitError(
+                f"resolution={resolution} m over a box of "
+                f"{' × '.join(f'{b - a:.1f}' for a, b in zip(low, high, strict=True))} m takes "
+                f"{' × '.join(map(str, shape))} cells = {n_bytes:,} bytes, above the limit of "
+                f"{memory_limit:,}; a resolution of {resolution * factor * 1.02:.3g} m or more fits."
+            )
+        return cls(tuple(i * resolution for i in first), resolution, shape)
+
+    def to_units(self, points: Tensor) -> Tensor:
+        """World points (M, D) in grid units, float64: cell (i, j, k) is [i, i+1) × …"""
+        origin = torch.tensor(self.origin, dtype=torch.float64, device=points.device)
+        return (points.double() - origin) / self.resolution
+
+    def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat cell index (M,) of world points (M, D), and whether each lies inside (index 0 where not)."""
+        cell = self.to_units(points).floor()
+        shape = torch.tensor(self.shape, dtype=torch.float64, device=points.device)
+        inside = ((cell >= 0) & (cell < shape)).all(1)
+        cell = torch.where(inside[:, None], cell, torch.zeros_like(cell)).long()
+        flat = cell[:, 0]
+        for axis in range(1, self.dim):
+            flat = flat * self.shape[axis] + cell[:, axis]
+        return flat, inside
+
+    def centers(self, device: torch.device | str | None = None) -> Tensor:
+        """Cell centres (n_cells, D) in world metres, float64, row-major."""
+        axes = [
+            o + (torch.arange(n, dtype=torch.float64, device=device) + 0.5) * self.resolution
+            for o, n in zip(self.origin, self.shape, strict=True)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.dim)

@@ -1,0 +1,91 @@
+"""Evidence of Gaussian components by Monte Carlo ray casting (thesis 3.2.3)."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import safe_cholesky
+
+Sampling = Literal["sobol", "stratified", "plain"]
+SAMPLINGS: tuple[str, ...] = get_args(Sampling)
+
+
+class Cones(NamedTuple):
+    """Components as seen from places: C rows, a component seen from two places takes two rows.
+
+    means (C, D), covariances (C, D, D): the component; origins (C, D): the sensor position;
+    counts (C,): its points measured from there; max_range (C,) bool: points that met no surface.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    origins: Tensor
+    counts: Tensor
+    max_range: Tensor
+
+
+class RayBundle(NamedTuple):
+    """Sampled rays: origins (R, D), ends (R, D), weights (R,), is_hit (R,)."""
+
+    origins: Tensor
+    ends: Tensor
+    weights: Tensor
+    is_hit: Tensor
+
+
+def allocate_samples(counts: Tensor, n_samples: int) -> Tensor:
+    """Samples per cone (C,), in proportion to its count, at least one where the count is above zero."""
+    share = counts.double() * (n_samples / counts.double().sum().clamp_min(1e-300))
+    return torch.where(counts > 0, share.round().clamp_min(1), 0.0).long()
+
+
+def sample_rays(
+    cones: Cones, n_samples: int, generator: torch.Generator | None = None, sampling: Sampling = "sobol"
+) -> RayBundle:
+    """Rays from the sensors to points drawn from the components.
+
+    Each ray of a cone with count N and n samples carries the weight N/n, so that evidence means
+    the same whatever the sample count. `stratified` and `sobol` give every cone its share of the
+    samples; `plain` draws the cone of each sample at random; `sobol` takes scrambled Sobol points
+    through the normal quantile instead of independent normals.
+
+    Args:
+        cones: the components and whence they were seen.
+        n_samples: about how many rays to draw in all (rounded per cone, at least one each).
+        generator: seeded source of randomness, on the CPU.
+
+    Raises:
+        InvalidArgumentError: fewer than one sample, or an unknown kind of sampling.
+    """
+    if sampling not in SAMPLINGS:
+        raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+    if n_samples < 1:
+        raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
+    device, dim = cones.means.device, cones.means.shape[1]
+    if sampling == "plain":
+        total = cones.counts.double().sum()
+        cone = torch.multinomial(cones.counts.double().cpu(), n_samples, True, generator=generator).to(device)
+        weights = (total / n_samples).expand(n_samples)
+    else:
+        per_cone = allocate_samples(cones.counts, n_samples)
+        cone = torch.repeat_interleave(per_cone)
+        weights = (cones.counts.double() / per_cone.clamp_min(1))[cone]
+    normals = _standard_normals(cone.shape[0], dim, generator, sampling).to(device)
+    factors = safe_cholesky(cones.covariances.double())
+    ends = cones.means.double()[cone] + (factors[cone] @ normals[:, :, None]).squeeze(-1)
+    return RayBundle(cones.origins.double()[cone], ends, weights, ~cones.max_range[cone])
+
+
+def _standard_normals(n: int, dim: int, generator: torch.Generator | None, sampling: str) -> Tensor:
+    """(n, dim) standard normal draws, float64, on the CPU."""
+    if sampling != "sobol":
+        return torch.randn(n, dim, dtype=torch.float64, generator=generator)
+    seed = int(torch.randint(2**31 - 1, (), generator=generator))
+    engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)
+    uniform = engine.draw(n, dtype=torch.float64) if n else torch.empty(0, dim, dtype=torch.float64)
+    # The engine has 30 bits: move its points to the middle of their intervals, off 0 and 1.
+    return torch.special.ndtri(uniform.clamp(0, 1 - 2.0**-30) + 2.0**-31)
