@@ -130,7 +130,9 @@ def run_em(
     bounds: list[float] = []
     converged = False
     for iteration in range(max_iter):
-        statistics, value = expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
+        statistics, value = expectation(
+            features, sample_weight, natural_parameters(parameters), softmax_dtype
+        )
         parameters = maximization(statistics, reg_covar)
         bounds.append(float(value / total))
         if on_iteration is not None:

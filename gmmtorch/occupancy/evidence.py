@@ -40,7 +40,9 @@ def bernoulli_variance(probability: Tensor) -> Tensor:
 
 def bernoulli_entropy(probability: Tensor) -> Tensor:
     """−θ log₂ θ − (1−θ) log₂(1−θ) in bits: 1 for an unknown cell."""
-    return -(torch.xlogy(probability, probability) + torch.xlogy(1 - probability, 1 - probability)) / math.log(2)
+    return -(
+        torch.xlogy(probability, probability) + torch.xlogy(1 - probability, 1 - probability)
+    ) / math.log(2)
 
 
 def classify(probability: Tensor, variance_threshold: float) -> Tensor:

@@ -85,9 +85,7 @@ class VoxelGrid:
         ):
             raise InvalidArgumentError(f"low={low}, high={high} is not a box of finite metres.")
         first = [math.floor(x / resolution) for x in low]
-        shape = tuple(
-            max(1, math.floor(x / resolution) + 1 - i) for x, i in zip(high, first, strict=True)
-        )
+        shape = tuple(max(1, math.floor(x / resolution) + 1 - i) for x, i in zip(high, first, strict=True))
         n_bytes = math.prod(shape) * BYTES_PER_CELL
         if n_bytes > memory_limit:
             factor = (n_bytes / memory_limit) ** (1 / len(shape))

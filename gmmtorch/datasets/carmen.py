@@ -1,0 +1,94 @@
+"""CARMEN logs of 2D lasers (the Radish collection and many others), gzip or plain text.
+
+Only lines `FLASER n r_1 … r_n x y theta …` are read: n ranges (m) and the laser's pose (m, rad),
+corrected by SLAM where the log is. Beam angles, 0 = forward: n = 180: −90° + i·1°; n = 360:
+−90° + i·0.5°; any other n: n beams spread evenly over [−90°, 90°].
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.errors import DataError
+from gmmtorch.scan import Scan
+
+_MAX_BEAMS = 100_000
+
+
+def beam_angles(n: int) -> Tensor:
+    """Angles (n,) of a front laser's beams in radians, 0 = forward, counter-clockwise."""
+    if n in (180, 360):
+        return (torch.arange(n, dtype=torch.float64) * (180 / n) - 90).deg2rad()
+    return torch.linspace(-math.pi / 2, math.pi / 2, n, dtype=torch.float64)
+
+
+class CarmenLog(Dataset):
+    """Scans of a CARMEN log in the order of the file.
+
+    No return: readings at or beyond `max_range` (the laser's code for "nothing seen": 81.83, 81.91
+    or 50 m in the Radish logs), which free `no_return_range`. Invalid, dropped: readings of 0 or
+    less, NaN.
+    """
+
+    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
+        path = existing(
+            path,
+            "file",
+            "a CARMEN log (text or gzip) with FLASER lines",
+            "Such logs are published in the Radish repository and the SLAM benchmarking pages of Freiburg.",
+        )
+        super().__init__(path.name.split(".")[0], ranges, stride)
+        self._records = _read_records(path)
+
+    def _count(self) -> int:
+        return len(self._records)
+
+    def _read(self, index: int) -> Scan:
+        record = self._records[index]
+        readings, (x, y, theta) = record[:-3], record[-3:]
+        angles = beam_angles(readings.shape[0]) + theta
+        origin = torch.stack([x, y])
+        valid = readings > 0  # NaN compares false
+        ends = origin + readings[valid, None] * torch.stack([angles.cos(), angles.sin()], 1)[valid]
+        return self.ranges.scan(ends, origin)
+
+
+def _read_records(path: Path) -> list[Tensor]:
+    """One tensor [r_1 … r_n, x, y, theta] per FLASER line."""
+    with path.open("rb") as probe:
+        compressed = probe.read(2) == b"\x1f\x8b"
+    records = []
+    try:
+        with gzip.open(path, "rt", errors="replace") if compressed else path.open(errors="replace") as lines:
+            for number, line in enumerate(lines, 1):
+                if line.startswith("FLASER "):
+                    records.append(_parse(line.split(), f"{path}, line {number}"))
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path} is not a whole gzip file ({error}); fetch it again.") from error
+    if not records:
+        raise DataError(f"{path} has no FLASER line, so it is not a CARMEN log of a front laser.")
+    return records
+
+
+def _parse(words: list[str], where: str) -> Tensor:
+    try:
+        n = int(words[1])
+        if not 1 <= n <= _MAX_BEAMS:
+            raise DataError(f"{where}: FLASER announces {n} beams; expected 1 to {_MAX_BEAMS}.")
+        if len(words) < 2 + n + 3:
+            raise DataError(f"{where}: FLASER announces {n} beams, but the line ends early.")
+        record = torch.tensor([float(w) for w in words[2 : 2 + n + 3]], dtype=torch.float64)
+    except (ValueError, IndexError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{where}: not a number in a FLASER line ({error}).") from error
+    if not bool(torch.isfinite(record[-3:]).all()):
+        raise DataError(f"{where}: the pose {record[-3:].tolist()} is not finite.")
+    return record

@@ -1,0 +1,103 @@
+"""Depth images with poses, in the layout of the 7-Scenes data set.
+
+`frame-*.depth.png`: 16 bit, millimetres along the optical axis; `frame-*.pose.txt`: 4×4
+camera-to-world, metres; `camera-intrinsics.txt`: 3×3 pinhole matrix in pixels.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing, rigid
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.scan import Scan
+
+_INVALID = (0, 65535)
+
+
+class DepthFrames(Dataset):
+    """Frames in the order of their names.
+
+    No return: pixels at or beyond `max_range` metres of distance. Invalid, dropped: depth 0 and
+    65535, with which the camera says that it could not tell. `pixel_stride` keeps every n-th
+    pixel of every n-th row.
+    """
+
+    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, pixel_stride: int = 1) -> None:
+        path = existing(
+            path,
+            "folder",
+            "frame-*.depth.png, frame-*.pose.txt and camera-intrinsics.txt",
+            "Microsoft's 7-Scenes data set is published in this layout.",
+        )
+        if pixel_stride < 1:
+            raise InvalidArgumentError(f"pixel_stride={pixel_stride} must be at least 1.")
+        super().__init__(path.name, ranges, stride)
+        self.pixel_stride = pixel_stride
+        self._files = sorted(path.glob("frame-*.depth.png"))
+        if not self._files:
+            raise DataError(f"{path} holds no frame-*.depth.png.")
+        poses = sorted(path.glob("frame-*.pose.txt"))
+        if len(poses) != len(self._files):
+            raise DataError(
+                f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; one each is needed."
+            )
+        self._intrinsics = _matrix(path / "camera-intrinsics.txt", 3)
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        path = self._files[index]
+        pose_path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
+        pose = rigid(_matrix(pose_path, 4), str(pose_path))
+        points = back_project(_depth(path), self._intrinsics, self.pixel_stride)
+        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+
+def back_project(depth: Tensor, intrinsics: Tensor, pixel_stride: int = 1) -> Tensor:
+    """Camera-frame points (N, 3) of the valid pixels of a depth image (H, W) in metres, row by row.
+
+    x = (u − c_x) d / f_x, y = (v − c_y) d / f_y, z = d; pixels of 0 or NaN depth are left out.
+    """
+    depth = depth[::pixel_stride, ::pixel_stride]
+    v, u = torch.meshgrid(
+        *(torch.arange(n, dtype=depth.dtype) * pixel_stride for n in depth.shape), indexing="ij"
+    )
+    x = (u - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (v - intrinsics[1, 2]) / intrinsics[1, 1]
+    return torch.stack([x * depth, y * depth, depth], -1)[depth > 0]
+
+
+def _depth(path: Path) -> Tensor:
+    """Depth (H, W) in metres, float64; invalid pixels 0."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            raw = np.asarray(image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path} is not a whole PNG image: {error}") from error
+    if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
+        raise DataError(
+            f"{path} is {raw.dtype} of shape {raw.shape}; expected one channel of 16 bit, millimetres."
+        )
+    return torch.from_numpy(np.where(np.isin(raw, _INVALID), 0, raw) / 1000.0)
+
+
+def _matrix(path: Path, size: int) -> Tensor:
+    if not path.is_file():
+        raise DataError(f"{path} is missing; expected a {size}×{size} matrix.")
+    try:
+        matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path} is not a matrix of numbers: {error}") from error
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise DataError(
+            f"{path} holds an array of shape {matrix.shape}; expected a finite {size}×{size} matrix."
+        )
+    return torch.from_numpy(matrix)

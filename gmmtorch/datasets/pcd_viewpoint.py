@@ -1,0 +1,52 @@
+"""A folder of PCD files whose points are already in the world frame, the origin in VIEWPOINT."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.clouds import pcd_header, read_cloud
+from gmmtorch.errors import DataError
+from gmmtorch.scan import Scan
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sorts scan_2 before scan_10."""
+    return [(0, int(w)) if w.isdigit() else (1, w) for w in re.split(r"(\d+)", path.name)]
+
+
+class PcdViewpoint(Dataset):
+    """Scans in the natural order of their file names (scan_2 before scan_10).
+
+    No return: points at or beyond `max_range` from the viewpoint. Invalid, dropped: NaN and
+    infinite points, and points on the sensor itself. The orientation in VIEWPOINT is not used.
+    """
+
+    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
+        path = existing(
+            path,
+            "folder",
+            "*.pcd in the world frame, the sensor position in VIEWPOINT",
+            "The la3dm project publishes its simulated lidar scans this way.",
+        )
+        super().__init__(path.name, ranges, stride)
+        self._files = sorted(path.glob("*.pcd"), key=natural_key)
+        if not self._files:
+            raise DataError(f"{path} holds no .pcd file.")
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        path = self._files[index]
+        words = pcd_header(path).get("VIEWPOINT", [])
+        try:
+            origin = torch.tensor([float(w) for w in words[:3]], dtype=torch.float64)
+        except ValueError as error:
+            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} is not numbers.") from error
+        if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
+            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not begin with a sensor position.")
+        return self.ranges.scan(read_cloud(path), origin)

@@ -1,0 +1,69 @@
+"""A folder `scans/*.pcd` (or `*.ply`) in the sensor frame, and `poses.txt` with one KITTI row each.
+
+A KITTI row is 12 numbers, the upper 3×4 of world ← sensor, row by row; metres. The sensor's
+position is the translation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing, rigid
+from gmmtorch.datasets.clouds import read_cloud
+from gmmtorch.errors import DataError
+from gmmtorch.scan import Scan
+
+
+class ScanFolder(Dataset):
+    """Scans in the order of their file names.
+
+    No return: points at or beyond `max_range`. Invalid, dropped: NaN and infinite points, and
+    points on the sensor itself.
+    """
+
+    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
+        path = existing(
+            path,
+            "folder",
+            "scans/*.pcd or scans/*.ply in the sensor frame, and poses.txt (12 numbers a row)",
+            "KITTI odometry, MulRan and most lidar SLAM systems export this layout.",
+        )
+        super().__init__(path.name, ranges, stride)
+        scans = path / "scans"
+        self._files = sorted([*scans.glob("*.pcd"), *scans.glob("*.ply")]) if scans.is_dir() else []
+        if not self._files:
+            raise DataError(f"{scans} holds no .pcd and no .ply file; put one file per scan there.")
+        self._poses = _read_poses(path / "poses.txt")
+        if len(self._poses) != len(self._files):
+            raise DataError(
+                f"{path}: poses.txt has {len(self._poses)} rows, but there are {len(self._files)} scans; "
+                "there must be one pose for each scan, in the order of the file names."
+            )
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        pose = self._poses[index]
+        points = read_cloud(self._files[index])
+        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+
+def _read_poses(path: Path) -> torch.Tensor:
+    """Poses (S, 4, 4) of a file of KITTI rows."""
+    if not path.is_file():
+        raise DataError(f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan.")
+    try:
+        rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path} is not a table of numbers: {error}") from error
+    if rows.size and rows.shape[1] != 12:
+        raise DataError(f"{path} has {rows.shape[1]} numbers a row; a KITTI pose has 12.")
+    poses = torch.eye(4, dtype=torch.float64).repeat(rows.shape[0], 1, 1)
+    poses[:, :3] = torch.from_numpy(rows.reshape(-1, 3, 4))
+    for number, pose in enumerate(poses, 1):
+        rigid(pose, f"{path}, row {number}")
+    return poses

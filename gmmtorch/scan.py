@@ -1,0 +1,112 @@
+"""Scan: what one sweep, frame or beam fan of a range sensor saw, in the world frame."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+ArrayLike = Tensor | np.ndarray | list | tuple
+
+_FLOAT32_WARNING_METRES = 1e4
+"""Beyond this distance from the origin float32 coordinates are coarser than about a millimetre."""
+
+
+def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
+    if value is None:
+        return torch.empty(0, dim or 0, dtype=torch.float64)
+    tensor = torch.as_tensor(value)
+    if not tensor.is_floating_point():
+        tensor = tensor.double()
+    if tensor.numel() == 0 and tensor.ndim < 2:
+        tensor = tensor.new_empty(0, dim or 0)
+    if tensor.ndim != 2 or (dim is not None and tensor.shape[1] != dim):
+        raise InvalidArgumentError(
+            f"{name} has shape {tuple(tensor.shape)}; expected (N, {dim if dim else '2 or 3'}), metres."
+        )
+    finite = torch.isfinite(tensor).all(1)
+    if not bool(finite.all()):
+        row = int((~finite).nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{row}] = {tensor[row].tolist()} is not finite; drop such rows first: "
+            f"{name} = {name}[torch.isfinite({name}).all(1)]."
+        )
+    if tensor.dtype == torch.float32 and bool((tensor.abs() > _FLOAT32_WARNING_METRES).any()):
+        warnings.warn(
+            f"{name} holds float32 coordinates beyond {_FLOAT32_WARNING_METRES / 1e3:.0f} km from the origin, "
+            "where float32 cannot tell millimetres apart; read them as float64, or subtract an offset.",
+            UserWarning,
+            stacklevel=4,
+        )
+    return tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Measured surface points, and whence they were measured. World frame, metres.
+
+    Attributes:
+        points: (N, D) returns, D = 2 or 3: each is a surface seen from `origin`.
+        origin: (D,) position of the sensor.
+        no_return: (M, D) one row for every beam that came back empty: the point up to which the
+            beam is taken to have met nothing. It speaks of free space and is never a surface.
+
+    Arrays, lists and tensors are taken. Raises `InvalidArgumentError` on shapes that disagree and
+    on NaN or infinite coordinates; warns about float32 coordinates too far out to be exact.
+    """
+
+    points: Tensor
+    origin: Tensor
+    no_return: Tensor = None  # type: ignore[assignment]  # becomes an empty (0, D) tensor
+
+    def __post_init__(self) -> None:
+        origin = torch.as_tensor(self.origin)
+        origin = origin if origin.is_floating_point() else origin.double()
+        if origin.shape not in ((2,), (3,)):
+            raise InvalidArgumentError(f"origin has shape {tuple(origin.shape)}; expected (2,) or (3,).")
+        dim = origin.shape[0]
+        _as_points("origin", origin[None], dim)
+        points = _as_points("points", self.points, dim)
+        no_return = _as_points("no_return", self.no_return, dim)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "origin", origin.to(points.device))
+        object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
+
+    @property
+    def dim(self) -> int:
+        return self.origin.shape[0]
+
+    @property
+    def n_beams(self) -> int:
+        """Beams that say something: returns and no-returns."""
+        return self.points.shape[0] + self.no_return.shape[0]
+
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """All beam ends (N + M, D), returns first, and which of them (N + M,) are returns."""
+        is_hit = torch.zeros(self.n_beams, dtype=torch.bool, device=self.points.device)
+        is_hit[: self.points.shape[0]] = True
+        return torch.cat([self.points, self.no_return]), is_hit
+
+    def select(self, keep: Tensor) -> Scan:
+        """The scan with only the beams (N + M,) marked in `keep`, in the order of `ends`."""
+        n = self.points.shape[0]
+        return replace(self, points=self.points[keep[:n]], no_return=self.no_return[keep[n:]])
+
+    def transformed(self, transform: Tensor) -> Scan:
+        """The scan moved by a rigid motion (D+1, D+1): x → R x + t."""
+        matrix = torch.as_tensor(transform, dtype=torch.float64)
+        rotation, translation = matrix[:-1, :-1], matrix[:-1, -1]
+
+        def move(x: Tensor) -> Tensor:
+            return (x.double() @ rotation.T + translation).to(x.dtype)
+
+        return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return))
+
+    def to(self, device: torch.device | str) -> Scan:
+        """The scan on another device."""
+        return Scan(self.points.to(device), self.origin.to(device), self.no_return.to(device))
