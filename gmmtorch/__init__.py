@@ -1,0 +1,61 @@
+"""Gaussian mixture maps from range data. See the README for a tour.
+
+Names are imported when they are first used, so that `import gmmtorch` stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gmmtorch import datasets as datasets
+    from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
+    from gmmtorch.errors import GmmTorchError as GmmTorchError
+    from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
+    from gmmtorch.mapping.learning import LearningRule as LearningRule
+    from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
+    from gmmtorch.occupancy.evidence import Evidence as Evidence
+    from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
+    from gmmtorch.scan import Scan as Scan
+
+try:
+    __version__ = version("gmmtorch")
+except PackageNotFoundError:  # a bare checkout on the path
+    __version__ = "0+unknown"
+
+_HOMES = {
+    "Evidence": "gmmtorch.occupancy.evidence",
+    "GaussianMap": "gmmtorch.mapping.gaussian_map",
+    "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
+    "GmmTorchError": "gmmtorch.errors",
+    "LearningRule": "gmmtorch.mapping.learning",
+    "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
+    "Scan": "gmmtorch.scan",
+    "VoxelGrid": "gmmtorch.occupancy.grid",
+}
+
+__all__ = [
+    "Evidence",
+    "GaussianMap",
+    "GaussianMixture",
+    "GmmTorchError",
+    "LearningRule",
+    "OccupancyGrid",
+    "Scan",
+    "VoxelGrid",
+    "datasets",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    if name == "datasets":
+        return importlib.import_module("gmmtorch.datasets")
+    raise AttributeError(f"module 'gmmtorch' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -51,7 +51,6 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
     for jitter in _JITTERS:
         index = bad.nonzero().squeeze(1)
         scale = matrices[index].diagonal(dim1=-2, dim2=-1).mean(-1).abs()
-        scale = scale.clamp_min(torch.finfo(matrices.dtype).tiny ** 0.5)
         mended, info = torch.linalg.cholesky_ex(matrices[index] + (jitter * scale)[:, None, None] * eye)
         good = info == 0
         factors[index[good]] = mended[good]
@@ -61,7 +60,7 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
     first = int(bad.nonzero()[0])
     raise NumericalError(
         f"{name}[{first}] is not positive definite: {matrices[first].tolist()}; "
-        "raise reg_covar, or check that the covariances are symmetric."
+        "raise reg_covar (1e-6 m² is usual), or check that the covariances are symmetric."
     )
 
 

@@ -1,0 +1,90 @@
+"""Scans from files in others' formats, and from simulated buildings.
+
+`load` opens a data set by name; its module is imported only then.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmmtorch.datasets.base import Dataset, Ranges
+from gmmtorch.errors import InvalidArgumentError
+
+__all__ = ["Dataset", "Ranges", "load"]
+
+
+class _Source(NamedTuple):
+    """Where a data set's class is, and what its readings mean unless the caller says otherwise."""
+
+    module: str
+    reader: str
+    max_range: float | None = None
+    no_return_range: float = 0.0
+    needs_path: bool = True
+
+
+_SOURCES = {
+    "carmen": _Source("carmen", "CarmenLog", 50.0, 8.0),
+    "scan_folder": _Source("scan_folder", "ScanFolder"),
+    "pcd_viewpoint": _Source("pcd_viewpoint", "PcdViewpoint"),
+    "depth_frames": _Source("depth_frames", "DepthFrames"),
+    "octomap_log": _Source("octomap_log", "OctomapLog"),
+    "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
+    "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
+}
+
+
+def load(
+    name: str,
+    path: str | Path | None = None,
+    *,
+    max_range: float | None = None,
+    no_return_range: float | None = None,
+    stride: int = 1,
+    **options: Any,
+) -> Dataset:
+    """The data set `name`: a sequence of `Scan`s, read when asked for.
+
+    Args:
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log (these need a `path`),
+            synthetic_building or synthetic_building_2d (these need none).
+        path: the file or folder.
+        max_range: readings at or beyond it (m) are beams without return. None: 50 for CARMEN logs,
+            the sensor's own maximum for the synthetic buildings, no limit (`math.inf`) for the others.
+        no_return_range: how far (m) such a beam speaks of free space; 0 drops them. None: 8 for CARMEN
+            logs and the synthetic buildings, 0 for the others.
+        stride: every n-th scan is read.
+        options: what only this data set takes: `pixel_stride` for depth_frames; `seed`, `n_scans` and
+            `sensor` ("lidar" or "depth_camera", in 3D) for the synthetic buildings.
+
+    Raises `InvalidArgumentError` for a name, option or value that is not known, `MissingDataError` for a
+    path that does not exist, and `DataError`, now or when a scan is read, for what cannot be read.
+    """
+    if name not in _SOURCES:
+        raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_SOURCES)}.")
+    source = _SOURCES[name]
+    reader = getattr(importlib.import_module(f"{__name__}.{source.module}"), source.reader)
+    ranges = Ranges(
+        source.max_range if max_range is None else max_range,
+        source.no_return_range if no_return_range is None else no_return_range,
+    )
+    known = set(inspect.signature(reader).parameters) - {"path", "ranges", "stride"}
+    for option, value in options.items():
+        if option not in known:
+            takes = f"takes {', '.join(sorted(known))}" if known else "takes no further options"
+            raise InvalidArgumentError(
+                f"{option}={value!r} is not an option of dataset={name}, which {takes}."
+            )
+    if source.needs_path:
+        dataset: Dataset = reader(path, ranges, stride, **options)
+        return dataset
+    if path is not None:
+        raise InvalidArgumentError(
+            f"dataset.path={path} is given, but dataset={name} is simulated; drop the path, or choose one of "
+            f"{', '.join(n for n, s in _SOURCES.items() if s.needs_path)}."
+        )
+    simulated: Dataset = reader(ranges, stride, **options)
+    return simulated

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,6 +109,11 @@ def existing(path: str | Path, kind: str, looked_for: str, where_to_get: str) ->
         what = "is not a " + kind if path.exists() else "does not exist"
         raise MissingDataError(f"dataset.path={path} {what}; looked for {looked_for}. {where_to_get}")
     return path
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sort key of file names that puts scan_2 before scan_10."""
+    return [(0, int(w)) if w.isdecimal() else (1, w) for w in re.split(r"(\d+)", path.name)]
 
 
 def rigid(matrix: Tensor, where: str) -> Tensor:

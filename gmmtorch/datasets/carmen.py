@@ -56,6 +56,8 @@ class CarmenLog(Dataset):
         angles = beam_angles(readings.shape[0]) + theta
         origin = torch.stack([x, y])
         valid = readings > 0  # NaN compares false
+        if self.ranges.max_range is not None:
+            readings = readings.clamp_max(self.ranges.max_range)  # some lasers report infinity
         ends = origin + readings[valid, None] * torch.stack([angles.cos(), angles.sin()], 1)[valid]
         return self.ranges.scan(ends, origin)
 

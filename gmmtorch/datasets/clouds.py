@@ -14,7 +14,10 @@ _HEADER_BYTES = 4096
 
 
 def read_cloud(path: Path) -> Tensor:
-    """Points (N, 3), float64, of a PCD or PLY file, NaN rows included. Raises `DataError` if it is unreadable."""
+    """Points (N, 3), float64, of a PCD or PLY file, NaN rows included.
+
+    Raises `DataError` if the file is unreadable.
+    """
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -25,7 +28,7 @@ def read_cloud(path: Path) -> Tensor:
     expected = _announced_points(path)
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            cloud = open3d.t.io.read_point_cloud(str(path))
+            cloud = open3d.t.io.read_point_cloud(path)
             points = cloud.point.positions.numpy() if "positions" in cloud.point else np.empty((0, 3))
     except (RuntimeError, KeyError) as error:
         raise DataError(f"{path} cannot be read as a point cloud: {error}") from error

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing, rigid
+from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key, rigid
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.scan import Scan
 
@@ -20,7 +20,7 @@ _INVALID = (0, 65535)
 
 
 class DepthFrames(Dataset):
-    """Frames in the order of their names.
+    """Frames in the natural order of their names (frame-2 before frame-10).
 
     No return: pixels at or beyond `max_range` metres of distance. Invalid, dropped: depth 0 and
     65535, with which the camera says that it could not tell. `pixel_stride` keeps every n-th
@@ -38,10 +38,10 @@ class DepthFrames(Dataset):
             raise InvalidArgumentError(f"pixel_stride={pixel_stride} must be at least 1.")
         super().__init__(path.name, ranges, stride)
         self.pixel_stride = pixel_stride
-        self._files = sorted(path.glob("frame-*.depth.png"))
+        self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
         if not self._files:
             raise DataError(f"{path} holds no frame-*.depth.png.")
-        poses = sorted(path.glob("frame-*.pose.txt"))
+        poses = list(path.glob("frame-*.pose.txt"))
         if len(poses) != len(self._files):
             raise DataError(
                 f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; one each is needed."

@@ -24,7 +24,7 @@ class OctomapLog(Dataset):
     """Scans in the order of the file, read when asked for: only their positions in it are kept.
 
     No return: points at or beyond `max_range`. Invalid, dropped: NaN and infinite points, and
-    points on the sensor itself. Gzip files are unpacked into memory.
+    points on the sensor itself. Gzip files are unpacked into memory, once.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
@@ -35,22 +35,14 @@ class OctomapLog(Dataset):
             "The OctoMap 3D scan dataset of the University of Freiburg is published in this format.",
         )
         super().__init__(self._path.name.split(".")[0], ranges, stride)
+        self._unpacked = _unpack(self._path)
         with self._open() as file:
-            self._nodes = [begin for begin, line in _lines(file) if line.startswith(b"NODE")]
+            self._nodes = _node_positions(file)
         if not self._nodes:
             raise DataError(f"{self._path} has no NODE line, so it is not an OctoMap scan log.")
 
     def _open(self) -> io.BufferedIOBase:
-        file = self._path.open("rb")
-        if file.peek(2)[:2] != b"\x1f\x8b":
-            return file
-        with file:
-            try:
-                return io.BytesIO(gzip.decompress(file.read()))
-            except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-                raise DataError(
-                    f"{self._path} is not a whole gzip file ({error}); fetch it again."
-                ) from error
+        return self._path.open("rb") if self._unpacked is None else io.BytesIO(self._unpacked)
 
     def _count(self) -> int:
         return len(self._nodes)
@@ -77,13 +69,25 @@ def rotation(roll: float, pitch: float, yaw: float) -> torch.Tensor:
     return torch.from_numpy(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix())
 
 
-def _lines(file: io.BufferedIOBase) -> list[tuple[int, bytes]]:
-    result, position = [], 0
+def _unpack(path: Path) -> bytes | None:
+    """The text of a gzip file; None for a plain one."""
+    with path.open("rb") as file:
+        if file.peek(2)[:2] != b"\x1f\x8b":
+            return None
+        try:
+            return gzip.decompress(file.read())
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise DataError(f"{path} is not a whole gzip file ({error}); fetch it again.") from error
+
+
+def _node_positions(file: io.BufferedIOBase) -> list[int]:
+    """Where in the file the NODE lines begin, in bytes."""
+    positions, position = [], 0
     for line in file:
         if line.startswith(b"NODE"):
-            result.append((position, line))
+            positions.append(position)
         position += len(line)
-    return result
+    return positions
 
 
 def _numbers(lines: list[str], columns: int, where: str) -> np.ndarray:
@@ -91,7 +95,7 @@ def _numbers(lines: list[str], columns: int, where: str) -> np.ndarray:
         table = np.array([line.split() for line in lines], dtype=np.float64)
     except ValueError as error:
         raise DataError(f"{where}: expected {columns} numbers a line ({error}).") from error
-    if table.size == 0:
+    if not lines:
         return np.empty((0, columns))
     if table.ndim != 2 or table.shape[1] != columns:
         raise DataError(f"{where}: expected {columns} numbers a line, found {table.shape[-1]}.")

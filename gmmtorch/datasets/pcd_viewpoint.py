@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key
 from gmmtorch.datasets.clouds import pcd_header, read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
-
-
-def natural_key(path: Path) -> list[tuple[int, int | str]]:
-    """Sorts scan_2 before scan_10."""
-    return [(0, int(w)) if w.isdigit() else (1, w) for w in re.split(r"(\d+)", path.name)]
 
 
 class PcdViewpoint(Dataset):

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing, rigid
+from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key, rigid
 from gmmtorch.datasets.clouds import read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
 
 class ScanFolder(Dataset):
-    """Scans in the order of their file names.
+    """Scans in the natural order of their file names (scan_2 before scan_10).
 
     No return: points at or beyond `max_range`. Invalid, dropped: NaN and infinite points, and
     points on the sensor itself.
@@ -33,7 +33,7 @@ class ScanFolder(Dataset):
         )
         super().__init__(path.name, ranges, stride)
         scans = path / "scans"
-        self._files = sorted([*scans.glob("*.pcd"), *scans.glob("*.ply")]) if scans.is_dir() else []
+        self._files = sorted([*scans.glob("*.pcd"), *scans.glob("*.ply")], key=natural_key)
         if not self._files:
             raise DataError(f"{scans} holds no .pcd and no .ply file; put one file per scan there.")
         self._poses = _read_poses(path / "poses.txt")

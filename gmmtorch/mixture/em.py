@@ -12,7 +12,7 @@ below and never falls (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -99,44 +99,156 @@ def expectation(
     return statistics.T, total
 
 
-def maximization(statistics: Tensor, reg_covar: float) -> Parameters:
-    """M-step: parameters from sufficient statistics; `reg_covar` (m²) is added to each variance."""
-    dim = _dimension(statistics.shape[1])
-    count = statistics[:, 0] + 10 * torch.finfo(statistics.dtype).eps
+def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
+    """The component (N,) with the largest responsibility for each row of features."""
+    natural = natural_parameters(parameters).T.contiguous()
+    rows = max(64, CHUNK_ELEMENTS // natural.shape[1])
+    return torch.cat([(part @ natural).argmax(1) for part in features.split(rows)])
+
+
+def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | None = None) -> Parameters:
+    """M-step: parameters from sufficient statistics; `reg_covar` (m²) is added to each variance.
+
+    A component that lost all its points keeps its `previous` mean and covariance, at weight 0.
+    """
+    dim = feature_dimension(statistics.shape[1])
+    eps = 10 * torch.finfo(statistics.dtype).eps
+    count = statistics[:, 0] + eps
     means = statistics[:, 1 : 1 + dim] / count[:, None]
     second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
     covariances = second - means[:, :, None] * means[:, None, :]
     covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(reg_covar)
-    return Parameters(count / count.sum(), means, covariances)
+    return _keep_dead(Parameters(count / count.sum(), means, covariances), statistics[:, 0] > eps, previous)
 
 
-def _dimension(n_features: int) -> int:
-    return {3: 1, 6: 2, 10: 3}.get(n_features) or int(((8 * n_features + 1) ** 0.5 - 3) / 2)
+def _keep_dead(new: Parameters, alive: Tensor, previous: Parameters | None) -> Parameters:
+    if previous is None or bool(alive.all()):
+        return new
+    return Parameters(
+        torch.where(alive, new.weights, 0.0),
+        torch.where(alive[:, None], new.means, previous.means),
+        torch.where(alive[:, None, None], new.covariances, previous.covariances),
+    )
+
+
+def feature_dimension(n_features: int) -> int:
+    """D such that 1 + D + D(D+1)/2 = n_features."""
+    return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
+
+
+# -- the slow, exact form -------------------------------------------------------------------------
+
+
+def is_ill_conditioned(parameters: Parameters) -> bool:
+    """Whether the natural parameters would cancel by more than about 1e-6 nats in float64.
+
+    φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats: with a component 1 mm thick this happens 10 km
+    from the centre of the cloud.
+    """
+    whiten = inverse_factor(safe_cholesky(parameters.covariances))
+    size = (parameters.means[:, None, :] @ whiten).square().sum((1, 2))
+    return bool((size * parameters.weights.sign()).max() * torch.finfo(whiten.dtype).eps > 1e-6)
+
+
+def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
+    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖²: no cancellation, however far out."""
+    weights, means, covariances = parameters
+    factors = safe_cholesky(covariances)
+    whiten = inverse_factor(factors)
+    offset = points[:, None, :] - means
+    squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
+    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
+    constant = torch.log(weights).clamp_min(_MIN_LOG_WEIGHT) - half_log_det - 0.5 * means.shape[1] * _LOG_2PI
+    return constant - 0.5 * squared
+
+
+def direct_step(
+    points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
+) -> tuple[Parameters, Tensor]:
+    """One E- and M-step without natural parameters: new parameters and Σ_n p_n log p(x_n).
+
+    Second moments are taken about the new means, in a second pass over the points.
+    """
+    n_components = parameters.weights.shape[0]
+    rows = max(1, CHUNK_ELEMENTS // n_components)
+
+    def chunks() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
+            joint = log_joint(part, parameters)
+            norm = torch.logsumexp(joint, 1)
+            yield part, torch.exp(joint - norm[:, None]) * p[:, None], torch.dot(p, norm)
+
+    eps = 10 * torch.finfo(points.dtype).eps
+    count = torch.zeros_like(parameters.weights)
+    first = torch.zeros_like(parameters.means)
+    total = points.new_zeros(())
+    for part, gamma, value in chunks():
+        count += gamma.sum(0)
+        first += gamma.T @ part
+        total += value
+    alive = count > eps
+    count = count + eps
+    means = first / count[:, None]
+    second = torch.zeros_like(parameters.covariances)
+    for part, gamma, _ in chunks():
+        offset = part[:, None, :] - means
+        second += torch.einsum("nk,nki,nkj->kij", gamma, offset, offset)
+    covariances = second / count[:, None, None]
+    covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
+    new = Parameters(count / count.sum(), means, covariances)
+    return _keep_dead(new, alive, parameters), total
+
+
+# -- the loop -------------------------------------------------------------------------------------
+
+Step = Callable[[Parameters], tuple[Parameters, float]]
+"""From parameters to better ones, and the mean lower bound (nats) of those it was given."""
+
+
+def natural_step(
+    features: Tensor,
+    sample_weight: Tensor,
+    reg_covar: float,
+    softmax_dtype: torch.dtype = torch.float32,
+    points: Tensor | None = None,
+) -> Step:
+    """EM steps on features (N, F), which may be those of cells. Both are float64.
+
+    With `points` (N, D), the ones the features are of, steps whose natural parameters would
+    cancel are taken in the direct form instead.
+    """
+    total = sample_weight.sum()
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        if points is None or not is_ill_conditioned(parameters):
+            statistics, value = expectation(
+                features, sample_weight, natural_parameters(parameters), softmax_dtype
+            )
+            new = maximization(statistics, reg_covar, parameters)
+            if points is None or not is_ill_conditioned(new):
+                return new, float(value / total)
+        new, value = direct_step(points, sample_weight, parameters, reg_covar)
+        return new, float(value / total)
+
+    return step
 
 
 def run_em(
-    features: Tensor,
-    sample_weight: Tensor,
+    step: Step,
     parameters: Parameters,
     *,
     tol: float = 1e-3,
     max_iter: int = 100,
-    reg_covar: float = 1e-6,
-    softmax_dtype: torch.dtype = torch.float32,
     on_iteration: Callable[[int, float], None] | None = None,
 ) -> EMResult:
     """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations."""
-    total = sample_weight.sum()
     bounds: list[float] = []
     converged = False
     for iteration in range(max_iter):
-        statistics, value = expectation(
-            features, sample_weight, natural_parameters(parameters), softmax_dtype
-        )
-        parameters = maximization(statistics, reg_covar)
-        bounds.append(float(value / total))
+        parameters, bound = step(parameters)
+        bounds.append(bound)
         if on_iteration is not None:
-            on_iteration(iteration + 1, bounds[-1])
+            on_iteration(iteration + 1, bound)
         if iteration and abs(bounds[-1] - bounds[-2]) < tol:
             converged = True
             break

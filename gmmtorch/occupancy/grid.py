@@ -44,8 +44,7 @@ class VoxelGrid:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        values = self.origin.tolist() if isinstance(self.origin, Tensor) else self.origin
-        object.__setattr__(self, "origin", tuple(float(x) for x in values))
+        object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))  # a tensor will do
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         object.__setattr__(self, "resolution", check_resolution(self.resolution))
         if len(self.origin) != len(self.shape) or len(self.shape) not in (2, 3):

@@ -11,6 +11,7 @@ Where a ray crosses two planes in the same point it crosses the lower axis first
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -133,7 +134,11 @@ def row_major_strides(shape: tuple[int, ...]) -> list[int]:
 
 
 def traverse(
-    starts: Tensor, ends: Tensor, shape: tuple[int, ...], chunk_visits: int = CHUNK_VISITS
+    starts: Tensor,
+    ends: Tensor,
+    shape: tuple[int, ...],
+    chunk_visits: int = CHUNK_VISITS,
+    strides: list[int] | None = None,
 ) -> Iterator[Visits]:
     """Voxels passed through and left by each segment, the end voxel excluded.
 
@@ -142,22 +147,22 @@ def traverse(
         ends: (R, D) segment ends in grid units, finite.
         shape: voxels along each axis; voxels outside are not reported.
         chunk_visits: about how many visits each yielded chunk holds.
+        strides: of the flat voxel index, one for each axis; row-major if not given.
 
     Yields:
-        `Visits` of flat row-major voxel indices and ray indices. Within a ray each voxel occurs
-        once; chunks and the order within them carry no meaning.
+        `Visits` of flat voxel indices and ray indices. Within a ray each voxel occurs once;
+        chunks and the order within them carry no meaning.
     """
     if starts.shape[0] == 0:
         return
     rays = _mirrored(starts.double(), ends.double())
     size = torch.tensor(shape, dtype=torch.float64, device=starts.device)
-    strides = row_major_strides(shape)
+    strides = strides or row_major_strides(shape)
     low = torch.where(rays.flipped, -size, torch.zeros_like(size))
     fits = ((rays.first >= low) & (rays.last < low + size)).all(1)
     # A ray that leaves the grid visits at most sum(shape) of its voxels.
     visits = torch.minimum((rays.last - rays.first).sum(1), size.sum() + 4 * len(shape))
-    bounds = _chunk_bounds(visits, chunk_visits)
-    for begin, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, stop in itertools.pairwise(_chunk_bounds(visits, chunk_visits)):
         part = _Rays(*(field[begin:stop] for field in rays))
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):

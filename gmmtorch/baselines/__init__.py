@@ -1,0 +1,1 @@
+"""The maps that robots use today, behind the same protocol as ours."""

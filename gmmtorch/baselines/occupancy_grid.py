@@ -1,0 +1,187 @@
+"""The classic occupancy grid, by counts or by log-odds, from the raw beams."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
+from gmmtorch.scan import ArrayLike, Scan
+
+_FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1
+_RAYS_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True)
+class LogOdds:
+    """Update of a cell hit by, or only passed by, the beams of a scan; and the clamp (OctoMap's defaults)."""
+
+    hit: float = math.log(0.7 / 0.3)
+    miss: float = math.log(0.4 / 0.6)
+    low: float = math.log(0.1192 / 0.8808)
+    high: float = math.log(0.971 / 0.029)
+
+
+class OccupancyGrid:
+    """Cells of one size, stored in blocks where beams went.
+
+    By counts: hits are beam ends in a cell, misses beams that passed through it, and θ follows from
+    (3.9), exactly as for a mixture. By log-odds: each scan adds one update to every cell it hits, and
+    another to every cell it only passed through, within a clamp (Hornung et al. 2013).
+
+    Args:
+        resolution: side of a cell (m).
+        log_odds: the updates, for the log-odds variant; None counts.
+        prior: N_p of (3.9); counts only.
+        memory_limit: bytes that the cells may take.
+    """
+
+    def __init__(
+        self,
+        resolution: float,
+        *,
+        log_odds: LogOdds | None = None,
+        prior: float = 1.0,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> None:
+        self.resolution = check_resolution(resolution)
+        self.log_odds = log_odds
+        self.prior = float(prior)
+        self.memory_limit = memory_limit
+        self._blocks: BlockEvidence | None = None  # counts; or log-odds in the place of hits
+        self._waiting: list[Scan] = []  # counts are additive, so scans are cast many at a time
+
+    def insert(self, scan: Scan) -> None:
+        """Count the beams of a scan."""
+        if self._blocks is None:
+            self._blocks = BlockEvidence(self.resolution, scan.dim, scan.points.device, self.memory_limit)
+        elif scan.dim != self._blocks.dim:
+            raise InvalidArgumentError(
+                f"scan is {scan.dim}-dimensional, but the grid is {self._blocks.dim}-dimensional."
+            )
+        if self.log_odds is not None:
+            self._update_log_odds(self._blocks, scan, self.log_odds)
+            return
+        self._waiting.append(scan)
+        if sum(waiting.n_beams for waiting in self._waiting) > _RAYS_AT_ONCE:
+            self.evidence()
+
+    def evidence(self) -> BlockEvidence:
+        """Hits and misses counted so far (in the log-odds variant: log-odds in the place of hits)."""
+        if self._blocks is None:
+            raise InvalidArgumentError("The grid is empty; insert a scan first.")
+        scans, self._waiting = self._waiting, []
+        if scans:
+            ends = [scan.ends() for scan in scans]
+            origins = torch.cat([scan.origin.double().expand(scan.n_beams, -1) for scan in scans])
+            self._blocks.add_rays(
+                origins, torch.cat([e[0] for e in ends]), None, torch.cat([e[1] for e in ends])
+            )
+        return self._blocks
+
+    def _update_log_odds(self, total: BlockEvidence, scan: Scan, rule: LogOdds) -> None:
+        ends, is_hit = scan.ends()
+        seen = BlockEvidence(self.resolution, scan.dim, ends.device, self.memory_limit)
+        seen.add_rays(scan.origin.double().expand(ends.shape[0], -1), ends, None, is_hit)
+        update = torch.where(seen.hits > 0, rule.hit, torch.where(seen.misses > 0, rule.miss, 0.0))
+        total.merge_hits(seen, update)
+        # Only touched cells have left 0, so the clamp (0 lies within it) leaves the others alone.
+        total.hits.clamp_(rule.low, rule.high)
+
+    def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Tensor | np.ndarray:
+        """Probability (M,) of the cells that hold the points (M, D); ½ where no beam went.
+
+        `resolution` is ignored: a grid answers with its own cells.
+        """
+        query = torch.as_tensor(points).double()
+        if bool(torch.isnan(query).any()):
+            raise InvalidArgumentError("points holds NaN; drop such rows before asking.")
+        if self._blocks is None:
+            theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64)
+        elif self.log_odds is None:
+            theta = self.evidence().lookup(query, self.prior)
+        else:
+            theta = torch.sigmoid(self._blocks.evidence_at(query)[0])
+        return theta if isinstance(points, Tensor) else theta.cpu().numpy()
+
+    # -- keeping ----------------------------------------------------------------------------------
+
+    def _serialized(self) -> bytes:
+        """Block keys; one bit a cell: has it evidence; and the values of those that have.
+
+        Counts take the narrowest unsigned type that holds them, log-odds a float32 each.
+        """
+        blocks = self.evidence()
+        hits, misses = blocks.in_key_order()
+        facts: dict[str, Any] = {"resolution": self.resolution, "dim": blocks.dim, "prior": self.prior}
+        observed = (hits != 0) | (misses != 0)
+        tensors = {"keys": blocks.keys, "observed": _pack_bits(observed)}
+        if self.log_odds is None:
+            tensors |= {"hits": _narrowest(hits[observed]), "misses": _narrowest(misses[observed])}
+        else:
+            facts["log_odds"] = vars(self.log_odds)
+            tensors["log_odds"] = hits[observed].float()
+        return pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file that `save` writes; 0 for an empty grid."""
+        return 0 if self._blocks is None else len(self._serialized())
+
+    def save(self, path: str | Path) -> None:
+        """Write the grid, atomically."""
+        write_bytes(path, self._serialized())
+
+    @classmethod
+    def load(cls, path: str | Path) -> OccupancyGrid:
+        """Read a grid that `save` wrote. Raises `DataError` if it is not one."""
+        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
+        try:
+            rule = LogOdds(**facts["log_odds"]) if "log_odds" in facts else None
+            grid = cls(facts["resolution"], log_odds=rule, prior=facts["prior"])
+            blocks = BlockEvidence(grid.resolution, {2: 2, 3: 3}[facts["dim"]])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
+        keys = require(tensors, "keys", (None,), torch.int64, path)
+        bits = require(tensors, "observed", (keys.shape[0], blocks.cells_per_block // 8), torch.uint8, path)
+        observed = _unpack_bits(bits)
+        n = int(observed.sum())
+        names = ("hits", "misses") if rule is None else ("log_odds",)
+        values = [tensors[name].double() for name in names if name in tensors]
+        if len(values) != len(names) or any(
+            v.shape != (n,) or not bool(torch.isfinite(v).all()) for v in values
+        ):
+            raise DataError(
+                f"{path}: {' and '.join(names)} should hold {n} finite values each; the file is damaged."
+            )
+        if bool((keys[1:] <= keys[:-1]).any()):
+            raise DataError(f"{path}: the block keys are not sorted; the file is damaged.")
+        blocks.fill(keys, observed, *values)
+        grid._blocks = blocks
+        return grid
+
+
+def _narrowest(values: Tensor) -> Tensor:
+    """Whole numbers ≥ 0 in the narrowest of uint8, int16, int32 and int64 that holds them all."""
+    largest = int(values.max()) if values.numel() else 0
+    for dtype in (torch.uint8, torch.int16, torch.int32):
+        if largest <= torch.iinfo(dtype).max:
+            return values.to(dtype)
+    return values.to(torch.int64)
+
+
+def _pack_bits(mask: Tensor) -> Tensor:
+    return torch.from_numpy(np.packbits(mask.cpu().numpy(), axis=1))
+
+
+def _unpack_bits(packed: Tensor) -> Tensor:
+    return torch.from_numpy(np.unpackbits(packed.numpy(), axis=1)).bool()

@@ -1,0 +1,120 @@
+"""Files that are never half-written, and tensor files that are checked before they are believed."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as safetensors_load
+from safetensors.torch import save as safetensors_save
+from torch import Tensor
+
+from gmmtorch.errors import DataError, MissingDataError
+
+MAX_FILE_BYTES = 8 << 30
+_MAX_HEADER_BYTES = 1 << 20
+
+
+def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
+    """Let `write` fill a temporary file beside `path`, then rename it; on any failure nothing is left.
+
+    The temporary file has the same suffix as `path`, as some writers go by it.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except BaseException:  # Ctrl-C and a full disk must not leave a fragment either
+        temporary.unlink(missing_ok=True)
+        raise
+    return path
+
+
+def write_bytes(path: str | Path, data: bytes) -> Path:
+    """Write bytes atomically."""
+    return write_atomically(path, lambda temporary: temporary.write_bytes(data) and None)
+
+
+def write_json(path: str | Path, value: Any) -> Path:
+    """Write JSON atomically; NaN and infinity are refused, as JSON has neither."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    return write_bytes(path, text.encode())
+
+
+def pack_tensors(tensors: Mapping[str, Tensor], kind: str, version: int, **facts: Any) -> bytes:
+    """A safetensors file that says what it holds. `facts` must be JSON."""
+    header = {"format": kind, "version": str(version), "facts": json.dumps(facts)}
+    return safetensors_save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, header)
+
+
+def read_tensors(path: str | Path, kind: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and facts of a file of `pack_tensors`.
+
+    Raises `MissingDataError` when it is not there, and `DataError` when it is too large, damaged,
+    of another kind, or of a later version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingDataError(f"{path} does not exist; expected a {kind} file.")
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise DataError(f"{path} has {size:,} bytes, more than the {MAX_FILE_BYTES:,} that are read.")
+    data = path.read_bytes()
+    header = _header(data, path)
+    if header.get("format") != kind:
+        raise DataError(f"{path} holds {header.get('format', 'something else')!r}; expected {kind!r}.")
+    if header.get("version") != str(version):
+        raise DataError(
+            f"{path} is version {header.get('version')!r} of {kind}; this gmmtorch reads version {version}. "
+            "Update gmmtorch, or write the file again."
+        )
+    try:
+        return safetensors_load(data), json.loads(header.get("facts", "{}"))
+    except (SafetensorError, ValueError) as error:
+        raise DataError(f"{path} is damaged: {error}") from error
+
+
+def _header(data: bytes, path: Path) -> dict[str, str]:
+    """The `__metadata__` of a safetensors file."""
+    try:
+        length = int.from_bytes(data[:8], "little")
+        if len(data) < 8 or length > min(_MAX_HEADER_BYTES, len(data) - 8):
+            raise ValueError("its header is longer than the file")
+        header = json.loads(data[8 : 8 + length]).get("__metadata__", {})
+        if not isinstance(header, dict):
+            raise ValueError("its header is not a table")
+        return header
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise DataError(f"{path} is truncated, or not a safetensors file: {error}") from error
+
+
+def require(
+    tensors: Mapping[str, Tensor],
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: torch.dtype,
+    path: str | Path,
+) -> Tensor:
+    """The tensor `name`, if it has this shape (None: any size) and dtype and is finite; else `DataError`."""
+    tensor = tensors.get(name)
+    if tensor is None:
+        raise DataError(f"{path} lacks the tensor {name!r}.")
+    fits = tensor.ndim == len(shape) and all(w in (None, n) for w, n in zip(shape, tensor.shape, strict=True))
+    if not fits or tensor.dtype != dtype:
+        raise DataError(
+            f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}; expected {dtype} {shape}, None for any size."
+        )
+    if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+        raise DataError(f"{path}: {name} holds NaN or infinite values; the file is damaged.")
+    return tensor

@@ -1,0 +1,131 @@
+"""Components that remember whence they were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import safe_cholesky
+from gmmtorch.occupancy.monte_carlo import Cones
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """K components in the world frame, metres; S origins; E sightings (component, origin, count).
+
+    means (K, D), covariances (K, D, D), support (K,): points each stands for, max_range (K,) bool:
+    no surface, but where beams without return were cut off, ids (K, 2): (robot, sequence);
+    origins (S, D): sensor positions; seen_by (E,), seen_from (E,), seen_count (E,): component
+    seen_by[e] has seen_count[e] of its points measured from origins[seen_from[e]].
+    The counts of a component add up to its support.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    support: Tensor
+    max_range: Tensor
+    ids: Tensor
+    origins: Tensor
+    seen_by: Tensor
+    seen_from: Tensor
+    seen_count: Tensor
+
+    @classmethod
+    def empty(cls, dim: int, device: torch.device | str | None = None) -> Components:
+        def zeros(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+            return torch.zeros(*shape, dtype=dtype, device=device)
+
+        return cls(
+            means=zeros(0, dim),
+            covariances=zeros(0, dim, dim),
+            support=zeros(0),
+            max_range=zeros(0, dtype=torch.bool),
+            ids=zeros(0, 2, dtype=torch.int64),
+            origins=zeros(0, dim),
+            seen_by=zeros(0, dtype=torch.int64),
+            seen_from=zeros(0, dtype=torch.int64),
+            seen_count=zeros(0),
+        )
+
+    @property
+    def dim(self) -> int:
+        return self.means.shape[1]
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Components]) -> Components:
+        """All components and origins of the parts, in order."""
+        by, whence = [], []
+        n_components = n_origins = 0
+        for part in parts:
+            by.append(part.seen_by + n_components)
+            whence.append(part.seen_from + n_origins)
+            n_components += len(part)
+            n_origins += part.origins.shape[0]
+        joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)}
+        return cls(**{**joined, "seen_by": torch.cat(by), "seen_from": torch.cat(whence)})
+
+    def cones(self) -> Cones:
+        """One row for each sighting: what the evidence functions take."""
+        return Cones(
+            self.means[self.seen_by],
+            self.covariances[self.seen_by],
+            self.origins[self.seen_from],
+            self.seen_count,
+            self.max_range[self.seen_by],
+        )
+
+    def transformed(self, transform: Tensor, chosen: Tensor) -> Components:
+        """The components marked in `chosen` (K,) moved by a rigid motion (D+1, D+1), origins with them."""
+        rotation, translation = transform[:-1, :-1], transform[:-1, -1]
+        moved_sighting = chosen[self.seen_by]
+        origins = torch.cat([self.origins, self.origins @ rotation.T + translation])
+        seen_from = self.seen_from + moved_sighting.long() * self.origins.shape[0]
+        used, seen_from = torch.unique(seen_from, return_inverse=True)
+        return replace(
+            self,
+            means=torch.where(chosen[:, None], self.means @ rotation.T + translation, self.means),
+            covariances=torch.where(
+                chosen[:, None, None], rotation @ self.covariances @ rotation.T, self.covariances
+            ),
+            origins=origins[used],
+            seen_from=seen_from,
+        )
+
+    def checked(self) -> Components:
+        """Itself, if shapes, indices, signs and covariances are sound; else `InvalidArgumentError`."""
+        k, dim = self.means.shape
+        n_sightings = self.seen_by.shape[0]
+        expected = {
+            "covariances": (k, dim, dim),
+            "support": (k,),
+            "max_range": (k,),
+            "ids": (k, 2),
+            "origins": (self.origins.shape[0], dim),
+            "seen_by": (n_sightings,),
+            "seen_from": (n_sightings,),
+            "seen_count": (n_sightings,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {shape}.")
+            if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+                raise InvalidArgumentError(f"{name} holds NaN or infinite values.")
+        if not bool(torch.isfinite(self.means).all()):
+            raise InvalidArgumentError("means holds NaN or infinite values.")
+        for name, limit in (("seen_by", k), ("seen_from", self.origins.shape[0])):
+            value = getattr(self, name)
+            if value.numel() and not (int(value.min()) >= 0 and int(value.max()) < limit):
+                raise InvalidArgumentError(f"{name} points outside its table of {limit} rows.")
+        if bool((self.support < 0).any()) or bool((self.seen_count < 0).any()):
+            raise InvalidArgumentError("support and counts must not be negative.")
+        if k:
+            safe_cholesky(self.covariances)
+        return self

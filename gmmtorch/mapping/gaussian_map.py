@@ -1,0 +1,344 @@
+"""GaussianMap: a map of Gaussian components that grows scan by scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import write_bytes
+from gmmtorch.mapping import storage
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning import LearningRule, learn_window
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
+from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
+from gmmtorch.scan import ArrayLike, Scan
+
+METHODS = ("monte_carlo",)
+_BUFFERS = tuple(f.name for f in fields(Components))
+_RAYS_AT_ONCE = 1 << 20
+
+
+class GaussianMap(nn.Module):
+    """A mixture of every window of `window` neighbouring scans; components know whence they were seen.
+
+    The components are buffers (see `Components` for shapes): means, covariances, support,
+    max_range, ids, origins, seen_by, seen_from, seen_count.
+
+    Args:
+        window: scans fitted together; 1 with `max_origins=1` is the thesis's map.
+        learning: how a window becomes components.
+        resolution: side (m) of the cells that queries without a resolution ask about.
+        n_samples: Monte Carlo rays drawn from the whole map to answer queries.
+        sampling: "sobol", "stratified" or "plain".
+        prior: N_p of (3.9), counts given to either outcome before any evidence.
+        random_state: seed; the same scans in the same order then give the same map and answers.
+        robot: first half of the components' ids.
+        memory_limit: bytes that evidence may take.
+
+    Asking a map does not change it: scans of a window that is not full yet are fitted for the
+    answer, and again when the window is.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    support: Tensor
+    max_range: Tensor
+    ids: Tensor
+    origins: Tensor
+    seen_by: Tensor
+    seen_from: Tensor
+    seen_count: Tensor
+
+    def __init__(
+        self,
+        window: int = 20,
+        learning: LearningRule | None = None,
+        *,
+        resolution: float = 0.1,
+        n_samples: int = 1_000_000,
+        sampling: Sampling = "sobol",
+        prior: float = 1.0,
+        random_state: int = 0,
+        robot: int = 0,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> None:
+        super().__init__()
+        if window < 1 or n_samples < 1:
+            raise InvalidArgumentError(f"window={window} and n_samples={n_samples} must be at least 1.")
+        if sampling not in SAMPLINGS:
+            raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+        self.window = window
+        self.learning = learning or LearningRule()
+        self.resolution = check_resolution(resolution)
+        self.n_samples = n_samples
+        self.sampling: Sampling = sampling
+        self.prior = float(prior)
+        self.random_state = int(random_state)
+        self.robot = robot
+        self.memory_limit = memory_limit
+        self.frame: Tensor | None = None  # (D,) whole metres, near the first scan
+        self._pending: list[Scan] = []
+        self._n_windows = 0
+        self._answers: dict[float, BlockEvidence] = {}
+        self._provisional: Components | None = None
+
+    @classmethod
+    def from_components(
+        cls,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        support: ArrayLike,
+        origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]],
+        max_range: ArrayLike | None = None,
+        **options: Any,
+    ) -> GaussianMap:
+        """A map of given components.
+
+        Args:
+            means (K, D), covariances (K, D, D), support (K,): the components; metres, points.
+            origins: (K, D), one sensor position each; or for each component a list of
+                (origin (D,), count), whose counts are scaled to add up to its support.
+            max_range: (K,) True for components of beams without return; none if not given.
+            options: as for `GaussianMap`.
+        """
+        mean = _tensor(means)
+        k = mean.shape[0]
+        sightings = _sightings(origins, _tensor(support))
+        flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
+        robot = int(options.get("robot", 0))
+        ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
+        covariance = _tensor(covariances)
+        made = cls(**options)
+        made._set(Components(mean, covariance, _tensor(support), flags, ids, *sightings).checked())
+        made.frame = made.origins[0].round() if len(made.origins) else mean.new_zeros(mean.shape[1])
+        return made
+
+    # -- learning ---------------------------------------------------------------------------------
+
+    def insert(self, scan: Scan) -> None:
+        """Learn from a scan. It counts at once; the components of its window are final when it is full."""
+        if self.dim is not None and scan.dim != self.dim:
+            raise InvalidArgumentError(
+                f"scan is {scan.dim}-dimensional, but the map is {self.dim}-dimensional."
+            )
+        if self.frame is None:
+            self.frame = scan.origin.double().round()
+            self._set(Components.empty(scan.dim, scan.points.device))
+        self._pending.append(scan)
+        self._forget_answers()
+        if len(self._pending) == self.window:
+            self._set(Components.concatenate([self._committed(), self._learn_pending()]))
+            self._pending = []
+            self._n_windows += 1
+
+    def _learn_pending(self) -> Components:
+        frame = cast(Tensor, self.frame)
+        # A generator of its own for every window: what was asked meanwhile does not matter.
+        generator = torch.Generator().manual_seed(hash((self.random_state, self._n_windows)) % 2**63)
+        found = storage.storable(learn_window(self._pending, self.learning, generator), frame)
+        first = int(self.ids[:, 1].max()) + 1 if len(self.ids) else 0
+        sequence = torch.arange(first, first + len(found), device=found.ids.device)
+        return replace(found, ids=torch.stack([torch.full_like(sequence, self.robot), sequence], 1))
+
+    def components(self) -> Components:
+        """All components, those of the unfinished window included."""
+        if not self._pending:
+            return self._committed()
+        if self._provisional is None:
+            self._provisional = Components.concatenate([self._committed(), self._learn_pending()])
+        return self._provisional
+
+    def _committed(self) -> Components:
+        if "means" not in self._buffers:
+            raise InvalidArgumentError("The map is empty; insert a scan first.")
+        return Components(**{name: getattr(self, name) for name in _BUFFERS})
+
+    def _set(self, components: Components) -> None:
+        for name in _BUFFERS:
+            self.register_buffer(name, getattr(components, name))
+        self._forget_answers()
+
+    def _forget_answers(self) -> None:
+        self._answers, self._provisional = {}, None
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
+        """Moving the module moves the waiting scans too (and keeps nothing computed elsewhere)."""
+        super()._apply(fn, recurse)
+        if "means" in self._buffers:
+            self._pending = [scan.to(self.means.device) for scan in self._pending]
+            self.frame = cast(Tensor, self.frame).to(self.means.device)
+        self._forget_answers()
+        return self
+
+    @property
+    def dim(self) -> int | None:
+        """2 or 3; None while the map is empty."""
+        return None if self.frame is None else self.frame.shape[0]
+
+    @property
+    def n_components(self) -> int:
+        return len(self.components()) if self.dim is not None else 0
+
+    def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
+        """Move components by a rigid motion (D+1, D+1), and with them the origins they were seen from.
+
+        `ids` (J, 2) names the components, as in the buffer of that name; all if not given. A pose
+        correction is this; nothing is fitted again. Scans of an unfinished window are fitted first.
+        """
+        matrix = _tensor(transform)
+        components = self.components()
+        if matrix.shape != (components.dim + 1,) * 2:
+            raise InvalidArgumentError(
+                f"transform has shape {tuple(matrix.shape)}; expected {(components.dim + 1,) * 2}."
+            )
+        rotation = matrix[:-1, :-1]
+        if not torch.allclose(
+            rotation @ rotation.T, torch.eye(components.dim, dtype=torch.float64), atol=1e-6
+        ):
+            raise InvalidArgumentError(
+                f"transform={matrix.tolist()} is not rigid: its rotation is not orthonormal."
+            )
+        if self._pending:
+            self._pending, self._n_windows = [], self._n_windows + 1
+        chosen = torch.ones(len(components), dtype=torch.bool)
+        if ids is not None:
+            wanted = torch.as_tensor(ids).reshape(-1, 2).to(components.ids)
+            chosen = (components.ids[:, None] == wanted).all(2).any(1)
+        moved = components.transformed(matrix.to(components.means), chosen.to(components.means.device))
+        self._set(storage.storable(moved, cast(Tensor, self.frame)))
+
+    # -- answering --------------------------------------------------------------------------------
+
+    def occupancy(
+        self, points: ArrayLike, resolution: float | None = None, method: str = "monte_carlo"
+    ) -> Tensor | np.ndarray:
+        """Probability (M,) that the cell of side `resolution` (m) that holds each point (M, D) is occupied.
+
+        Exactly ½ where no evidence is, and everywhere while the map is empty. Arrays in, arrays
+        out. The evidence is computed once for each resolution, and kept until the map changes.
+        """
+        query = _tensor(points)
+        if query.ndim != 2 or (self.dim is not None and query.shape[1] != self.dim):
+            raise InvalidArgumentError(
+                f"points has shape {tuple(query.shape)}; expected (M, {self.dim or 'D'})."
+            )
+        if bool(torch.isnan(query).any()):
+            raise InvalidArgumentError("points holds NaN; drop such rows before asking.")
+        if self.dim is None:
+            theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64, device=query.device)
+        else:
+            theta = self._block_evidence(resolution, method).lookup(query.to(self.means.device), self.prior)
+        return theta.to(query.device) if isinstance(points, Tensor) else theta.cpu().numpy()
+
+    def evidence(self, grid: VoxelGrid, method: str = "monte_carlo") -> Evidence:
+        """Hits and misses of every cell of a grid."""
+        _check_method(method)
+        if self.dim is not None and grid.dim != self.dim:
+            raise InvalidArgumentError(
+                f"grid is {grid.dim}-dimensional, but the map is {self.dim}-dimensional."
+            )
+        evidence = Evidence.empty(grid, None if self.dim is None else self.means.device)
+        self._cast(evidence)
+        return evidence
+
+    def _block_evidence(self, resolution: float | None, method: str) -> BlockEvidence:
+        _check_method(method)
+        resolution = self.resolution if resolution is None else check_resolution(resolution)
+        if resolution not in self._answers:
+            evidence = BlockEvidence(resolution, cast(int, self.dim), self.means.device, self.memory_limit)
+            self._cast(evidence)
+            self._answers[resolution] = evidence
+        return self._answers[resolution]
+
+    def _cast(self, evidence: Evidence | BlockEvidence) -> None:
+        """Monte Carlo rays of the whole map, added to `evidence`."""
+        if self.dim is None or len(self.components()) == 0:
+            return
+        generator = torch.Generator().manual_seed(self.random_state)
+        rays = sample_rays(self.components().cones(), self.n_samples, generator, self.sampling)
+        for part in zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True):
+            evidence.add_rays(*part)
+
+    # -- keeping ----------------------------------------------------------------------------------
+
+    def _serialized(self) -> bytes:
+        facts = {
+            "window": self.window,
+            "learning": asdict(self.learning),
+            "resolution": self.resolution,
+            "n_samples": self.n_samples,
+            "sampling": self.sampling,
+            "prior": self.prior,
+            "random_state": self.random_state,
+            "robot": self.robot,
+        }
+        return storage.to_bytes(self.components(), cast(Tensor, self.frame), facts)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file that `save` writes; 0 for an empty map."""
+        return len(self._serialized()) if self.dim is not None else 0
+
+    def save(self, path: str | Path) -> None:
+        """Write the map, atomically. An unfinished window is written as it is fitted now."""
+        write_bytes(path, self._serialized())
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianMap:
+        """Read a map that `save` wrote; it gives the same answers. Raises `DataError` if it is not one."""
+        components, frame, facts = storage.from_file(path)
+        try:
+            made = cls(**{**facts, "learning": LearningRule(**facts["learning"])})
+        except (TypeError, KeyError, ValueError) as error:
+            raise DataError(f"{path}: its settings are damaged ({error}).") from error
+        made._set(components)
+        made.frame = frame
+        return made
+
+
+def _check_method(method: str) -> None:
+    if method not in METHODS:
+        raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
+
+
+def _tensor(value: ArrayLike) -> Tensor:
+    return torch.as_tensor(value).double()
+
+
+def _sightings(
+    origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Table of origins, and seen_by, seen_from, seen_count, of the `origins` of `from_components`."""
+    k = support.shape[0]
+    if isinstance(origins, Tensor | np.ndarray):
+        return _tensor(origins), torch.arange(k), torch.arange(k), support
+    rows: list[Tensor] = []
+    by: list[int] = []
+    counts: list[float] = []
+    for component, seen in enumerate(origins):
+        if torch.as_tensor(seen[0]).ndim == 0:  # one plain position each
+            seen = [(cast(ArrayLike, seen), 1.0)]
+        total = sum(float(count) for _, count in seen)
+        if not total > 0:
+            raise InvalidArgumentError(
+                f"origins[{component}] has counts that add up to {total}; they must be > 0."
+            )
+        for origin, count in seen:
+            rows.append(_tensor(origin))
+            by.append(component)
+            counts.append(float(count) / total * float(support[component]))
+    if len(origins) != k:
+        raise InvalidArgumentError(
+            f"origins has {len(origins)} entries for {k} components; one each is needed."
+        )
+    table = torch.stack(rows) if rows else torch.zeros(0, 2, dtype=torch.float64)
+    return table, torch.tensor(by), torch.arange(len(by)), torch.tensor(counts, dtype=torch.float64)

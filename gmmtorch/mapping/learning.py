@@ -1,0 +1,126 @@
+"""From a window of scans to components: how many, where, and whence they were seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.components import Components
+from gmmtorch.mixture import em
+from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.partition import FlatnessRule, partition, pool
+from gmmtorch.scan import Scan
+
+
+@dataclass(frozen=True)
+class LearningRule:
+    """How a window of scans becomes components.
+
+    noise: standard deviation of the range sensor (m); its square is the least variance of a
+        component, and pieces of twice that thickness count as flat.
+    length: largest standard deviation (m) along a component.
+    min_points: fewest points a component is made of; None: 3 in 2D, 10 in 3D.
+    n_components: components of a window at most; None: as many as the surfaces ask for.
+    max_origins: sensor positions kept for a component, sampled by their counts.
+    iterations: of EM, which starts from the flat pieces and so needs few.
+    max_cells: more points than this are first summed into cells.
+    """
+
+    noise: float = 0.01
+    length: float = 0.3
+    min_points: float | None = None
+    n_components: int | None = None
+    max_origins: int = 8
+    iterations: int = 5
+    max_cells: int = 20_000
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        for name in ("n_components", "max_origins", "iterations", "max_cells", "min_points"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InvalidArgumentError(f"{name}={value} must be at least 1, or null for the default.")
+
+    def flatness(self, dim: int) -> FlatnessRule:
+        return FlatnessRule(
+            thickness=2 * self.noise,
+            length=self.length,
+            min_weight=self.min_points or (3 if dim == 2 else 10),
+            max_components=self.n_components,
+        )
+
+
+def learn_window(scans: list[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
+    """Components of the returns, and flagged ones of the no-returns, of neighbouring scans.
+
+    `ids` are left at zero: who calls numbers them.
+    """
+    origins = torch.stack([scan.origin.double() for scan in scans])
+    returns = _learn([scan.points for scan in scans], origins, rule, generator, max_range=False)
+    empty = _learn([scan.no_return for scan in scans], origins, rule, generator, max_range=True)
+    return Components.concatenate([returns, empty])
+
+
+def _learn(
+    clouds: list[Tensor], origins: Tensor, rule: LearningRule, generator: torch.Generator, max_range: bool
+) -> Components:
+    sizes = torch.tensor([cloud.shape[0] for cloud in clouds], device=origins.device)
+    scan_index = torch.repeat_interleave(sizes)
+    points = torch.cat(clouds).double()
+    dim = points.shape[1]
+    if points.shape[0] == 0:
+        return Components.empty(dim, points.device)
+    center = points.mean(0)
+    cells = pool_into_cells(points - center, rule.max_cells)
+    pieces = partition(cells.features[:, 1 : 1 + dim].contiguous(), cells.weight, rule.flatness(dim))
+    reg = rule.noise**2
+    first = em.maximization(pool(cells.features, cells.weight, pieces.labels, pieces.n_pieces), reg)
+    step = em.natural_step(cells.features, cells.weight, reg)
+    found = em.run_em(step, first, tol=1e-4, max_iter=rule.iterations).parameters
+    owner = em.most_likely(cells.features, found)[cells.member]
+    n_scans, n_components = len(clouds), found.weights.shape[0]
+    counts = torch.bincount(owner * n_scans + scan_index, minlength=n_components * n_scans)
+    support = found.weights * points.shape[0]
+    seen_by, seen_from, seen_count = _sample_origins(
+        counts.view(n_components, n_scans).double(), support, rule.max_origins, generator
+    )
+    alive = torch.bincount(seen_by, minlength=n_components) > 0
+    renumber = torch.cumsum(alive.long(), 0) - 1
+    return Components(
+        means=(found.means + center)[alive],
+        covariances=found.covariances[alive],
+        support=support[alive],
+        max_range=torch.full((int(alive.sum()),), max_range, device=points.device),
+        ids=torch.zeros(int(alive.sum()), 2, dtype=torch.int64, device=points.device),
+        origins=origins,
+        seen_by=renumber[seen_by],
+        seen_from=seen_from,
+        seen_count=seen_count,
+    )
+
+
+def _sample_origins(
+    counts: Tensor, support: Tensor, max_origins: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sightings from the points each component (row) has in each scan (column).
+
+    At most `max_origins` scans are kept for a component, drawn by their counts without
+    replacement, and share its support. Real origins, not their centroid: a centroid loses the
+    space around the sensors. A component that is no point's likeliest one has no sighting; it
+    is dropped, and its points are others' already.
+    """
+    k, n_scans = counts.shape
+    n_kept = min(max_origins, n_scans)
+    if n_kept < n_scans:
+        race = torch.empty(counts.shape, dtype=torch.float64).exponential_(generator=generator)
+        key = torch.where(counts > 0, race.to(counts.device) / counts.clamp_min(1), float("inf"))
+        kept = key.topk(n_kept, dim=1, largest=False).indices
+        counts = torch.zeros_like(counts).scatter_(1, kept, counts.gather(1, kept))
+    share = counts * (support / counts.sum(1).clamp_min(1e-12))[:, None]
+    seen_by, seen_from = (share > 0).nonzero(as_tuple=True)
+    return seen_by, seen_from, share[seen_by, seen_from]

@@ -1,0 +1,476 @@
+"""GaussianMixture: a torch module with scikit-learn's interface."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import validate_data
+from torch import Tensor, nn
+
+from gmmtorch.errors import DataError, InvalidArgumentError, NotFittedError
+from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.mixture import em
+from gmmtorch.mixture.em import EMResult, Parameters
+from gmmtorch.mixture.initialization import INITIALIZATIONS, start
+
+Array = Tensor | np.ndarray
+RandomState = int | np.random.RandomState | torch.Generator | None
+
+_FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
+    """Weighted full-covariance EM (thesis 2.1.1) on any device.
+
+    Arrays in, arrays out; tensors in, tensors out. Parameters are kept in float64 relative to
+    nothing: clouds are centred while they are worked on, so points 500 km away lose no digits.
+
+    Args:
+        n_components: K, at most the number of points.
+        tol: EM stops when the mean log-likelihood changes by less (nats a point).
+        reg_covar: added to each variance, in the square of the points' unit (m²).
+        max_iter: EM iterations at most, in each start.
+        n_init: starts; the one with the best lower bound is kept.
+        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        weights_init, means_init, precisions_init: (K,), (K, D), (K, D, D): given parameters, in
+            place of those the initialization finds.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
+        dtype: of the exponentials inside EM. The products always run in float64; with "float64"
+            nothing at all runs in float32.
+        warm_start: go on from the last fit's parameters.
+
+    Fitted attributes, in the kind (array or tensor) of the points given to `fit`: `weights_` (K,),
+    `means_` (K, D), `covariances_` (K, D, D), `precisions_` (K, D, D); and `lower_bound_`,
+    `lower_bounds_`, `n_iter_`, `converged_`, `n_features_in_`. The buffers `weights`, `means` and
+    `covariances` are tensors always, and move with `.to(device)`.
+    """
+
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+
+    def __init__(
+        self,
+        n_components: int = 1,
+        *,
+        tol: float = 1e-3,
+        reg_covar: float = 1e-6,
+        max_iter: int = 100,
+        n_init: int = 1,
+        init_params: str = "kmeans",
+        weights_init: Array | None = None,
+        means_init: Array | None = None,
+        precisions_init: Array | None = None,
+        random_state: RandomState = None,
+        dtype: str = "float32",
+        warm_start: bool = False,
+    ) -> None:
+        nn.Module.__init__(self)
+        self.n_components = n_components
+        self.tol = tol
+        self.reg_covar = reg_covar
+        self.max_iter = max_iter
+        self.n_init = n_init
+        self.init_params = init_params
+        self.weights_init = weights_init
+        self.means_init = means_init
+        self.precisions_init = precisions_init
+        self.random_state = random_state
+        self.dtype = dtype
+        self.warm_start = warm_start
+
+    # -- learning ---------------------------------------------------------------------------------
+
+    def fit(
+        self,
+        X: Array,
+        y: Any = None,
+        sample_weight: Array | None = None,
+        on_iteration: Callable[[int, float], None] | None = None,
+    ) -> GaussianMixture:
+        """Learn the mixture of points X (N, D).
+
+        Args:
+            X: points, finite.
+            y: ignored, as in scikit-learn.
+            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
+            on_iteration: called with the iteration (from 1) and the mean log-likelihood.
+
+        Raises:
+            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
+                number of points of non-zero weight.
+            NumericalError: a component collapsed, as happens with reg_covar = 0.
+        """
+        self._check_parameters()
+        points = self._as_points(X, reset=True)
+        weight = self._as_weight(sample_weight, points)
+        points, weight = points[weight > 0], weight[weight > 0]
+        if points.shape[0] < self.n_components:
+            raise InvalidArgumentError(
+                f"n_components={self.n_components} is more than the n_samples={points.shape[0]} points of "
+                "non-zero weight; ask for fewer components, or give more points."
+            )
+        center = (points * (weight / weight.sum())[:, None]).sum(0)
+        centered = points - center
+        dtype = _DTYPES[self.dtype]
+        features = em.quadratic_features(centered)
+        step = em.natural_step(features, weight, float(self.reg_covar), dtype, centered)
+        generator = as_generator(self.random_state)
+        best: EMResult | None = None
+        for _ in range(1 if self._continues() else self.n_init):
+            first = self._start(centered, weight, center, generator)
+            found = em.run_em(step, first, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
+            if best is None or found.lower_bounds[-1] > best.lower_bounds[-1]:
+                best = found
+        self._keep(cast(EMResult, best), center)
+        if not self.converged_ and self.tol > 0:
+            warnings.warn(
+                f"EM did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
+                ConvergenceWarning,
+                stacklevel=2,
+            )
+        return self
+
+    def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
+        """Fit, and the most likely component (N,) of each point."""
+        return self.fit(X, y, sample_weight).predict(X)
+
+    def _continues(self) -> bool:
+        return bool(self.warm_start) and hasattr(self, "means")
+
+    def _start(
+        self, points: Tensor, weight: Tensor, center: Tensor, generator: torch.Generator
+    ) -> Parameters:
+        """Where EM begins, in the centred frame."""
+        if self._continues():
+            means = self.means.to(points.device) - center
+            return Parameters(self.weights.to(points.device), means, self.covariances.to(points.device))
+        given = (self.weights_init, self.means_init, self.precisions_init)
+        k, dim = self.n_components, points.shape[1]
+        shapes = ((k,), (k, dim), (k, dim, dim))
+        names = ("weights_init", "means_init", "precisions_init")
+        weights, means, precisions = (
+            None if value is None else _checked_init(value, shape, name, points.device)
+            for value, shape, name in zip(given, shapes, names, strict=True)
+        )
+        if weights is None or means is None or precisions is None:
+            found = start(self.init_params, points, weight, k, float(self.reg_covar), generator)
+        else:
+            found = Parameters(weights, means, precisions)
+        covariances = found.covariances
+        if precisions is not None:
+            whiten = inverse_factor(safe_cholesky(precisions, "precisions_init"))
+            covariances = whiten @ whiten.transpose(-2, -1)
+        return Parameters(
+            found.weights if weights is None else weights / weights.sum(),
+            found.means if means is None else means - center,
+            covariances,
+        )
+
+    def _keep(self, result: EMResult, center: Tensor) -> None:
+        weights, means, covariances = result.parameters
+        self._set_buffers(weights / weights.sum(), means + center, covariances)
+        self.lower_bounds_ = list(result.lower_bounds)
+        self.lower_bound_ = result.lower_bounds[-1]
+        self.n_iter_ = result.n_iter
+        self.converged_ = result.converged
+
+    def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
+        for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
+            self.register_buffer(name, value)
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def score_samples(self, X: Array) -> Array:
+        """log p(x) of each point, (N,), nats."""
+        points = self._as_points(X)
+        return self._like(torch.cat([torch.logsumexp(part, 1) for part in self._joint(points)]), X)
+
+    def forward(self, X: Tensor) -> Tensor:
+        """log p(x) of each point, (N,), nats: `score_samples` for use inside a network."""
+        return cast(Tensor, self.score_samples(X))
+
+    def score(self, X: Array, y: Any = None) -> float:
+        """Mean log-likelihood of the points, nats."""
+        return float(self.score_samples(X).mean())
+
+    def predict_proba(self, X: Array) -> Array:
+        """Responsibilities γ (N, K): rows sum to one."""
+        points = self._as_points(X)
+        return self._like(torch.cat([torch.softmax(part, 1) for part in self._joint(points)]), X)
+
+    def predict(self, X: Array) -> Array:
+        """The most likely component of each point, (N,)."""
+        points = self._as_points(X)
+        labels = torch.cat([part.argmax(1) for part in self._joint(points)])
+        return labels if isinstance(X, Tensor) else labels.cpu().numpy()
+
+    def _joint(self, points: Tensor) -> list[Tensor]:
+        """log π_k + log N(x|k), in chunks (n, K)."""
+        center = (self.weights[:, None] * self.means).sum(0)
+        centered = points - center
+        parameters = Parameters(self.weights, self.means - center, self.covariances)
+        rows = max(64, em.CHUNK_ELEMENTS // self.weights.shape[0])
+        if em.is_ill_conditioned(parameters) or bool((centered.abs() > 1e4).any()):
+            return [em.log_joint(part, parameters) for part in centered.split(rows)]
+        natural = em.natural_parameters(parameters).T.contiguous()
+        return [em.quadratic_features(part) @ natural for part in centered.split(rows)]
+
+    def n_parameters(self) -> int:
+        """Free parameters: K(1 + D + D(D+1)/2) − 1."""
+        k, dim = self._fitted().shape
+        return k * (1 + dim + dim * (dim + 1) // 2) - 1
+
+    def bic(self, X: Array) -> float:
+        """Bayesian information criterion on X; the lower the better."""
+        return -2 * self.score(X) * len(X) + self.n_parameters() * math.log(len(X))
+
+    def aic(self, X: Array) -> float:
+        """Akaike information criterion on X; the lower the better."""
+        return -2 * self.score(X) * len(X) + 2 * self.n_parameters()
+
+    def sample(self, n_samples: int = 1, random_state: RandomState = None) -> tuple[Array, Array]:
+        """Draw points (n, D) and their components (n,), ordered by component.
+
+        `random_state` defaults to the estimator's own: with a seed, every call gives the same.
+        """
+        means = self._fitted()
+        if n_samples < 1:
+            raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
+        generator = as_generator(self.random_state if random_state is None else random_state)
+        weights = self.weights.cpu()
+        labels = torch.multinomial(weights, n_samples, True, generator=generator).sort().values
+        normals = torch.randn(n_samples, means.shape[1], dtype=torch.float64, generator=generator)
+        labels, normals = labels.to(means.device), normals.to(means.device)
+        factors = safe_cholesky(self.covariances)
+        points = means[labels] + (factors[labels] @ normals[:, :, None]).squeeze(-1)
+        return (points, labels) if self._tensors else (points.cpu().numpy(), labels.cpu().numpy())
+
+    @property
+    def weights_(self) -> Array:
+        """Mixing weights (K,)."""
+        self._fitted()
+        return self._as_fitted(self.weights)
+
+    @property
+    def means_(self) -> Array:
+        """Means (K, D)."""
+        return self._as_fitted(self._fitted())
+
+    @property
+    def covariances_(self) -> Array:
+        """Covariances (K, D, D)."""
+        self._fitted()
+        return self._as_fitted(self.covariances)
+
+    @property
+    def precisions_(self) -> Array:
+        """Inverse covariances (K, D, D)."""
+        self._fitted()
+        whiten = inverse_factor(safe_cholesky(self.covariances))
+        return self._as_fitted(whiten @ whiten.transpose(-2, -1))
+
+    # -- moving and keeping -----------------------------------------------------------------------
+
+    # scikit-learn takes whatever has `transform` for a feature transformer. Only a fitted mixture
+    # can be moved, so only a fitted one has it.
+    @available_if(lambda self: self._fitted() is not None)
+    def transform(self, transform: Array) -> GaussianMixture:
+        """A copy moved by a rigid motion (D+1, D+1): means R μ + t, covariances R Σ Rᵀ."""
+        means = self._fitted()
+        matrix = torch.as_tensor(transform, dtype=torch.float64, device=means.device)
+        dim = means.shape[1]
+        if matrix.shape != (dim + 1, dim + 1):
+            raise InvalidArgumentError(
+                f"transform has shape {tuple(matrix.shape)}; a rigid motion of this mixture is {(dim + 1, dim + 1)}."
+            )
+        rotation, translation = matrix[:dim, :dim], matrix[:dim, dim]
+        identity = torch.eye(dim, dtype=torch.float64, device=means.device)
+        if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6):
+            raise InvalidArgumentError(
+                f"transform={matrix.tolist()} is not rigid: its rotation is not orthonormal."
+            )
+        moved = GaussianMixture(**self.get_params(deep=False))
+        moved.__dict__.update({k: v for k, v in self.__dict__.items() if k.endswith("_") and k[0] != "_"})
+        moved._tensors = self._tensors
+        moved._set_buffers(
+            self.weights.clone(), means @ rotation.T + translation, rotation @ self.covariances @ rotation.T
+        )
+        return moved
+
+    def save(self, path: str | Path) -> None:
+        """Write the fitted mixture as safetensors, atomically."""
+        self._fitted()
+        tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
+        facts = {
+            "lower_bounds": self.lower_bounds_,
+            "converged": self.converged_,
+            "arrays": not self._tensors,
+            "parameters": {
+                k: v
+                for k, v in self.get_params(deep=False).items()
+                if isinstance(v, int | float | str | bool | None)
+            },
+        }
+        write_bytes(path, pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts))
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianMixture:
+        """Read a mixture that `save` wrote. Raises `DataError` when the file is not one."""
+        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
+        means = require(tensors, "means", (None, None), torch.float64, path)
+        k, dim = means.shape
+        weights = require(tensors, "weights", (k,), torch.float64, path)
+        covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
+        if k == 0 or dim == 0 or bool((weights < 0).any()) or abs(float(weights.sum()) - 1) > 1e-6:
+            raise DataError(f"{path}: the {k} weights are not those of a mixture; the file is damaged.")
+        safe_cholesky(covariances, f"{path}: covariances")
+        known = cls._get_param_names()
+        try:
+            mixture = cls(**{key: v for key, v in dict(facts["parameters"]).items() if key in known})
+            mixture.lower_bounds_ = [float(x) for x in facts["lower_bounds"]]
+            mixture.lower_bound_ = mixture.lower_bounds_[-1]
+            mixture.converged_ = bool(facts["converged"])
+            mixture._tensors = not facts["arrays"]
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise DataError(f"{path}: its facts are damaged ({error!r}).") from error
+        mixture.n_components = k
+        mixture.n_iter_ = len(mixture.lower_bounds_)
+        mixture.n_features_in_ = dim
+        mixture._set_buffers(weights, means, covariances)
+        return mixture
+
+    # -- arguments --------------------------------------------------------------------------------
+
+    def _check_parameters(self) -> None:
+        for name in ("n_components", "max_iter", "n_init"):
+            value = getattr(self, name)
+            if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < 1:
+                raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least 1.")
+        for name in ("tol", "reg_covar"):
+            value = getattr(self, name)
+            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
+                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
+        if self.init_params not in INITIALIZATIONS:
+            raise InvalidArgumentError(
+                f"init_params={self.init_params!r} is not one of {', '.join(INITIALIZATIONS)}."
+            )
+        if self.dtype not in _DTYPES:
+            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(_DTYPES)}.")
+
+    def _as_points(self, X: Array, reset: bool = False) -> Tensor:
+        """X as a float64 tensor (N, D), checked; with `reset`, D and the kind of X are remembered."""
+        if not reset:
+            self._fitted()
+        if not isinstance(X, Tensor):
+            checked = validate_data(
+                self, X, reset=reset, dtype=[np.float64, np.float32], ensure_min_samples=1
+            )
+            points = torch.from_numpy(np.array(checked, dtype=np.float64))
+            points = points if reset else points.to(self.means.device)
+        else:
+            points = _checked_tensor(X).double()
+            if reset:
+                self.n_features_in_ = points.shape[1]
+        if reset:
+            self._tensors = isinstance(X, Tensor)
+        elif points.shape[1] != self.n_features_in_:
+            raise InvalidArgumentError(
+                f"X has {points.shape[1]} features, but GaussianMixture is expecting {self.n_features_in_} "
+                "features as input."
+            )
+        return points
+
+    def _as_weight(self, sample_weight: Array | None, points: Tensor) -> Tensor:
+        n = points.shape[0]
+        if sample_weight is None:
+            return points.new_ones(n)
+        if not isinstance(sample_weight, Tensor):
+            sample_weight = torch.from_numpy(np.array(sample_weight, dtype=np.float64))
+        weight = sample_weight.to(points.device, torch.float64)
+        if weight.shape != (n,):
+            raise InvalidArgumentError(
+                f"sample_weight has shape {tuple(weight.shape)}; expected ({n},), one weight for each point."
+            )
+        if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()):
+            raise InvalidArgumentError(
+                "sample_weight holds NaN, infinite or negative weights; make them ≥ 0."
+            )
+        if float(weight.sum()) == 0:
+            raise InvalidArgumentError("sample_weight is all zero; at least one point must count.")
+        return weight
+
+    def _fitted(self) -> Tensor:
+        """The means, if there are any."""
+        if "means" not in self._buffers:
+            raise NotFittedError("This GaussianMixture is not fitted yet; call fit with points first.")
+        return self.means
+
+    def _as_fitted(self, value: Tensor) -> Array:
+        return value if self._tensors else value.cpu().numpy()
+
+    def _like(self, value: Tensor, X: Array) -> Array:
+        """`value` in the kind and, if it is a floating type, the dtype of X."""
+        if isinstance(X, Tensor):
+            return value.to(X.dtype) if X.is_floating_point() else value
+        dtype = getattr(X, "dtype", np.dtype(np.float64))
+        return value.cpu().numpy().astype(dtype if dtype == np.float32 else np.float64, copy=False)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return "means" in self._buffers
+
+
+def as_generator(random_state: RandomState) -> torch.Generator:
+    """A CPU generator from a seed, a NumPy RandomState, a generator (returned as it is), or None (fresh)."""
+    if isinstance(random_state, torch.Generator):
+        return random_state
+    generator = torch.Generator()
+    if random_state is None:
+        generator.seed()
+    elif isinstance(random_state, np.random.RandomState):
+        generator.manual_seed(int(random_state.randint(2**31 - 1)))
+    elif isinstance(random_state, numbers.Integral) and 0 <= int(random_state) < 2**63:
+        generator.manual_seed(int(random_state))
+    else:
+        raise InvalidArgumentError(
+            f"random_state={random_state!r} must be None, a whole number of at least 0, "
+            "a numpy RandomState or a torch Generator."
+        )
+    return generator
+
+
+def _checked_tensor(X: Tensor) -> Tensor:
+    if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
+        raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
+    if X.is_complex():
+        raise InvalidArgumentError("X is complex; Complex data not supported.")
+    finite = torch.isfinite(X).all(1)
+    if not bool(finite.all()):
+        row = int((~finite).nonzero()[0])
+        raise InvalidArgumentError(
+            f"X[{row}] = {X[row].tolist()} is not finite; drop such rows: X = X[torch.isfinite(X).all(1)]."
+        )
+    return X
+
+
+def _checked_init(value: Array, shape: tuple[int, ...], name: str, device: torch.device) -> Tensor:
+    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    if tuple(tensor.shape) != shape or not bool(torch.isfinite(tensor).all()):
+        raise InvalidArgumentError(
+            f"{name} has shape {tuple(tensor.shape)}; expected finite numbers of shape {shape}."
+        )
+    if name == "weights_init" and (bool((tensor < 0).any()) or float(tensor.sum()) <= 0):
+        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be ≥ 0 and not all zero.")
+    return tensor

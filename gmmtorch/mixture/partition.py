@@ -1,0 +1,100 @@
+"""Cutting a cloud into flat pieces: how many components it needs, and where they begin.
+
+A piece is halved at its mean, across its longest direction, as long as it is thicker than the
+sensor's noise explains or longer than a component should be, and both halves keep enough points.
+The pieces of one level are cut in one batch of tensor operations. What a surface looks like thus
+decides the number of components: a wall takes few, clutter many, and never more than its points
+can support.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.linalg import unpack_symmetric
+from gmmtorch.mixture.em import quadratic_features
+
+_MAX_LEVELS = 48
+
+
+@dataclass(frozen=True)
+class FlatnessRule:
+    """When a piece is cut: standard deviations in metres, weights in points.
+
+    thickness: pieces whose thinnest direction exceeds it are not flat. length: pieces whose
+    longest direction exceeds it are too long. min_weight: no half may weigh less.
+    max_components: pieces at most; those of the largest scatter are cut first.
+    """
+
+    thickness: float = 0.02
+    length: float = 0.3
+    min_weight: float = 3.0
+    max_components: int | None = None
+
+
+class Partition(NamedTuple):
+    """labels (N,): the piece of each point; n_pieces: how many there are, none of them empty."""
+
+    labels: Tensor
+    n_pieces: int
+
+
+def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Tensor:
+    """Weighted sums (n_pieces, F) of features (N, F) by label: the statistics of each piece."""
+    sums = features.new_zeros(n_pieces, features.shape[1])
+    return sums.index_add_(0, labels, features * weight[:, None])
+
+
+def partition(points: Tensor, weight: Tensor, rule: FlatnessRule) -> Partition:
+    """Cut points (N, D), centred, float64, N ≥ 1, with weights (N,) into flat pieces."""
+    n, dim = points.shape
+    features = quadratic_features(points)
+    labels = torch.zeros(n, dtype=torch.int64, device=points.device)
+    n_pieces = 1
+    fresh = torch.ones(1, dtype=torch.bool, device=points.device)
+    for _ in range(_MAX_LEVELS):
+        statistics = pool(features, weight, labels, n_pieces)
+        count = statistics[:, 0].clamp_min(1e-300)
+        means = statistics[:, 1 : 1 + dim] / count[:, None]
+        second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
+        variances, directions = torch.linalg.eigh(second - means[:, :, None] * means[:, None, :])
+        deviation = variances.clamp_min(0).sqrt()
+        wanted = (deviation[:, 0] > rule.thickness) | (deviation[:, -1] > rule.length)
+        cut = fresh & wanted & (count >= 2 * rule.min_weight) & (deviation[:, -1] > 0)
+        cut = _within_budget(cut, count * variances[:, -1], n_pieces, rule.max_components)
+        across = directions[:, :, -1]
+        beyond = ((points - means[labels]) * across[labels]).sum(1) > 0
+        cut, beyond = _only_supported(cut, beyond, labels, weight, n_pieces, rule.min_weight)
+        n_new = int(cut.sum())
+        if n_new == 0:
+            break
+        new_label = torch.cumsum(cut.long(), 0) - 1 + n_pieces
+        labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
+        n_pieces += n_new
+        fresh = torch.cat([cut, cut.new_ones(n_new)])  # a piece left whole stays as it is
+    return Partition(labels, n_pieces)
+
+
+def _within_budget(cut: Tensor, scatter: Tensor, n_pieces: int, limit: int | None) -> Tensor:
+    """Of the pieces to be cut, those of the largest scatter, so that `limit` is not passed."""
+    if limit is None or n_pieces + int(cut.sum()) <= limit:
+        return cut
+    order = torch.where(cut, scatter, -1.0).argsort(descending=True)
+    chosen = torch.zeros_like(cut)
+    chosen[order[: max(0, limit - n_pieces)]] = True
+    return chosen & cut
+
+
+def _only_supported(
+    cut: Tensor, beyond: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, min_weight: float
+) -> tuple[Tensor, Tensor]:
+    """Drop cuts that would leave less than `min_weight` on either side."""
+    far = torch.zeros(n_pieces, dtype=weight.dtype, device=weight.device).index_add_(
+        0, labels, weight * beyond
+    )
+    near = torch.zeros_like(far).index_add_(0, labels, weight * ~beyond)
+    return cut & (far >= min_weight) & (near >= min_weight) & (far > 0) & (near > 0), beyond

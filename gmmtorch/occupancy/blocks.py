@@ -1,0 +1,276 @@
+"""BlockEvidence: hits and misses stored only where rays went, on an unbounded voxel lattice.
+
+The lattice is cut into blocks of 8³ cells (16² in 2D). A block is allocated when a ray first
+touches it, which one coarse traversal over blocks finds out; memory follows observed space, not
+the bounding box, so a stray return at 200 m costs its ray and nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
+from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT, VoxelGrid, check_resolution
+from gmmtorch.occupancy.raycast import CHUNK_VISITS, traverse
+
+_BLOCK_BITS = {2: 4, 3: 3}
+_KEY_BITS = {2: 31, 3: 21}  # of one block coordinate within a packed int64 key
+
+
+class _Window(NamedTuple):
+    """The box of blocks that a bundle of rays can touch, and its table of slots."""
+
+    low: Tensor  # (D,) lowest block coordinate
+    bits: tuple[int, ...]  # bits of the block coordinate along each axis, within the window
+    offsets: Tensor  # flat table, block in window → storage index of its first cell
+
+
+class BlockEvidence:
+    """Hits and misses on the lattice of cells [i·resolution, (i+1)·resolution) of the world frame.
+
+    Raises `InvalidArgumentError` for a resolution that is not above zero, and `MemoryLimitError`
+    when the observed cells would take more than `memory_limit` bytes.
+    """
+
+    def __init__(
+        self,
+        resolution: float,
+        dim: int,
+        device: torch.device | str | None = None,
+        memory_limit: int = MEMORY_LIMIT,
+    ) -> None:
+        self.resolution = check_resolution(resolution)
+        self.dim = dim
+        self.block_side = 1 << _BLOCK_BITS[dim]
+        self.cells_per_block = self.block_side**dim
+        self.memory_limit = memory_limit
+        self.keys = torch.empty(0, dtype=torch.int64, device=device)
+        """Packed coordinates of the blocks, sorted: (B,)."""
+        self._slots = torch.empty(0, dtype=torch.int64, device=device)  # where each is stored
+        self._storage = torch.zeros(2, 0, self.cells_per_block, dtype=torch.float64, device=device)
+
+    @property
+    def n_blocks(self) -> int:
+        return self.keys.shape[0]
+
+    @property
+    def hits(self) -> Tensor:
+        """Hits (B, cells) of each block, in the order they were allocated."""
+        return self._storage[0, : self.n_blocks]
+
+    @property
+    def misses(self) -> Tensor:
+        """Misses (B, cells) of each block, in the order they were allocated."""
+        return self._storage[1, : self.n_blocks]
+
+    # -- geometry ---------------------------------------------------------------------------------
+
+    def _cells(self, points: Tensor) -> Tensor:
+        """Lattice cell (M, D) of each point, float64."""
+        return (points.double() / self.resolution).floor()
+
+    def pack(self, blocks: Tensor) -> Tensor:
+        """Keys (M,) of block coordinates (M, D), int64; ordered as the coordinates are."""
+        half = 1 << (_KEY_BITS[self.dim] - 1)
+        if blocks.numel() and int(blocks.abs().max()) >= half:
+            raise InvalidArgumentError(
+                f"resolution={self.resolution} m cannot index points {half * self.block_side * self.resolution:.3g} "
+                "m from the origin; take a coarser resolution, or move the scans nearer to the origin."
+            )
+        key = blocks[:, 0] + half
+        for axis in range(1, self.dim):
+            key = (key << _KEY_BITS[self.dim]) | (blocks[:, axis] + half)
+        return key
+
+    def unpack(self, keys: Tensor) -> Tensor:
+        """Block coordinates (M, D) of keys (M,)."""
+        bits, half = _KEY_BITS[self.dim], 1 << (_KEY_BITS[self.dim] - 1)
+        columns = [
+            ((keys >> (bits * (self.dim - 1 - a))) & ((1 << bits) - 1)) - half for a in range(self.dim)
+        ]
+        return torch.stack(columns, 1)
+
+    def _find(self, keys: Tensor) -> Tensor:
+        """Slot (M,) of each key, −1 where the block is not allocated."""
+        if self.keys.numel() == 0:
+            return torch.full_like(keys, -1)
+        rank = torch.searchsorted(self.keys, keys).clamp_max(self.keys.numel() - 1)
+        return torch.where(self.keys[rank] == keys, self._slots[rank], -1)
+
+    def _locate(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat storage index (M,) of the cell of each point, and whether it is stored (index 0 if not).
+
+        Points that are not finite, or too far out to have a key, are not stored.
+        """
+        bits = _BLOCK_BITS[self.dim]
+        cells = self._cells(points)
+        limit = float(1 << (_KEY_BITS[self.dim] - 1 + bits))
+        valid = (cells.abs() < limit - self.block_side).all(1)  # NaN compares false
+        cells = torch.where(valid[:, None], cells, 0.0).long()
+        slot = self._find(self.pack(cells >> bits))
+        local = torch.zeros_like(slot)
+        for axis in range(self.dim):
+            local = (local << bits) | (cells[:, axis] & (self.block_side - 1))
+        stored = valid & (slot >= 0)
+        return torch.where(stored, slot * self.cells_per_block + local, 0), stored
+
+    # -- counting ---------------------------------------------------------------------------------
+
+    def add_rays(
+        self,
+        origins: Tensor,
+        ends: Tensor,
+        weights: Tensor | None = None,
+        is_hit: Tensor | None = None,
+        chunk_visits: int = CHUNK_VISITS,
+    ) -> None:
+        """Count rays: a hit in the cell of each end, a miss in every cell passed on the way to it.
+
+        Args and meaning as in `Evidence.add_rays`.
+        """
+        if ends.shape[0] == 0:
+            return
+        window = self._open_window(origins, ends)
+        self._add_misses(window, origins, ends, weights, chunk_visits)
+        index, stored = self._locate(ends)
+        counted = stored if is_hit is None else stored & is_hit
+        source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+        self.hits.view(-1).scatter_add_(0, index[counted], source[counted])
+
+    def _open_window(self, origins: Tensor, ends: Tensor) -> _Window:
+        """Allocate every block that the rays touch, and tabulate the slots of the box around them."""
+        side = self.block_side
+        starts, stops = origins.double() / self.resolution / side, ends.double() / self.resolution / side
+        both = torch.cat([starts, stops])
+        low = both.amin(0).floor()
+        shape = (both.amax(0).floor() - low + 1).long().tolist()
+        bits = tuple((n - 1).bit_length() for n in shape)
+        n_bytes = 8 << sum(bits)
+        if n_bytes > self.memory_limit:
+            raise MemoryLimitError(
+                f"resolution={self.resolution} m over rays that span {[n * side for n in shape]} cells needs a "
+                f"table of {n_bytes:,} bytes, above the limit of {self.memory_limit:,}; a resolution of "
+                f"{self.resolution * (n_bytes / self.memory_limit) ** (1 / self.dim) * 1.02:.3g} m or more fits, "
+                "or set dataset.max_range to drop stray far returns."
+            )
+        strides = _power_of_two_strides(bits)
+        stride_t = torch.tensor(strides, device=low.device)
+        touched = torch.zeros(1 << sum(bits), dtype=torch.bool, device=low.device)
+        for visit in traverse(starts - low, stops - low, tuple(shape), strides=strides):
+            touched[visit.voxel] = True
+        touched[((stops.floor() - low).long() * stride_t).sum(1)] = True
+        index = touched.nonzero().squeeze(1)
+        blocks = torch.stack([(index >> shift) & ((1 << b) - 1) for shift, b in _fields(bits)], 1)
+        keys = self.pack(blocks + low.long())
+        self._allocate(keys)
+        offsets = torch.zeros(1 << sum(bits), dtype=torch.int64, device=low.device)
+        offsets[index] = self._find(keys) * self.cells_per_block
+        return _Window(low, bits, offsets)
+
+    def _allocate(self, keys: Tensor) -> None:
+        """Make room for the blocks `keys` that are not there yet."""
+        fresh = keys[self._find(keys) < 0]
+        if fresh.numel() == 0:
+            return
+        fresh = fresh.unique()
+        n_blocks = self.n_blocks + fresh.numel()
+        n_bytes = n_blocks * self.cells_per_block * BYTES_PER_CELL
+        if n_bytes > self.memory_limit:
+            factor = (n_bytes / self.memory_limit) ** (1 / self.dim)
+            raise MemoryLimitError(
+                f"resolution={self.resolution} m takes {n_bytes:,} bytes for the cells that rays touch, above "
+                f"the limit of {self.memory_limit:,}; a resolution of {self.resolution * factor * 1.1:.3g} m fits."
+            )
+        if n_blocks > self._storage.shape[1]:  # grow by half again, so that many small insertions stay cheap
+            grown = self._storage.new_zeros(
+                2, max(n_blocks, self._storage.shape[1] * 3 // 2), self.cells_per_block
+            )
+            grown[:, : self.n_blocks] = self._storage[:, : self.n_blocks]
+            self._storage = grown
+        new_slots = torch.arange(self.n_blocks, n_blocks, device=keys.device)
+        self.keys, order = torch.sort(torch.cat([self.keys, fresh]))
+        self._slots = torch.cat([self._slots, new_slots])[order]
+
+    def _add_misses(
+        self, window: _Window, origins: Tensor, ends: Tensor, weights: Tensor | None, chunk_visits: int
+    ) -> None:
+        local_bits, side = _BLOCK_BITS[self.dim], self.block_side
+        # Cell indices are packed into powers of two, so that bit fields give block and cell.
+        bits = tuple(b + local_bits for b in window.bits)
+        shape = tuple(1 << b for b in bits)
+        corner = window.low * side
+        starts = origins.double() / self.resolution - corner
+        stops = ends.double() / self.resolution - corner
+        misses = self.misses.view(-1)
+        ones = torch.ones((), dtype=torch.float64, device=misses.device)
+        weight = None if weights is None else weights.double()
+        for visit in traverse(starts, stops, shape, chunk_visits, _power_of_two_strides(bits)):
+            voxel = visit.voxel.int() if sum(bits) < 31 else visit.voxel
+            # Cut each axis's field into block bits and cell bits, and gather either sort.
+            block, local = voxel >> local_bits & ((1 << window.bits[-1]) - 1), voxel & (side - 1)
+            for axis in range(self.dim - 2, -1, -1):
+                shift, width = _fields(bits)[axis][0], window.bits[axis]
+                above = sum(window.bits[axis + 1 :])
+                block |= (voxel >> (shift + local_bits - above)) & (((1 << width) - 1) << above)
+                place = local_bits * (self.dim - 1 - axis)
+                local |= (voxel >> (shift - place)) & ((side - 1) << place)
+            index = window.offsets.index_select(0, block).add_(local)
+            source = ones.expand(index.shape) if weight is None else weight[visit.ray]
+            misses.scatter_add_(0, index, source)
+
+    def merge_hits(self, other: BlockEvidence, update: Tensor) -> None:
+        """Add `update` (B, cells), laid out as `other.hits`, to this one's hits."""
+        self._allocate(other.keys)
+        if other.n_blocks:
+            slots = torch.empty_like(other._slots)
+            slots[other._slots] = self._find(other.keys)
+            self.hits.index_add_(0, slots, update)
+
+    def fill(self, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor | None = None) -> None:
+        """Set the cells marked in `observed` (B, cells), blocks in order of `keys`, of an empty lattice."""
+        self._allocate(keys)
+        self.hits[observed] = hits
+        if misses is not None:
+            self.misses[observed] = misses
+
+    def in_key_order(self) -> tuple[Tensor, Tensor]:
+        """Hits and misses (B, cells) with the blocks in the order of `keys`."""
+        return self.hits[self._slots], self.misses[self._slots]
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def evidence_at(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Hits (M,) and misses (M,) of the cells that hold the points (M, D); 0 where no ray went."""
+        if self.keys.numel() == 0:
+            zero = torch.zeros(points.shape[0], dtype=torch.float64, device=points.device)
+            return zero, zero.clone()
+        index, stored = self._locate(points)
+        return self.hits.view(-1)[index] * stored, self.misses.view(-1)[index] * stored
+
+    def lookup(self, points: Tensor, prior: float = 1.0) -> Tensor:
+        """Occupancy (M,) of the cells that hold the points (M, D); exactly ½ where no ray went."""
+        return occupancy_probability(*self.evidence_at(points), prior)
+
+    def dense(self, grid: VoxelGrid) -> Evidence:
+        """The evidence of a grid whose cells are cells of the lattice (as `VoxelGrid.covering` makes them)."""
+        hits, misses = self.evidence_at(grid.centers(self.keys.device))
+        return Evidence(grid, hits.reshape(grid.shape), misses.reshape(grid.shape))
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest corner (D,) of the allocated blocks, world metres."""
+        blocks = self.unpack(self.keys)
+        size = self.block_side * self.resolution
+        return blocks.amin(0) * size, (blocks.amax(0) + 1) * size
+
+
+def _power_of_two_strides(bits: tuple[int, ...]) -> list[int]:
+    return [1 << shift for shift, _ in _fields(bits)]
+
+
+def _fields(bits: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(shift, width) of each axis in a packed index, the last axis lowest."""
+    return [(sum(bits[axis + 1 :]), bits[axis]) for axis in range(len(bits))]

@@ -1,0 +1,117 @@
+"""How far a ray flies until it meets a line segment (2D) or a triangle (3D), in plain torch.
+
+Every ray is tested against every primitive, in chunks of bounded memory, which for the few hundred
+primitives of a building is faster than walking a tree in Python.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+_CHUNK_PAIRS = 1 << 15
+"""Ray-primitive pairs held at once: 256 KB a temporary in float64, so that they stay in cache."""
+
+_SLACK = 64
+"""How many units of rounding a ray may pass beside an edge and still count as a hit, so that no ray slips
+through where two primitives meet; rays closer than four times that to parallel do not meet a primitive."""
+
+
+def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tensor:
+    """Distances (N,), float64, in lengths of the direction, to the nearest segment; inf where none is met.
+
+    Solves o + t d = a + s (b − a) for t > 0 and 0 ≤ s ≤ 1. Rays along a segment do not meet it.
+
+    Args:
+        origins: (N, 2), or (2,) for rays that all start at one place.
+        directions: (N, 2).
+        segments: (S, 2, 2), the two ends of each.
+    """
+    origins, directions, segments = _checked(origins, directions, segments, (2, 2))
+    best = _nothing(directions)
+    a, edge = segments[:, 0], segments[:, 1] - segments[:, 0]
+    slack = _SLACK * torch.finfo(torch.float64).eps
+    flat = 4 * slack * edge.norm(dim=1)
+    for rows in _chunks(directions.shape[0], segments.shape[0]):
+        d = directions[rows, None]
+        to_start = a - origins[rows, None]
+        turn = _cross_2d(d, edge)
+        t = _cross_2d(to_start, edge) / turn
+        s = _cross_2d(to_start, d) / turn
+        met = (t > 0) & (s >= -slack) & (s <= 1 + slack) & (turn.abs() > flat * d.norm(dim=2))
+        best[rows] = torch.where(met, t, torch.inf).amin(1)
+    return best
+
+
+def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Tensor:
+    """Distances (N,), float64, in lengths of the direction, to the nearest triangle; inf where none is met.
+
+    A ray passes inside a triangle if it passes all three edges on the same side. The side of the edge
+    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p), a product of
+    two matrices. Neighbours share an edge with opposite sign, so no ray slips through between them.
+    Both faces count; rays in the plane of a triangle do not meet it.
+
+    Args:
+        origins: (N, 3), or (3,) for rays that all start at one place.
+        directions: (N, 3).
+        triangles: (T, 3, 3), the three corners of each.
+    """
+    origins, directions, triangles = _checked(origins, directions, triangles, (3, 3))
+    best = _nothing(directions)
+    if triangles.shape[0] == 0 or directions.shape[0] == 0:
+        return best
+    centre = triangles.mean((0, 1))  # shortens the vectors whose products cancel
+    origins, triangles = origins - centre, triangles - centre
+    rays = torch.cat([directions, torch.linalg.cross(origins, directions)], 1)
+    ahead = triangles.roll(-1, dims=1)
+    edges = torch.cat([torch.linalg.cross(triangles, ahead), ahead - triangles], 2)  # (T, 3, 6)
+    normals = edges[:, :, :3].sum(1)
+    offsets = (normals * triangles[:, 0]).sum(1)
+    slack = _SLACK * torch.finfo(torch.float64).eps * rays.norm(dim=1).max() * edges.norm(dim=2).amax(1)
+    columns = edges.permute(1, 2, 0).contiguous()
+    for rows in _chunks(directions.shape[0], triangles.shape[0]):
+        side_a, side_b, side_c = (rays[rows] @ columns[k] for k in range(3))
+        lowest = torch.minimum(torch.minimum(side_a, side_b), side_c)
+        highest = torch.maximum(torch.maximum(side_a, side_b), side_c)
+        ray, triangle = ((lowest >= -slack) | (highest <= slack)).nonzero(as_tuple=True)
+        ray = ray + rows.start
+        normal = normals[triangle]
+        steepness = (normal * directions[ray]).sum(1)
+        t = (offsets[triangle] - (normal * origins[ray]).sum(1)) / steepness
+        t = torch.where((t > 0) & (steepness.abs() > 4 * slack[triangle]), t, torch.inf)
+        best.scatter_reduce_(0, ray, t, "amin")
+    return best
+
+
+def _cross_2d(u: Tensor, v: Tensor) -> Tensor:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def _nothing(directions: Tensor) -> Tensor:
+    return torch.full_like(directions[:, 0], torch.inf)
+
+
+def _chunks(n_rays: int, n_primitives: int) -> list[slice]:
+    size = max(1, _CHUNK_PAIRS // max(1, n_primitives))
+    return [slice(i, min(i + size, n_rays)) for i in range(0, n_rays, size) if n_primitives]
+
+
+def _checked(
+    origins: Tensor, directions: Tensor, primitives: Tensor, shape: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Origins (N, D), directions (N, D) and primitives, all float64: the products below cancel."""
+    dim = shape[1]
+    if directions.ndim != 2 or directions.shape[1] != dim:
+        raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, {dim}).")
+    if origins.shape not in ((dim,), directions.shape):
+        raise InvalidArgumentError(
+            f"origins has shape {tuple(origins.shape)}; expected ({dim},) or {tuple(directions.shape)}, "
+            "one for each direction."
+        )
+    if primitives.ndim != 3 or primitives.shape[1:] != shape:
+        raise InvalidArgumentError(
+            f"segments or triangles have shape {tuple(primitives.shape)}; expected (N, {shape[0]}, {dim})."
+        )
+    return origins.double().expand(directions.shape), directions.double(), primitives.double()

@@ -1,0 +1,150 @@
+"""Range sensors: where their beams point, and how their readings err.
+
+Sensor frame: x forward, y left, z up, for the camera too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.scan import Scan
+
+_CLOSEST_READING = 1e-3
+
+
+class World(Protocol):
+    """What a sensor needs to know of a world."""
+
+    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+        """Metres (N,) from the origin (D,) along unit directions (N, D) to the first surface, or inf."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RangeSensor:
+    """Beams and their errors.
+
+    Attributes:
+        directions: (B, D) unit vectors in the sensor frame.
+        max_range: what lies at this distance (m) or beyond is not seen.
+        range_noise: standard deviation (m) of a reading, along the beam.
+        dropout: share of the beams that yield no reading at all, which says nothing of free space.
+    """
+
+    directions: Tensor
+    max_range: float
+    range_noise: float = 0.01
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.max_range) and self.max_range > 0):
+            raise InvalidArgumentError(f"max_range={self.max_range} must be a distance above zero metres.")
+        if not (math.isfinite(self.range_noise) and self.range_noise >= 0):
+            raise InvalidArgumentError(f"range_noise={self.range_noise} must be zero metres or more.")
+        if not 0 <= self.dropout < 1:
+            raise InvalidArgumentError(f"dropout={self.dropout} must be a share of the beams in [0, 1).")
+
+
+def laser_2d(
+    n_beams: int = 180,
+    field_of_view: float = math.pi,
+    max_range: float = 12.0,
+    range_noise: float = 0.01,
+    dropout: float = 0.0,
+) -> RangeSensor:
+    """A planar laser: `n_beams` spread evenly over `field_of_view` radians, right to left."""
+    _at_least_one(n_beams=n_beams)
+    _angle(field_of_view=field_of_view, limit=2 * math.pi)
+    angles = (torch.arange(n_beams, dtype=torch.float64) + 0.5) / n_beams * field_of_view - field_of_view / 2
+    return RangeSensor(torch.stack([angles.cos(), angles.sin()], 1), max_range, range_noise, dropout)
+
+
+def spinning_lidar(
+    n_rings: int = 32,
+    n_azimuths: int = 160,
+    elevations: tuple[float, float] = (-math.radians(28), math.radians(28)),
+    max_range: float = 10.0,
+    range_noise: float = 0.01,
+    dropout: float = 0.0,
+) -> RangeSensor:
+    """A lidar of `n_rings` × `n_azimuths` beams, ring by ring from the lowest of `elevations` (rad) up."""
+    _at_least_one(n_rings=n_rings, n_azimuths=n_azimuths)
+    elevation = torch.linspace(*elevations, n_rings, dtype=torch.float64)[:, None]
+    azimuth = torch.arange(n_azimuths, dtype=torch.float64) * (2 * math.pi / n_azimuths)
+    directions = torch.stack(
+        [
+            elevation.cos() * azimuth.cos(),
+            elevation.cos() * azimuth.sin(),
+            elevation.sin().expand(n_rings, n_azimuths),
+        ],
+        -1,
+    )
+    return RangeSensor(directions.flatten(0, 1), max_range, range_noise, dropout)
+
+
+def depth_camera(
+    width: int = 80,
+    height: int = 64,
+    field_of_view: float = math.radians(75),
+    max_range: float = 10.0,
+    range_noise: float = 0.01,
+    dropout: float = 0.0,
+) -> RangeSensor:
+    """A pinhole camera of `width` × `height` square pixels, row by row from the top left.
+
+    `field_of_view` is the angle (rad) from the left edge of the image to the right.
+    """
+    _at_least_one(width=width, height=height)
+    _angle(field_of_view=field_of_view, limit=math.pi)
+    focal = width / 2 / math.tan(field_of_view / 2)
+    left = (width / 2 - 0.5 - torch.arange(width, dtype=torch.float64)) / focal
+    up = (height / 2 - 0.5 - torch.arange(height, dtype=torch.float64)) / focal
+    z, y = torch.meshgrid(up, left, indexing="ij")
+    directions = torch.nn.functional.normalize(
+        torch.stack([torch.ones_like(y), y, z], -1).flatten(0, 1), dim=1
+    )
+    return RangeSensor(directions, max_range, range_noise, dropout)
+
+
+def sense(
+    sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Beam ends (N, D) in the world frame, and which (N,) of them saw nothing within range.
+
+    The pose (D+1, D+1) is world ← sensor. A beam that saw nothing ends at the sensor's maximum range;
+    beams that dropped out are missing. The same number of random draws is spent whatever is seen.
+    """
+    origin, directions = pose[:-1, -1], sensor.directions @ pose[:-1, :-1].T
+    n_beams = directions.shape[0]
+    noise = torch.randn(n_beams, generator=generator, dtype=torch.float64) * sensor.range_noise
+    kept = torch.rand(n_beams, generator=generator, dtype=torch.float64) >= sensor.dropout
+    truth = world.distances(origin, directions)
+    reading = (truth + noise).clamp_min(_CLOSEST_READING)
+    no_return = (truth >= sensor.max_range) | (reading >= sensor.max_range)
+    reading = torch.where(no_return, sensor.max_range, reading)
+    return (origin + directions * reading[:, None])[kept], no_return[kept]
+
+
+def simulate_scan(sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator) -> Scan:
+    """The scan taken at a pose (D+1, D+1); beams that saw nothing are free up to the maximum range."""
+    ends, no_return = sense(sensor, pose, world, generator)
+    return Scan(ends[~no_return], pose[:-1, -1], ends[no_return])
+
+
+def _at_least_one(**counts: int) -> None:
+    for name, value in counts.items():
+        if value < 1:
+            raise InvalidArgumentError(f"{name}={value} must be at least 1.")
+
+
+def _angle(field_of_view: float, limit: float) -> None:
+    if not 0 < field_of_view <= limit:
+        raise InvalidArgumentError(
+            f"field_of_view={field_of_view} must be an angle above 0 and at most {limit:.4g} radians."
+        )

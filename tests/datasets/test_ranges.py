@@ -1,0 +1,99 @@
+"""Ranges: which beam ends are surfaces, which are empty beams, which are invalid; and Dataset as a sequence."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gmmtorch.datasets import Dataset, Ranges
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.scan import Scan
+
+ORIGIN = torch.zeros(2, dtype=torch.float64)
+ENDS = torch.tensor([[1.0, 0.0], [0.0, 5.0], [-20.0, 0.0]], dtype=torch.float64)
+
+
+def test_without_limit_every_end_is_a_surface():
+    scan = Ranges().scan(ENDS, ORIGIN)
+    assert scan.points.tolist() == ENDS.tolist()
+    assert scan.no_return.shape == (0, 2)
+
+
+def test_readings_at_or_beyond_the_limit_free_no_return_range():
+    scan = Ranges(5.0, 3.0).scan(ENDS, ORIGIN)
+    assert scan.points.tolist() == [[1.0, 0.0]]
+    assert scan.no_return.tolist() == [[0.0, 3.0], [-3.0, 0.0]]
+
+
+def test_no_return_range_zero_drops_empty_beams():
+    scan = Ranges(5.0, 0.0).scan(ENDS, ORIGIN)
+    assert scan.points.tolist() == [[1.0, 0.0]]
+    assert scan.no_return.shape == (0, 2)
+
+
+def test_empty_beams_never_free_more_than_the_limit_or_their_own_length():
+    scan = Ranges(6.0, 50.0).scan(ENDS, ORIGIN, no_return=torch.tensor([False, True, False]))
+    assert scan.no_return.tolist() == [[0.0, 5.0], [-6.0, 0.0]]
+
+
+def test_ends_not_finite_or_on_the_sensor_are_dropped():
+    ends = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
+    scan = Ranges(5.0, 3.0).scan(ends, ORIGIN)
+    assert scan.points.tolist() == [[1.0, 1.0]]
+    assert scan.no_return.shape == (0, 2)
+
+
+def test_the_callers_mask_is_left_alone():
+    mask = torch.zeros(3, dtype=torch.bool)
+    Ranges(5.0, 3.0).scan(ENDS, ORIGIN, no_return=mask)
+    assert not bool(mask.any())
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_refuses_a_limit_that_is_not_a_distance(value):
+    with pytest.raises(InvalidArgumentError, match="max_range"):
+        Ranges(value)
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_refuses_a_no_return_range_that_is_not_a_distance(value):
+    with pytest.raises(InvalidArgumentError, match="no_return_range"):
+        Ranges(None, value)
+
+
+class _Ten(Dataset):
+    """Ten scans, scan i with one point at (i, 0)."""
+
+    def _count(self) -> int:
+        return 10
+
+    def _read(self, index: int) -> Scan:
+        return Scan([[float(index), 0.0]], [0.0, 1.0])
+
+
+def _numbers(scans: list[Scan]) -> list[float]:
+    return [float(scan.points[0, 0]) for scan in scans]
+
+
+@pytest.mark.parametrize(
+    ("stride", "expected"), [(1, list(range(10))), (3, [0, 3, 6, 9]), (4, [0, 4, 8]), (20, [0])]
+)
+def test_stride_reads_every_nth(stride, expected):
+    dataset = _Ten("ten", Ranges(), stride)
+    assert len(dataset) == len(expected)
+    assert _numbers(list(dataset)) == expected
+
+
+def test_indexing_is_that_of_a_sequence():
+    dataset = _Ten("ten", Ranges(), 2)
+    assert _numbers([dataset[-1]]) == [8]
+    assert _numbers(dataset[1:3]) == [2, 4]
+    with pytest.raises(IndexError, match="ten"):
+        dataset[5]
+
+
+def test_refuses_a_stride_below_one():
+    with pytest.raises(InvalidArgumentError, match="stride=0"):
+        _Ten("ten", Ranges(), 0)

@@ -1,0 +1,119 @@
+"""Scan: what it takes, what it refuses, and how beams are selected and moved."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.scan import Scan
+
+POINTS = [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+
+
+def make(points=POINTS, origin=(0.0, 0.0, 0.5), no_return=((0.0, 0.0, 3.0),)) -> Scan:
+    return Scan(
+        torch.tensor(points, dtype=torch.float64),
+        torch.tensor(origin, dtype=torch.float64),
+        torch.tensor(no_return, dtype=torch.float64),
+    )
+
+
+@pytest.mark.parametrize("convert", [list, np.array, torch.tensor, lambda x: tuple(map(tuple, x))])
+def test_takes_lists_arrays_and_tensors(convert):
+    scan = Scan(convert(POINTS), np.zeros(3))
+    assert scan.points.shape == (2, 3)
+    assert scan.no_return.shape == (0, 3)
+    assert scan.dim == 3
+    assert scan.n_beams == 2
+
+
+def test_integers_become_float64():
+    scan = Scan([[1, 2], [3, 4]], [0, 0])
+    assert scan.points.dtype == torch.float64
+    assert scan.origin.dtype == torch.float64
+
+
+def test_no_return_follows_the_dtype_of_the_points():
+    scan = Scan(torch.zeros(1, 2), torch.zeros(2), torch.ones(3, 2, dtype=torch.float64))
+    assert scan.no_return.dtype == torch.float32
+
+
+@pytest.mark.parametrize("empty", [[], np.empty((0, 3)), torch.empty(0, 3)])
+def test_a_scan_may_be_empty(empty):
+    scan = Scan(empty, [0.0, 0.0, 0.0])
+    ends, is_hit = scan.ends()
+    assert scan.n_beams == 0
+    assert ends.shape == (0, 3)
+    assert is_hit.shape == (0,)
+
+
+def test_ends_puts_returns_first():
+    ends, is_hit = make().ends()
+    assert ends.tolist() == [*POINTS, [0.0, 0.0, 3.0]]
+    assert is_hit.tolist() == [True, True, False]
+
+
+def test_select_keeps_marked_beams():
+    scan = make().select(torch.tensor([False, True, True]))
+    assert scan.points.tolist() == [POINTS[1]]
+    assert scan.no_return.tolist() == [[0.0, 0.0, 3.0]]
+
+
+def test_transformed_moves_points_origin_and_no_returns():
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    turn[:3, 3] = torch.tensor([10.0, 0.0, 1.0])
+    scan = make().transformed(turn)
+    torch.testing.assert_close(scan.points, torch.tensor([[10.0, 1, 1], [8, 0, 1]], dtype=torch.float64))
+    assert scan.origin.tolist() == [10.0, 0.0, 1.5]
+    assert scan.no_return.tolist() == [[10.0, 0.0, 4.0]]
+
+
+def test_transformed_there_and_back_is_the_same_scan():
+    angle = 0.3
+    pose = torch.eye(3, dtype=torch.float64)
+    pose[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    pose[:2, 2] = torch.tensor([3.0, -4.0])
+    scan = Scan(torch.randn(20, 2, generator=torch.Generator().manual_seed(0)).double(), [1.0, 2.0])
+    back = scan.transformed(pose).transformed(torch.linalg.inv(pose))
+    torch.testing.assert_close(back.points, scan.points)
+    torch.testing.assert_close(back.origin, scan.origin)
+
+
+def test_to_keeps_everything():
+    scan = make().to("cpu")
+    assert scan.n_beams == 3
+
+
+@pytest.mark.parametrize(
+    ("points", "origin", "no_return", "named"),
+    [
+        ([[1.0, 2.0]], [0.0, 0.0, 0.0], None, "points"),
+        ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0], None, "points"),
+        ([[1.0, 2.0, 3.0]], [0.0], None, "origin"),
+        ([[1.0, 2.0, 3.0]], [[0.0, 0.0, 0.0]], None, "origin"),
+        ([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0], [[1.0, 2.0]], "no_return"),
+        ([[1.0, 2.0, math.nan]], [0.0, 0.0, 0.0], None, r"points\[0\]"),
+        ([[1.0, 2.0, 3.0], [math.inf, 0.0, 0.0]], [0.0, 0.0, 0.0], None, r"points\[1\]"),
+        ([[1.0, 2.0, 3.0]], [0.0, math.nan, 0.0], None, "origin"),
+        ([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0], [[0.0, 0.0, math.inf]], r"no_return\[0\]"),
+    ],
+)
+def test_refuses_what_does_not_fit_and_names_it(points, origin, no_return, named):
+    with pytest.raises(InvalidArgumentError, match=named) as caught:
+        Scan(points, origin, no_return)
+    assert isinstance(caught.value, GmmTorchError)
+
+
+def test_far_float32_coordinates_warn_and_float64_do_not():
+    far = torch.full((1, 3), 5e4)
+    with pytest.warns(UserWarning, match="float64"):
+        Scan(far, torch.zeros(3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Scan(far.double(), torch.zeros(3))
