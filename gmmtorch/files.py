@@ -43,7 +43,11 @@ def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
 
 def write_bytes(path: str | Path, data: bytes) -> Path:
     """Write bytes atomically."""
-    return write_atomically(path, lambda temporary: temporary.write_bytes(data) and None)
+    return write_atomically(path, lambda temporary: _write_all(temporary, data))
+
+
+def _write_all(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
 
 
 def write_json(path: str | Path, value: Any) -> Path:
@@ -113,7 +117,8 @@ def require(
     fits = tensor.ndim == len(shape) and all(w in (None, n) for w, n in zip(shape, tensor.shape, strict=True))
     if not fits or tensor.dtype != dtype:
         raise DataError(
-            f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}; expected {dtype} {shape}, None for any size."
+            f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}; expected {dtype} "
+            f"{shape}, None for any size."
         )
     if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
         raise DataError(f"{path}: {name} holds NaN or infinite values; the file is damaged.")

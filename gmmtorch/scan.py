@@ -39,7 +39,7 @@ def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
     if tensor.dtype == torch.float32 and bool((tensor.abs() > _FLOAT32_WARNING_METRES).any()):
         warnings.warn(
             f"{name} holds float32 coordinates beyond {_FLOAT32_WARNING_METRES / 1e3:.0f} km from the "
-            "origin, where float32 cannot tell millimetres apart; read them as float64, or subtract an offset.",
+            "origin, where float32 cannot tell millimetres apart; read them as float64, or move them.",
             UserWarning,
             stacklevel=4,
         )

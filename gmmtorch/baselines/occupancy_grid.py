@@ -23,20 +23,18 @@ _RAYS_AT_ONCE = 1 << 18
 
 @dataclass(frozen=True)
 class LogOdds:
-    """Update of a cell hit by, or only passed by, the beams of a scan; and the clamp (OctoMap's defaults)."""
+    """What one beam adds to the log-odds of the cell it ends in, and of a cell it passes through."""
 
-    hit: float = math.log(0.7 / 0.3)
+    hit: float = math.log(0.9 / 0.1)
     miss: float = math.log(0.4 / 0.6)
-    low: float = math.log(0.1192 / 0.8808)
-    high: float = math.log(0.971 / 0.029)
 
 
 class OccupancyGrid:
     """Cells of one size, stored in blocks where beams went.
 
     By counts: hits are beam ends in a cell, misses beams that passed through it, and θ follows from
-    (3.9), exactly as for a mixture. By log-odds: each scan adds one update to every cell it hits, and
-    another to every cell it only passed through, within a clamp (Hornung et al. 2013).
+    (3.9), exactly as for a mixture. By log-odds: every beam adds its update to each cell it meets
+    (Moravec & Elfes 1985; Thrun et al. 2005, ch. 9), without a clamp, which would only tie cells.
 
     Args:
         resolution: side of a cell (m).
@@ -57,7 +55,7 @@ class OccupancyGrid:
         self.log_odds = log_odds
         self.prior = float(prior)
         self.memory_limit = memory_limit
-        self._blocks: BlockEvidence | None = None  # counts; or log-odds in the place of hits
+        self._blocks: BlockEvidence | None = None
         self._waiting: list[Scan] = []  # counts are additive, so scans are cast many at a time
 
     def insert(self, scan: Scan) -> None:
@@ -68,15 +66,12 @@ class OccupancyGrid:
             raise InvalidArgumentError(
                 f"scan is {scan.dim}-dimensional, but the grid is {self._blocks.dim}-dimensional."
             )
-        if self.log_odds is not None:
-            self._update_log_odds(self._blocks, scan, self.log_odds)
-            return
         self._waiting.append(scan)
         if sum(waiting.n_beams for waiting in self._waiting) > _RAYS_AT_ONCE:
             self.evidence()
 
     def evidence(self) -> BlockEvidence:
-        """Hits and misses counted so far (in the log-odds variant: log-odds in the place of hits)."""
+        """Hits and misses counted so far."""
         if self._blocks is None:
             raise InvalidArgumentError("The grid is empty; insert a scan first.")
         scans, self._waiting = self._waiting, []
@@ -87,15 +82,6 @@ class OccupancyGrid:
                 origins, torch.cat([e[0] for e in ends]), None, torch.cat([e[1] for e in ends])
             )
         return self._blocks
-
-    def _update_log_odds(self, total: BlockEvidence, scan: Scan, rule: LogOdds) -> None:
-        ends, is_hit = scan.ends()
-        seen = BlockEvidence(self.resolution, scan.dim, ends.device, self.memory_limit)
-        seen.add_rays(scan.origin.double().expand(ends.shape[0], -1), ends, None, is_hit)
-        update = torch.where(seen.hits > 0, rule.hit, torch.where(seen.misses > 0, rule.miss, 0.0))
-        total.merge_hits(seen, update)
-        # Only touched cells have left 0, so the clamp (0 lies within it) leaves the others alone.
-        total.hits.clamp_(rule.low, rule.high)
 
     def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Tensor | np.ndarray:
         """Probability (M,) of the cells that hold the points (M, D); ½ where no beam went.
@@ -110,26 +96,34 @@ class OccupancyGrid:
         elif self.log_odds is None:
             theta = self.evidence().lookup(query, self.prior)
         else:
-            theta = torch.sigmoid(self._blocks.evidence_at(query)[0])
+            theta = torch.sigmoid(self._sum(*self.evidence().evidence_at(query), self.log_odds))
         return theta if isinstance(points, Tensor) else theta.cpu().numpy()
+
+    @staticmethod
+    def _sum(hits: Tensor, misses: Tensor, rule: LogOdds) -> Tensor:
+        """Log-odds of cells from what they met."""
+        return rule.hit * hits + rule.miss * misses
 
     # -- keeping ----------------------------------------------------------------------------------
 
     def _serialized(self) -> bytes:
         """Block keys; one bit a cell: has it evidence; and the values of those that have.
 
-        Counts take the narrowest unsigned type that holds them, log-odds a float32 each.
+        Each sort of count takes the narrowest integer type that holds it.
         """
         blocks = self.evidence()
         hits, misses = blocks.in_key_order()
         facts: dict[str, Any] = {"resolution": self.resolution, "dim": blocks.dim, "prior": self.prior}
-        observed = (hits != 0) | (misses != 0)
-        tensors = {"keys": blocks.keys, "observed": _pack_bits(observed)}
-        if self.log_odds is None:
-            tensors |= {"hits": _narrowest(hits[observed]), "misses": _narrowest(misses[observed])}
-        else:
+        if self.log_odds is not None:
             facts["log_odds"] = vars(self.log_odds)
-            tensors["log_odds"] = hits[observed].float()
+        observed = (hits != 0) | (misses != 0)
+        tensors = {
+            "anchor": blocks.anchor if blocks.anchor is not None else blocks.keys.new_zeros(blocks.dim),
+            "keys": blocks.keys,
+            "observed": _pack_bits(observed),
+            "hits": _narrowest(hits[observed]),
+            "misses": _narrowest(misses[observed]),
+        }
         return pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts)
 
     @property
@@ -151,21 +145,17 @@ class OccupancyGrid:
             blocks = BlockEvidence(grid.resolution, {2: 2, 3: 3}[facts["dim"]])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
+        anchor = require(tensors, "anchor", (blocks.dim,), torch.int64, path)
         keys = require(tensors, "keys", (None,), torch.int64, path)
         bits = require(tensors, "observed", (keys.shape[0], blocks.cells_per_block // 8), torch.uint8, path)
         observed = _unpack_bits(bits)
         n = int(observed.sum())
-        names = ("hits", "misses") if rule is None else ("log_odds",)
-        values = [tensors[name].double() for name in names if name in tensors]
-        if len(values) != len(names) or any(
-            v.shape != (n,) or not bool(torch.isfinite(v).all()) for v in values
-        ):
-            raise DataError(
-                f"{path}: {' and '.join(names)} should hold {n} finite values each; the file is damaged."
-            )
+        counts = [tensors[name].double() for name in ("hits", "misses") if name in tensors]
+        if len(counts) != 2 or any(c.shape != (n,) or bool((c < 0).any()) for c in counts):
+            raise DataError(f"{path}: hits and misses should hold {n} counts each; the file is damaged.")
         if bool((keys[1:] <= keys[:-1]).any()):
             raise DataError(f"{path}: the block keys are not sorted; the file is damaged.")
-        blocks.fill(keys, observed, *values)
+        blocks.fill(anchor, keys, observed, *counts)
         grid._blocks = blocks
         return grid
 

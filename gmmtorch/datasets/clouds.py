@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,13 +11,28 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 
-_HEADER_BYTES = 4096
+_HEADER_BYTES = 1 << 16
+_PLY_BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+
+
+class _Announced(NamedTuple):
+    """What a header promises: points, and the words (text) or bytes (binary) of data that follow it."""
+
+    points: int
+    is_text: bool
+    length: int
+    header_bytes: int
 
 
 def read_cloud(path: Path) -> Tensor:
     """Points (N, 3), float64, of a PCD or PLY file, NaN rows included.
 
-    Raises `DataError` if the file is unreadable.
+    Raises `DataError` if the file is unreadable or shorter than its header says.
     """
     try:
         import open3d
@@ -25,7 +41,7 @@ def read_cloud(path: Path) -> Tensor:
             f"{path} cannot be read, because Open3D does not load: {error}. On Debian or Ubuntu install "
             "libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libgomp1 (scripts/setup.sh does it)."
         ) from error
-    expected = _announced_points(path)
+    expected = _check_whole(path)
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
             cloud = open3d.t.io.read_point_cloud(path)
@@ -43,10 +59,8 @@ def read_cloud(path: Path) -> Tensor:
 def pcd_header(path: Path) -> dict[str, list[str]]:
     """Header fields of a PCD file, such as {"VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"]}."""
     fields: dict[str, list[str]] = {}
-    with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
-    for line in head.decode("ascii", errors="replace").splitlines():
-        words = line.split()
+    for line in _head(path).split(b"\n"):
+        words = line.decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
             fields[words[0]] = words[1:]
             if words[0] == "DATA":
@@ -54,16 +68,71 @@ def pcd_header(path: Path) -> dict[str, list[str]]:
     raise DataError(f"{path} has no PCD header (no DATA line); it is not a PCD file.")
 
 
-def _announced_points(path: Path) -> int:
-    """How many points the header promises, so that a short read does not pass unnoticed."""
-    if path.suffix == ".pcd":
-        count = pcd_header(path).get("POINTS", [])
-    else:
+def _check_whole(path: Path) -> int:
+    """How many points the file holds, after checking that it is as long as its header says.
+
+    Open3D fills up with zeros what a truncated file lacks, and so would not notice.
+    """
+    try:
+        announced = _pcd_announced(path) if path.suffix == ".pcd" else _ply_announced(path)
+    except (ValueError, KeyError, IndexError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error
+    if announced.is_text:
         with path.open("rb") as file:
-            lines = file.read(_HEADER_BYTES).decode("ascii", errors="replace").splitlines()
-        if not lines or lines[0].strip() != "ply":
-            raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
-        count = next((line.split()[2:] for line in lines if line.startswith("element vertex")), [])
-    if not count or not count[0].isdigit():
-        raise DataError(f"{path} does not say how many points it holds; it is damaged.")
-    return int(count[0])
+            file.seek(announced.header_bytes)
+            held = len(file.read().split())
+    else:
+        held = path.stat().st_size - announced.header_bytes
+    if held < announced.length:
+        unit = "numbers" if announced.is_text else "bytes"
+        raise DataError(
+            f"{path} announces {announced.points} points, but ends after {held} of {announced.length} "
+            f"{unit}; it is truncated. Write or fetch it again."
+        )
+    return announced.points
+
+
+def _pcd_announced(path: Path) -> _Announced:
+    header = pcd_header(path)
+    if not header.get("POINTS", [""])[0].isdecimal():
+        raise DataError(f"{path} does not say how many points it holds (POINTS); it is damaged.")
+    points, kind = int(header["POINTS"][0]), header["DATA"][0]
+    counts = [int(c) for c in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
+    width = sum(counts)
+    if kind != "ascii":
+        width = sum(c * int(s) for c, s in zip(counts, header["SIZE"], strict=True))
+    # a compressed file starts with its own length, which Open3D does check
+    length = 0 if kind == "binary_compressed" else points * width
+    return _Announced(points, kind == "ascii", length, _header_end(path, b"DATA"))
+
+
+def _ply_announced(path: Path) -> _Announced:
+    """A list is counted with its length alone, since how long it is stands in the data."""
+    lines = [line.decode("ascii", errors="replace").split() for line in _head(path).split(b"\n")]
+    if lines[0] != ["ply"]:
+        raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
+    is_text, points, length, count = True, None, 0, 0
+    for words in lines[: lines.index(["end_header"])]:
+        if words[:1] == ["format"]:
+            is_text = words[1] == "ascii"
+        elif words[:1] == ["element"]:
+            count = int(words[2])
+            points = count if words[1] == "vertex" else points
+        elif words[:1] == ["property"]:
+            length += count * (1 if is_text else _PLY_BYTES[words[2] if words[1] == "list" else words[1]])
+    if points is None:
+        raise DataError(f"{path} does not say how many points it holds (element vertex); it is damaged.")
+    return _Announced(points, is_text, length, _header_end(path, b"end_header"))
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_HEADER_BYTES)
+
+
+def _header_end(path: Path, last_line: bytes) -> int:
+    """Position of the first byte after the line that begins with `last_line`."""
+    head = _head(path)
+    return head.index(b"\n", head.index(b"\n" + last_line) + 1) + 1

@@ -114,7 +114,7 @@ def _sample_origins(
     space around the sensors. A component that is no point's likeliest one has no sighting; it
     is dropped, and its points are others' already.
     """
-    k, n_scans = counts.shape
+    n_scans = counts.shape[1]
     n_kept = min(max_origins, n_scans)
     if n_kept < n_scans:
         race = torch.empty(counts.shape, dtype=torch.float64).exponential_(generator=generator)

@@ -17,7 +17,7 @@ _FINEST = 1 << 20  # cells along the longest side
 
 
 class Cells(NamedTuple):
-    """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): cell of each point."""
+    """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): each point's cell."""
 
     features: Tensor
     weight: Tensor

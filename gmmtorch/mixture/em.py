@@ -38,7 +38,7 @@ class Parameters(NamedTuple):
 
 @dataclass(frozen=True)
 class EMResult:
-    """What a run of EM found: the parameters, and the lower bound (mean log-likelihood, nats) of each iteration."""
+    """Parameters, and the lower bound (mean log-likelihood, nats) before each iteration's M-step."""
 
     parameters: Parameters
     lower_bounds: list[float]

@@ -25,7 +25,7 @@ from gmmtorch.mixture.em import EMResult, Parameters
 from gmmtorch.mixture.initialization import INITIALIZATIONS, start
 
 Array = Tensor | np.ndarray
-RandomState = int | np.random.RandomState | torch.Generator | None
+RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -60,6 +60,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
     weights: Tensor
     means: Tensor
     covariances: Tensor
+    _tensors: bool  # whether fit was given a tensor
 
     def __init__(
         self,
@@ -161,21 +162,21 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         k, dim = self.n_components, points.shape[1]
         shapes = ((k,), (k, dim), (k, dim, dim))
         names = ("weights_init", "means_init", "precisions_init")
-        weights, means, precisions = (
+        first_weights, first_means, precisions = (
             None if value is None else _checked_init(value, shape, name, points.device)
             for value, shape, name in zip(given, shapes, names, strict=True)
         )
-        if weights is None or means is None or precisions is None:
+        if first_weights is None or first_means is None or precisions is None:
             found = start(self.init_params, points, weight, k, float(self.reg_covar), generator)
         else:
-            found = Parameters(weights, means, precisions)
+            found = Parameters(first_weights, first_means, precisions)
         covariances = found.covariances
         if precisions is not None:
             whiten = inverse_factor(safe_cholesky(precisions, "precisions_init"))
             covariances = whiten @ whiten.transpose(-2, -1)
         return Parameters(
-            found.weights if weights is None else weights / weights.sum(),
-            found.means if means is None else means - center,
+            found.weights if first_weights is None else first_weights / first_weights.sum(),
+            found.means if first_means is None else first_means - center,
             covariances,
         )
 
@@ -294,7 +295,8 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         dim = means.shape[1]
         if matrix.shape != (dim + 1, dim + 1):
             raise InvalidArgumentError(
-                f"transform has shape {tuple(matrix.shape)}; a rigid motion of this mixture is {(dim + 1, dim + 1)}."
+                f"transform has shape {tuple(matrix.shape)}; a rigid motion of this mixture is "
+                f"{(dim + 1, dim + 1)}."
             )
         rotation, translation = matrix[:dim, :dim], matrix[:dim, dim]
         identity = torch.eye(dim, dtype=torch.float64, device=means.device)
@@ -302,9 +304,10 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             raise InvalidArgumentError(
                 f"transform={matrix.tolist()} is not rigid: its rotation is not orthonormal."
             )
-        moved = GaussianMixture(**self.get_params(deep=False))
-        moved.__dict__.update({k: v for k, v in self.__dict__.items() if k.endswith("_") and k[0] != "_"})
-        moved._tensors = self._tensors
+        moved = GaussianMixture(**BaseEstimator.get_params(self, deep=False))
+        facts = ("_tensors", "n_features_in_", "lower_bounds_", "lower_bound_", "n_iter_", "converged_")
+        for name in facts:
+            setattr(moved, name, getattr(self, name))
         moved._set_buffers(
             self.weights.clone(), means @ rotation.T + translation, rotation @ self.covariances @ rotation.T
         )
@@ -320,7 +323,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             "arrays": not self._tensors,
             "parameters": {
                 k: v
-                for k, v in self.get_params(deep=False).items()
+                for k, v in BaseEstimator.get_params(self, deep=False).items()
                 if isinstance(v, int | float | str | bool | None)
             },
         }
@@ -357,7 +360,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
     def _check_parameters(self) -> None:
         for name in ("n_components", "max_iter", "n_init"):
             value = getattr(self, name)
-            if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < 1:
+            if not isinstance(value, numbers.Integral) or int(value) < 1:
                 raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least 1.")
         for name in ("tol", "reg_covar"):
             value = getattr(self, name)
@@ -441,7 +444,7 @@ def as_generator(random_state: RandomState) -> torch.Generator:
         generator.seed()
     elif isinstance(random_state, np.random.RandomState):
         generator.manual_seed(int(random_state.randint(2**31 - 1)))
-    elif isinstance(random_state, numbers.Integral) and 0 <= int(random_state) < 2**63:
+    elif isinstance(random_state, int | np.integer) and 0 <= int(random_state) < 2**63:
         generator.manual_seed(int(random_state))
     else:
         raise InvalidArgumentError(

@@ -48,6 +48,8 @@ class BlockEvidence:
         self.block_side = 1 << _BLOCK_BITS[dim]
         self.cells_per_block = self.block_side**dim
         self.memory_limit = memory_limit
+        self.anchor: Tensor | None = None
+        """Block coordinates (D,) that keys are relative to, near the first ray: maps far out work too."""
         self.keys = torch.empty(0, dtype=torch.int64, device=device)
         """Packed coordinates of the blocks, sorted: (B,)."""
         self._slots = torch.empty(0, dtype=torch.int64, device=device)  # where each is stored
@@ -69,17 +71,20 @@ class BlockEvidence:
 
     # -- geometry ---------------------------------------------------------------------------------
 
+    def _anchored(self) -> Tensor:
+        return torch.zeros(self.dim, dtype=torch.int64) if self.anchor is None else self.anchor
+
     def _cells(self, points: Tensor) -> Tensor:
         """Lattice cell (M, D) of each point, float64."""
         return (points.double() / self.resolution).floor()
 
     def pack(self, blocks: Tensor) -> Tensor:
-        """Keys (M,) of block coordinates (M, D), int64; ordered as the coordinates are."""
+        """Keys (M,) of anchored block coordinates (M, D), int64; ordered as the coordinates are."""
         half = 1 << (_KEY_BITS[self.dim] - 1)
         if blocks.numel() and int(blocks.abs().max()) >= half:
             raise InvalidArgumentError(
-                f"resolution={self.resolution} m cannot index points {half * self.block_side * self.resolution:.3g} "
-                "m from the origin; take a coarser resolution, or move the scans nearer to the origin."
+                f"resolution={self.resolution} m cannot index points "
+                f"{half * self.block_side * self.resolution:.3g} m from the first scan; take a coarser one."
             )
         key = blocks[:, 0] + half
         for axis in range(1, self.dim):
@@ -87,7 +92,7 @@ class BlockEvidence:
         return key
 
     def unpack(self, keys: Tensor) -> Tensor:
-        """Block coordinates (M, D) of keys (M,)."""
+        """Anchored block coordinates (M, D) of keys (M,)."""
         bits, half = _KEY_BITS[self.dim], 1 << (_KEY_BITS[self.dim] - 1)
         columns = [
             ((keys >> (bits * (self.dim - 1 - a))) & ((1 << bits) - 1)) - half for a in range(self.dim)
@@ -107,7 +112,7 @@ class BlockEvidence:
         Points that are not finite, or too far out to have a key, are not stored.
         """
         bits = _BLOCK_BITS[self.dim]
-        cells = self._cells(points)
+        cells = self._cells(points) - self._anchored() * self.block_side
         limit = float(1 << (_KEY_BITS[self.dim] - 1 + bits))
         valid = (cells.abs() < limit - self.block_side).all(1)  # NaN compares false
         cells = torch.where(valid[:, None], cells, 0.0).long()
@@ -147,15 +152,17 @@ class BlockEvidence:
         starts, stops = origins.double() / self.resolution / side, ends.double() / self.resolution / side
         both = torch.cat([starts, stops])
         low = both.amin(0).floor()
+        if self.anchor is None:
+            self.anchor = low.long()
         shape = (both.amax(0).floor() - low + 1).long().tolist()
         bits = tuple((n - 1).bit_length() for n in shape)
         n_bytes = 8 << sum(bits)
         if n_bytes > self.memory_limit:
             raise MemoryLimitError(
-                f"resolution={self.resolution} m over rays that span {[n * side for n in shape]} cells needs a "
-                f"table of {n_bytes:,} bytes, above the limit of {self.memory_limit:,}; a resolution of "
-                f"{self.resolution * (n_bytes / self.memory_limit) ** (1 / self.dim) * 1.02:.3g} m or more fits, "
-                "or set dataset.max_range to drop stray far returns."
+                f"resolution={self.resolution} m over rays that span {[n * side for n in shape]} cells needs "
+                f"a table of {n_bytes:,} bytes, above the limit of {self.memory_limit:,}; a resolution of "
+                f"{self.resolution * (n_bytes / self.memory_limit) ** (1 / self.dim) * 1.02:.3g} m or more "
+                "fits, or set dataset.max_range to drop stray far returns."
             )
         strides = _power_of_two_strides(bits)
         stride_t = torch.tensor(strides, device=low.device)
@@ -165,7 +172,7 @@ class BlockEvidence:
         touched[((stops.floor() - low).long() * stride_t).sum(1)] = True
         index = touched.nonzero().squeeze(1)
         blocks = torch.stack([(index >> shift) & ((1 << b) - 1) for shift, b in _fields(bits)], 1)
-        keys = self.pack(blocks + low.long())
+        keys = self.pack(blocks + low.long() - self._anchored())
         self._allocate(keys)
         offsets = torch.zeros(1 << sum(bits), dtype=torch.int64, device=low.device)
         offsets[index] = self._find(keys) * self.cells_per_block
@@ -182,13 +189,14 @@ class BlockEvidence:
         if n_bytes > self.memory_limit:
             factor = (n_bytes / self.memory_limit) ** (1 / self.dim)
             raise MemoryLimitError(
-                f"resolution={self.resolution} m takes {n_bytes:,} bytes for the cells that rays touch, above "
-                f"the limit of {self.memory_limit:,}; a resolution of {self.resolution * factor * 1.1:.3g} m fits."
+                f"resolution={self.resolution} m takes {n_bytes:,} bytes for the cells that rays touch, "
+                f"above the limit of {self.memory_limit:,}; a resolution of "
+                f"{self.resolution * factor * 1.1:.3g} m fits."
             )
-        if n_blocks > self._storage.shape[1]:  # grow by half again, so that many small insertions stay cheap
-            grown = self._storage.new_zeros(
-                2, max(n_blocks, self._storage.shape[1] * 3 // 2), self.cells_per_block
-            )
+        if n_blocks > self._storage.shape[1]:
+            # Grow by half again, so that many small insertions stay cheap.
+            capacity = max(n_blocks, self._storage.shape[1] * 3 // 2)
+            grown = self._storage.new_zeros(2, capacity, self.cells_per_block)
             grown[:, : self.n_blocks] = self._storage[:, : self.n_blocks]
             self._storage = grown
         new_slots = torch.arange(self.n_blocks, n_blocks, device=keys.device)
@@ -222,20 +230,12 @@ class BlockEvidence:
             source = ones.expand(index.shape) if weight is None else weight[visit.ray]
             misses.scatter_add_(0, index, source)
 
-    def merge_hits(self, other: BlockEvidence, update: Tensor) -> None:
-        """Add `update` (B, cells), laid out as `other.hits`, to this one's hits."""
-        self._allocate(other.keys)
-        if other.n_blocks:
-            slots = torch.empty_like(other._slots)
-            slots[other._slots] = self._find(other.keys)
-            self.hits.index_add_(0, slots, update)
-
-    def fill(self, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor | None = None) -> None:
+    def fill(self, anchor: Tensor, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor) -> None:
         """Set the cells marked in `observed` (B, cells), blocks in order of `keys`, of an empty lattice."""
+        self.anchor = anchor
         self._allocate(keys)
         self.hits[observed] = hits
-        if misses is not None:
-            self.misses[observed] = misses
+        self.misses[observed] = misses
 
     def in_key_order(self) -> tuple[Tensor, Tensor]:
         """Hits and misses (B, cells) with the blocks in the order of `keys`."""
@@ -256,13 +256,13 @@ class BlockEvidence:
         return occupancy_probability(*self.evidence_at(points), prior)
 
     def dense(self, grid: VoxelGrid) -> Evidence:
-        """The evidence of a grid whose cells are cells of the lattice (as `VoxelGrid.covering` makes them)."""
+        """The evidence of a grid of lattice cells, as `VoxelGrid.covering` makes them."""
         hits, misses = self.evidence_at(grid.centers(self.keys.device))
         return Evidence(grid, hits.reshape(grid.shape), misses.reshape(grid.shape))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (D,) of the allocated blocks, world metres."""
-        blocks = self.unpack(self.keys)
+        blocks = self.unpack(self.keys) + self._anchored()
         size = self.block_side * self.resolution
         return blocks.amin(0) * size, (blocks.amax(0) + 1) * size
 

@@ -1,4 +1,4 @@
-"""Ranges: which beam ends are surfaces, which are empty beams, which are invalid; and Dataset as a sequence."""
+"""Ranges: which beam ends are surfaces, empty beams or invalid; and Dataset as a sequence."""
 
 from __future__ import annotations
 
@@ -43,6 +43,12 @@ def test_ends_not_finite_or_on_the_sensor_are_dropped():
     scan = Ranges(5.0, 3.0).scan(ends, ORIGIN)
     assert scan.points.tolist() == [[1.0, 1.0]]
     assert scan.no_return.shape == (0, 2)
+
+
+def test_rounding_does_not_turn_the_limit_into_a_surface():
+    angle = torch.linspace(0, 6, 1000)  # float32: lengths come out a little below 50 as often as above
+    ends = 50 * torch.stack([angle.cos(), angle.sin()], 1)
+    assert Ranges(50.0, 8.0).scan(ends, torch.zeros(2)).points.shape == (0, 2)
 
 
 def test_the_callers_mask_is_left_alone():

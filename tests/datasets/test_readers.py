@@ -1,0 +1,440 @@
+"""Every reader on small files written here: values, order, what is invalid, and what a bad file is told."""
+
+from __future__ import annotations
+
+import gzip
+import importlib.util
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gmmtorch.datasets import Dataset, load
+from gmmtorch.datasets.carmen import beam_angles
+from gmmtorch.datasets.clouds import read_cloud
+from gmmtorch.datasets.octomap_log import rotation
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+NAN_POINT = (math.nan,) * 3
+
+
+def open3d_loads() -> bool:
+    if importlib.util.find_spec("open3d") is None:
+        return False
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError):
+        return False
+    return True
+
+
+needs_open3d = pytest.mark.skipif(not open3d_loads(), reason="Open3D does not load on this machine")
+
+
+def flaser(readings: list[float], pose: tuple[float, ...] = (0.0, 0.0, 0.0)) -> str:
+    words = ["FLASER", len(readings), *readings, *pose, 9, 9, 9, 0.0, "host", 0.0]
+    return " ".join(map(str, words)) + "\n"
+
+
+def pcd(
+    points: list, viewpoint: str = "0 0 0 1 0 0 0", binary: bool = True, announce: int | None = None
+) -> bytes:
+    n = len(points) if announce is None else announce
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {n}\nDATA {'binary' if binary else 'ascii'}\n"
+    )
+    if binary:
+        return header.encode() + b"".join(struct.pack("<3f", *p) for p in points)
+    return (header + "".join("{} {} {}\n".format(*p) for p in points)).encode()
+
+
+def ply(points: list) -> bytes:
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(
+        f"property float {axis}\n" for axis in "xyz"
+    )
+    return (header + "end_header\n" + "".join("{} {} {}\n".format(*p) for p in points)).encode()
+
+
+def kitti(rotation: np.ndarray, translation: list[float]) -> str:
+    return " ".join(str(v) for v in np.column_stack([rotation, translation]).ravel()) + "\n"
+
+
+def scan_folder(path: Path, clouds: dict[str, bytes], poses: str) -> Path:
+    (path / "scans").mkdir()
+    for name, content in clouds.items():
+        (path / "scans" / name).write_bytes(content)
+    (path / "poses.txt").write_text(poses)
+    return path
+
+
+def depth_folder(path: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    (path / "camera-intrinsics.txt").write_text("100 0 1\n0 200 1\n0 0 1\n")
+    for number, (depth, pose) in enumerate(frames):
+        Image.fromarray(depth).save(path / f"frame-{number:06d}.depth.png")
+        np.savetxt(path / f"frame-{number:06d}.pose.txt", pose)
+    return path
+
+
+# CARMEN logs
+
+
+@pytest.mark.parametrize(
+    ("n", "first", "last"),
+    [(180, -90, 89), (360, -90, 89.5), (181, -90, 90), (361, -90, 90), (3, -90, 90)],
+)
+def test_carmen_beam_angles(n, first, last):
+    angles = beam_angles(n)
+    assert angles.shape == (n,)
+    assert float(angles[0].rad2deg()) == pytest.approx(first)
+    assert float(angles[-1].rad2deg()) == pytest.approx(last)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_carmen_values(tmp_path, compressed):
+    text = "# a comment\nODOM 1 2 3\n" + flaser([1.0, 2.0, 3.0], (10.0, 20.0, math.pi / 2))
+    path = tmp_path / "room.log"
+    path.write_bytes(gzip.compress(text.encode()) if compressed else text.encode())
+    dataset = load("carmen", path)
+    assert dataset.name == "room"
+    (scan,) = dataset
+    assert scan.origin.tolist() == [10.0, 20.0]
+    expected = [[11.0, 20.0], [10.0, 22.0], [7.0, 20.0]]  # the robot looks up the page: right, ahead, left
+    torch.testing.assert_close(scan.points, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_carmen_no_return_and_invalid_readings(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text(flaser([0.0, -1.0, 1.0, 81.83, 50.0, math.nan, math.inf]))
+    scan = load("carmen", path)[0]
+    assert scan.points.shape == (1, 2)
+    assert scan.no_return.norm(dim=1).tolist() == pytest.approx([8.0, 8.0, 8.0])
+    assert load("carmen", path, no_return_range=0)[0].no_return.shape == (0, 2)
+    unlimited = load("carmen", path, max_range=math.inf)[0]
+    assert unlimited.points.norm(dim=1).tolist() == pytest.approx([1.0, 81.83, 50.0])
+
+
+def test_carmen_scan_of_empty_beams_only(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text(flaser([81.83] * 180))
+    scan = load("carmen", path)[0]
+    assert scan.points.shape == (0, 2)
+    assert scan.no_return.shape == (180, 2)
+    assert load("carmen", path, no_return_range=0)[0].n_beams == 0
+
+
+def test_carmen_stride(tmp_path):
+    path = tmp_path / "a.log"
+    path.write_text("".join(flaser([1.0], (float(i), 0.0, 0.0)) for i in range(7)))
+    assert [float(scan.origin[0]) for scan in load("carmen", path, stride=3)] == [0.0, 3.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"hello\n", "no FLASER line"),
+        (b"", "no FLASER line"),
+        (b"\x89PNG\r\n\x1a\n\x00\xff", "no FLASER line"),
+        (b"FLASER 3 1.0 2.0\n", "line 1.*ends early"),
+        (b"FLASER x 1.0\n", "line 1.*not a number"),
+        (b"FLASER \n", "line 1.*not a number"),
+        (b"FLASER 1 abc 0 0 0\n", "line 1.*not a number"),
+        (b"FLASER 999999999 1 2 3 4\n", "line 1.*announces 999999999 beams"),
+        (b"FLASER -1 0 0 0\n", "line 1.*announces -1 beams"),
+        (flaser([1.0], (math.nan, 0.0, 0.0)).encode(), "line 1.*pose.*not finite"),
+        (gzip.compress(flaser([1.0] * 50).encode() * 50)[:-20], "not a whole gzip file"),
+        (b"\x1f\x8b\x08garbage that is not gzip at all", "not a whole gzip file"),
+    ],
+)
+def test_carmen_bad_files_are_named(tmp_path, content, complaint):
+    path = tmp_path / "bad.log"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=rf"bad\.log.*{complaint}"):
+        load("carmen", path)
+
+
+# Scan folders
+
+
+@needs_open3d
+@pytest.mark.parametrize(
+    "write", [pcd, lambda p: pcd(p, binary=False), ply], ids=["binary.pcd", "ascii.pcd", "ascii.ply"]
+)
+def test_scan_folder_values(tmp_path, write):
+    suffix = "ply" if write is ply else "pcd"
+    clouds = {f"{i:06d}.{suffix}": write([(1.0, 0.0, 0.0), (0.0, 2.0, float(i))]) for i in range(2)}
+    poses = kitti(np.eye(3), [0.0, 0.0, 0.0]) + kitti(TURN_LEFT, [5.0, 0.0, 1.0])
+    first, second = load("scan_folder", scan_folder(tmp_path, clouds, poses))
+    assert first.points.tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    assert second.origin.tolist() == [5.0, 0.0, 1.0]
+    assert second.points.tolist() == [[5.0, 1.0, 1.0], [3.0, 0.0, 2.0]]
+
+
+@needs_open3d
+def test_scan_folder_order_is_natural(tmp_path):
+    clouds = {f"scan_{i}.pcd": pcd([(float(i), 1.0, 0.0)]) for i in (1, 2, 10)}
+    poses = "".join(kitti(np.eye(3), [0.0, 0.0, float(i)]) for i in range(3))
+    scans = load("scan_folder", scan_folder(tmp_path, clouds, poses))
+    assert [float(scan.points[0, 0]) for scan in scans] == [1.0, 2.0, 10.0]
+
+
+@needs_open3d
+def test_scan_folder_no_return_and_invalid_points(tmp_path):
+    points = [(1.0, 0.0, 0.0), NAN_POINT, (0.0, 0.0, 0.0), (math.inf, 0.0, 0.0), (0.0, 30.0, 0.0)]
+    folder = scan_folder(tmp_path, {"0.pcd": pcd(points)}, kitti(np.eye(3), [0.0, 0.0, 0.0]))
+    (scan,) = load("scan_folder", folder, max_range=20.0, no_return_range=5.0)
+    assert scan.points.tolist() == [[1.0, 0.0, 0.0]]
+    assert scan.no_return.tolist() == [[0.0, 5.0, 0.0]]
+    (scan,) = load("scan_folder", folder)
+    assert scan.points.shape == (2, 3)
+
+
+@needs_open3d
+@pytest.mark.parametrize("points", [[], [NAN_POINT]])
+def test_scan_folder_scan_without_points(tmp_path, points):
+    folder = scan_folder(tmp_path, {"0.pcd": pcd(points)}, kitti(np.eye(3), [1.0, 2.0, 3.0]))
+    (scan,) = load("scan_folder", folder)
+    assert scan.n_beams == 0
+    assert scan.origin.tolist() == [1.0, 2.0, 3.0]
+
+
+IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("poses", "complaint"),
+    [
+        (IDENTITY * 2, r"2 rows, but there are 1 scans.*one pose for each"),
+        ("", "0 rows"),
+        ("1 0 0 0 0 1 0 0\n", "8 numbers a row; a KITTI pose has 12"),
+        ("one two three\n", "not a table of numbers"),
+        (kitti(np.eye(3), [math.nan, 0.0, 0.0]), "row 1 is not a rigid pose"),
+        (kitti(2 * np.eye(3), [0.0, 0.0, 0.0]), "row 1 is not a rigid pose"),
+        (kitti(np.diag([1.0, 1.0, -1.0]), [0.0, 0.0, 0.0]), "row 1 is not a rigid pose"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt")
+def test_scan_folder_bad_poses_are_named(tmp_path, poses, complaint):
+    with pytest.raises(DataError, match=rf"poses\.txt.*{complaint}"):
+        load("scan_folder", scan_folder(tmp_path, {"0.pcd": pcd([])}, poses))
+
+
+def test_scan_folder_missing_parts_are_named(tmp_path):
+    with pytest.raises(DataError, match=r"scans.*holds no \.pcd"):
+        load("scan_folder", tmp_path)
+    scan_folder(tmp_path, {"0.pcd": pcd([])}, IDENTITY)
+    (tmp_path / "poses.txt").unlink()
+    with pytest.raises(DataError, match=r"poses\.txt is missing"):
+        load("scan_folder", tmp_path)
+
+
+@needs_open3d
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("0.pcd", pcd([(1.0, 2.0, 3.0)] * 100)[:-500]),
+        ("0.pcd", pcd([(1.0, 2.0, 3.0)] * 3, binary=False, announce=5)),
+        ("0.pcd", pcd([(1.0, 2.0, 3.0)])[:60]),
+        ("0.pcd", b"\x89PNG\r\n\x1a\n" + bytes(200)),
+        ("0.pcd", b""),
+        ("0.ply", ply([(1.0, 2.0, 3.0)] * 100)[:-500]),
+        ("0.ply", b"this is no ply file"),
+        ("0.ply", b""),
+    ],
+    ids=["short", "short-ascii", "header-cut", "png", "empty", "short-ply", "text-ply", "empty-ply"],
+)
+def test_damaged_clouds_are_named(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=name):
+        read_cloud(path)
+
+
+# PCD files in the world frame
+
+
+@needs_open3d
+def test_pcd_viewpoint_values_order_and_limit(tmp_path):
+    for i in (10, 2, 1):
+        content = pcd([(float(i), 0.0, 1.0), (float(i), 10.0, 1.0)], viewpoint=f"{i} 0 0 1 0 0 0")
+        (tmp_path / f"scan_{i}.pcd").write_bytes(content)
+    scans = load("pcd_viewpoint", tmp_path, max_range=8.0, no_return_range=4.0)
+    assert [scan.origin.tolist() for scan in scans] == [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
+    assert scans[0].points.tolist() == [[1.0, 0.0, 1.0]]
+    assert float((scans[0].no_return - scans[0].origin).norm()) == pytest.approx(4.0)
+    assert load("pcd_viewpoint", tmp_path)[0].points.shape == (2, 3)
+
+
+@pytest.mark.parametrize("viewpoint", ["", "0 0", "a b c", "nan 0 0 1 0 0 0"])
+def test_pcd_viewpoint_without_a_position_is_named(tmp_path, viewpoint):
+    (tmp_path / "0.pcd").write_bytes(pcd([(1.0, 2.0, 3.0)], viewpoint))
+    with pytest.raises(DataError, match=r"0\.pcd: VIEWPOINT"):
+        load("pcd_viewpoint", tmp_path)[0]
+
+
+def test_pcd_viewpoint_empty_folder_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"holds no \.pcd file"):
+        load("pcd_viewpoint", tmp_path)
+
+
+# Depth frames
+
+
+def test_depth_frames_values(tmp_path):
+    depth = np.array([[1000, 0, 65535], [0, 2000, 0], [0, 0, 4000]], dtype=np.uint16)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
+    dataset = load("depth_frames", depth_folder(tmp_path, [(depth, np.eye(4)), (depth, pose)]))
+    first, second = dataset
+    expected = torch.tensor([[-0.01, -0.005, 1.0], [0.0, 0.0, 2.0], [0.04, 0.02, 4.0]], dtype=torch.float64)
+    torch.testing.assert_close(first.points, expected)
+    assert second.origin.tolist() == [1.0, 2.0, 3.0]
+    moved = expected @ torch.from_numpy(TURN_LEFT).T + second.origin
+    torch.testing.assert_close(second.points, moved)
+
+
+def test_depth_frames_limit_and_pixel_stride(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder, pixel_stride=2)[0].points.shape == (6, 3)
+    scan = load("depth_frames", folder, max_range=3.0, no_return_range=2.0)[0]
+    assert scan.points.shape == (0, 3)
+    assert scan.no_return.shape == (24, 3)
+    with pytest.raises(InvalidArgumentError, match="pixel_stride=0"):
+        load("depth_frames", folder, pixel_stride=0)
+
+
+def test_depth_frame_without_valid_pixels(tmp_path):
+    folder = depth_folder(tmp_path, [(np.zeros((4, 6), dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder)[0].n_beams == 0
+
+
+def _cut_png(folder: Path) -> None:
+    path = folder / "frame-000000.depth.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def _text_png(folder: Path) -> None:
+    (folder / "frame-000000.depth.png").write_text("not an image")
+
+
+def _colour_png(folder: Path) -> None:
+    Image.fromarray(np.zeros((4, 6, 3), dtype=np.uint8)).save(folder / "frame-000000.depth.png")
+
+
+def _pose(value: np.ndarray | str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        path = folder / "frame-000000.pose.txt"
+        path.write_text(value) if isinstance(value, str) else np.savetxt(path, value)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("spoil", "complaint"),
+    [
+        (_cut_png, r"000000\.depth\.png is not a whole PNG"),
+        (_text_png, r"000000\.depth\.png is not a whole PNG"),
+        (_colour_png, r"000000\.depth\.png is uint8.*expected one channel of 16 bit"),
+        (_pose(np.full((4, 4), math.nan)), r"000000\.pose\.txt.*finite 4×4"),
+        (_pose(np.eye(3)), r"000000\.pose\.txt.*finite 4×4"),
+        (_pose(3 * np.eye(4)), r"000000\.pose\.txt is not a rigid pose"),
+        (_pose("lost"), r"000000\.pose\.txt is not a matrix of numbers"),
+    ],
+)
+def test_depth_frames_bad_files_are_named(tmp_path, spoil, complaint):
+    noise = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
+    dataset = load("depth_frames", depth_folder(tmp_path, [(noise, np.eye(4))]))
+    spoil(tmp_path)
+    with pytest.raises(DataError, match=complaint):
+        dataset[0]
+
+
+def test_depth_frames_missing_parts_are_named(tmp_path):
+    with pytest.raises(DataError, match="holds no frame-"):
+        load("depth_frames", tmp_path)
+    depth_folder(tmp_path, [(np.ones((2, 2), dtype=np.uint16), np.eye(4))] * 2)
+    (tmp_path / "frame-000001.pose.txt").unlink()
+    with pytest.raises(DataError, match="2 depth images, but 1 poses"):
+        load("depth_frames", tmp_path)
+    np.savetxt(tmp_path / "frame-000007.pose.txt", np.eye(4))
+    with pytest.raises(DataError, match=r"000001\.pose\.txt is missing"):
+        load("depth_frames", tmp_path)[1]
+    (tmp_path / "camera-intrinsics.txt").unlink()
+    with pytest.raises(DataError, match=r"camera-intrinsics\.txt is missing"):
+        load("depth_frames", tmp_path)
+
+
+# OctoMap logs
+
+OCTOMAP = """NODE 1 2 3 0 0 0
+1 0 0
+0 1 0
+
+NODE 0 0 0 0 0 1.5707963267948966
+1 0 0
+nan 0 0
+0 0 0
+0 30 0
+NODE 5 5 5 0 0 0
+"""
+
+
+def octomap(path: Path, text: str, compressed: bool = False) -> Dataset:
+    path.write_bytes(gzip.compress(text.encode()) if compressed else text.encode())
+    return load("octomap_log", path, max_range=20.0, no_return_range=5.0)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_octomap_values(tmp_path, compressed, newline):
+    first, second, third = octomap(tmp_path / "campus.graph", OCTOMAP.replace("\n", newline), compressed)
+    assert first.origin.tolist() == [1.0, 2.0, 3.0]
+    assert first.points.tolist() == [[2.0, 2.0, 3.0], [1.0, 3.0, 3.0]]
+    torch.testing.assert_close(second.points, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(second.no_return, torch.tensor([[-5.0, 0.0, 0.0]], dtype=torch.float64))
+    assert third.n_beams == 0
+
+
+def test_octomap_rotation_is_yaw_pitch_roll():
+    roll, pitch, yaw = 0.1, -0.2, 0.3
+
+    def about(axis: int, angle: float) -> torch.Tensor:
+        i, j = [(1, 2), (2, 0), (0, 1)][axis]
+        matrix = torch.eye(3, dtype=torch.float64)
+        matrix[i, i] = matrix[j, j] = math.cos(angle)
+        matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
+        return matrix
+
+    torch.testing.assert_close(rotation(roll, pitch, yaw), about(2, yaw) @ about(1, pitch) @ about(0, roll))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("NODE 0 0 0\n1 2 3\n", "NODE line: expected 6 numbers"),
+        ("NODE\n1 2 3\n", "NODE line: expected 6 numbers"),
+        ("NODE 0 0 0 0 0 nan\n1 2 3\n", "pose.*not finite"),
+        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0: expected 3 numbers a line, found 2"),
+        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0: expected 3 numbers a line"),
+        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers a line"),
+    ],
+)
+def test_octomap_bad_scans_are_named(tmp_path, text, complaint):
+    dataset = octomap(tmp_path / "bad.graph", text)
+    with pytest.raises(DataError, match=rf"bad\.graph.*{complaint}"):
+        dataset[0]
+
+
+def test_octomap_foreign_and_cut_files_are_named(tmp_path):
+    with pytest.raises(DataError, match="no NODE line"):
+        octomap(tmp_path / "a.graph", "hello\n")
+    path = tmp_path / "b.graph"
+    path.write_bytes(gzip.compress(OCTOMAP.encode() * 20)[:-15])
+    with pytest.raises(DataError, match=r"b\.graph is not a whole gzip file"):
+        load("octomap_log", path)
