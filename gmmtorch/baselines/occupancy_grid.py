@@ -70,6 +70,11 @@ class OccupancyGrid:
         if sum(waiting.n_beams for waiting in self._waiting) > _RAYS_AT_ONCE:
             self.evidence()
 
+    def finish(self) -> None:
+        """Count the scans that wait now, rather than at the first question."""
+        if self._blocks is not None:
+            self.evidence()
+
     def evidence(self) -> BlockEvidence:
         """Hits and misses counted so far."""
         if self._blocks is None:

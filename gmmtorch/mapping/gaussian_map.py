@@ -149,6 +149,11 @@ class GaussianMap(nn.Module):
         sequence = torch.arange(first, first + len(found), device=found.ids.device)
         return replace(found, ids=torch.stack([torch.full_like(sequence, self.robot), sequence], 1))
 
+    def finish(self) -> None:
+        """Fit the scans that wait now, rather than at the first question. Changes no answer."""
+        if self.dim is not None:
+            self.components()
+
     def components(self) -> Components:
         """All components, those of the unfinished window included."""
         if not self._pending:

@@ -27,6 +27,7 @@ class LearningRule:
     max_origins: sensor positions kept for a component, sampled by their counts.
     iterations: of EM, which starts from the flat pieces and so needs few.
     max_cells: more points than this are first summed into cells.
+    dtype: of the exponentials in EM, "float32" or "float64".
     """
 
     noise: float = 0.01
@@ -36,6 +37,7 @@ class LearningRule:
     max_origins: int = 8
     iterations: int = 5
     max_cells: int = 20_000
+    dtype: str = "float32"
 
     def __post_init__(self) -> None:
         for name in ("noise", "length"):
@@ -45,12 +47,18 @@ class LearningRule:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InvalidArgumentError(f"{name}={value} must be at least 1, or null for the default.")
+        if self.dtype not in em.SOFTMAX_DTYPES:
+            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
 
     def flatness(self, dim: int) -> FlatnessRule:
+        # In 2D a few points that span several surfaces are better told apart, down to single ones
+        # (sparse intel, 0.1 m, AUC 0.948 against 0.940); in 3D that only adds components.
+        least = self.min_points or (3 if dim == 2 else 10)
         return FlatnessRule(
             thickness=2 * self.noise,
             length=self.length,
-            min_weight=self.min_points or (3 if dim == 2 else 10),
+            min_weight=least,
+            min_weight_thick=1 if dim == 2 else least,
             max_components=self.n_components,
         )
 
@@ -76,11 +84,11 @@ def _learn(
     if points.shape[0] == 0:
         return Components.empty(dim, points.device)
     center = points.mean(0)
-    cells = pool_into_cells(points - center, rule.max_cells)
+    cells = pool_into_cells(points - center, rule.max_cells, rule.noise)
     pieces = partition(cells.features[:, 1 : 1 + dim].contiguous(), cells.weight, rule.flatness(dim))
     reg = rule.noise**2
     first = em.maximization(pool(cells.features, cells.weight, pieces.labels, pieces.n_pieces), reg)
-    step = em.natural_step(cells.features, cells.weight, reg)
+    step = em.natural_step(cells.features, cells.weight, reg, em.SOFTMAX_DTYPES[rule.dtype])
     found = em.run_em(step, first, tol=1e-4, max_iter=rule.iterations).parameters
     owner = em.most_likely(cells.features, found)[cells.member]
     n_scans, n_components = len(clouds), found.weights.shape[0]

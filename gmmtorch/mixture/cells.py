@@ -13,7 +13,9 @@ from torch import Tensor
 
 from gmmtorch.mixture.em import quadratic_features
 
-_FINEST = 1 << 20  # cells along the longest side
+_KEY_BITS = 20  # of a cell's coordinate within its key
+_MOST_CELLS = (1 << _KEY_BITS) - 2  # along the longest side
+_CHUNK_POINTS = 1 << 17
 
 
 class Cells(NamedTuple):
@@ -24,48 +26,49 @@ class Cells(NamedTuple):
     member: Tensor
 
 
-def pool_into_cells(points: Tensor, max_cells: int) -> Cells:
+def pool_into_cells(points: Tensor, max_cells: int, finest: float) -> Cells:
     """Sum centred points (N, D), float64, into at most `max_cells` cubes of one size.
 
-    No point is pooled when there are no more than `max_cells` of them. The side is the smallest
-    of a doubling sequence, then refined once by √2, that keeps within the limit.
+    The cubes have side `finest` (m; the sensor's noise is a good choice), or the smallest of a
+    sequence, each a third of an octave coarser than the last, that keeps within the limit. Nothing
+    is pooled when there are no more than `max_cells` points.
     """
     n = points.shape[0]
-    features = quadratic_features(points)
     if n <= max_cells:
         ones = points.new_ones(n)
-        return Cells(features, ones, torch.arange(n, device=points.device))
-    low = points.amin(0)
-    extent = float((points.amax(0) - low).max())
-    if extent == 0:
-        member = torch.zeros(n, dtype=torch.int64, device=points.device)
-    else:
-        member = _finest_cells(points - low, extent, max_cells)
-    n_cells = int(member.max()) + 1
-    sums = features.new_zeros(n_cells, features.shape[1]).index_add_(0, member, features)
+        return Cells(quadratic_features(points), ones, torch.arange(n, device=points.device))
+    member, n_cells = _cell_members(points, max_cells, finest)
+    n_features = 1 + points.shape[1] + points.shape[1] * (points.shape[1] + 1) // 2
+    sums = points.new_zeros(n_cells, n_features)
+    for part, cell in zip(points.split(_CHUNK_POINTS), member.split(_CHUNK_POINTS), strict=True):
+        sums.index_add_(0, cell, quadratic_features(part))
     return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
 
 
-def _finest_cells(offset: Tensor, extent: float, max_cells: int) -> Tensor:
-    """Cell (N,) of each point, numbered 0 … C−1, on the finest grid with C ≤ max_cells."""
-    level, count = 1, 0
-    key = torch.zeros(offset.shape[0], dtype=torch.int64, device=offset.device)
-    while level < _FINEST:
-        trial = _keys(offset, extent / (2 * level))
-        count = int(torch.unique(trial).numel())
-        if count > max_cells:
-            break
-        level, key = 2 * level, trial
-    trial = _keys(offset, extent / (2**0.5 * level))
-    unique, member = torch.unique(trial, return_inverse=True)
-    if unique.numel() <= max_cells:
-        return member
-    return torch.unique(key, return_inverse=True)[1]
+def _cell_members(points: Tensor, max_cells: int, finest: float) -> tuple[Tensor, int]:
+    """Cell (N,) of each point, numbered from 0, and how many cells there are."""
+    low = points.amin(0)
+    extent = float((points.amax(0) - low).max())
+    side = max(finest, extent / _MOST_CELLS)
+    fine = ((points - low) / side).long()
+    # Sort the points once, at the finest level; coarser levels only merge its cells.
+    keys, member = torch.unique(_pack(fine), return_inverse=True)
+    fine = _unpack(keys, points.shape[1])
+    merged, count, octaves = torch.arange(keys.numel(), device=points.device), keys.numel(), 0.0
+    while count > max_cells:
+        octaves += 1 / 3
+        unique, merged = torch.unique(_pack((fine * 2.0**-octaves).long()), return_inverse=True)
+        count = unique.numel()
+    return merged[member], count
 
 
-def _keys(offset: Tensor, side: float) -> Tensor:
-    cell = (offset / side).long()
-    key = cell[:, 0]
-    for axis in range(1, offset.shape[1]):
-        key = key * (2 * _FINEST) + cell[:, axis]
+def _pack(cells: Tensor) -> Tensor:
+    key = cells[:, 0]
+    for axis in range(1, cells.shape[1]):
+        key = key << _KEY_BITS | cells[:, axis]
     return key
+
+
+def _unpack(keys: Tensor, dim: int) -> Tensor:
+    mask = (1 << _KEY_BITS) - 1
+    return torch.stack([(keys >> (_KEY_BITS * (dim - 1 - axis))) & mask for axis in range(dim)], 1)

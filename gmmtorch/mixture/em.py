@@ -24,6 +24,9 @@ from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unp
 CHUNK_ELEMENTS = 1 << 17
 """Entries of the N×K block worked on at once, so that it stays in a core's cache."""
 
+SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+"""What the exponentials of the E-step may be computed in, by name."""
+
 _LOG_2PI = 1.8378770664093453
 _MIN_LOG_WEIGHT = -1e30  # stands for log 0: finite, so that products stay free of NaN
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +17,7 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, InvalidArgumentError, NotFittedError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NotFittedError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture import em
@@ -28,7 +28,6 @@ Array = Tensor | np.ndarray
 RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
@@ -92,6 +91,45 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         self.dtype = dtype
         self.warm_start = warm_start
 
+    @classmethod
+    def from_parameters(
+        cls,
+        weights: Array,
+        means: Array,
+        covariances: Array,
+        *,
+        lower_bounds: Sequence[float] = (),
+        converged: bool = True,
+        **options: Any,
+    ) -> GaussianMixture:
+        """A fitted mixture of given weights (K,), means (K, D) and covariances (K, D, D).
+
+        `lower_bounds` and `converged` say how it was found, if that is known; `options` are those
+        of the constructor. Raises `InvalidArgumentError` or `NumericalError` if it is no mixture.
+        """
+        mean = torch.as_tensor(means).double()
+        if mean.ndim != 2 or 0 in mean.shape:
+            raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, D).")
+        k, dim = mean.shape
+        mixture = cls(k, **options)
+        checked = (
+            _checked_init(value, shape, name, mean.device)
+            for value, shape, name in (
+                (weights, (k,), "weights"),
+                (means, (k, dim), "means"),
+                (covariances, (k, dim, dim), "covariances"),
+            )
+        )
+        weight, mean, covariance = checked
+        if bool((weight < 0).any()) or abs(float(weight.sum()) - 1) > 1e-6:
+            raise InvalidArgumentError(f"weights={weight.tolist()} must be at least zero and add up to one.")
+        safe_cholesky(covariance)
+        mixture._tensors = isinstance(means, Tensor)
+        mixture.n_features_in_ = dim
+        mixture._set_history(lower_bounds, converged)
+        mixture._set_buffers(weight, mean, covariance)
+        return mixture
+
     # -- learning ---------------------------------------------------------------------------------
 
     def fit(
@@ -125,7 +163,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             )
         center = (points * (weight / weight.sum())[:, None]).sum(0)
         centered = points - center
-        dtype = _DTYPES[self.dtype]
+        dtype = em.SOFTMAX_DTYPES[self.dtype]
         features = em.quadratic_features(centered)
         step = em.natural_step(features, weight, float(self.reg_covar), dtype, centered)
         generator = as_generator(self.random_state)
@@ -183,10 +221,13 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
     def _keep(self, result: EMResult, center: Tensor) -> None:
         weights, means, covariances = result.parameters
         self._set_buffers(weights / weights.sum(), means + center, covariances)
-        self.lower_bounds_ = list(result.lower_bounds)
-        self.lower_bound_ = result.lower_bounds[-1]
-        self.n_iter_ = result.n_iter
-        self.converged_ = result.converged
+        self._set_history(result.lower_bounds, result.converged)
+
+    def _set_history(self, lower_bounds: Sequence[float], converged: bool) -> None:
+        self.lower_bounds_ = [float(x) for x in lower_bounds]
+        self.lower_bound_ = self.lower_bounds_[-1] if self.lower_bounds_ else math.nan
+        self.n_iter_ = len(self.lower_bounds_)
+        self.converged_ = bool(converged)
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
@@ -337,22 +378,19 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         k, dim = means.shape
         weights = require(tensors, "weights", (k,), torch.float64, path)
         covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
-        if k == 0 or dim == 0 or bool((weights < 0).any()) or abs(float(weights.sum()) - 1) > 1e-6:
-            raise DataError(f"{path}: the {k} weights are not those of a mixture; the file is damaged.")
-        safe_cholesky(covariances, f"{path}: covariances")
-        known = cls._get_param_names()
+        known = set(cls._get_param_names()) - {"n_components"}
         try:
-            mixture = cls(**{key: v for key, v in dict(facts["parameters"]).items() if key in known})
-            mixture.lower_bounds_ = [float(x) for x in facts["lower_bounds"]]
-            mixture.lower_bound_ = mixture.lower_bounds_[-1]
-            mixture.converged_ = bool(facts["converged"])
+            mixture = cls.from_parameters(
+                weights,
+                means,
+                covariances,
+                lower_bounds=facts["lower_bounds"],
+                converged=facts["converged"],
+                **{key: v for key, v in dict(facts["parameters"]).items() if key in known},
+            )
             mixture._tensors = not facts["arrays"]
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise DataError(f"{path}: its facts are damaged ({error!r}).") from error
-        mixture.n_components = k
-        mixture.n_iter_ = len(mixture.lower_bounds_)
-        mixture.n_features_in_ = dim
-        mixture._set_buffers(weights, means, covariances)
+        except (KeyError, TypeError, ValueError, GmmTorchError) as error:
+            raise DataError(f"{path} does not hold a mixture: {error}") from error
         return mixture
 
     # -- arguments --------------------------------------------------------------------------------
@@ -370,8 +408,8 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             raise InvalidArgumentError(
                 f"init_params={self.init_params!r} is not one of {', '.join(INITIALIZATIONS)}."
             )
-        if self.dtype not in _DTYPES:
-            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(_DTYPES)}.")
+        if self.dtype not in em.SOFTMAX_DTYPES:
+            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
 
     def _as_points(self, X: Array, reset: bool = False) -> Tensor:
         """X as a float64 tensor (N, D), checked; with `reset`, D and the kind of X are remembered."""

@@ -26,13 +26,15 @@ class FlatnessRule:
     """When a piece is cut: standard deviations in metres, weights in points.
 
     thickness: pieces whose thinnest direction exceeds it are not flat. length: pieces whose
-    longest direction exceeds it are too long. min_weight: no half may weigh less.
-    max_components: pieces at most; those of the largest scatter are cut first.
+    longest direction exceeds it are too long. min_weight: no half may weigh less;
+    min_weight_thick: nor the halves of a piece of over twice the thickness, which spans several
+    surfaces. max_components: pieces at most; those of the largest scatter are cut first.
     """
 
     thickness: float = 0.02
     length: float = 0.3
     min_weight: float = 3.0
+    min_weight_thick: float = 1.0
     max_components: int | None = None
 
 
@@ -64,11 +66,14 @@ def partition(points: Tensor, weight: Tensor, rule: FlatnessRule) -> Partition:
         variances, directions = torch.linalg.eigh(second - means[:, :, None] * means[:, None, :])
         deviation = variances.clamp_min(0).sqrt()
         wanted = (deviation[:, 0] > rule.thickness) | (deviation[:, -1] > rule.length)
-        cut = fresh & wanted & (count >= 2 * rule.min_weight) & (deviation[:, -1] > 0)
+        least = torch.where(deviation[:, 0] > 2 * rule.thickness, rule.min_weight_thick, rule.min_weight).to(
+            count
+        )
+        cut = fresh & wanted & (count >= 2 * least) & (deviation[:, -1] > 0)
         cut = _within_budget(cut, count * variances[:, -1], n_pieces, rule.max_components)
         across = directions[:, :, -1]
         beyond = ((points - means[labels]) * across[labels]).sum(1) > 0
-        cut, beyond = _only_supported(cut, beyond, labels, weight, n_pieces, rule.min_weight)
+        cut, beyond = _only_supported(cut, beyond, labels, weight, n_pieces, least)
         n_new = int(cut.sum())
         if n_new == 0:
             break
@@ -90,11 +95,11 @@ def _within_budget(cut: Tensor, scatter: Tensor, n_pieces: int, limit: int | Non
 
 
 def _only_supported(
-    cut: Tensor, beyond: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, min_weight: float
+    cut: Tensor, beyond: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Drop cuts that would leave less than `min_weight` on either side."""
+    """Drop cuts that would leave less than `least` (n_pieces,) on either side."""
     far = torch.zeros(n_pieces, dtype=weight.dtype, device=weight.device).index_add_(
         0, labels, weight * beyond
     )
     near = torch.zeros_like(far).index_add_(0, labels, weight * ~beyond)
-    return cut & (far >= min_weight) & (near >= min_weight) & (far > 0) & (near > 0), beyond
+    return cut & (far >= least) & (near >= least) & (far > 0) & (near > 0), beyond

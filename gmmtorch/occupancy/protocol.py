@@ -15,6 +15,9 @@ class OccupancyMap(Protocol):
     def insert(self, scan: Scan) -> None:
         """Learn from one scan, in the world frame."""
 
+    def finish(self) -> None:
+        """Do now what would otherwise be done at the first question. Changes no answer."""
+
     def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Any:
         """Probability (M,) in [0, 1] that the cube of side `resolution` (m) at each point (M, D) is
         occupied; exactly ½ where nothing is known. Grids answer with their own cell."""

@@ -1,7 +1,7 @@
 """How far a ray flies until it meets a line segment (2D) or a triangle (3D), in plain torch.
 
-Every ray is tested against every primitive, in chunks of bounded memory, which for the few hundred
-primitives of a building is faster than walking a tree in Python.
+Segments are few, so every ray is tested against each. Rays that start at one place, as those of a sensor
+do, are tested only against the triangles that reach into the cone of their bundle: a few in a hundred.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.simulation.ray_bundles import apart, bundled, candidates
 
 _CHUNK_PAIRS = 1 << 15
-"""Ray-primitive pairs held at once: 256 KB a temporary in float64, so that they stay in cache."""
+"""Pairs of ray and segment held at once."""
 
-_SLACK = 64
-"""How many units of rounding a ray may pass beside an edge and still count as a hit, so that no ray slips
-through where two primitives meet; rays closer than four times that to parallel do not meet a primitive."""
+_SLACK = 64 * torch.finfo(torch.float64).eps
+"""How far beside an edge, relatively, a ray may pass and still count as a hit, so that no ray slips through
+where two primitives meet; rays closer than four times that to parallel do not meet a primitive."""
 
 
 def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tensor:
@@ -32,15 +33,14 @@ def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tenso
     origins, directions, segments = _checked(origins, directions, segments, (2, 2))
     best = _nothing(directions)
     a, edge = segments[:, 0], segments[:, 1] - segments[:, 0]
-    slack = _SLACK * torch.finfo(torch.float64).eps
-    flat = 4 * slack * edge.norm(dim=1)
+    flat = 4 * _SLACK * edge.norm(dim=1)
     for rows in _chunks(directions.shape[0], segments.shape[0]):
         d = directions[rows, None]
         to_start = a - origins[rows, None]
         turn = _cross_2d(d, edge)
         t = _cross_2d(to_start, edge) / turn
         s = _cross_2d(to_start, d) / turn
-        met = (t > 0) & (s >= -slack) & (s <= 1 + slack) & (turn.abs() > flat * d.norm(dim=2))
+        met = (t > 0) & (s >= -_SLACK) & (s <= 1 + _SLACK) & (turn.abs() > flat * d.norm(dim=2))
         best[rows] = torch.where(met, t, torch.inf).amin(1)
     return best
 
@@ -49,8 +49,8 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
     """Distances (N,), float64, in lengths of the direction, to the nearest triangle; inf where none is met.
 
     A ray passes inside a triangle if it passes all three edges on the same side. The side of the edge
-    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p), a product of
-    two matrices. Neighbours share an edge with opposite sign, so no ray slips through between them.
+    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p). Neighbours
+    share an edge with opposite sign, so no ray slips through between them.
     Both faces count; rays in the plane of a triangle do not meet it.
 
     Args:
@@ -58,31 +58,45 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
         directions: (N, 3).
         triangles: (T, 3, 3), the three corners of each.
     """
+    one_origin = origins.ndim == 1
     origins, directions, triangles = _checked(origins, directions, triangles, (3, 3))
     best = _nothing(directions)
     if triangles.shape[0] == 0 or directions.shape[0] == 0:
         return best
-    centre = triangles.mean((0, 1))  # shortens the vectors whose products cancel
+    centre = origins[0]  # about which the products below cancel least
     origins, triangles = origins - centre, triangles - centre
     rays = torch.cat([directions, torch.linalg.cross(origins, directions)], 1)
     ahead = triangles.roll(-1, dims=1)
     edges = torch.cat([torch.linalg.cross(triangles, ahead), ahead - triangles], 2)  # (T, 3, 6)
     normals = edges[:, :, :3].sum(1)
     offsets = (normals * triangles[:, 0]).sum(1)
-    slack = _SLACK * torch.finfo(torch.float64).eps * rays.norm(dim=1).max() * edges.norm(dim=2).amax(1)
-    columns = edges.permute(1, 2, 0).contiguous()
-    for rows in _chunks(directions.shape[0], triangles.shape[0]):
-        side_a, side_b, side_c = (rays[rows] @ columns[k] for k in range(3))
+    slack = _SLACK * rays.norm(dim=1).max() * edges.norm(dim=2).amax(1)
+    if one_origin:  # then all moments o × d are zero
+        rays, edges = rays[:, :3], edges[..., :3]
+    lines, sides = rays.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row a coordinate
+    bundles = bundled(directions) if one_origin else apart(directions.shape[0])
+    for ray, triangle in candidates(bundles, triangles):
+        line = [row[ray] for row in lines]
+        side_a, side_b, side_c = (_dot(line, [row[triangle] for row in edge]) for edge in sides)
         lowest = torch.minimum(torch.minimum(side_a, side_b), side_c)
         highest = torch.maximum(torch.maximum(side_a, side_b), side_c)
-        ray, triangle = ((lowest >= -slack) | (highest <= slack)).nonzero(as_tuple=True)
-        ray = ray + rows.start
-        normal = normals[triangle]
-        steepness = (normal * directions[ray]).sum(1)
-        t = (offsets[triangle] - (normal * origins[ray]).sum(1)) / steepness
-        t = torch.where((t > 0) & (steepness.abs() > 4 * slack[triangle]), t, torch.inf)
-        best.scatter_reduce_(0, ray, t, "amin")
+        bound = slack[triangle]
+        steepness = side_a + side_b + side_c  # d · normal
+        height = offsets[triangle]
+        if not one_origin:
+            height = height - (normals[triangle] * origins[ray]).sum(1)
+        t = height / steepness
+        met = ((lowest >= -bound) | (highest <= bound)) & (t > 0) & (steepness.abs() > 4 * bound)
+        best.scatter_reduce_(0, ray, torch.where(met, t, torch.inf), "amin")
     return best
+
+
+def _dot(u: list[Tensor], v: list[Tensor]) -> Tensor:
+    """Dot products (P,) of vectors given by coordinate: gathering rows in one call would wake all threads."""
+    total = u[0] * v[0]
+    for a, b in zip(u[1:], v[1:], strict=True):
+        total = torch.addcmul(total, a, b)
+    return total
 
 
 def _cross_2d(u: Tensor, v: Tensor) -> Tensor:

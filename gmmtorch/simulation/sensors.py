@@ -101,7 +101,7 @@ def depth_camera(
     `field_of_view` is the angle (rad) from the left edge of the image to the right.
     """
     _at_least_one(width=width, height=height)
-    _angle(field_of_view=field_of_view, limit=math.pi)
+    _angle(field_of_view=field_of_view, limit=math.radians(179))
     focal = width / 2 / math.tan(field_of_view / 2)
     left = (width / 2 - 0.5 - torch.arange(width, dtype=torch.float64)) / focal
     up = (height / 2 - 0.5 - torch.arange(height, dtype=torch.float64)) / focal

@@ -1,0 +1,140 @@
+"""What the commands share: finding conf/, setting up the run, errors, results."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+if TYPE_CHECKING:
+    from gmmtorch.datasets import Dataset
+    from gmmtorch.scan import Scan
+
+logger = logging.getLogger("gmmtorch")
+
+
+def conf_dir() -> str:
+    """The folder of configuration files: in the package once installed, beside it in a checkout."""
+    package = Path(__file__).resolve().parent.parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "occupancy.yaml").is_file():
+            return str(candidate)
+    raise FileNotFoundError(
+        f"conf/ is neither in {package} nor beside it; install gmmtorch again, or run from a whole checkout."
+    )
+
+
+def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any:
+    """Run a command; errors raised on purpose become one line and exit status 1, without a traceback."""
+    from gmmtorch.errors import GmmTorchError
+
+    try:
+        return command(config)
+    except GmmTorchError as error:
+        sys.exit(f"gmmtorch: error: {error}")
+    except KeyboardInterrupt:
+        print("gmmtorch: interrupted; nothing half-written is left.", file=sys.stderr)
+        sys.exit(130)
+
+
+def run_dir() -> Path:
+    """Where this run's files go: `hydra.run.dir`, or the sweep's folder for this job."""
+    from hydra.core.hydra_config import HydraConfig
+
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def set_up(runtime: DictConfig) -> str:
+    """Apply the runtime options; returns the device. Raises `InvalidArgumentError` on a bad one."""
+    import torch
+
+    from gmmtorch.errors import InvalidArgumentError
+
+    if runtime.threads is not None:
+        if runtime.threads < 1:
+            raise InvalidArgumentError(f"runtime.threads={runtime.threads} must be at least 1, or null.")
+        torch.set_num_threads(runtime.threads)
+    if runtime.memory_limit < 1:
+        raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
+    try:
+        torch.empty(0, device=runtime.device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InvalidArgumentError(
+            f"runtime.device={runtime.device} cannot be used here ({reason}); use cpu, or a torch "
+            "build for it."
+        ) from error
+    return str(runtime.device)
+
+
+def open_dataset(config: DictConfig) -> Dataset:
+    """The data set that the options `dataset.*` describe."""
+    from gmmtorch import datasets
+
+    options = {
+        key: config[key]
+        for key in config
+        # A path that was not given is left to the reader, which says what it wants.
+        if not OmegaConf.is_missing(config, key) and config[key] is not None
+    }
+    return datasets.load(options.pop("name"), options.pop("path", None), **options)
+
+
+def read_scans(
+    dataset: Dataset, indices: Sequence[int], device: str, on_event: Callable[[str, int, int | None], None]
+) -> list[Scan]:
+    """The scans with these indices, on the device."""
+    scans = []
+    on_event("reading scans", 0, len(indices))
+    for done, index in enumerate(indices, 1):
+        scans.append(dataset[index].to(device))
+        on_event("reading scans", done, len(indices))
+    return scans
+
+
+def write_results(command: str, config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> Path:
+    """results.json of a run: command, version, seed, config and rows, written atomically."""
+    import gmmtorch
+    from gmmtorch.files import write_json
+
+    results = {
+        "command": command,
+        "version": gmmtorch.__version__,
+        "seed": config.seed,
+        "config": OmegaConf.to_container(config, resolve=True),
+        "rows": rows,
+    }
+    return write_json(folder / "results.json", results)
+
+
+def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str], title: str) -> None:
+    """The rows as a table on standard output."""
+    from gmmtorch.report.table import format_table
+
+    print(f"\n{title}\n{format_table(list(rows), columns)}")
+
+
+def print_files(folder: Path, results: Path) -> None:
+    """Where the run's files are, on standard output."""
+    pictures = sorted(path.name for path in folder.glob("*.png"))
+    print(f"\nresults   {results}")
+    if pictures:
+        print(f"pictures  {folder}/{{{', '.join(pictures)}}}")
+    if (folder / "tensorboard").is_dir():
+        print(f"browse    tensorboard --logdir {folder / 'tensorboard'}")
+
+
+def flat(config: DictConfig) -> dict[str, Any]:
+    """The configuration as one level of dotted names, for the hyperparameter table."""
+
+    def walk(prefix: str, value: Any) -> dict[str, Any]:
+        if isinstance(value, dict):
+            parts = [walk(f"{prefix}.{key}" if prefix else str(key), v) for key, v in value.items()]
+            return {k: v for part in parts for k, v in part.items()}
+        return {prefix: value}
+
+    return walk("", OmegaConf.to_container(config, resolve=True))

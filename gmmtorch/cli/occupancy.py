@@ -1,0 +1,160 @@
+"""gmmtorch-occupancy: learn maps from scans, score them on held-out ones, show them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch.cli import common, schema
+
+if TYPE_CHECKING:
+    from gmmtorch.evaluation.occupancy import Built, Outcome
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.scan import Scan
+
+_TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
+
+
+def main() -> None:
+    """Entry point of the command."""
+    schema.register()
+    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="occupancy")(_guarded)()
+
+
+def _guarded(config: DictConfig) -> float | None:
+    return common.run_guarded(run, config)
+
+
+def run(config: DictConfig) -> float:
+    """One run; returns the AUC of the last row, which an optimiser may sweep over."""
+    from gmmtorch.evaluation import occupancy
+    from gmmtorch.report.progress import ProgressBars
+
+    device = common.set_up(config.runtime)
+    folder = common.run_dir()
+    factories = occupancy.choose(list(config.method), occupancy.methods(_map_factory(config)))
+    protocol = occupancy.Protocol(**OmegaConf.to_container(config.evaluation))
+    dataset = common.open_dataset(config.dataset)
+    with ProgressBars(enabled=config.report.progress) as bars:
+        scans = common.read_scans(dataset, range(len(dataset)), device, bars)
+        outcome = occupancy.evaluate(dataset.name, scans, factories, protocol, config.seed, bars)
+    path = common.write_results("occupancy", config, outcome.rows, folder)
+    _show(config, scans, outcome, folder)
+    common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {len(scans)} scans")
+    common.print_files(folder, path)
+    return float(outcome.rows[-1]["auc"])
+
+
+def _map_factory(config: DictConfig) -> Callable[[], GaussianMap]:
+    """Makes empty maps with the options `map.*`."""
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mapping.learning import LearningRule
+
+    options: dict[str, Any] = {str(key): value for key, value in config.map.items()}
+    options.pop("name")
+    own = {key: options.pop(key) for key in ("window", "n_samples", "sampling", "prior")}
+    rule = LearningRule(**options, dtype=config.runtime.dtype)
+    return lambda: GaussianMap(
+        learning=rule, random_state=config.seed, memory_limit=config.runtime.memory_limit, **own
+    )
+
+
+def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
+    """Figures as PNG and, with the numbers, in TensorBoard."""
+    if not (config.report.figures or config.report.tensorboard):
+        return
+    figures = _figures(scans, outcome)
+    if config.report.figures:
+        from gmmtorch.report.save import save_figure
+
+        for name, figure in figures.items():
+            save_figure(figure, folder / f"{name}.png")
+    if config.report.tensorboard:
+        _write_board(config, scans, outcome, figures, folder / "tensorboard")
+
+
+def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
+    """Every figure of a run by file name."""
+    import torch
+
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.report import (
+        MapPanel,
+        auc_against_kept_figure,
+        map_figure,
+        mixture_figure,
+        roc_figure,
+    )
+    from gmmtorch.report.raster import robust_bounds
+
+    trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
+    points = torch.cat([scan.points.double().cpu() for scan in scans])
+    low, high = robust_bounds(points[:: max(1, len(points) // 200_000)], trajectory)
+    figures: dict[str, Any] = {"auc_against_kept": auc_against_kept_figure(outcome.rows)}
+    for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
+        shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
+        panels = [
+            MapPanel(_label(built), _answers(built, resolution), resolution, low, high) for built in shown
+        ]
+        figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory)
+        curves = {_label(built): built.roc for built in shown}
+        figures[f"roc_{resolution:g}m"] = roc_figure(curves, f"{shown[0].row['dataset']}, {resolution:g} m")
+    for built in outcome.shown:
+        if isinstance(built.map, GaussianMap):
+            components = built.map.components()
+            surface = ~components.max_range
+            figures["mixture"] = mixture_figure(
+                points,
+                components.means[surface],
+                components.covariances[surface],
+                components.support[surface],
+            )
+            break
+    return figures
+
+
+def _label(built: Built) -> str:
+    return str(built.row["method"])
+
+
+def _answers(built: Built, resolution: float) -> Callable[[Any], Any]:
+    return lambda points: built.map.occupancy(points, resolution)
+
+
+def _write_board(
+    config: DictConfig, scans: Sequence[Scan], outcome: Outcome, figures: dict[str, Any], folder: Path
+) -> None:
+    import torch
+
+    from gmmtorch.evaluation.queries import OCCUPIED
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.report import Board
+
+    with Board(folder) as board:
+        for row in outcome.rows:
+            tag = f"{row['method']}/{row['resolution']:g}m"
+            board.scalars(row, tag, step=round(100 * row["kept"]))
+        for built in outcome.shown:
+            tag = f"{built.row['method']}/{built.row['resolution']:g}m"
+            known = built.asked.labels <= OCCUPIED
+            board.curve(tag, built.asked.labels[known] == OCCUPIED, built.theta[known])
+        for name, figure in figures.items():
+            board.figure(f"figures/{name}", figure)
+        points = torch.cat([scan.points.double().cpu() for scan in scans])
+        board.cloud("points", points)
+        for built in outcome.shown:
+            if isinstance(built.map, GaussianMap):
+                components = built.map.components()
+                surface = ~components.max_range
+                board.ellipsoids("mixture", components.means[surface], components.covariances[surface])
+                break
+        best = {f"hparam/auc_{row['method']}": row["auc"] for row in outcome.rows}
+        board.hparams(common.flat(config), best)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How good a map is, on scans that it was never shown."""

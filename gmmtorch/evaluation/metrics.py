@@ -1,0 +1,101 @@
+"""Scores of probabilities, and of a mixture against its points."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+_BINS = 4096
+CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
+"""θ below which a cell is called free, and above which occupied, in the scores of unknown space."""
+
+
+class Roc(NamedTuple):
+    """false_positive (T,), true_positive (T,): the ROC curve; auc: the area under it."""
+
+    false_positive: np.ndarray
+    true_positive: np.ndarray
+    auc: float
+
+
+def roc(occupied: Tensor, free: Tensor) -> Roc:
+    """ROC of the probabilities given to occupied (P,) and free (Q,) points; ties count one half."""
+    from sklearn.metrics import auc, roc_curve
+
+    if occupied.numel() == 0 or free.numel() == 0:
+        raise InvalidArgumentError("An ROC curve needs at least one occupied and one free point.")
+    labels = np.concatenate([np.ones(occupied.numel()), np.zeros(free.numel())])
+    scores = torch.cat([occupied, free]).cpu().numpy()
+    false_positive, true_positive, _ = roc_curve(labels, scores)
+    return Roc(false_positive, true_positive, float(auc(false_positive, true_positive)))
+
+
+def auc_interval(
+    occupied: Tensor, free: Tensor, auc: float, seed: int, n_resamples: int = 1000, level: float = 0.95
+) -> tuple[float, float]:
+    """Bootstrap interval of an AUC: occupied and free points are resampled with replacement.
+
+    Done on the counts of 4096 quantile bins, whose resampling is multinomial; the replicates
+    spread about their own mean, and are centred on the exact AUC.
+    """
+    generator = np.random.default_rng(seed)
+    scores = torch.cat([occupied, free]).cpu().numpy()
+    edges = np.unique(np.quantile(scores, np.linspace(0, 1, _BINS + 1)[1:-1]))
+    share = [
+        np.bincount(np.searchsorted(edges, x.cpu().numpy()), minlength=len(edges) + 1)
+        for x in (free, occupied)
+    ]
+    below, above = (
+        generator.multinomial(counts.sum(), counts / counts.sum(), n_resamples) / counts.sum()
+        for counts in share
+    )
+    replicates = (above * (np.cumsum(below, 1) - below / 2)).sum(1)
+    tail = (1 - level) / 2
+    low, high = np.quantile(replicates - replicates.mean(), [tail, 1 - tail]) + auc
+    return float(low), float(high)
+
+
+def brier(occupied: Tensor, free: Tensor) -> float:
+    """Mean squared difference of probability and truth: 0 is perfect, ¼ is knowing nothing."""
+    return float(torch.cat([(1 - occupied) ** 2, free**2]).mean())
+
+
+def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
+    """How well unknown space is told from free space, by the probabilities of either.
+
+    unknown_auc: by how near θ is to ½. unknown_called_free, unknown_called_occupied: shares of the
+    unknown points; free_recall: share of the free points that are called free. None without
+    unknown points.
+    """
+    recall = float((free < CALLED_FREE).double().mean())
+    if unknown.numel() == 0:
+        names = ("unknown_auc", "unknown_called_free", "unknown_called_occupied")
+        return {**dict.fromkeys(names), "free_recall": recall}
+    return {
+        "unknown_auc": roc(-(unknown - 0.5).abs(), -(free - 0.5).abs()).auc,
+        "unknown_called_free": float((unknown < CALLED_FREE).double().mean()),
+        "unknown_called_occupied": float((unknown > CALLED_OCCUPIED).double().mean()),
+        "free_recall": recall,
+    }
+
+
+def psnr2(points: Tensor, sampled: Tensor) -> float:
+    """PSNR2 (2.10) in dB of a cloud (N, D) and as many points (N, D) drawn from its model.
+
+    20 log₁₀(B/RMSE(X, X̂)) + 20 log₁₀(B/RMSE(X̂, X)), B the diagonal of the cloud's bounding box,
+    RMSE over nearest-neighbour distances. Infinite where both clouds are the same.
+    """
+    x, y = points.cpu().numpy(), sampled.cpu().numpy()
+    diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
+    there, back = cKDTree(y).query(x)[0], cKDTree(x).query(y)[0]
+    errors = [math.sqrt(float((d**2).mean())) for d in (there, back)]
+    if min(errors) == 0:
+        return math.inf
+    return sum(20 * math.log10(diagonal / e) for e in errors) if diagonal > 0 else -math.inf

@@ -1,0 +1,231 @@
+"""Maps built from training scans, and their scores on held-out ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.scan import Scan
+
+Event = Callable[[str, int, int | None], None]
+"""Called with a stage's name, how much of it is done, and how much there is."""
+
+
+def _ignore(stage: str, done: int, total: int | None) -> None:
+    """Nobody listens."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The test, as the options `evaluation.*` describe it; see docs/commands.md.
+
+    max_beams: held-out beams asked about at most; more are thinned at random.
+    """
+
+    test_every: int = 10
+    kept: Sequence[float] = (1.0,)
+    removal: split.Removal = "beams"
+    resolution: Sequence[float] = (0.1,)
+    free: queries.FreePoints = "uniform"
+    unknown: bool = False
+    pose_noise: Sequence[float] = (0.0, 0.0)
+    max_beams: int = 1_000_000
+    save_queries: str | None = None
+    save_map: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.kept or not self.resolution:
+            raise InvalidArgumentError(
+                "evaluation.kept and evaluation.resolution need at least one value each."
+            )
+        for value in self.resolution:
+            check_resolution(value)
+        if self.max_beams < 1:
+            raise InvalidArgumentError(f"max_beams={self.max_beams} must be at least 1.")
+
+
+@dataclass(frozen=True)
+class Built:
+    """One map, and what it answered: `theta` (M,) for `asked`, a row of results, the ROC curve."""
+
+    map: OccupancyMap
+    row: dict[str, Any]
+    asked: Queries
+    theta: Tensor
+    roc: metrics.Roc
+
+
+@dataclass
+class Outcome:
+    """rows: as in results.json; shown: the maps of the largest share kept, which figures show."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    shown: list[Built] = field(default_factory=list)
+
+
+MapFactory = Callable[[float], OccupancyMap]
+"""Makes an empty map for a resolution (m)."""
+
+
+def methods(new_map: Callable[[], GaussianMap]) -> dict[str, MapFactory]:
+    """Every method by name; `new_map` makes the mixture map that ours answer from."""
+    return {
+        "monte_carlo": lambda resolution: new_map(),
+        "occupancy_grid": lambda resolution: OccupancyGrid(resolution),
+        "occupancy_log_odds": lambda resolution: OccupancyGrid(resolution, log_odds=LogOdds()),
+    }
+
+
+def choose(names: Sequence[str], known: dict[str, MapFactory]) -> dict[str, MapFactory]:
+    """The factories asked for, in that order. An unknown name raises an error that lists the known."""
+    if not names:
+        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(known))}.")
+    for name in names:
+        if name not in known:
+            raise InvalidArgumentError(f"method={name!r} is not known; known are {', '.join(sorted(known))}.")
+    return {name: known[name] for name in names}
+
+
+def evaluate(
+    name: str,
+    scans: Sequence[Scan],
+    factories: dict[str, MapFactory],
+    protocol: Protocol,
+    seed: int = 0,
+    on_event: Event = _ignore,
+) -> Outcome:
+    """Build every method's map for every share kept and resolution, and score each on the same test.
+
+    Args:
+        name: of the data set, for the rows.
+        scans: in the order they were taken, all in memory.
+        factories: the methods, see `choose`.
+        protocol: the test.
+        seed: of the split's thinning, the free points and the bootstrap.
+        on_event: told of progress.
+    """
+    train_index, test_index = split.split_indices(len(scans), protocol.test_every)
+    train = split.perturb_poses([scans[i] for i in train_index], protocol.pose_noise, seed)
+    origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
+    asked = {
+        r: _questions(origins, ends, [scans[i] for i in train_index], r, protocol, seed)
+        for r in protocol.resolution
+    }
+    if protocol.save_queries:
+        queries.save_queries(protocol.save_queries, asked, train_index, test_index)
+    outcome = Outcome()
+    largest = max(protocol.kept)
+    for kept in protocol.kept:
+        shown = split.keep_share(train, kept, protocol.removal, seed)
+        for method, factory in factories.items():
+            label = f"{method}, {kept:.0%} of the {protocol.removal}"
+            previous: tuple[OccupancyMap, float] | None = None
+            for resolution in protocol.resolution:
+                # A mixture does not depend on the resolution: it is built once and asked again.
+                if previous is not None and isinstance(previous[0], GaussianMap):
+                    built, seconds = previous
+                else:
+                    built, seconds = _build(factory(resolution), shown, label, on_event)
+                previous = (built, seconds)
+                made = _score(built, asked[resolution], resolution, seed, protocol.unknown)
+                made.row.update(
+                    dataset=name,
+                    method=method,
+                    removal=protocol.removal,
+                    kept=float(kept),
+                    n_train_points=sum(scan.points.shape[0] for scan in shown),
+                    build_seconds=seconds,
+                )
+                outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
+                if protocol.save_map:
+                    file = Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}.safetensors"
+                    built.save(file)
+                if kept == largest:
+                    outcome.shown.append(made)
+    return outcome
+
+
+def _questions(
+    origins: Tensor, ends: Tensor, train: Sequence[Scan], resolution: float, protocol: Protocol, seed: int
+) -> Queries:
+    asked = queries.hit_and_free(origins, ends, protocol.free, resolution, seed)
+    if not protocol.unknown:
+        return asked
+    seen = OccupancyGrid(resolution)  # of all training rays: what is unseen by them is unseen by any share
+    for scan in train:
+        seen.insert(scan)
+    extra = queries.unseen(origins, ends, seen.evidence(), seed)
+    return Queries(torch.cat([asked.points, extra.points]), torch.cat([asked.labels, extra.labels]))
+
+
+def _build(
+    empty: OccupancyMap, scans: Sequence[Scan], label: str, on_event: Event
+) -> tuple[OccupancyMap, float]:
+    """The map of the scans, and the seconds it took, an unfinished window's fit included."""
+    on_event(label, 0, len(scans))
+    begin = time.perf_counter()
+    for number, scan in enumerate(scans, 1):
+        empty.insert(scan)
+        on_event(label, number, len(scans))
+    empty.finish()
+    return empty, time.perf_counter() - begin
+
+
+def _score(built: OccupancyMap, asked: Queries, resolution: float, seed: int, unknown: bool) -> Built:
+    begin = time.perf_counter()
+    theta = torch.as_tensor(built.occupancy(asked.points, resolution))
+    seconds = time.perf_counter() - begin
+    occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
+    curve = metrics.roc(occupied, free)
+    low, high = metrics.auc_interval(occupied, free, curve.auc, seed)
+    row: dict[str, Any] = {
+        "resolution": float(resolution),
+        "auc": curve.auc,
+        "auc_low": low,
+        "auc_high": high,
+        "brier": metrics.brier(occupied, free),
+        "n_components": built.n_components if isinstance(built, GaussianMap) else None,
+        "nbytes": built.nbytes,
+        "query_seconds": seconds,
+        "n_queries": theta.shape[0],
+    }
+    if unknown:
+        row |= metrics.unknown_scores(theta[asked.of(UNKNOWN)], free)
+    return Built(built, row, asked, theta, curve)
+
+
+_COLUMNS = [
+    "dataset",
+    "method",
+    "resolution",
+    "removal",
+    "kept",
+    "auc",
+    "auc_low",
+    "auc_high",
+    "brier",
+    "n_train_points",
+    "n_components",
+    "nbytes",
+    "build_seconds",
+    "query_seconds",
+    "n_queries",
+]
+
+
+def _column(name: str) -> tuple[int, str]:
+    """Order of the fields of a row: those of the contract first."""
+    return (_COLUMNS.index(name) if name in _COLUMNS else len(_COLUMNS), name)

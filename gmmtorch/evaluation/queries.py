@@ -1,0 +1,115 @@
+"""Points whose truth is known from held-out beams."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.files import write_bytes
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.scan import Scan
+
+FREE, OCCUPIED, UNKNOWN = 0, 1, 2
+FreePoints = Literal["uniform", "near_surface"]
+
+
+@dataclass(frozen=True)
+class Queries:
+    """points (M, D), world metres; labels (M,) int64: 0 free, 1 occupied, 2 never seen in training."""
+
+    points: Tensor
+    labels: Tensor
+
+    def of(self, label: int) -> Tensor:
+        """Which points (M,) have this label."""
+        return self.labels == label
+
+
+def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Origins and ends (B, D) of the beams of the test scans that hit something.
+
+    More than `max_beams` are thinned to that many at random.
+    """
+    ends = torch.cat([scan.points.double() for scan in scans])
+    origins = torch.cat([scan.origin.double().expand(scan.points.shape[0], -1) for scan in scans])
+    if ends.shape[0] == 0:
+        raise InvalidArgumentError(
+            "The held-out scans have no beam that hit anything, so there is nothing to test on; "
+            "check dataset.max_range, or change evaluation.test_every."
+        )
+    if ends.shape[0] > max_beams:
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randperm(ends.shape[0], generator=generator)[:max_beams].sort().values
+        origins, ends = origins[chosen], ends[chosen]
+    return origins, ends
+
+
+def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: float, seed: int) -> Queries:
+    """One hit and one free point a beam.
+
+    The free point is uniform along the beam, or half to two cells before the hit ("near_surface",
+    which shows how thick a map's surfaces are), never before the sensor.
+    """
+    if free not in ("uniform", "near_surface"):
+        raise InvalidArgumentError(f"free={free!r} is not one of uniform, near_surface.")
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
+    if free == "near_surface":
+        length = (ends - origins).norm(dim=1)
+        uniform = (1 - (0.5 + 1.5 * uniform) * resolution / length).clamp_min(0)
+    points = origins + (ends - origins) * uniform[:, None]
+    labels = torch.cat([torch.full((len(ends),), OCCUPIED), torch.full((len(ends),), FREE)])
+    return Queries(torch.cat([ends, points]), labels)
+
+
+def unseen(origins: Tensor, ends: Tensor, seen: BlockEvidence, seed: int) -> Queries:
+    """Points 2 to 12 cells behind test hits that no training ray came near.
+
+    `seen` counts all training rays at the resolution in question; a point stays only if its cell
+    and all its neighbours (8 in 2D, 26 in 3D) have no evidence.
+    """
+    generator = torch.Generator().manual_seed(seed + 1)
+    behind = 2 + 10 * torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
+    direction = (ends - origins) / (ends - origins).norm(dim=1, keepdim=True)
+    points = ends + direction * (behind * seen.resolution)[:, None]
+    untouched = torch.ones(points.shape[0], dtype=torch.bool)
+    for offset in itertools.product((-1, 0, 1), repeat=points.shape[1]):
+        shift = torch.tensor(offset, dtype=torch.float64) * seen.resolution
+        hits, misses = seen.evidence_at(points + shift)
+        untouched &= hits + misses == 0
+    kept = points[untouched]
+    return Queries(kept, torch.full((kept.shape[0],), UNKNOWN))
+
+
+def save_queries(
+    path: str | Path, by_resolution: dict[float, Queries], train: Sequence[int], test: Sequence[int]
+) -> None:
+    """Write the very test points as NPZ: points, labels, resolution, train_scans, test_scans.
+
+    `resolution` (M,) says at which resolution a point is asked about, and is 0 for points that are
+    the same at all of them.
+    """
+    each = list(by_resolution.items())
+    first = each[0][1]
+    shared = all(torch.equal(first.points, queries.points) for _, queries in each)
+    groups = [(0.0, first)] if shared else each
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        points=torch.cat([queries.points for _, queries in groups]).numpy(),
+        labels=torch.cat([queries.labels for _, queries in groups]).numpy().astype(np.int64),
+        resolution=np.concatenate([np.full(len(queries.labels), r) for r, queries in groups]),
+        train_scans=np.asarray(train, dtype=np.int64),
+        test_scans=np.asarray(test, dtype=np.int64),
+    )
+    path = Path(path)
+    write_bytes(path if path.suffix == ".npz" else path.with_name(path.name + ".npz"), buffer.getvalue())

@@ -1,0 +1,82 @@
+"""Which scans train and which test, and what is kept of those that train."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.scan import Scan
+
+Removal = Literal["beams", "scans"]
+
+
+def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
+    """Indices of training and test scans: 0, n, 2n, … are held out."""
+    if test_every < 2:
+        raise InvalidArgumentError(
+            f"test_every={test_every} must be at least 2: with 1 every scan is held out and none is left."
+        )
+    if n_scans < 2:
+        raise InvalidArgumentError(
+            f"The data set has {n_scans} scans; at least 2 are needed, one to learn from and one to test on."
+        )
+    test = list(range(0, n_scans, test_every))
+    held_out = set(test)
+    return [i for i in range(n_scans) if i not in held_out], test
+
+
+def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int) -> list[Scan]:
+    """The scans with a random share of their beams, or a random share of the scans.
+
+    Smaller shares are subsets of larger ones with the same seed.
+    """
+    if not 0 < share <= 1:
+        raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
+    if removal not in ("beams", "scans"):
+        raise InvalidArgumentError(f"removal={removal!r} is not one of beams, scans.")
+    if share == 1:
+        return list(scans)
+    generator = torch.Generator().manual_seed(seed)
+    if removal == "scans":
+        rank = torch.rand(len(scans), generator=generator).argsort().argsort()
+        return [scan for scan, r in zip(scans, rank.tolist(), strict=True) if r < max(1, share * len(scans))]
+    return [scan.select(torch.rand(scan.n_beams, generator=generator) < share) for scan in scans]
+
+
+def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[Scan]:
+    """Each scan moved by a random rigid motion about its sensor.
+
+    `noise`: standard deviations of the shift along each axis (m) and of the rotation about each
+    axis (rad).
+    """
+    shift, angle = noise
+    if not (shift >= 0 and angle >= 0):
+        raise InvalidArgumentError(f"pose_noise={list(noise)} must be two numbers ≥ 0: metres and radians.")
+    if shift == 0 and angle == 0:
+        return list(scans)
+    generator = torch.Generator().manual_seed(seed)
+    moved = []
+    for scan in scans:
+        dim = scan.dim
+        translation = torch.randn(dim, generator=generator, dtype=torch.float64) * shift
+        turn = torch.randn(1 if dim == 2 else 3, generator=generator, dtype=torch.float64) * angle
+        transform = torch.eye(dim + 1, dtype=torch.float64)
+        transform[:dim, :dim] = _rotation(turn)
+        origin = scan.origin.double()
+        transform[:dim, dim] = origin + translation - transform[:dim, :dim] @ origin
+        moved.append(scan.transformed(transform))
+    return moved
+
+
+def _rotation(turn: torch.Tensor) -> torch.Tensor:
+    """Rotation matrix of an angle (1,) or of a rotation vector (3,): exp of the skew matrix."""
+    skew = torch.zeros(2 if turn.shape[0] == 1 else 3, 2 if turn.shape[0] == 1 else 3, dtype=torch.float64)
+    if turn.shape[0] == 1:
+        skew[0, 1], skew[1, 0] = -turn[0], turn[0]
+    else:
+        skew[0, 1], skew[0, 2], skew[1, 2] = -turn[2], turn[1], -turn[0]
+        skew = skew - skew.T
+    return torch.matrix_exp(skew)

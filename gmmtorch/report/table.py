@@ -1,0 +1,75 @@
+"""Plain-text tables of result rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_FOUR_DECIMALS = ("auc", "brier", "recall", "called")
+_PREFIXES = ("", "K", "M", "G", "T")
+
+
+def format_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Rows as aligned text: a heading, a rule, one line a row; no trailing newline.
+
+    Numbers stand to the right: four decimals for areas, Brier scores and shares of answers, bytes
+    with SI prefixes (28.1 KB is 28,100 bytes), whole numbers with commas, other numbers with four
+    digits; None and what a row lacks is a dash.
+
+    Args:
+        rows: by column name: numbers, text, truth values or None.
+        columns: which to show, in order; all that occur, in the order they do, if not given.
+    """
+    names = list(columns) if columns is not None else list(dict.fromkeys(key for row in rows for key in row))
+    if not names:
+        return ""
+    cells = [[format_value(name, row.get(name)) for name in names] for row in rows]
+    right = [any(_is_number(row.get(name)) for row in rows) for name in names]
+    widths = [max(len(name), *(len(line[i]) for line in cells), 0) for i, name in enumerate(names)]
+    lines = [names, ["-" * width for width in widths], *cells]
+    return "\n".join(_aligned(line, widths, right) for line in lines)
+
+
+def format_value(name: str, value: Any) -> str:
+    """One value as a cell of the column `name`."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return f"[{len(value)} values]"
+    if not _is_number(value):
+        return " ".join(str(value).split())
+    words = name.split("_")
+    if any(word in ("bytes", "nbytes") for word in words) and math.isfinite(value):
+        return format_bytes(float(value))
+    if any(word in words for word in _FOUR_DECIMALS):
+        return f"{value:.4f}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}"
+
+
+def format_bytes(n_bytes: float) -> str:
+    """Bytes with an SI prefix and three digits: 950 B, 28.1 KB, 1.25 MB."""
+    value = float(n_bytes)
+    for prefix in _PREFIXES:
+        # 999.6 would round to 1000 of this unit, which is 1.00 of the next.
+        if abs(value) < 999.5 or prefix == _PREFIXES[-1]:
+            break
+        value /= 1000
+    digits = 0 if prefix == "" or abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{value:.{digits}f} {prefix}B"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _aligned(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+    padded = (
+        cell.rjust(width) if is_right else cell.ljust(width)
+        for cell, width, is_right in zip(cells, widths, right, strict=True)
+    )
+    return "  ".join(padded).rstrip()
