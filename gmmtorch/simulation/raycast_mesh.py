@@ -76,8 +76,10 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
     lines, sides = rays.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row a coordinate
     bundles = bundled(directions) if one_origin else apart(directions.shape[0])
     for ray, triangle in candidates(bundles, triangles):
-        line = [row[ray] for row in lines]
-        side_a, side_b, side_c = (_dot(line, [row[triangle] for row in edge]) for edge in sides)
+        line = [row.index_select(0, ray) for row in lines]
+        side_a, side_b, side_c = (
+            _dot(line, [row.index_select(0, triangle) for row in edge]) for edge in sides
+        )
         lowest = torch.minimum(torch.minimum(side_a, side_b), side_c)
         highest = torch.maximum(torch.maximum(side_a, side_b), side_c)
         bound = slack[triangle]

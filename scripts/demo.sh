@@ -1,0 +1,18 @@
+#!/usr/bin/env bash
+# The main job on embedded data: maps of a 2D and of a 3D building, by mixture and by grid, scored
+# on scans that neither was shown. Prints tables, and where the pictures are.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+./scripts/setup.sh
+OUT="outputs/demo"
+rm -rf "$OUT"
+begin=$(date +%s)
+.venv/bin/gmmtorch-occupancy dataset=synthetic_building_2d 'evaluation.resolution=[0.1,0.02]' \
+  'evaluation.kept=[1.0,0.3,0.1]' hydra.run.dir="$OUT/2d" "$@"
+.venv/bin/gmmtorch-occupancy dataset=synthetic_building evaluation.test_every=5 \
+  'evaluation.resolution=[0.1]' 'evaluation.kept=[1.0,0.3,0.1]' hydra.run.dir="$OUT/3d" "$@"
+.venv/bin/gmmtorch-fit mixture.n_components=100 hydra.run.dir="$OUT/fit" "$@"
+echo
+echo "demo: done in $(($(date +%s) - begin)) s. Look at $OUT/2d, $OUT/3d and $OUT/fit, or run"
+echo "  .venv/bin/tensorboard --logdir $OUT"

@@ -1,0 +1,48 @@
+"""What all tests share: one thread, reproducible examples, and where the real data is."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # k-means has threads of its own
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, settings
+
+pytest.register_assert_rewrite("occupancy.protocol_contract")
+
+torch.set_num_threads(1)
+settings.register_profile(
+    "gmmtorch",
+    derandomize=True,
+    deadline=None,
+    max_examples=30,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+settings.load_profile("gmmtorch")
+
+
+@pytest.fixture(autouse=True)
+def _single_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """A seeded source of random numbers."""
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def real_data() -> Path:
+    """The folder of real scans; skips where there is none."""
+    root = os.environ.get("GMMTORCH_DATA")
+    if not root:
+        pytest.skip("GMMTORCH_DATA is not set")
+    path = Path(root)
+    if not path.is_dir():
+        pytest.skip(f"{path} is not there")
+    return path

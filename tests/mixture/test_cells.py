@@ -1,0 +1,110 @@
+"""Cells: many points summed into few, with nothing lost."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.em import quadratic_features
+
+
+def cloud(n: int, dim: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(n, dim, generator=generator, dtype=torch.float64)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 300),
+    dim=st.integers(2, 3),
+    limit=st.integers(1, 300),
+    finest=st.sampled_from([1e-3, 0.1, 1.0]),
+)
+def test_number_sum_and_sum_of_products_are_conserved_within_the_limit(seed, n, dim, limit, finest):
+    points = cloud(n, dim, seed)
+    cells = pool_into_cells(points, limit, finest)
+    assert cells.weight.shape[0] <= limit
+    assert float(cells.weight.min()) >= 1
+    assert float(cells.weight.sum()) == n
+    torch.testing.assert_close(
+        (cells.features * cells.weight[:, None]).sum(0), quadratic_features(points).sum(0), rtol=1e-11, atol=1e-11
+    )
+
+
+def test_each_cell_is_the_exact_mean_of_its_points():
+    points = (cloud(200, 3, 0) * 1024).round() / 1024
+    cells = pool_into_cells(points, 40, 0.01)
+    for cell in range(cells.weight.shape[0]):
+        own = [[Fraction(x) for x in row] for row in points[cells.member == cell].tolist()]
+        assert len(own) == int(cells.weight[cell])
+        products = [(i, j) for i in range(3) for j in range(i, 3)]
+        expected = [Fraction(1)]
+        expected += [sum(row[i] for row in own) / len(own) for i in range(3)]
+        expected += [sum(row[i] * row[j] for row in own) / len(own) for i, j in products]
+        # Sums of these numbers are exact in float64, so only the division may round.
+        assert cells.features[cell].tolist() == [float(x) for x in expected]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_of_the_finest_side_hold_only_neighbours(dim):
+    points = cloud(3000, dim, 1)
+    cells = pool_into_cells(points, 2999, 0.3)
+    assert cells.weight.shape[0] < 2999
+    low = points.amin(0).numpy()
+    keys = {tuple(k) for k in np.floor((points.numpy() - low) / 0.3).astype(int)}
+    assert cells.weight.shape[0] == len(keys)
+    for cell in range(cells.weight.shape[0]):
+        own = points[cells.member == cell]
+        assert float((own.amax(0) - own.amin(0)).max()) <= 0.3 + 1e-12
+
+
+@pytest.mark.parametrize("limit", [50, 200, 1000])
+def test_no_coarser_than_the_limit_asks_for(limit):
+    points = torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    n_cells = pool_into_cells(points, limit, 1e-3).weight.shape[0]
+    # A third of an octave in side is 1.6 in area; the rest is partial cells at the far edges.
+    assert 0.4 * limit <= n_cells <= limit
+
+
+def test_few_points_are_not_pooled():
+    points = cloud(20, 3, 0)
+    cells = pool_into_cells(points, 20, 10.0)
+    assert torch.equal(cells.features, quadratic_features(points))
+    assert cells.weight.tolist() == [1.0] * 20
+    assert cells.member.tolist() == list(range(20))
+
+
+def test_equal_points_share_one_cell():
+    cells = pool_into_cells(torch.full((50, 3), 0.7, dtype=torch.float64), 5, 0.01)
+    assert cells.weight.tolist() == [50.0]
+    assert cells.member.tolist() == [0] * 50
+
+
+def test_one_cell_takes_everything():
+    cells = pool_into_cells(cloud(50, 2, 0), 1, 0.01)
+    assert cells.weight.tolist() == [50.0]
+
+
+def test_an_outlier_far_out_does_not_break_the_keys():
+    points = torch.cat([cloud(500, 3, 0), torch.full((1, 3), 5e5, dtype=torch.float64)])
+    cells = pool_into_cells(points, 100, 0.01)
+    assert int(cells.weight[cells.member[-1]]) == 1  # it stays alone
+    assert float(cells.weight.sum()) == 501
+    torch.testing.assert_close(
+        (cells.features * cells.weight[:, None]).sum(0), quadratic_features(points).sum(0), rtol=1e-12, atol=0
+    )
+
+
+def test_the_order_of_the_points_does_not_matter():
+    points = cloud(400, 2, 3)
+    order = torch.randperm(400, generator=torch.Generator().manual_seed(1))
+    cells, shuffled = pool_into_cells(points, 60, 0.01), pool_into_cells(points[order], 60, 0.01)
+    torch.testing.assert_close(cells.features, shuffled.features, rtol=1e-12, atol=1e-12)
+    assert torch.equal(cells.member[order], shuffled.member)

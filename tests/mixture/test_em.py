@@ -1,0 +1,333 @@
+"""EM as two matrix products, against scipy, loops, and arithmetic with fifty digits."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+from gmmtorch.mixture import em
+from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.em import Parameters, quadratic_features
+
+
+def random_parameters(k: int, dim: int, generator: torch.Generator, spread: float = 2.0) -> Parameters:
+    weights = torch.rand(k, generator=generator, dtype=torch.float64) + 0.1
+    root = torch.randn(k, dim, dim, generator=generator, dtype=torch.float64)
+    means = spread * torch.randn(k, dim, generator=generator, dtype=torch.float64)
+    return Parameters(weights / weights.sum(), means, root @ root.mT + 0.2 * torch.eye(dim).double())
+
+
+def random_points(n: int, dim: int, generator: torch.Generator) -> Tensor:
+    return 2 * torch.randn(n, dim, generator=generator, dtype=torch.float64)
+
+
+def scipy_log_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
+    weights, means, covariances = (p.numpy() for p in parameters)
+    columns = [
+        np.log(w) + multivariate_normal(m, c).logpdf(points.numpy())
+        for w, m, c in zip(weights, means, covariances, strict=True)
+    ]
+    return np.stack(np.atleast_2d(columns), -1).reshape(len(points), -1)
+
+
+def brute_force_statistics(points: Tensor, weight: Tensor, parameters: Parameters) -> tuple[np.ndarray, float]:
+    """N_k, Σ γ x, Σ γ x_i x_j (i ≤ j), point by point."""
+    joint = scipy_log_joint(points, parameters)
+    dim = points.shape[1]
+    total = 0.0
+    rows = np.zeros((joint.shape[1], 1 + dim + dim * (dim + 1) // 2))
+    for x, p, row in zip(points.numpy(), weight.numpy(), joint, strict=True):
+        norm = logsumexp(row)
+        total += p * norm
+        for k in range(len(row)):
+            gamma = p * math.exp(row[k] - norm)
+            products = [x[i] * x[j] for i in range(dim) for j in range(i, dim)]
+            rows[k] += gamma * np.array([1.0, *x, *products])
+    return rows, total
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_features_are_one_x_and_the_products(dim, generator):
+    x = random_points(4, dim, generator)
+    for row, feature in zip(x.tolist(), quadratic_features(x).tolist(), strict=True):
+        assert feature == [1.0, *row, *(row[i] * row[j] for i in range(dim) for j in range(i, dim))]
+    assert em.feature_dimension(quadratic_features(x).shape[1]) == dim
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("k", [1, 5])
+def test_features_times_natural_parameters_are_weighted_log_densities(dim, k, generator):
+    parameters = random_parameters(k, dim, generator)
+    points = random_points(50, dim, generator)
+    product = quadratic_features(points) @ em.natural_parameters(parameters).T
+    np.testing.assert_allclose(product.numpy(), scipy_log_joint(points, parameters), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_direct_log_joint_is_scipys(dim, generator):
+    parameters = random_parameters(4, dim, generator)
+    points = random_points(50, dim, generator)
+    joint = em.log_joint(points, parameters)
+    np.testing.assert_allclose(joint.numpy(), scipy_log_joint(points, parameters), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
+def test_expectation_sums_what_a_loop_over_points_sums(dim, dtype, rtol, generator):
+    parameters = random_parameters(4, dim, generator)
+    points = random_points(60, dim, generator)
+    weight = torch.rand(60, generator=generator, dtype=torch.float64) * 3
+    statistics, total = em.expectation(
+        quadratic_features(points), weight, em.natural_parameters(parameters), dtype
+    )
+    expected, expected_total = brute_force_statistics(points, weight, parameters)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(statistics.numpy(), expected, rtol=rtol, atol=rtol * scale)
+    assert float(total) == pytest.approx(expected_total, rel=rtol)
+
+
+def test_chunks_do_not_change_the_statistics(generator, monkeypatch):
+    parameters = random_parameters(3, 3, generator)
+    features = quadratic_features(random_points(500, 3, generator))
+    weight = torch.rand(500, generator=generator, dtype=torch.float64)
+    natural = em.natural_parameters(parameters)
+    whole = em.expectation(features, weight, natural, torch.float64)
+    labels = em.most_likely(features, parameters)
+    monkeypatch.setattr(em, "CHUNK_ELEMENTS", 1)  # 64 rows at once, the last block shorter
+    parts = em.expectation(features, weight, natural, torch.float64)
+    torch.testing.assert_close(parts, whole, rtol=1e-12, atol=1e-10)
+    assert torch.equal(em.most_likely(features, parameters), labels)
+
+
+def test_the_likeliest_component_is_the_largest_of_scipys(generator):
+    parameters = random_parameters(6, 2, generator)
+    points = random_points(300, 2, generator)
+    labels = em.most_likely(quadratic_features(points), parameters)
+    assert labels.tolist() == scipy_log_joint(points, parameters).argmax(1).tolist()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_maximization_gives_weighted_means_and_covariances(dim, generator):
+    points = random_points(40, dim, generator)
+    gamma = torch.rand(40, 3, generator=generator, dtype=torch.float64)
+    found = em.maximization(gamma.T @ quadratic_features(points), reg_covar=0.25)
+    for k in range(3):
+        w = gamma[:, k].numpy()
+        covariance = np.cov(points.numpy().T, aweights=w, ddof=0) + 0.25 * np.eye(dim)
+        mean = np.average(points.numpy(), axis=0, weights=w)
+        np.testing.assert_allclose(found.means[k].numpy(), mean, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(found.covariances[k].numpy(), covariance, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.weights.numpy(), (gamma.sum(0) / gamma.sum()).numpy(), rtol=1e-12)
+
+
+# -- the bound ------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 5))
+def test_the_log_likelihood_never_falls(seed, dim, k):
+    generator = torch.Generator().manual_seed(seed)
+    points = random_points(60 * k, dim, generator)
+    weight = torch.rand(60 * k, generator=generator, dtype=torch.float64) + 0.01
+    step = em.natural_step(quadratic_features(points), weight, 0.0, torch.float64, points)
+    found = em.run_em(step, random_parameters(k, dim, generator), tol=0, max_iter=15)
+    rises = np.diff(found.lower_bounds)
+    assert rises.min() > -1e-12
+    first = np.average(
+        logsumexp(scipy_log_joint(points, random_parameters(k, dim, _replayed(seed, points))), axis=1),
+        weights=weight.numpy(),
+    )
+    assert found.lower_bounds[0] == pytest.approx(first, rel=1e-9)
+
+
+def _replayed(seed: int, points: Tensor) -> torch.Generator:
+    """The generator as it was when the starting parameters were drawn."""
+    generator = torch.Generator().manual_seed(seed)
+    random_points(*points.shape, generator)
+    torch.rand(points.shape[0], generator=generator, dtype=torch.float64)
+    return generator
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 4))
+def test_on_cells_the_bound_never_falls_and_stays_below_the_log_likelihood(seed, dim, k):
+    generator = torch.Generator().manual_seed(seed)
+    points = random_points(1000, dim, generator)
+    cells = pool_into_cells(points, 200, 0.05)
+    assert cells.weight.shape[0] < 1000
+    step = em.natural_step(cells.features, cells.weight, 0.0, torch.float64)
+    parameters = random_parameters(k, dim, generator)
+    previous = -math.inf
+    for _ in range(12):
+        likelihood = logsumexp(scipy_log_joint(points, parameters), axis=1).mean()
+        parameters, bound = step(parameters)
+        assert previous - 1e-12 < bound <= likelihood + 1e-9
+        previous = bound
+
+
+def test_cells_of_one_point_each_are_plain_em(generator):
+    points = random_points(100, 3, generator)
+    start = random_parameters(3, 3, generator)
+    cells = pool_into_cells(points, 100, 0.01)
+    one, bound = em.natural_step(cells.features, cells.weight, 1e-6)(start)
+    other, expected = em.natural_step(quadratic_features(points), torch.ones(100).double(), 1e-6)(start)
+    torch.testing.assert_close(one, other)
+    assert bound == expected
+
+
+# -- the direct form, and when it is taken ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_both_forms_agree_where_nothing_cancels(dim, generator):
+    points = random_points(200, dim, generator)
+    weight = torch.rand(200, generator=generator, dtype=torch.float64)
+    start = random_parameters(4, dim, generator)
+    natural, bound = em.natural_step(quadratic_features(points), weight, 1e-4, torch.float64)(start)
+    direct, total = em.direct_step(points, weight, start, 1e-4)
+    torch.testing.assert_close(natural, direct, rtol=1e-10, atol=1e-12)
+    assert bound == pytest.approx(float(total / weight.sum()), rel=1e-12)
+
+
+def test_a_room_is_well_conditioned_and_thin_walls_far_out_are_not():
+    thin = torch.diag(torch.tensor([1e-6, 1.0, 1.0], dtype=torch.float64))[None]  # 1 mm thick
+    weight = torch.ones(1, dtype=torch.float64)
+    near = Parameters(weight, torch.tensor([[10.0, 10.0, 3.0]]).double(), thin)
+    far = Parameters(weight, torch.tensor([[250_000.0, 0.0, 0.0]]).double(), thin)
+    assert not em.is_ill_conditioned(near)
+    assert em.is_ill_conditioned(far)
+
+
+def test_a_dead_component_does_not_make_a_step_ill_conditioned():
+    covariances = 1e-6 * torch.eye(2, dtype=torch.float64).repeat(2, 1, 1)
+    means = torch.tensor([[0.0, 0.0], [1e6, 0.0]], dtype=torch.float64)
+    assert not em.is_ill_conditioned(Parameters(torch.tensor([1.0, 0.0]).double(), means, covariances))
+    assert em.is_ill_conditioned(Parameters(torch.tensor([0.5, 0.5]).double(), means, covariances))
+
+
+def two_thin_walls(generator: torch.Generator) -> tuple[Tensor, Parameters]:
+    """Walls 1 mm thick that cross at an angle, with coordinates on multiples of 2⁻²⁴ m, and a start."""
+    n = 150
+    along = torch.rand(2, n, generator=generator, dtype=torch.float64) * 4 - 2
+    off = torch.randn(2, n, generator=generator, dtype=torch.float64) * 1e-3
+    walls = torch.cat([torch.stack([off[0], along[0]], 1), torch.stack([along[1], off[1] + 0.2], 1)])
+    points = torch.round(walls * 2**24) / 2**24
+    covariances = torch.diag_embed(torch.tensor([[2e-6, 1.0], [1.0, 2e-6]], dtype=torch.float64))
+    return points, Parameters(torch.tensor([0.5, 0.5]).double(), points.new_tensor([[0, 0], [0, 0.2]]), covariances)
+
+
+def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(generator):
+    local, start = two_thin_walls(generator)
+    shifts = torch.tensor([[-250_000.0, 0.0], [250_000.0, 4096.0]], dtype=torch.float64)
+    points = torch.cat([local + shifts[0], local + shifts[1]])  # exact: 24 fractional bits fit
+    both = Parameters(
+        torch.cat([start.weights, start.weights]) / 2,
+        torch.cat([start.means + shifts[0], start.means + shifts[1]]),
+        torch.cat([start.covariances, start.covariances]),
+    )
+    weight = points.new_ones(points.shape[0])
+    step = em.natural_step(quadratic_features(points), weight, 1e-8, torch.float64, points)
+    alone = em.natural_step(quadratic_features(local), weight[: len(local)], 1e-8, torch.float64)
+    far, near = both, start
+    for _ in range(3):
+        far, bound = step(far)
+        near, expected = alone(near)
+        assert bound == pytest.approx(expected - math.log(2), abs=1e-6)
+    for part, shift in ((slice(0, 2), shifts[0]), (slice(2, 4), shifts[1])):
+        torch.testing.assert_close(far.means[part] - shift, near.means, rtol=0, atol=1e-9)
+        torch.testing.assert_close(far.covariances[part], near.covariances, rtol=1e-5, atol=1e-11)
+        torch.testing.assert_close(2 * far.weights[part], near.weights, rtol=1e-6, atol=0)
+
+
+def test_log_densities_far_out_have_the_digits_of_exact_arithmetic():
+    mean = [250_000.25, -40_000.5]
+    covariance = [[1.25e-6, 5e-7], [5e-7, 4.0]]
+    points = torch.tensor([[250_000.2509765625, -40_001.5], [250_000.25, -40_000.0]], dtype=torch.float64)
+    parameters = Parameters(
+        torch.tensor([0.25], dtype=torch.float64),
+        torch.tensor([mean], dtype=torch.float64),
+        torch.tensor([covariance], dtype=torch.float64),
+    )
+    with mpmath.workdps(50):
+        inverse = mpmath.matrix(covariance) ** -1
+        log_det = mpmath.log(mpmath.det(mpmath.matrix(covariance)))
+        expected = []
+        for x in points.tolist():
+            d = mpmath.matrix([mpmath.mpf(a) - mpmath.mpf(b) for a, b in zip(x, mean, strict=True)])
+            squared = (d.T * inverse * d)[0]
+            expected.append(
+                float(mpmath.log(0.25) - (squared + log_det) / 2 - mpmath.log(2 * mpmath.pi))
+            )
+    assert em.log_joint(points, parameters)[:, 0].tolist() == pytest.approx(expected, abs=1e-9)
+
+
+# -- components without points ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("direct", [False, True])
+def test_a_component_of_weight_zero_stays_as_it_is(dtype, direct, generator):
+    points = random_points(80, 2, generator)
+    start = random_parameters(3, 2, generator)
+    weights = torch.tensor([0.4, 0.0, 0.6], dtype=torch.float64)
+    parameters = Parameters(weights, start.means, start.covariances)
+    ones = points.new_ones(80)
+    for _ in range(5):
+        if direct:
+            parameters, bound = em.direct_step(points, ones, parameters, 1e-6)
+        else:
+            parameters, bound = em.natural_step(quadratic_features(points), ones, 1e-6, dtype)(parameters)
+        assert math.isfinite(bound)
+    assert float(parameters.weights[1]) == 0
+    assert torch.equal(parameters.means[1], start.means[1])
+    assert torch.equal(parameters.covariances[1], start.covariances[1])
+    assert all(bool(torch.isfinite(p).all()) for p in parameters)
+    assert float(parameters.weights.sum()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_component_that_loses_every_point_dies_without_harm(dtype, generator):
+    points = random_points(80, 2, generator)
+    start = Parameters(
+        torch.tensor([0.5, 0.5], dtype=torch.float64),
+        torch.tensor([[0.0, 0.0], [1e4, 1e4]], dtype=torch.float64),
+        torch.eye(2, dtype=torch.float64).repeat(2, 1, 1),
+    )
+    step = em.natural_step(quadratic_features(points), points.new_ones(80), 1e-6, dtype, points)
+    found = em.run_em(step, start, tol=0, max_iter=4).parameters
+    assert float(found.weights[1]) == 0
+    assert torch.equal(found.means[1], start.means[1])
+    np.testing.assert_allclose(found.means[0].numpy(), points.numpy().mean(0), rtol=1e-5, atol=1e-6)
+
+
+# -- the loop -------------------------------------------------------------------------------------
+
+
+def test_em_stops_when_the_bound_rests_and_says_so(generator):
+    points = random_points(300, 2, generator)
+    step = em.natural_step(quadratic_features(points), points.new_ones(300), 1e-6, torch.float64)
+    start = random_parameters(2, 2, generator)
+    seen: list[tuple[int, float]] = []
+    found = em.run_em(step, start, tol=1e-4, on_iteration=lambda i, bound: seen.append((i, bound)))
+    assert found.converged
+    assert seen == list(enumerate(found.lower_bounds, 1))
+    assert found.n_iter == len(seen) < 100
+    changes = np.abs(np.diff(found.lower_bounds))
+    assert changes[-1] < 1e-4
+    assert (changes[:-1] >= 1e-4).all()
+
+
+def test_em_stops_at_the_limit_and_says_so(generator):
+    points = random_points(50, 2, generator)
+    step = em.natural_step(quadratic_features(points), points.new_ones(50), 1e-6, torch.float64)
+    found = em.run_em(step, random_parameters(2, 2, generator), tol=0, max_iter=3)
+    assert (found.converged, found.n_iter) == (False, 3)

@@ -1,0 +1,116 @@
+"""Where EM starts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.mixture.initialization import INITIALIZATIONS, distinct_points, start
+
+METHODS = sorted(INITIALIZATIONS)
+
+
+def cloud(n: int, dim: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, dim, generator=generator, dtype=torch.float64)
+    return points - points.mean(0)
+
+
+def begin(method: str, points: Tensor, k: int, weight: Tensor | None = None, seed: int = 0):
+    weight = points.new_ones(len(points)) if weight is None else weight
+    return start(method, points, weight, k, 1e-6, torch.Generator().manual_seed(seed))
+
+
+def test_distinct_points_are_sorted_and_carry_the_summed_weight():
+    points = torch.tensor([[1.0, 2.0], [0.0, 5.0], [1.0, 2.0], [1.0, -3.0]], dtype=torch.float64)
+    rows, weight = distinct_points(points, torch.tensor([1.0, 2.0, 3.0, 0.5], dtype=torch.float64))
+    assert rows.tolist() == [[0.0, 5.0], [1.0, -3.0], [1.0, 2.0]]
+    assert weight.tolist() == [2.0, 0.5, 4.0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_start_is_a_mixture_within_the_cloud(method, dim):
+    points = cloud(300, dim)
+    weights, means, covariances = begin(method, points, 7)
+    assert (weights.shape, means.shape, covariances.shape) == ((7,), (7, dim), (7, dim, dim))
+    assert float(weights.min()) > 0
+    assert float(weights.sum()) == pytest.approx(1)
+    assert float(torch.linalg.eigvalsh(covariances).min()) > 0
+    assert bool(((means >= points.amin(0)) & (means <= points.amax(0))).all())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_seed_decides(method):
+    points = cloud(200, 2)
+    first, again, other = begin(method, points, 5), begin(method, points, 5), begin(method, points, 5, seed=1)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first.means, other.means)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_weight_counts_as_so_many_points_in_any_order(method):
+    points = cloud(100, 3)
+    weight = torch.randint(1, 4, (100,), generator=torch.Generator().manual_seed(2)).double()
+    repeated = points.repeat_interleave(weight.long(), 0)
+    shuffled = repeated[torch.randperm(len(repeated), generator=torch.Generator().manual_seed(3))]
+    found, same = begin(method, points, 6, weight), begin(method, shuffled, 6)
+    torch.testing.assert_close(tuple(found), tuple(same), rtol=1e-10, atol=1e-12)
+
+
+def test_random_points_starts_at_points_that_differ():
+    points = cloud(30, 2)
+    means = begin("random_points", points, 30).means
+    assert sorted(means.tolist()) == sorted(points.tolist())
+
+
+def test_random_points_are_drawn_by_weight():
+    points = torch.arange(4.0, dtype=torch.float64)[:, None].expand(4, 2)
+    weight = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
+    drawn = [float(begin("random_points", points, 1, weight, seed).means[0, 0]) for seed in range(2000)]
+    shares = np.bincount(np.array(drawn, dtype=int), minlength=4) / 2000
+    np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.045)  # four standard errors
+
+
+def test_bounding_box_fills_the_box_evenly():
+    points = torch.tensor([[-1.0, 2.0], [3.0, 2.5], [0.0, 4.0]], dtype=torch.float64).repeat(300, 1)
+    points = points + 1e-9 * torch.arange(900, dtype=torch.float64)[:, None]
+    means = begin("bounding_box", points, 900).means
+    unit = ((means - points.amin(0)) / (points.amax(0) - points.amin(0))).numpy()
+    for column in unit.T:
+        counts = np.histogram(column, bins=4, range=(0, 1))[0]
+        assert abs(counts - 225).max() < 60  # more than four standard deviations
+
+
+@pytest.mark.parametrize("method", ["random_points", "bounding_box"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_isotropic_starts_share_the_clouds_variance(method, dim):
+    points = cloud(500, dim)
+    covariances = begin(method, points, 4).covariances
+    variance = points.numpy().var(axis=0).mean() * 4 ** (-2 / dim) + 1e-6
+    expected = np.broadcast_to(variance * np.eye(dim), (4, dim, dim))
+    np.testing.assert_allclose(covariances.numpy(), expected, rtol=1e-10)
+
+
+def test_kmeans_gives_each_cluster_its_moments():
+    centers = torch.tensor([[-9.0, 0.0], [0.0, 9.0], [9.0, 0.0]], dtype=torch.float64)
+    points = torch.cat([center + 0.3 * cloud(n, 2, n) for center, n in zip(centers, (30, 50, 20), strict=True)])
+    weights, means, covariances = begin("kmeans", points, 3)
+    order = means[:, 0].argsort()
+    np.testing.assert_allclose(weights[order].numpy(), [0.3, 0.5, 0.2], rtol=1e-10)
+    for i, own in zip(order, points.split([30, 50, 20]), strict=True):
+        np.testing.assert_allclose(means[i].numpy(), own.numpy().mean(0), atol=1e-10)
+        expected = np.cov(own.numpy().T, ddof=0) + 1e-6 * np.eye(2)
+        np.testing.assert_allclose(covariances[i].numpy(), expected, rtol=1e-8, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_with_few_distinct_points_copies_share_the_weight(method):
+    points = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64).repeat(10, 1)
+    weights, means, covariances = begin(method, points, 5)
+    assert weights.shape == (5,)
+    assert float(weights.sum()) == pytest.approx(1)
+    assert len({tuple(row) for row in means.tolist()}) == 2
+    assert float(torch.linalg.eigvalsh(covariances).min()) > 0

@@ -1,0 +1,130 @@
+"""Cutting a cloud into flat pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.mixture.em import quadratic_features
+from gmmtorch.mixture.partition import FlatnessRule, Partition, partition, pool
+
+RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
+
+
+def cloud(n: int, dim: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, dim, generator=generator, dtype=torch.float64)
+    return points - points.mean(0)
+
+
+def cut(points: Tensor, rule: FlatnessRule, weight: Tensor | None = None) -> Partition:
+    return partition(points, points.new_ones(len(points)) if weight is None else weight, rule)
+
+
+def wall(n: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([4.0, 2.0, 0.0], dtype=torch.float64)
+    points = (torch.rand(n, 3, generator=generator, dtype=torch.float64) - 0.5) * scale
+    points[:, 2] = 0.005 * torch.randn(n, generator=generator, dtype=torch.float64)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))[0]
+    return (points - points.mean(0)) @ rotation.T
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 200),
+    dim=st.integers(2, 3),
+    min_weight=st.floats(1, 20),
+    limit=st.none() | st.integers(1, 12),
+)
+def test_pieces_are_whole_supported_and_no_more_than_asked_for(seed, n, dim, min_weight, limit):
+    points = cloud(n, dim, seed)
+    weight = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 + 0.1
+    rule = FlatnessRule(0.02, 0.3, min_weight, limit)
+    labels, n_pieces = partition(points, weight, rule)
+    assert labels.shape == (n,)
+    assert labels.unique().tolist() == list(range(n_pieces))  # every label used: no piece is empty
+    pieces = np.bincount(labels.numpy(), weights=weight.numpy(), minlength=n_pieces)
+    if n_pieces > 1:
+        assert pieces.min() >= min_weight - 1e-9
+    if limit is not None:
+        assert n_pieces <= limit
+
+
+@given(seed=st.integers(0, 10**6), dim=st.integers(2, 3))
+def test_what_is_left_whole_is_flat_and_short_or_cannot_be_halved(seed, dim):
+    points = cloud(300, dim, seed)
+    labels, n_pieces = cut(points, RULE)
+    for piece in range(n_pieces):
+        own = points[labels == piece].numpy()
+        variances, directions = np.linalg.eigh(np.cov(own.T, ddof=0))
+        flat = variances[0] <= RULE.thickness**2 * (1 + 1e-9)
+        short = variances[-1] <= RULE.length**2 * (1 + 1e-9)
+        beyond = ((own - own.mean(0)) @ directions[:, -1] > 0).sum()
+        too_light = min(beyond, len(own) - beyond) < RULE.min_weight
+        assert (flat and short) or too_light
+
+
+def test_the_same_cloud_is_cut_the_same_way():
+    points = cloud(500, 3, 1)
+    assert torch.equal(cut(points, RULE).labels, cut(points, RULE).labels)
+
+
+def test_a_wall_takes_few_pieces_and_clutter_many():
+    few = cut(wall(2000), RULE).n_pieces
+    many = cut(cloud(2000, 3, 0), RULE).n_pieces
+    assert 2 <= few <= 16  # 4 m × 2 m: standard deviations 1.15 and 0.58 m, halved to below 0.5 m
+    assert many > 5 * few
+
+
+def test_more_points_on_a_wall_do_not_ask_for_more_pieces():
+    assert cut(wall(8000), RULE).n_pieces <= 2 * cut(wall(1000), RULE).n_pieces
+
+
+def test_with_a_limit_the_widest_pieces_are_cut_first():
+    generator = torch.Generator().manual_seed(0)
+    wide = torch.randn(200, 2, generator=generator, dtype=torch.float64)
+    narrow = 0.1 * torch.randn(200, 2, generator=generator, dtype=torch.float64) + 50.0
+    points = torch.cat([wide, narrow])
+    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(0.001, 0.001, 2, 3))
+    assert n_pieces == 3
+    assert len(set(labels[200:].tolist())) == 1
+    assert len(set(labels[:200].tolist())) == 2
+
+
+def test_weights_count_as_points():
+    points = cloud(120, 2, 4)
+    weight = torch.randint(1, 4, (120,), generator=torch.Generator().manual_seed(0)).double()
+    repeated = points.repeat_interleave(weight.long(), 0)
+    center = repeated.mean(0)
+    labels, n_pieces = cut(points - center, RULE, weight)
+    again = cut(repeated - center, RULE)
+    assert n_pieces == again.n_pieces
+    assert torch.equal(labels.repeat_interleave(weight.long()), again.labels)
+
+
+@pytest.mark.parametrize("n", [1, 2, 100])
+def test_equal_points_are_one_piece(n):
+    assert cut(torch.zeros(n, 3, dtype=torch.float64), RULE).n_pieces == 1
+
+
+def test_a_line_is_cut_only_along_its_length():
+    along = torch.linspace(-4, 4, 801, dtype=torch.float64)
+    labels, n_pieces = cut(torch.stack([along, 0 * along], 1), RULE)
+    assert 4 <= n_pieces <= 16
+    assert (labels[1:] != labels[:-1]).sum() == n_pieces - 1  # pieces are intervals
+
+
+def test_pooled_statistics_are_sums_by_label(generator):
+    features = quadratic_features(torch.randn(50, 3, generator=generator, dtype=torch.float64))
+    weight = torch.rand(50, generator=generator, dtype=torch.float64)
+    labels = torch.randint(4, (50,), generator=generator)
+    sums = pool(features, weight, labels, 5)
+    for piece in range(5):
+        own = labels == piece
+        expected = (features[own] * weight[own, None]).sum(0)
+        torch.testing.assert_close(sums[piece], expected, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,200 @@
+"""Evidence: what rays add, and the occupancy that follows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from exact_dda import voxels_left
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.stats import bernoulli
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.evidence import (
+    CellClass,
+    Evidence,
+    bernoulli_entropy,
+    bernoulli_variance,
+    classify,
+    occupancy_probability,
+)
+from gmmtorch.occupancy.grid import VoxelGrid
+
+GRIDS = {2: VoxelGrid((-1.0, 0.5), 0.25, (9, 8)), 3: VoxelGrid((-1.0, 0.5, 0.0), 0.25, (6, 7, 5))}
+counts = st.floats(0, 1e6)
+
+
+def random_rays(grid: VoxelGrid, n: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Rays with dyadic coordinates, some of which start or end outside the grid."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor(grid.shape, dtype=torch.float64) * grid.resolution
+    unit = torch.rand(2, n, grid.dim, generator=generator, dtype=torch.float64) * 1.4 - 0.2
+    rays = torch.tensor(grid.origin, dtype=torch.float64) + torch.round(unit * size * 1024) / 1024
+    return rays[0], rays[1]
+
+
+def brute_force(grid: VoxelGrid, origins: Tensor, ends: Tensor, weights: list[float], is_hit: list[bool]):
+    hits, misses = np.zeros(grid.shape), np.zeros(grid.shape)
+    for start, stop, weight, hit in zip(origins, ends, weights, is_hit, strict=True):
+        a, b = (((x - torch.tensor(grid.origin).double()) / grid.resolution).tolist() for x in (start, stop))
+        for voxel in voxels_left(a, b, grid.shape):
+            misses[voxel] += weight
+        last = tuple(math.floor(x) for x in b)
+        if hit and all(0 <= i < n for i, n in zip(last, grid.shape, strict=True)):
+            hits[last] += weight
+    return hits, misses
+
+
+# -- probability ---------------------------------------------------------------------------------------
+
+
+@given(hits=counts, misses=counts, prior=st.floats(1e-3, 100))
+def test_theta_is_equation_3_9(hits, misses, prior):
+    pair = torch.tensor([[hits], [misses]], dtype=torch.float64)
+    theta = float(occupancy_probability(pair[0], pair[1], prior))
+    assert theta == pytest.approx((hits + prior) / (hits + misses + 2 * prior), rel=1e-12)
+    assert 0 <= theta <= 1
+
+
+@pytest.mark.parametrize("prior", [0, 1e-300, 0.1, 1 / 3, 1, 7.7])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_what_was_never_seen_is_exactly_a_half(prior, dtype):
+    zero = torch.zeros(3, dtype=dtype)
+    assert occupancy_probability(zero, zero, prior).tolist() == [0.5] * 3
+
+
+def test_without_a_prior_theta_is_the_share_of_hits():
+    theta = occupancy_probability(torch.tensor([3.0, 0.0, 2.0]), torch.tensor([1.0, 5.0, 0.0]), 0)
+    assert theta.tolist() == [0.75, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("prior", [-1, float("nan"), float("inf")])
+def test_a_prior_that_is_no_count_is_refused(prior):
+    with pytest.raises(InvalidArgumentError, match="prior"):
+        occupancy_probability(torch.ones(1), torch.ones(1), prior)
+
+
+@pytest.mark.parametrize("theta", [0.0, 1e-12, 0.1, 0.5, 0.77, 1.0])
+def test_variance_and_entropy_are_those_of_a_coin(theta):
+    value = torch.tensor([theta], dtype=torch.float64)
+    assert float(bernoulli_variance(value)) == pytest.approx(bernoulli(theta).var(), abs=1e-15)
+    expected = float(bernoulli(theta).entropy()) / math.log(2) if 0 < theta < 1 else 0.0
+    assert float(bernoulli_entropy(value)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_grid_wide_forms_are_the_same_numbers():
+    grid = GRIDS[2]
+    generator = torch.Generator().manual_seed(0)
+    evidence = Evidence(grid, *(5 * torch.rand(2, *grid.shape, generator=generator, dtype=torch.float64)))
+    theta = (evidence.hits + 2) / (evidence.hits + evidence.misses + 4)
+    torch.testing.assert_close(evidence.probability(2), theta)
+    torch.testing.assert_close(evidence.variance(2), theta * (1 - theta))
+    torch.testing.assert_close(evidence.entropy(2), bernoulli_entropy(theta))
+    assert evidence.classify(0.2, 2).tolist() == classify(theta, 0.2).tolist()
+
+
+# -- the dead band -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threshold", [1e-6, 0.01, 0.06, 0.2, 0.2499])
+def test_the_dead_band_ends_where_the_variance_is_the_threshold(threshold):
+    low = brentq(lambda t: t * (1 - t) - threshold, 0, 0.5, xtol=1e-14)
+    high = brentq(lambda t: t * (1 - t) - threshold, 0.5, 1, xtol=1e-14)
+    theta = torch.tensor([low - 1e-9, low + 1e-9, 0.5, high - 1e-9, high + 1e-9], dtype=torch.float64)
+    unknown = CellClass.UNKNOWN
+    expected = [CellClass.FREE, unknown, unknown, unknown, CellClass.OCCUPIED]
+    assert classify(theta, threshold).tolist() == expected
+
+
+def test_without_a_dead_band_only_a_half_is_unknown():
+    theta = torch.tensor([0.0, 0.4999, 0.5, 0.5001, 1.0])
+    assert classify(theta, 0.25).tolist() == [0, 0, -1, 1, 1]
+    assert classify(theta, 0.25).dtype == torch.int8
+
+
+@pytest.mark.parametrize("threshold", [0, -0.1, 0.26, float("nan")])
+def test_a_variance_that_no_coin_has_is_refused(threshold):
+    with pytest.raises(InvalidArgumentError, match="variance_threshold"):
+        classify(torch.tensor([0.5]), threshold)
+
+
+# -- counting ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rays_count_as_by_hand(dim):
+    grid = GRIDS[dim]
+    origins, ends = random_rays(grid, 300)
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.rand(300, generator=generator, dtype=torch.float64)
+    is_hit = torch.rand(300, generator=generator) > 0.3
+    evidence = Evidence.empty(grid)
+    evidence.add_rays(origins, ends, weights, is_hit)
+    hits, misses = brute_force(grid, origins, ends, weights.tolist(), is_hit.tolist())
+    np.testing.assert_allclose(evidence.hits.numpy(), hits, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(evidence.misses.numpy(), misses, rtol=1e-12, atol=1e-12)
+    assert hits.sum() > 0 < misses.sum()
+
+
+def test_without_weights_each_ray_counts_one_and_hits():
+    grid = GRIDS[2]
+    origins, ends = random_rays(grid, 200)
+    evidence = Evidence.empty(grid)
+    evidence.add_rays(origins, ends)
+    hits, misses = brute_force(grid, origins, ends, [1.0] * 200, [True] * 200)
+    assert (evidence.hits.numpy() == hits).all()
+    assert (evidence.misses.numpy() == misses).all()
+
+
+def test_order_and_chunks_and_portions_do_not_matter():
+    grid = GRIDS[3]
+    origins, ends = random_rays(grid, 200)
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    whole, parts = Evidence.empty(grid), Evidence.empty(grid)
+    whole.add_rays(origins, ends)
+    for part in order.split(37):
+        parts.add_rays(origins[part], ends[part], chunk_visits=5)
+    assert torch.equal(whole.hits, parts.hits)
+    assert torch.equal(whole.misses, parts.misses)
+
+
+def test_rays_without_return_never_hit():
+    grid = GRIDS[2]
+    origins, ends = random_rays(grid, 100)
+    evidence = Evidence.empty(grid)
+    evidence.add_rays(origins, ends, is_hit=torch.zeros(100, dtype=torch.bool))
+    assert float(evidence.hits.abs().max()) == 0
+    assert float(evidence.misses.max()) > 0
+    assert float(evidence.probability().max()) <= 0.5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+def test_weights_of_any_number_type_are_taken(dtype):
+    grid = GRIDS[2]
+    origins, ends = random_rays(grid, 50)
+    one, other = Evidence.empty(grid), Evidence.empty(grid)
+    one.add_rays(origins, ends, torch.full((50,), 2, dtype=dtype))
+    other.add_rays(origins.repeat(2, 1), ends.repeat(2, 1))
+    assert torch.equal(one.hits, other.hits)
+    assert torch.equal(one.misses, other.misses)
+
+
+def test_no_rays_add_nothing():
+    evidence = Evidence.empty(GRIDS[2])
+    evidence.add_rays(torch.empty(0, 2), torch.empty(0, 2))
+    assert evidence.probability().unique().tolist() == [0.5]
+
+
+def test_a_look_up_reads_the_cell_and_a_half_outside():
+    grid = GRIDS[2]
+    evidence = Evidence.empty(grid)
+    evidence.add_rays(*random_rays(grid, 200))
+    assert torch.equal(evidence.lookup(grid.centers()), evidence.probability().flatten())
+    nan, inf = float("nan"), float("inf")
+    far = torch.tensor([[100.0, 0.0], [-1.01, 1.0], [nan, 1.0], [inf, 1.0]], dtype=torch.float64)
+    assert evidence.lookup(far).tolist() == [0.5] * 4

@@ -1,0 +1,111 @@
+"""What a Board writes, TensorBoard's own reader finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
+from tensorboard.util.tensor_util import make_ndarray
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import Board, roc_figure
+
+
+def read(directory) -> EventAccumulator:
+    events = EventAccumulator(str(directory), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
+    return events.Reload()
+
+
+def tensor(events: EventAccumulator, tag: str) -> np.ndarray:
+    return make_ndarray(events.Tensors(tag)[-1].tensor_proto)
+
+
+def test_scalars_are_the_finite_numbers_of_a_row(tmp_path):
+    row = {"auc": 0.5, "n": 3, "method": "x", "yes": True, "none": None, "nan": float("nan"), "list": [1.0]}
+    with Board(tmp_path) as board:
+        board.scalars(row, prefix="occupancy", step=0)
+        board.scalars({"auc": np.float32(0.75)}, prefix="occupancy", step=4)
+        board.scalars({"bare": 1})
+    events = read(tmp_path)
+    assert sorted(events.Tags()["scalars"]) == ["bare", "occupancy/auc", "occupancy/n"]
+    assert [(e.step, e.value) for e in events.Scalars("occupancy/auc")] == [(0, 0.5), (4, 0.75)]
+
+
+def test_figures_and_curves(tmp_path):
+    labels = torch.tensor([0, 1, 1, 0, 1])
+    with Board(tmp_path) as board:
+        board.figure("maps", roc_figure({}))
+        board.curve("grid", labels, torch.tensor([0.1, 0.9, 0.8, 0.6, 0.4]), step=2)
+        board.curve("one_class", torch.ones(3), torch.rand(3))
+        board.curve("none", torch.empty(0), torch.empty(0))
+    events = read(tmp_path)
+    assert sorted(events.Tags()["images"]) == ["grid/roc", "maps"]
+    image = events.Images("maps")[0]
+    assert image.encoded_image_string.startswith(b"\x89PNG")
+    assert image.width > 300
+    assert sorted(events.Tags()["tensors"]) == ["grid", "one_class"]
+    true_positives = tensor(events, "grid")[0]
+    assert true_positives[0] == 3
+    with Board(tmp_path / "bad") as board, pytest.raises(InvalidArgumentError, match="labels has shape"):
+        board.curve("bad", labels, torch.zeros(4))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_clouds_are_thinned_the_same_way_every_time(tmp_path, dim):
+    points = torch.arange(100 * dim, dtype=torch.float64).reshape(100, dim)
+    colors = torch.full((100, 3), 300)
+    for name in ("a", "b"):
+        with Board(tmp_path / name, max_points=10) as board:
+            board.cloud("scan", points, colors)
+            board.cloud("one", points[:1])
+            board.cloud("empty", points[:0])
+    first, second = (read(tmp_path / name) for name in ("a", "b"))
+    vertices = tensor(first, "scan_VERTEX")
+    assert vertices.shape == (1, 10, 3)
+    np.testing.assert_array_equal(vertices[0, :, :dim], points[::10])
+    np.testing.assert_array_equal(vertices, tensor(second, "scan_VERTEX"))
+    assert (tensor(first, "scan_COLOR") == 255).all()
+    assert tensor(first, "one_VERTEX").shape == (1, 1, 3)
+    assert not any("empty" in tag for tag in first.Tags()["tensors"])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("k", "n_vertices"), [(3, 3 * 162), (20, 20 * 12), (200, 41 * 12), (0, None)])
+def test_ellipsoids_are_as_fine_as_the_limit_permits(tmp_path, dim, k, n_vertices):
+    with Board(tmp_path, max_points=500) as board:
+        board.ellipsoids("mixture", torch.zeros(k, dim), torch.eye(dim).expand(k, dim, dim))
+    events = read(tmp_path)
+    if n_vertices is None:
+        assert events.Tags()["tensors"] == []
+        return
+    assert tensor(events, "mixture_VERTEX").shape == (1, n_vertices, 3)
+    faces = tensor(events, "mixture_FACE")
+    assert faces.max() == n_vertices - 1
+    assert tensor(events, "mixture_COLOR").shape == (1, n_vertices, 3)
+
+
+def test_hparams_stay_in_the_run(tmp_path):
+    config = {"seed": 0, "method": "point", "flag": True, "path": None, "kept": [1.0, 0.3]}
+    with Board(tmp_path) as board:
+        board.hparams(config, {"auc": 0.9, "missing": None})
+    assert [p.is_file() for p in tmp_path.iterdir()] == [True]
+    events = read(tmp_path)
+    assert events.Scalars("auc")[0].value == pytest.approx(0.9)
+    content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
+    assert start.hparams["method"].string_value == "point"
+    assert start.hparams["path"].string_value == "None"
+    assert start.hparams["kept"].string_value == "[1.0, 0.3]"
+    assert start.hparams["flag"].number_value == 1
+
+
+def test_says_what_is_wrong(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="max_points=0"):
+        Board(tmp_path, max_points=0)
+    with Board(tmp_path) as board:
+        with pytest.raises(InvalidArgumentError, match="points has shape"):
+            board.cloud("bad", torch.zeros(3))
+        with pytest.raises(InvalidArgumentError, match="colors has shape"):
+            board.cloud("bad", torch.zeros(3, 3), torch.zeros(2, 3))

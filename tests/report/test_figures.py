@@ -1,0 +1,137 @@
+"""Figures of mixtures and of results."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import (
+    auc_against_kept_figure,
+    convergence_figure,
+    mixture_figure,
+    roc_figure,
+    save_figure,
+)
+
+
+def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(k, dim, dtype=torch.float64, generator=generator)
+    factors = torch.randn(k, dim, dim, dtype=torch.float64, generator=generator)
+    return means, factors @ factors.mT * 0.01, torch.full((k,), 1 / max(k, 1))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("n", "k"), [(200, 5), (1, 1), (0, 0), (5, 0), (0, 3)])
+def test_mixture_figure(dim, n, k):
+    points = torch.randn(n, dim, generator=torch.Generator().manual_seed(1))
+    figure = mixture_figure(points, *mixture(k, dim), origins=torch.zeros(1, dim))
+    figure.canvas.draw()
+    title = figure.get_suptitle()
+    assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}, {n} point{'s' * (n != 1)}"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_of_many_components_the_heaviest_are_drawn_and_the_title_says_so(dim):
+    means, covariances, _ = mixture(6, dim)
+    weights = torch.tensor([0.1, 0.3, 0.0, 0.2, 0.3, 0.1])
+    figure = mixture_figure(means, means, covariances, weights, max_components=3)
+    assert "the 3 heaviest of 6 components" in figure.get_suptitle()
+    plane = figure.axes[0] if dim == 2 else figure.axes[1]
+    ellipses = [c for c in plane.collections if len(c.get_paths()) == 3]
+    centres = np.sort([path.vertices[:-1].mean(0)[0] for path in ellipses[0].get_paths()])
+    np.testing.assert_allclose(centres, np.sort(means[[1, 3, 4], 0].numpy()), atol=1e-9)
+
+
+def test_a_mixture_of_arrays_and_of_identical_points():
+    points = np.ones((10, 2))
+    mixture_figure(points, points[:1], np.zeros((1, 2, 2)), np.ones(1)).canvas.draw()
+
+
+def test_mixture_figure_says_what_is_wrong():
+    means, covariances, weights = mixture(3, 2)
+    with pytest.raises(InvalidArgumentError, match="weights has shape"):
+        mixture_figure(means, means, covariances, weights[:2])
+    with pytest.raises(InvalidArgumentError, match="covariances"):
+        mixture_figure(means, means, covariances[:2], weights)
+
+
+def test_roc_figure():
+    curve = (np.array([0.0, 0.2, 1.0]), np.array([0.0, 0.9, 1.0]), 0.85)
+    figure = roc_figure({"monte_carlo": curve, "grid": curve}, "lab")
+    figure.canvas.draw()
+    texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert texts == ["chance, AUC 0.5", "monte carlo, AUC 0.8500", "grid, AUC 0.8500"]
+    roc_figure({}).canvas.draw()
+
+
+def test_convergence_figure():
+    figure = convergence_figure({"fit": [-3.0, -2.0, -1.5], "none": [], "one": [-1.0]})
+    figure.canvas.draw()
+    assert [len(line.get_xdata()) for line in figure.axes[0].lines] == [3, 1, 1, 1]
+    convergence_figure({}).canvas.draw()
+
+
+def row(method: str, resolution: float, kept: float, auc: float | None, **more: object) -> dict[str, object]:
+    facts = {"dataset": "lab", "method": method, "resolution": resolution, "removal": "beams"}
+    return {**facts, "kept": kept, "auc": auc, **more}
+
+
+def test_auc_against_kept_has_a_panel_a_resolution_and_a_line_a_method():
+    rows = [
+        row(method, resolution, kept, 0.9 * kept**0.1, auc_low=0.5, auc_high=0.95)
+        for method in ("monte_carlo", "occupancy_grid")
+        for resolution in (0.02, 0.1)
+        for kept in (0.1, 1.0, 0.3)
+    ]
+    figure = auc_against_kept_figure([*rows, row("broken", 0.1, 0.5, None)], "lab")
+    figure.canvas.draw()
+    assert [axes.get_title() for axes in figure.axes] == ["cells of 0.1 m", "cells of 0.02 m"]
+    axes = figure.axes[0]
+    assert axes.get_xscale() == "log"
+    assert axes.get_xlim()[0] > axes.get_xlim()[1]
+    lines = {line.get_label(): line for line in axes.lines}
+    assert list(lines["monte carlo"].get_xdata()) == pytest.approx([10.0, 30.0, 100.0])
+    assert "broken" not in lines
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["monte carlo", "occupancy grid"]
+
+
+def test_auc_against_kept_tells_datasets_and_removals_apart():
+    rows = [row("a", 0.1, 1.0, 0.9), {**row("a", 0.1, 1.0, 0.8), "dataset": "hall", "removal": "scans"}]
+    titles = [axes.get_title() for axes in auc_against_kept_figure(rows).axes]
+    assert titles == ["hall, scans removed, cells of 0.1 m", "lab, beams removed, cells of 0.1 m"]
+    auc_against_kept_figure([]).canvas.draw()
+
+
+def test_figures_are_saved_whole_or_not_at_all(tmp_path):
+    figure = roc_figure({})
+    path = save_figure(figure, tmp_path / "new" / "roc.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(InvalidArgumentError, match=r"\.png"):
+        save_figure(figure, tmp_path / "roc.txt")
+    assert [p.name for p in tmp_path.rglob("*.*")] == ["roc.png"]
+
+
+PROGRAM = """
+import sys, torch
+import gmmtorch.report
+assert "matplotlib" not in sys.modules and "tensorboard" not in sys.modules
+from gmmtorch.report import Board, MapPanel, map_figure, mixture_figure, roc_figure, save_figure
+eye, panel = torch.eye(3)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
+with Board(sys.argv[1]) as board:
+    board.figure("map", map_figure([panel], torch.zeros(2, 3)))
+    board.figure("mixture", mixture_figure(torch.zeros(1, 3), torch.zeros(1, 3), eye, torch.ones(1)))
+    board.curve("c", torch.tensor([0, 1]), torch.tensor([0.1, 0.9]))
+save_figure(roc_figure({}), sys.argv[1] + "/roc.png")
+assert "matplotlib.pyplot" not in sys.modules
+"""
+
+
+def test_pyplot_is_never_imported_and_nothing_before_it_is_used(tmp_path):
+    done = subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,186 @@
+"""Maps as pictures: pixels are cells, unknown stays unknown, and whatever answers can be drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.report import MapPanel, map_figure
+from gmmtorch.report.raster import height_image, plan, robust_bounds, roof_above, slice_image
+
+
+def wall_map(dim: int) -> BlockEvidence:
+    """Rays from the origin to the plane x = 2, cells of 0.5 m."""
+    evidence = BlockEvidence(0.5, dim)
+    side = torch.linspace(-1.9, 1.9, 21, dtype=torch.float64)
+    others = torch.cartesian_prod(side, side) if dim == 3 else side[:, None]
+    ends = torch.cat([torch.full((len(others), 1), 2.1, dtype=torch.float64), others], 1)
+    evidence.add_rays(torch.zeros_like(ends) + 0.05, ends)
+    return evidence
+
+
+def unknown(points: torch.Tensor) -> torch.Tensor:
+    return torch.full((len(points),), 0.5)
+
+
+def box(dim: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return (-1.0,) * dim, (3.0,) * dim
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("n_panels", [1, 2, 5])
+def test_draws_maps_side_by_side(dim, n_panels):
+    low, high = box(dim)
+    panels = [MapPanel(f"map {i}", wall_map(dim).lookup, 0.5, low, high) for i in range(n_panels)]
+    path = torch.tensor([[0.0] * dim, [1.0] * dim])
+    figure = map_figure(panels, path, title="wall")
+    figure.canvas.draw()
+    shown = [axes for axes in figure.axes if axes.get_visible() and axes.get_images()]
+    assert len(shown) == n_panels * (dim - 1)
+    assert all(axes.get_aspect() == 1 for axes in shown)
+    texts = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"sensor path", "start", "end"} <= texts
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("path", [None, "empty", "one"])
+def test_draws_an_all_unknown_map(dim, path):
+    panel = MapPanel("nothing", unknown, 0.5, *box(dim))
+    trajectory = {None: None, "empty": torch.empty(0, dim), "one": torch.zeros(1, dim)}[path]
+    map_figure([panel], trajectory).canvas.draw()
+    assert np.isnan(slice_image(panel)[0]).all()
+
+
+def test_pixels_are_the_cells_of_the_grid():
+    evidence = Evidence.empty(VoxelGrid((-1.0, 2.0), 0.5, (3, 2)))
+    evidence.hits[2, 0] = 3.0
+    evidence.misses[0, 1] = 1.0
+    panel = MapPanel.of_evidence("grid", evidence)
+    image, raster = slice_image(panel)
+    assert raster.extent == (-1.0, 0.5, 2.0, 3.0)
+    expected = np.full((2, 3), np.nan)  # rows are y
+    expected[0, 2], expected[1, 0] = 4 / 5, 1 / 3
+    np.testing.assert_allclose(image, expected)
+
+
+def test_every_nth_cell_is_asked_where_there_are_too_many():
+    asked = []
+
+    def occupancy(points):
+        asked.append(points)
+        return unknown(points)
+
+    panel = MapPanel("large", occupancy, 0.1, (0.0, 0.0), (100.0, 50.0))
+    image, raster = slice_image(panel, max_pixels=100)
+    points = torch.cat(asked)
+    assert image.shape == (50, 100)
+    assert len(points) == 5000
+    assert raster.spacing == pytest.approx(1.0)
+    inside_a_cell = (points / 0.1) % 1.0
+    torch.testing.assert_close(inside_a_cell, torch.full_like(inside_a_cell, 0.5), atol=1e-6, rtol=0)
+
+
+def test_shrinking_keeps_walls_and_unknown():
+    theta = torch.full((4, 4), 0.5, dtype=torch.float64)
+    theta[0, :2] = torch.tensor([0.9, 0.1])  # a wall cell among free and unknown ones
+    theta[2:, 2:] = 0.2
+    theta[3, 3] = 0.4
+
+    def occupancy(points):
+        cell = points.floor().long()
+        return theta[cell[:, 1], cell[:, 0]]
+
+    image, raster = slice_image(MapPanel("m", occupancy, 1.0, (0.0, 0.0), (4.0, 4.0)), shown_pixels=2)
+    np.testing.assert_allclose(image, [[0.9, np.nan], [np.nan, 0.25]])
+    assert raster.extent == (0.0, 4.0, 0.0, 4.0)
+
+
+def test_heights_are_of_the_highest_occupied_cell():
+    def occupancy(points):
+        x, _, z = points.unbind(1)
+        occupied = ((x < 1) & (z < 1)) | ((x > 2) & (z > 1) & (z < 2))
+        return torch.where(occupied, 0.9, 0.1)
+
+    panel = MapPanel("steps", occupancy, 1.0, (0.0, 0.0, 0.0), (3.0, 1.0, 4.0))
+    image, raster = height_image(panel, 0.5)
+    np.testing.assert_allclose(image, [[0.5, np.nan, 1.5]])
+    coarse, _ = height_image(panel, 0.5, max_queries=4)
+    assert coarse.size < image.size
+    assert raster.spacing == 1.0
+
+
+def test_unknown_cells_are_no_surface_however_low_the_threshold():
+    panel = MapPanel("nothing", unknown, 0.5, *box(3))
+    assert np.isnan(height_image(panel, 0.1)[0]).all()
+
+
+@pytest.mark.parametrize("roof", [2.0, 100.0])
+def test_a_roof_is_left_out_of_the_view_from_the_top(roof):
+    def occupancy(points):
+        return torch.where((points[:, 2] < 0) | (points[:, 2] > roof), 0.9, 0.1)
+
+    panel = MapPanel("room", occupancy, 0.5, (0.0, 0.0, -1.0), (4.0, 4.0, 3.0))
+    path = torch.tensor([[1.0, 1.0, 1.0], [3.0, 3.0, 1.0]], dtype=torch.float64)
+    assert roof_above(panel, path.numpy(), 0.5) == (roof == 2.0)
+    titles = [axes.get_title() for axes in map_figure([panel], path).axes]
+    assert any("below z = 1.5 m" in title for title in titles) == (roof == 2.0)
+    assert not any("below" in axes.get_title() for axes in map_figure([panel], path, ceiling=50.0).axes)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_scattered_blocks_are_shown_where_they_are(dim):
+    evidence = BlockEvidence(0.5, dim)
+    ends = torch.full((1, dim), -30.0, dtype=torch.float64)
+    evidence.add_rays(ends + 20, ends)
+    blocks = MapPanel.of_evidence("blocks", evidence)
+    assert -50 < blocks.low[0] <= -30
+    assert -10 <= blocks.high[0] < 10
+    empty = MapPanel.of_evidence("empty", BlockEvidence(0.1, dim))
+    assert np.isnan(slice_image(empty)[0]).all()
+    corners = (torch.zeros(dim), torch.ones(dim))
+    given = MapPanel.of_evidence("given", evidence, bounds=corners)
+    assert (given.low, given.high) == ((0.0,) * dim, (1.0,) * dim)
+
+
+def test_robust_bounds():
+    points = torch.zeros(1000, 2)
+    points[0] = torch.tensor([1e4, -1e4])
+    low, high = robust_bounds(points, torch.tensor([[5.0, 0.0]]), margin=1.0)
+    assert low == (-1.0, -1.0)
+    assert high == (6.0, 1.0)
+    assert robust_bounds(torch.empty(0, 3)) == ((-1.0,) * 3, (1.0,) * 3)
+    with pytest.raises(InvalidArgumentError, match=r"share=0\.0"):
+        robust_bounds(points, share=0.0)
+
+
+def test_arrays_are_taken_as_answers():
+    panel = MapPanel("array", lambda points: np.full(len(points), 0.25), 0.5, *box(2))
+    assert (slice_image(panel)[0] == 0.25).all()
+
+
+def test_says_what_is_wrong():
+    with pytest.raises(InvalidArgumentError, match="panels is empty"):
+        map_figure([])
+    with pytest.raises(InvalidArgumentError, match="span no region"):
+        MapPanel("flat", unknown, 0.1, (0.0, 0.0), (0.0, 1.0))
+    with pytest.raises(InvalidArgumentError, match="resolution=0"):
+        MapPanel("no cells", unknown, 0.0, *box(2))
+    flat, solid = (MapPanel("m", unknown, 0.5, *box(dim)) for dim in (2, 3))
+    with pytest.raises(InvalidArgumentError, match="all 3D"):
+        map_figure([flat, solid])
+    with pytest.raises(InvalidArgumentError, match="all 3D"):
+        map_figure([flat], torch.zeros(4, 3))
+    with pytest.raises(InvalidArgumentError, match="one probability for each point"):
+        slice_image(MapPanel("short", lambda points: torch.zeros(1), 0.5, *box(2)))
+
+
+def test_rasters_cover_the_region_on_the_lattice_of_cells():
+    raster = plan(MapPanel("m", unknown, 0.1, (-0.25, 0.3), (0.31, 0.4)))
+    assert raster.extent == pytest.approx((-0.3, 0.4, 0.3, 0.4))
+    assert raster.x[0] == pytest.approx(-0.25)
+    assert (len(raster.x), len(raster.y)) == (7, 1)

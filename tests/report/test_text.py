@@ -1,0 +1,101 @@
+"""Tables, byte by byte, and progress bars on standard error."""
+
+from __future__ import annotations
+
+import pytest
+
+from gmmtorch.report import ProgressBars, format_table
+from gmmtorch.report.table import format_bytes, format_value
+
+
+def test_table_is_aligned():
+    rows = [
+        {"method": "monte_carlo", "auc": 0.97654, "n_components": 12670, "nbytes": 28_100, "kept": 0.3},
+        {"method": "occupancy_grid", "auc": 1, "n_components": None, "nbytes": 1_250_000, "kept": 1.0},
+    ]
+    assert format_table(rows).splitlines() == [
+        "method             auc  n_components   nbytes  kept",
+        "--------------  ------  ------------  -------  ----",
+        "monte_carlo     0.9765        12,670  28.1 KB   0.3",
+        "occupancy_grid  1.0000             -  1.25 MB     1",
+    ]
+
+
+def test_columns_are_chosen_and_ordered_and_gaps_are_dashes():
+    rows = [{"b": 1, "a": "x"}, {"a": "longer"}]
+    assert format_table(rows, ["a", "b", "c"]) == ("a       b  c\n------  -  -\nx       1  -\nlonger  -  -")
+    assert format_table(rows).splitlines()[0] == "b  a"
+    assert format_table([]) == ""
+    assert format_table([], ["a", "bc"]) == "a  bc\n-  --"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("unknown_auc", 0.5, "0.5000"),
+        ("brier", 0.01234, "0.0123"),
+        ("seconds", 12.3456, "12.35"),
+        ("log_likelihood", -1.5, "-1.5"),
+        ("auc", float("nan"), "nan"),
+        ("auc", None, "-"),
+        ("n_points", 1136597, "1,136,597"),
+        ("bytes_sent", 999, "999 B"),
+        ("converged", True, "yes"),
+        ("times", [1.0, 2.0], "[2 values]"),
+        ("path", "two\nlines", "two lines"),
+    ],
+)
+def test_values(name, value, text):
+    assert format_value(name, value) == text
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "text"),
+    [
+        (0, "0 B"),
+        (999, "999 B"),
+        (1000, "1.00 KB"),
+        (28_100, "28.1 KB"),
+        (99_960, "100 KB"),
+        (999_499, "999 KB"),
+        (999_600, "1.00 MB"),
+        (5e15, "5000 TB"),
+    ],
+)
+def test_bytes(n_bytes, text):
+    assert format_bytes(n_bytes) == text
+
+
+def test_bars_open_and_close_with_their_stages(capsys):
+    with ProgressBars() as progress:
+        progress("fit", 0, 3)
+        progress("query", 1, None)
+        assert progress.stages == ("fit", "query")
+        progress("fit", 3, 3)
+        assert progress.stages == ("query",)
+        progress("fit", 2, 3)  # begins again
+        progress("fit", 1, 3)  # and again
+        progress("nothing", 0, 0)
+        assert progress.stages == ("query", "fit")
+    assert progress.stages == ()
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "fit" in captured.err
+
+
+def test_bars_close_on_an_error_and_are_quiet_when_disabled(capsys):
+    progress = ProgressBars()
+
+    def work():
+        with progress:
+            progress("fit", 1, 3)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        work()
+    assert progress.stages == ()
+    capsys.readouterr()
+    with ProgressBars(enabled=False) as progress:
+        progress("fit", 1, 3)
+    captured = capsys.readouterr()
+    assert captured.out + captured.err == ""
