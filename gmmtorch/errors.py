@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from sklearn.exceptions import NotFittedError as _SklearnNotFittedError
-
 
 class GmmTorchError(Exception):
     """Base of every error that gmmtorch raises on purpose."""
@@ -26,10 +24,6 @@ class MissingDataError(GmmTorchError, FileNotFoundError):
 
 class MemoryLimitError(GmmTorchError, MemoryError):
     """What was asked for does not fit into the memory allowed for it."""
-
-
-class NotFittedError(GmmTorchError, _SklearnNotFittedError):
-    """A model was used before it was fitted."""
 
 
 class NumericalError(GmmTorchError, ArithmeticError):

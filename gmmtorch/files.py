@@ -19,6 +19,7 @@ from gmmtorch.errors import DataError, MissingDataError
 
 MAX_FILE_BYTES = 8 << 30
 _MAX_HEADER_BYTES = 1 << 20
+NARROW_DTYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
@@ -101,6 +102,12 @@ def _header(data: bytes, path: Path) -> dict[str, str]:
         return header
     except (ValueError, AttributeError, RecursionError) as error:
         raise DataError(f"{path} is truncated, or not a safetensors file: {error}") from error
+
+
+def narrowest(values: Tensor) -> Tensor:
+    """Whole numbers ≥ 0 in the narrowest of uint8, int16, int32 and int64 that holds them all."""
+    largest = int(values.max()) if values.numel() else 0
+    return values.to(next(dtype for dtype in NARROW_DTYPES if largest <= torch.iinfo(dtype).max))
 
 
 def require(

@@ -111,6 +111,10 @@ def test_json_comes_back_and_nan_is_refused(tmp_path):
     assert json.loads((tmp_path / "r.json").read_text()) == value
 
 
+def test_the_same_content_is_the_same_bytes():
+    assert len({sound_file() for _ in range(10)}) == 1
+
+
 # -- reading --------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,17 @@ import pytest
 import gmmtorch
 
 PACKAGE = Path(gmmtorch.__file__).parent
-ROOMS = ["simulation", "datasets", "mixture", "occupancy", "mapping", "baselines", "evaluation", "report", "cli"]
+ROOMS = [
+    "simulation",
+    "datasets",
+    "mixture",
+    "occupancy",
+    "mapping",
+    "baselines",
+    "evaluation",
+    "report",
+    "cli",
+]
 GROUND = ["errors", "linalg", "files", "scan"]
 RANK = {**dict.fromkeys(GROUND, 0), **{room: i for i, room in enumerate(ROOMS, 1)}}
 OWNERS = {"hydra": {"cli"}, "omegaconf": {"cli"}, "matplotlib": {"report"}, "tensorboard": {"report"}}
@@ -122,7 +132,7 @@ def test_unknown_names_are_attribute_errors():
 
 @pytest.mark.parametrize("path", [p for p, _ in modules()], ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_the_names_a_module_exports_exist(path):
-    if '__all__' not in path.read_text(encoding="utf-8"):
+    if "__all__" not in path.read_text(encoding="utf-8"):
         return
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     module = importlib.import_module(".".join(parts).removesuffix(".__init__"))

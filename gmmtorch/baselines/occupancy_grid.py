@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.scan import ArrayLike, Scan
@@ -126,8 +126,8 @@ class OccupancyGrid:
             "anchor": blocks.anchor if blocks.anchor is not None else blocks.keys.new_zeros(blocks.dim),
             "keys": blocks.keys,
             "observed": _pack_bits(observed),
-            "hits": _narrowest(hits[observed]),
-            "misses": _narrowest(misses[observed]),
+            "hits": narrowest(hits[observed]),
+            "misses": narrowest(misses[observed]),
         }
         return pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts)
 
@@ -163,15 +163,6 @@ class OccupancyGrid:
         blocks.fill(anchor, keys, observed, *counts)
         grid._blocks = blocks
         return grid
-
-
-def _narrowest(values: Tensor) -> Tensor:
-    """Whole numbers ≥ 0 in the narrowest of uint8, int16, int32 and int64 that holds them all."""
-    largest = int(values.max()) if values.numel() else 0
-    for dtype in (torch.uint8, torch.int16, torch.int32):
-        if largest <= torch.iinfo(dtype).max:
-            return values.to(dtype)
-    return values.to(torch.int64)
 
 
 def _pack_bits(mask: Tensor) -> Tensor:

@@ -41,6 +41,12 @@ def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any
         sys.exit(130)
 
 
+def as_options(node: DictConfig) -> dict[str, Any]:
+    """A configuration node as keyword arguments."""
+    plain: Any = OmegaConf.to_container(node, resolve=True)
+    return {str(key): value for key, value in plain.items()}
+
+
 def run_dir() -> Path:
     """Where this run's files go: `hydra.run.dir`, or the sweep's folder for this job."""
     from hydra.core.hydra_config import HydraConfig
@@ -76,7 +82,7 @@ def open_dataset(config: DictConfig) -> Dataset:
     from gmmtorch import datasets
 
     options = {
-        key: config[key]
+        str(key): config[key]
         for key in config
         # A path that was not given is left to the reader, which says what it wants.
         if not OmegaConf.is_missing(config, key) and config[key] is not None

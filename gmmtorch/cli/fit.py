@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gmmtorch.cli import common, schema
 
@@ -44,7 +44,7 @@ def run(config: DictConfig) -> float:
             dataset.name,
             points,
             list(config.method),
-            fitting.FitOptions(**OmegaConf.to_container(config.mixture), dtype=config.runtime.dtype),
+            fitting.FitOptions(**common.as_options(config.mixture), dtype=config.runtime.dtype),
             config.test_share,
             config.seed,
             bars,

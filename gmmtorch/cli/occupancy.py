@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gmmtorch.cli import common, schema
 
@@ -37,7 +37,7 @@ def run(config: DictConfig) -> float:
     device = common.set_up(config.runtime)
     folder = common.run_dir()
     factories = occupancy.choose(list(config.method), occupancy.methods(_map_factory(config)))
-    protocol = occupancy.Protocol(**OmegaConf.to_container(config.evaluation))
+    protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     dataset = common.open_dataset(config.dataset)
     with ProgressBars(enabled=config.report.progress) as bars:
         scans = common.read_scans(dataset, range(len(dataset)), device, bars)
@@ -54,7 +54,7 @@ def _map_factory(config: DictConfig) -> Callable[[], GaussianMap]:
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.learning import LearningRule
 
-    options: dict[str, Any] = {str(key): value for key, value in config.map.items()}
+    options = common.as_options(config.map)
     options.pop("name")
     own = {key: options.pop(key) for key in ("window", "n_samples", "sampling", "prior")}
     rule = LearningRule(**options, dtype=config.runtime.dtype)

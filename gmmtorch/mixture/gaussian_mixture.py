@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from sklearn.base import BaseEstimator, DensityMixin
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.exceptions import NotFittedError as ScikitLearnNotFittedError
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, NotFittedError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture import em
@@ -28,6 +29,10 @@ Array = Tensor | np.ndarray
 RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
+
+
+class NotFittedError(GmmTorchError, ScikitLearnNotFittedError):
+    """A mixture was used before it was fitted."""
 
 
 class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):

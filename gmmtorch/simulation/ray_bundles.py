@@ -1,7 +1,8 @@
 """Which rays may meet which triangles: bundles of rays of similar direction against cones around triangles.
 
-Operations are kept small on purpose. Beyond some 32 thousand elements torch shares an operation among
-threads, and with many small operations on a busy machine threads wait for each other longer than they work.
+Operations are kept small on purpose, and gather with `index_select`. Beyond some 32 thousand elements
+(with `x[index]` sooner) torch shares an operation among threads, and on a busy machine these wait for each
+other at every one of many small operations, far longer than they work.
 """
 
 from __future__ import annotations
@@ -91,13 +92,14 @@ def candidates(bundles: Bundles, triangles: Tensor) -> Iterator[tuple[Tensor, Te
 
 def _expanded(bundles: Bundles, bundle: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor]:
     """Every ray of each bundle (Q,) with that bundle's triangle (Q,)."""
-    sizes = bundles.sizes[bundle]
+    sizes = bundles.sizes.index_select(0, bundle)
     ends = sizes.cumsum(0)
     is_next = torch.zeros(int(ends[-1]), dtype=torch.long)
-    is_next[ends[:-1]] = 1  # no bundle is empty; repeat_interleave would wake all threads
+    is_next[ends[:-1]] = 1  # no bundle is empty, so this counts up; repeat_interleave would wake all threads
     pair = is_next.cumsum(0)
-    within = torch.arange(pair.shape[0]) - (ends - sizes)[pair]
-    return bundles.rays[bundles.starts[bundle][pair] + within], triangle[pair]
+    shift = bundles.starts.index_select(0, bundle) - (ends - sizes)
+    position = torch.arange(pair.shape[0]) + shift.index_select(0, pair)
+    return bundles.rays.index_select(0, position), triangle.index_select(0, pair)
 
 
 def _cones(axis: Tensor, width: Tensor) -> Cones:

@@ -82,9 +82,9 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
         )
         lowest = torch.minimum(torch.minimum(side_a, side_b), side_c)
         highest = torch.maximum(torch.maximum(side_a, side_b), side_c)
-        bound = slack[triangle]
+        bound = slack.index_select(0, triangle)
         steepness = side_a + side_b + side_c  # d · normal
-        height = offsets[triangle]
+        height = offsets.index_select(0, triangle)
         if not one_origin:
             height = height - (normals[triangle] * origins[ray]).sum(1)
         t = height / steepness
@@ -94,7 +94,7 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
 
 
 def _dot(u: list[Tensor], v: list[Tensor]) -> Tensor:
-    """Dot products (P,) of vectors given by coordinate: gathering rows in one call would wake all threads."""
+    """Dot products (P,) of vectors given by coordinate."""
     total = u[0] * v[0]
     for a, b in zip(u[1:], v[1:], strict=True):
         total = torch.addcmul(total, a, b)

@@ -34,7 +34,10 @@ def test_number_sum_and_sum_of_products_are_conserved_within_the_limit(seed, n, 
     assert float(cells.weight.min()) >= 1
     assert float(cells.weight.sum()) == n
     torch.testing.assert_close(
-        (cells.features * cells.weight[:, None]).sum(0), quadratic_features(points).sum(0), rtol=1e-11, atol=1e-11
+        (cells.features * cells.weight[:, None]).sum(0),
+        quadratic_features(points).sum(0),
+        rtol=1e-11,
+        atol=1e-11,
     )
 
 

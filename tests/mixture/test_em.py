@@ -39,7 +39,9 @@ def scipy_log_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
     return np.stack(np.atleast_2d(columns), -1).reshape(len(points), -1)
 
 
-def brute_force_statistics(points: Tensor, weight: Tensor, parameters: Parameters) -> tuple[np.ndarray, float]:
+def brute_force_statistics(
+    points: Tensor, weight: Tensor, parameters: Parameters
+) -> tuple[np.ndarray, float]:
     """N_k, Σ γ x, Σ γ x_i x_j (i ≤ j), point by point."""
     joint = scipy_log_joint(points, parameters)
     dim = points.shape[1]
@@ -222,7 +224,9 @@ def two_thin_walls(generator: torch.Generator) -> tuple[Tensor, Parameters]:
     walls = torch.cat([torch.stack([off[0], along[0]], 1), torch.stack([along[1], off[1] + 0.2], 1)])
     points = torch.round(walls * 2**24) / 2**24
     covariances = torch.diag_embed(torch.tensor([[2e-6, 1.0], [1.0, 2e-6]], dtype=torch.float64))
-    return points, Parameters(torch.tensor([0.5, 0.5]).double(), points.new_tensor([[0, 0], [0, 0.2]]), covariances)
+    return points, Parameters(
+        torch.tensor([0.5, 0.5]).double(), points.new_tensor([[0, 0], [0, 0.2]]), covariances
+    )
 
 
 def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(generator):
@@ -264,9 +268,7 @@ def test_log_densities_far_out_have_the_digits_of_exact_arithmetic():
         for x in points.tolist():
             d = mpmath.matrix([mpmath.mpf(a) - mpmath.mpf(b) for a, b in zip(x, mean, strict=True)])
             squared = (d.T * inverse * d)[0]
-            expected.append(
-                float(mpmath.log(0.25) - (squared + log_det) / 2 - mpmath.log(2 * mpmath.pi))
-            )
+            expected.append(float(mpmath.log(0.25) - (squared + log_det) / 2 - mpmath.log(2 * mpmath.pi)))
     assert em.log_joint(points, parameters)[:, 0].tolist() == pytest.approx(expected, abs=1e-9)
 
 

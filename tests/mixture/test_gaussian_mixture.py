@@ -182,7 +182,8 @@ def test_only_the_ratios_of_the_weights_matter():
 
 
 @pytest.mark.parametrize(
-    "weight", [[1.0, -1.0, 1.0], [1.0, float("nan"), 1.0], [1.0, float("inf"), 1.0], [0.0] * 3, [1.0] * 2, [[1.0] * 3]]
+    "weight",
+    [[1.0, -1.0, 1.0], [1.0, float("nan"), 1.0], [1.0, float("inf"), 1.0], [0.0] * 3, [1.0] * 2, [[1.0] * 3]],
 )
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 def test_bad_weights_are_named(weight, kind):
@@ -193,11 +194,15 @@ def test_bad_weights_are_named(weight, kind):
 # -- kinds -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dtype", "expected"), [(np.float64, np.float64), (np.float32, np.float32), (int, np.float64)])
+@pytest.mark.parametrize(
+    ("dtype", "expected"), [(np.float64, np.float64), (np.float32, np.float32), (int, np.float64)]
+)
 def test_arrays_in_arrays_out(dtype, expected):
     x = (10 * blobs()).astype(dtype)
     gmm = GaussianMixture(3, random_state=0).fit(x)
-    assert all(isinstance(v, np.ndarray) for v in (gmm.weights_, gmm.means_, gmm.covariances_, gmm.precisions_))
+    assert all(
+        isinstance(v, np.ndarray) for v in (gmm.weights_, gmm.means_, gmm.covariances_, gmm.precisions_)
+    )
     assert gmm.score_samples(x).dtype == expected
     assert gmm.predict_proba(x).dtype == expected
     assert np.issubdtype(gmm.predict(x).dtype, np.integer)
@@ -266,6 +271,20 @@ def test_500_km_away_is_the_same_fit_moved(dim, dtype):
     assert far.n_iter_ == near.n_iter_
 
 
+@pytest.mark.parametrize("init", INITS)
+def test_thin_walls_500_km_apart_are_learned_in_one_cloud(init):
+    rng = np.random.default_rng(0)
+    wall = np.round(np.stack([rng.normal(size=400) * 1e-3, rng.uniform(-2, 2, 400)], 1) * 2**24) / 2**24
+    shifts = np.array([[-250_000.0, 0.0], [250_000.0, 4096.0]])
+    gmm = GaussianMixture(2, init_params=init, random_state=0, n_init=5, reg_covar=1e-8, max_iter=300)
+    gmm.fit(np.concatenate([wall + shift for shift in shifts]))
+    for shift in shifts:
+        k = np.abs(gmm.means_ - shift).sum(1).argmin()
+        np.testing.assert_allclose(gmm.means_[k] - shift, wall.mean(0), atol=1e-8)
+        expected = np.cov(wall.T, ddof=0) + 1e-8 * np.eye(2)
+        np.testing.assert_allclose(gmm.covariances_[k], expected, rtol=1e-4, atol=1e-9)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_moving_commutes_with_fitting_and_scoring(dim):
     x, motion, start = blobs(dim=dim), rigid_motion(dim), given_start(dim)
@@ -281,7 +300,9 @@ def test_moving_commutes_with_fitting_and_scoring(dim):
     np.testing.assert_allclose(one.means_, other.means_, atol=1e-9)
     np.testing.assert_allclose(one.covariances_, other.covariances_, atol=1e-9)
     np.testing.assert_allclose(
-        one.score_samples(moved_x), GaussianMixture(3, **start, dtype="float64").fit(x).score_samples(x), atol=1e-9
+        one.score_samples(moved_x),
+        GaussianMixture(3, **start, dtype="float64").fit(x).score_samples(x),
+        atol=1e-9,
     )
 
 
@@ -370,7 +391,9 @@ def test_given_means_alone_are_where_em_begins():
     gmm = GaussianMixture(3, means_init=means, max_iter=1, random_state=0, dtype="float64").fit(x)
     k_means = GaussianMixture(3, max_iter=1, random_state=0, dtype="float64").fit(x)
     assert not np.allclose(gmm.means_, k_means.means_)
-    both = GaussianMixture(3, means_init=torch.from_numpy(means), max_iter=1, random_state=0, dtype="float64").fit(x)
+    both = GaussianMixture(
+        3, means_init=torch.from_numpy(means), max_iter=1, random_state=0, dtype="float64"
+    ).fit(x)
     assert (both.means_ == gmm.means_).all()
 
 
@@ -407,7 +430,9 @@ def test_warm_start_in_another_dimension_is_no_silent_mix_up():
 
 def test_progress_is_reported():
     seen: list[tuple[int, float]] = []
-    gmm = GaussianMixture(3, random_state=0).fit(blobs(), on_iteration=lambda i, bound: seen.append((i, bound)))
+    gmm = GaussianMixture(3, random_state=0).fit(
+        blobs(), on_iteration=lambda i, bound: seen.append((i, bound))
+    )
     assert seen == list(enumerate(gmm.lower_bounds_, 1))
     assert gmm.n_iter_ == len(seen)
     assert gmm.lower_bound_ == seen[-1][1]
@@ -467,7 +492,9 @@ def test_one_point_is_a_component_of_the_least_variance(init):
 def test_equal_points_are_a_component_of_the_least_variance(init):
     gmm = GaussianMixture(2, init_params=init, random_state=0).fit(np.full((50, 2), 0.1))
     assert all_finite(gmm)
-    np.testing.assert_allclose(gmm.covariances_, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(
+        gmm.covariances_, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), rtol=1e-6, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("init", INITS)
@@ -564,7 +591,9 @@ def test_before_fitting_every_question_says_so(ask):
         ask(GaussianMixture())
 
 
-@pytest.mark.parametrize("name", ["means_", "weights_", "covariances_", "precisions_", "lower_bound_", "n_iter_"])
+@pytest.mark.parametrize(
+    "name", ["means_", "weights_", "covariances_", "precisions_", "lower_bound_", "n_iter_"]
+)
 def test_before_fitting_there_are_no_fitted_attributes(name):
     assert not hasattr(GaussianMixture(), name)
     assert hasattr(fitted(), name)
@@ -704,7 +733,13 @@ def test_a_mixture_of_given_parameters_is_a_fitted_one(kind, tmp_path):
     gmm = fitted()
     parts = (kind(p.copy()) for p in (gmm.weights_, gmm.means_, gmm.covariances_))
     other = GaussianMixture.from_parameters(*parts, tol=0.5, lower_bounds=[-3.0, -2.0], converged=False)
-    assert (other.n_components, other.tol, other.n_iter_, other.lower_bound_, other.converged_) == (3, 0.5, 2, -2.0, False)
+    assert (other.n_components, other.tol, other.n_iter_, other.lower_bound_, other.converged_) == (
+        3,
+        0.5,
+        2,
+        -2.0,
+        False,
+    )
     assert (other.score_samples(blobs()) == gmm.score_samples(blobs())).all()
     assert isinstance(other.means_, Tensor) == (kind is torch.from_numpy)
     other.save(tmp_path / "m.safetensors")
@@ -751,7 +786,9 @@ def test_what_is_loaded_is_what_was_saved(tmp_path, kind):
 
 def test_parameters_that_json_lacks_do_not_prevent_saving(tmp_path):
     start = {name: torch.from_numpy(value) for name, value in given_start(2).items()}
-    gmm = GaussianMixture(3, **start, random_state=torch.Generator().manual_seed(0), tol=np.float32(0.01)).fit(blobs())
+    gmm = GaussianMixture(
+        3, **start, random_state=torch.Generator().manual_seed(0), tol=np.float32(0.01)
+    ).fit(blobs())
     gmm.save(tmp_path / "m.safetensors")
     assert torch.equal(GaussianMixture.load(tmp_path / "m.safetensors").means, gmm.means)
 

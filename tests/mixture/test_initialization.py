@@ -96,7 +96,9 @@ def test_isotropic_starts_share_the_clouds_variance(method, dim):
 
 def test_kmeans_gives_each_cluster_its_moments():
     centers = torch.tensor([[-9.0, 0.0], [0.0, 9.0], [9.0, 0.0]], dtype=torch.float64)
-    points = torch.cat([center + 0.3 * cloud(n, 2, n) for center, n in zip(centers, (30, 50, 20), strict=True)])
+    points = torch.cat(
+        [center + 0.3 * cloud(n, 2, n) for center, n in zip(centers, (30, 50, 20), strict=True)]
+    )
     weights, means, covariances = begin("kmeans", points, 3)
     order = means[:, 0].argsort()
     np.testing.assert_allclose(weights[order].numpy(), [0.3, 0.5, 0.2], rtol=1e-10)

@@ -28,7 +28,8 @@ class WithoutMotion(GaussianMixture):
 
 
 CHECKS = [
-    (estimator, check) for estimator, check in estimator_checks_generator(WithoutMotion(), mark=None, legacy=True)
+    (estimator, check)
+    for estimator, check in estimator_checks_generator(WithoutMotion(), mark=None, legacy=True)
 ]
 
 

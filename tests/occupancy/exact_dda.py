@@ -9,7 +9,9 @@ from fractions import Fraction
 Voxel = tuple[int, ...]
 
 
-def voxels_left(start: Sequence[float], end: Sequence[float], shape: Sequence[int] | None = None) -> list[Voxel]:
+def voxels_left(
+    start: Sequence[float], end: Sequence[float], shape: Sequence[int] | None = None
+) -> list[Voxel]:
     """Voxels that the segment leaves, in order, of those inside `shape` (all of them if None).
 
     Voxel i is [i, i+1) on every axis; of planes crossed in the same point that of the lower axis is

@@ -181,7 +181,9 @@ def test_a_stray_far_return_costs_its_own_ray():
     near = counted(origins, ends)
     stray = torch.tensor([[0.3, 0.3, 0.3]]).double(), torch.tensor([[60.3, 50.7, 5.1]]).double()
     both = counted(torch.cat([origins, stray[0]]), torch.cat([ends, stray[1]]))
-    walked = sum(abs(math.floor(b) - math.floor(a)) for a, b in zip(stray[0][0], stray[1][0], strict=True)) + 4
+    walked = (
+        sum(abs(math.floor(b) - math.floor(a)) for a, b in zip(stray[0][0], stray[1][0], strict=True)) + 4
+    )
     assert both.n_blocks - near.n_blocks <= walked  # blocks have a side of 1 m
     box = 60 * 50 * 5 * both.cells_per_block
     assert both.n_blocks * both.cells_per_block < box / 50
@@ -235,7 +237,10 @@ def test_a_resolution_that_is_none_is_refused(resolution):
 @pytest.mark.parametrize("offset", [500_000.0, -500_000.0, 4_000_000.0])
 def test_utm_coordinates_count_as_those_near_the_origin(dim, offset):
     origins, ends = random_rays(100, dim)
-    near, far = counted(origins, ends), counted(origins + offset, ends + offset)  # multiples of a block's side
+    near, far = (
+        counted(origins, ends),
+        counted(origins + offset, ends + offset),
+    )  # multiples of a block's side
     assert near.n_blocks == far.n_blocks
     assert torch.equal(near.in_key_order()[0], far.in_key_order()[0])
     assert torch.equal(near.in_key_order()[1], far.in_key_order()[1])
@@ -246,7 +251,10 @@ def test_utm_coordinates_count_as_those_near_the_origin(dim, offset):
 
 @pytest.mark.parametrize("offset", [500_000.0, 4_000_000.0])
 def test_utm_coordinates_work_at_resolutions_that_are_no_binary_fraction(offset):
-    start, end = torch.tensor([[offset + 0.53, offset + 0.47]]).double(), torch.tensor([[offset + 2.03, offset + 0.47]]).double()
+    start, end = (
+        torch.tensor([[offset + 0.53, offset + 0.47]]).double(),
+        torch.tensor([[offset + 2.03, offset + 0.47]]).double(),
+    )
     blocks = counted(start, end, 0.1)
     assert float(blocks.lookup(end)) > 0.5
     between = start + (end - start) * torch.linspace(0, 0.9, 10, dtype=torch.float64)[:, None]

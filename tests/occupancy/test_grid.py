@@ -35,7 +35,9 @@ def test_flat_indices_are_row_major(grid):
 
 def test_cells_are_half_open():
     grid = VoxelGrid((0.0, 0.0), 0.5, (2, 3))
-    points = torch.tensor([[0, 0], [0.5, 0], [0, 0.5], [0.999, 1.499], [1.0, 0], [0, 1.5], [-1e-9, 0]]).double()
+    points = torch.tensor(
+        [[0, 0], [0.5, 0], [0, 0.5], [0.999, 1.499], [1.0, 0], [0, 1.5], [-1e-9, 0]]
+    ).double()
     cell, inside = grid.flat_index(points)
     assert cell.tolist() == [0, 3, 1, 5, 0, 0, 0]
     assert inside.tolist() == [True] * 4 + [False] * 3
@@ -69,7 +71,12 @@ def test_covering_takes_tensors_and_a_point():
 
 @pytest.mark.parametrize(
     ("low", "high"),
-    [([0, 0], [300, 500]), ([0, 0, 0], [80, 70, 90]), ([0, 0, 0], [2000, 2000, 0.01]), ([0, 0, 0], [90000, 0, 0])],
+    [
+        ([0, 0], [300, 500]),
+        ([0, 0, 0], [80, 70, 90]),
+        ([0, 0, 0], [2000, 2000, 0.01]),
+        ([0, 0, 0], [90000, 0, 0]),
+    ],
     ids=["square", "cube", "thin slab", "line"],
 )
 def test_a_grid_too_large_names_its_bytes_and_a_resolution_that_fits(low, high):
@@ -108,7 +115,9 @@ def test_a_shape_or_origin_that_makes_no_grid_is_refused(origin, shape):
         VoxelGrid(origin, 0.1, shape)
 
 
-@pytest.mark.parametrize(("low", "high"), [([0, 0], [-1, 1]), ([0, float("nan")], [1, 1]), ([0, 0], [1, float("inf")])])
+@pytest.mark.parametrize(
+    ("low", "high"), [([0, 0], [-1, 1]), ([0, float("nan")], [1, 1]), ([0, 0], [1, float("inf")])]
+)
 def test_a_box_that_is_none_is_refused(low, high):
     with pytest.raises(InvalidArgumentError, match=r"low|high"):
         VoxelGrid.covering(low, high, 0.1)

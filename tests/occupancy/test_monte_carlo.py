@@ -95,7 +95,10 @@ def test_hits_are_the_counts_share_of_the_density_in_2d():
 
 
 def test_hits_are_the_counts_share_of_the_density_in_3d():
-    mean, covariance = np.array([2.0, 0.3, 0.1]), np.array([[0.2, 0.08, 0], [0.08, 0.1, 0.02], [0, 0.02, 0.15]])
+    mean, covariance = (
+        np.array([2.0, 0.3, 0.1]),
+        np.array([[0.2, 0.08, 0], [0.08, 0.1, 0.02], [0, 0.02, 0.15]]),
+    )
     grid = VoxelGrid((1.0, -0.75, -0.75), 0.5, (4, 4, 4))
     expected = 20 * box_probability(grid, mean, covariance)
     found = evidence_of(grid, cones([mean], [covariance], [[0, 0, 0]], [20.0]), 1 << 17).hits.numpy()
@@ -172,7 +175,9 @@ def test_weights_add_up_to_the_count_of_points(sampling, n):
 @pytest.mark.parametrize("sampling", ["sobol", "stratified"])
 def test_each_cones_weights_add_up_to_its_own_count(sampling):
     what = three_cones()
-    rays = sample_rays(what._replace(origins=torch.diag(torch.tensor([1.0, 2.0, 3.0])).double()), 333, seeded(), sampling)
+    rays = sample_rays(
+        what._replace(origins=torch.diag(torch.tensor([1.0, 2.0, 3.0])).double()), 333, seeded(), sampling
+    )
     for cone in range(3):
         own = rays.origins[:, cone] != 0
         assert float(rays.weights[own].sum()) == pytest.approx(float(what.counts[cone]))

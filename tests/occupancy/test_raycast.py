@@ -43,7 +43,9 @@ def check(starts: Tensor, ends: Tensor, shape: tuple[int, ...]) -> None:
     assert visited(starts, ends, shape) == expected(starts, ends, shape)
 
 
-def random_rays(n: int, shape: tuple[int, ...], margin: float, step: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+def random_rays(
+    n: int, shape: tuple[int, ...], margin: float, step: float, seed: int = 0
+) -> tuple[Tensor, Tensor]:
     """Ends within the box grown by `margin` of its size, on multiples of `step`."""
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(shape, dtype=torch.float64)
@@ -130,7 +132,12 @@ def test_a_ray_of_no_length_leaves_nothing(point):
 
 @pytest.mark.parametrize(
     ("start", "end"),
-    [([-2.0, -1.0], [-1.0, 7.0]), ([6.0, 0.5], [9.0, 4.5]), ([-1.0, 4.5], [4.5, 10.0]), ([-3.0, 5.0], [9.0, 5.0])],
+    [
+        ([-2.0, -1.0], [-1.0, 7.0]),
+        ([6.0, 0.5], [9.0, 4.5]),
+        ([-1.0, 4.5], [4.5, 10.0]),
+        ([-3.0, 5.0], [9.0, 5.0]),
+    ],
 )
 def test_rays_that_pass_by_outside_report_nothing(start, end):
     assert one(start, end, (5, 5)) == []
@@ -146,7 +153,11 @@ nice = st.sampled_from([-2.0, 0.0, 0.5, 1.0, 2.0, 2.25, 3.0, 4.0, 5.0, 8.0]) | c
 
 
 @settings(max_examples=150)
-@given(st.sampled_from([2, 3]).flatmap(lambda d: st.lists(st.lists(nice, min_size=2 * d, max_size=2 * d), min_size=1, max_size=6)))
+@given(
+    st.sampled_from([2, 3]).flatmap(
+        lambda d: st.lists(st.lists(nice, min_size=2 * d, max_size=2 * d), min_size=1, max_size=6)
+    )
+)
 def test_any_rays_agree_with_the_oracle(rows):
     rays = torch.tensor(rows, dtype=torch.float64)
     dim = rays.shape[1] // 2
@@ -156,6 +167,18 @@ def test_any_rays_agree_with_the_oracle(rows):
 def test_float32_rays_are_taken_as_they_are():
     starts, ends = random_rays(200, (7, 9), 0.5, 2.0**-10)
     assert visited(starts.float(), ends.float(), (7, 9)) == expected(starts, ends, (7, 9))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_each_voxel_occurs_once_where_rounding_decides_which_plane_comes_first(dim):
+    # Through edges and corners all the way, in coordinates that are no binary fractions.
+    starts = torch.arange(0.1, 1.0, 0.1, dtype=torch.float64)[:, None].repeat(1, dim)
+    starts[:, 0] += 0.03
+    ends = starts + 12.3
+    ends[:, 0] += 0.5
+    found = visited(starts, ends, (20,) * dim)
+    assert len(found) == len(set(found))
+    assert len(found) == len(expected(starts, ends, (20,) * dim))
 
 
 # -- chunks, strides, work ----------------------------------------------------------------------------
@@ -213,7 +236,7 @@ def test_a_ray_of_500_km_costs_no_more_than_the_grid(direction):
 
 
 def test_a_ray_of_500_km_visits_what_exact_arithmetic_says():
-    starts = torch.tensor([[-2.0**22 + 0.25, 1.5], [2.0**22, 2.0**21]], dtype=torch.float64)
+    starts = torch.tensor([[-(2.0**22) + 0.25, 1.5], [2.0**22, 2.0**21]], dtype=torch.float64)
     ends = torch.tensor([[2.0**22, 2.75], [-(2.0**22) + 8, -(2.0**21) + 8]], dtype=torch.float64)
     found = visited(starts, ends, (9, 9))
     # Only the middle of the oracle's walk is affordable: cut the rays at exact points around the grid.

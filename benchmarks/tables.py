@@ -1,0 +1,50 @@
+"""Tables of measurements, written between markers into BENCHMARKS.md."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy
+import sklearn
+import torch
+
+from gmmtorch.files import write_bytes
+
+PAGE = Path(__file__).resolve().parent.parent / "BENCHMARKS.md"
+
+
+def hardware() -> str:
+    """The machine and the versions, in a line."""
+    model = platform.processor() or platform.machine()
+    cpu_info = Path("/proc/cpuinfo")
+    if cpu_info.exists():
+        names = [
+            line.split(":")[1].strip() for line in cpu_info.read_text().splitlines() if "model name" in line
+        ]
+        model = names[0] if names else model
+    return (
+        f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used; torch {torch.__version__}, "
+        f"scikit-learn {sklearn.__version__}, numpy {numpy.__version__}, Python {platform.python_version()}"
+    )
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def publish(name: str, text: str) -> None:
+    """Put `text` between the markers of `name` in BENCHMARKS.md, which must be there."""
+    page = PAGE.read_text()
+    begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    if begin not in page or end not in page:
+        raise SystemExit(f"BENCHMARKS.md has no place for {name!r}: add {begin} and {end}.")
+    before, rest = page.split(begin)
+    after = rest.split(end)[1]
+    write_bytes(PAGE, f"{before}{begin}\n{text}\n{end}{after}".encode())
+    print(f"\n{name}\n{text}")
