@@ -41,6 +41,7 @@ class OccupancyGrid:
         log_odds: the updates, for the log-odds variant; None counts.
         prior: N_p of (3.9); counts only.
         memory_limit: bytes that the cells may take.
+        compiled: cast rays with torch.compile, see `traverse`.
     """
 
     def __init__(
@@ -50,18 +51,22 @@ class OccupancyGrid:
         log_odds: LogOdds | None = None,
         prior: float = 1.0,
         memory_limit: int = MEMORY_LIMIT,
+        compiled: bool = False,
     ) -> None:
         self.resolution = check_resolution(resolution)
         self.log_odds = log_odds
         self.prior = float(prior)
         self.memory_limit = memory_limit
+        self.compiled = compiled
         self._blocks: BlockEvidence | None = None
         self._waiting: list[Scan] = []  # counts are additive, so scans are cast many at a time
 
     def insert(self, scan: Scan) -> None:
         """Count the beams of a scan."""
         if self._blocks is None:
-            self._blocks = BlockEvidence(self.resolution, scan.dim, scan.points.device, self.memory_limit)
+            self._blocks = BlockEvidence(
+                self.resolution, scan.dim, scan.points.device, self.memory_limit, self.compiled
+            )
         elif scan.dim != self._blocks.dim:
             raise InvalidArgumentError(
                 f"scan is {scan.dim}-dimensional, but the grid is {self._blocks.dim}-dimensional."

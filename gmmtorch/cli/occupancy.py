@@ -36,7 +36,9 @@ def run(config: DictConfig) -> float:
 
     device = common.set_up(config.runtime)
     folder = common.run_dir()
-    factories = occupancy.choose(list(config.method), occupancy.methods(_map_factory(config)))
+    limits = {"memory_limit": config.runtime.memory_limit, "compiled": config.runtime.compile}
+    known = occupancy.methods(_map_factory(config, limits), **limits)
+    factories = occupancy.choose(list(config.method), known)
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     dataset = common.open_dataset(config.dataset)
     with ProgressBars(enabled=config.report.progress) as bars:
@@ -49,7 +51,7 @@ def run(config: DictConfig) -> float:
     return float(outcome.rows[-1]["auc"])
 
 
-def _map_factory(config: DictConfig) -> Callable[[], GaussianMap]:
+def _map_factory(config: DictConfig, limits: dict[str, Any]) -> Callable[[], GaussianMap]:
     """Makes empty maps with the options `map.*`."""
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.learning import LearningRule
@@ -58,9 +60,7 @@ def _map_factory(config: DictConfig) -> Callable[[], GaussianMap]:
     options.pop("name")
     own = {key: options.pop(key) for key in ("window", "n_samples", "sampling", "prior")}
     rule = LearningRule(**options, dtype=config.runtime.dtype)
-    return lambda: GaussianMap(
-        learning=rule, random_state=config.seed, memory_limit=config.runtime.memory_limit, **own
-    )
+    return lambda: GaussianMap(learning=rule, random_state=config.seed, **own, **limits)
 
 
 def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:

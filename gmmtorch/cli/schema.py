@@ -90,6 +90,7 @@ class Runtime:
     device: str = "cpu"
     threads: int | None = 1
     dtype: str = "float32"
+    compile: bool = False
     memory_limit: int = 4 << 30
 
 

@@ -80,12 +80,17 @@ MapFactory = Callable[[float], OccupancyMap]
 """Makes an empty map for a resolution (m)."""
 
 
-def methods(new_map: Callable[[], GaussianMap]) -> dict[str, MapFactory]:
-    """Every method by name; `new_map` makes the mixture map that ours answer from."""
+def methods(new_map: Callable[[], GaussianMap], **grid_options: Any) -> dict[str, MapFactory]:
+    """Every method by name; `new_map` makes the mixture map that ours answer from.
+
+    `grid_options` are those of `OccupancyGrid`, other than its kind.
+    """
     return {
         "monte_carlo": lambda resolution: new_map(),
-        "occupancy_grid": lambda resolution: OccupancyGrid(resolution),
-        "occupancy_log_odds": lambda resolution: OccupancyGrid(resolution, log_odds=LogOdds()),
+        "occupancy_grid": lambda resolution: OccupancyGrid(resolution, **grid_options),
+        "occupancy_log_odds": lambda resolution: OccupancyGrid(
+            resolution, log_odds=LogOdds(), **grid_options
+        ),
     }
 
 

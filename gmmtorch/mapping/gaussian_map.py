@@ -43,6 +43,7 @@ class GaussianMap(nn.Module):
         random_state: seed; the same scans in the same order then give the same map and answers.
         robot: first half of the components' ids.
         memory_limit: bytes that evidence may take.
+        compiled: cast rays with torch.compile, see `traverse`.
 
     Asking a map does not change it: scans of a window that is not full yet are fitted for the
     answer, and again when the window is.
@@ -70,6 +71,7 @@ class GaussianMap(nn.Module):
         random_state: int = 0,
         robot: int = 0,
         memory_limit: int = MEMORY_LIMIT,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         if window < 1 or n_samples < 1:
@@ -85,6 +87,7 @@ class GaussianMap(nn.Module):
         self.random_state = int(random_state)
         self.robot = robot
         self.memory_limit = memory_limit
+        self.compiled = compiled
         self.frame: Tensor | None = None  # (D,) whole metres, near the first scan
         self._pending: list[Scan] = []
         self._n_windows = 0
@@ -259,7 +262,9 @@ class GaussianMap(nn.Module):
         _check_method(method)
         resolution = self.resolution if resolution is None else check_resolution(resolution)
         if resolution not in self._answers:
-            evidence = BlockEvidence(resolution, cast(int, self.dim), self.means.device, self.memory_limit)
+            evidence = BlockEvidence(
+                resolution, cast(int, self.dim), self.means.device, self.memory_limit, self.compiled
+            )
             self._cast(evidence)
             self._answers[resolution] = evidence
         return self._answers[resolution]

@@ -7,6 +7,8 @@ the bounding box, so a stray return at 200 m costs its ray and nothing else.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -42,12 +44,14 @@ class BlockEvidence:
         dim: int,
         device: torch.device | str | None = None,
         memory_limit: int = MEMORY_LIMIT,
+        compiled: bool = False,
     ) -> None:
         self.resolution = check_resolution(resolution)
         self.dim = dim
         self.block_side = 1 << _BLOCK_BITS[dim]
         self.cells_per_block = self.block_side**dim
         self.memory_limit = memory_limit
+        self.compiled = compiled  # see `traverse`
         self.anchor: Tensor | None = None
         """Block coordinates (D,) that keys are relative to, near the first ray: maps far out work too."""
         self.keys = torch.empty(0, dtype=torch.int64, device=device)
@@ -174,7 +178,10 @@ class BlockEvidence:
         blocks = torch.stack([(index >> shift) & ((1 << b) - 1) for shift, b in _fields(bits)], 1)
         keys = self.pack(blocks + low.long() - self._anchored())
         self._allocate(keys)
-        offsets = torch.zeros(1 << sum(bits), dtype=torch.int64, device=low.device)
+        # Rounding at a corner may let the fine traversal touch a block that the coarse one did not:
+        # that visit, of no length, goes to the spare block behind the last.
+        spare = self.n_blocks * self.cells_per_block
+        offsets = torch.full((1 << sum(bits),), spare, dtype=torch.int64, device=low.device)
         offsets[index] = self._find(keys) * self.cells_per_block
         return _Window(low, bits, offsets)
 
@@ -193,9 +200,9 @@ class BlockEvidence:
                 f"above the limit of {self.memory_limit:,}; a resolution of "
                 f"{self.resolution * factor * 1.1:.3g} m fits."
             )
-        if n_blocks > self._storage.shape[1]:
+        if n_blocks + 1 > self._storage.shape[1]:  # one to spare
             # Grow by half again, so that many small insertions stay cheap.
-            capacity = max(n_blocks, self._storage.shape[1] * 3 // 2)
+            capacity = max(n_blocks + 1, self._storage.shape[1] * 3 // 2)
             grown = self._storage.new_zeros(2, capacity, self.cells_per_block)
             grown[:, : self.n_blocks] = self._storage[:, : self.n_blocks]
             self._storage = grown
@@ -213,22 +220,16 @@ class BlockEvidence:
         corner = window.low * side
         starts = origins.double() / self.resolution - corner
         stops = ends.double() / self.resolution - corner
-        misses = self.misses.view(-1)
+        misses = self._storage[1].view(-1)
         ones = torch.ones((), dtype=torch.float64, device=misses.device)
         weight = None if weights is None else weights.double()
-        for visit in traverse(starts, stops, shape, chunk_visits, _power_of_two_strides(bits)):
-            voxel = visit.voxel.int() if sum(bits) < 31 else visit.voxel
-            # Cut each axis's field into block bits and cell bits, and gather either sort.
-            block, local = voxel >> local_bits & ((1 << window.bits[-1]) - 1), voxel & (side - 1)
-            for axis in range(self.dim - 2, -1, -1):
-                shift, width = _fields(bits)[axis][0], window.bits[axis]
-                above = sum(window.bits[axis + 1 :])
-                block |= (voxel >> (shift + local_bits - above)) & (((1 << width) - 1) << above)
-                place = local_bits * (self.dim - 1 - axis)
-                local |= (voxel >> (shift - place)) & ((side - 1) << place)
-            index = window.offsets.index_select(0, block).add_(local)
+        locate = _compiled_storage_index() if self.compiled else _storage_index
+        strides = _power_of_two_strides(bits)
+        for visit in traverse(starts, stops, shape, chunk_visits, strides, self.compiled):
+            index = locate(visit.voxel, window.offsets, window.bits, local_bits)
             source = ones.expand(index.shape) if weight is None else weight[visit.ray]
             misses.scatter_add_(0, index, source)
+        self._storage[1, self.n_blocks] = 0  # what spilled
 
     def fill(self, anchor: Tensor, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor) -> None:
         """Set the cells marked in `observed` (B, cells), blocks in order of `keys`, of an empty lattice."""
@@ -265,6 +266,28 @@ class BlockEvidence:
         blocks = self.unpack(self.keys) + self._anchored()
         size = self.block_side * self.resolution
         return blocks.amin(0) * size, (blocks.amax(0) + 1) * size
+
+
+def _storage_index(voxel: Tensor, offsets: Tensor, block_bits: tuple[int, ...], local_bits: int) -> Tensor:
+    """Storage index (V,) of packed cell indices: each axis's field is cut into block bits and cell
+    bits, and either sort is gathered."""
+    bits = tuple(b + local_bits for b in block_bits)
+    packed = voxel.int() if sum(bits) < 31 else voxel
+    side_mask = (1 << local_bits) - 1
+    block, local = packed >> local_bits & ((1 << block_bits[-1]) - 1), packed & side_mask
+    for axis in range(len(bits) - 2, -1, -1):
+        shift, width = _fields(bits)[axis][0], block_bits[axis]
+        above = sum(block_bits[axis + 1 :])
+        block = block | ((packed >> (shift + local_bits - above)) & (((1 << width) - 1) << above))
+        place = local_bits * (len(bits) - 1 - axis)
+        local = local | ((packed >> (shift - place)) & (side_mask << place))
+    return offsets.index_select(0, block).add_(local)
+
+
+@functools.cache
+def _compiled_storage_index() -> Callable[..., Tensor]:
+    compiled: Callable[..., Tensor] = torch.compile(_storage_index, dynamic=True)
+    return compiled
 
 
 def _power_of_two_strides(bits: tuple[int, ...]) -> list[int]:

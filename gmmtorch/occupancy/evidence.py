@@ -108,6 +108,7 @@ class Evidence:
         weights: Tensor | None = None,
         is_hit: Tensor | None = None,
         chunk_visits: int = CHUNK_VISITS,
+        compiled: bool = False,
     ) -> None:
         """Count rays: a hit in the cell of each end, a miss in every cell passed on the way to it.
 
@@ -117,11 +118,12 @@ class Evidence:
             weights: (R,) how many rays each stands for; 1 if not given.
             is_hit: (R,) False for rays that met no surface: misses only. All True if not given.
             chunk_visits: voxel visits worked on at once; bounds the memory, not the result.
+            compiled: see `traverse`.
         """
         starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)
         misses = self.misses.view(-1)
         ones = torch.ones((), dtype=torch.float64, device=misses.device)
-        for visit in traverse(starts, stops, self.grid.shape, chunk_visits):
+        for visit in traverse(starts, stops, self.grid.shape, chunk_visits, compiled=compiled):
             source = ones.expand(visit.voxel.shape) if weights is None else weights.double()[visit.ray]
             misses.scatter_add_(0, visit.voxel, source)
         cell, counted = self.grid.flat_index(ends)

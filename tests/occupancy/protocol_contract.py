@@ -144,7 +144,8 @@ class OccupancyMapContract(ABC):
         inside = 2 * torch.rand(50, dim, generator=generator, dtype=torch.float64)
         theta = self.ask(made, inside)
         assert 0 <= float(theta.min()) <= float(theta.max()) <= 1
-        assert (theta != 0.5).any() or n + m < 5
+        seen = torch.cat([ends, (ends + scan.origin) / 2])
+        assert (self.ask(made, seen) != 0.5).any()
         assert (self.ask(made, inside + 1000) == 0.5).all()
 
     @dims

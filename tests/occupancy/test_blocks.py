@@ -105,7 +105,7 @@ def test_packing_blocks_is_undone_and_keeps_their_order(dim):
     assert index[keys.argsort()].tolist() == sorted(index.tolist())
 
 
-# -- ties: exact on the lattice, and never far from the ray ---------------------------------------------------
+# -- ties: exact on the lattice, and never far from the ray --------------------------------------------
 
 
 @given(

@@ -1,0 +1,198 @@
+"""Scores against scikit-learn, enumeration and formulas written out."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
+from sklearn.metrics import brier_score_loss, roc_auc_score
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.metrics import auc_interval, brier, psnr2, roc, unknown_scores
+
+eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)
+"""Few values, so that ties are common."""
+
+
+def scores(n: int, shift: float, seed: int, levels: int | None = None) -> Tensor:
+    """Probabilities (n,), the higher the larger the shift; on a few levels, so that many tie, if asked."""
+    raw = np.random.default_rng(seed).normal(shift, 1.0, n)
+    theta = torch.from_numpy(1 / (1 + np.exp(-raw)))
+    return theta if levels is None else (theta * levels).round() / levels
+
+
+def labelled(occupied: Tensor, free: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    truth = np.r_[np.ones(len(occupied)), np.zeros(len(free))]
+    return truth, torch.cat([occupied, free]).numpy()
+
+
+# -- area under the curve -------------------------------------------------------------------------
+
+
+@given(eighths, eighths)
+def test_auc_is_the_share_of_pairs_in_the_right_order_and_ties_count_half(occupied, free):
+    pairs = [0.5 * ((p > q) + (p >= q)) for p, q in itertools.product(occupied, free)]
+    found = roc(torch.tensor(occupied).double(), torch.tensor(free).double()).auc
+    assert found == pytest.approx(sum(pairs) / len(pairs), abs=1e-12)
+
+
+@pytest.mark.parametrize("levels", [None, 10, 2])
+def test_auc_is_that_of_scikit_learn(levels):
+    occupied, free = scores(700, 0.8, 0, levels), scores(1300, -0.2, 1, levels)
+    assert roc(occupied, free).auc == pytest.approx(roc_auc_score(*labelled(occupied, free)), abs=1e-12)
+
+
+def test_the_curve_climbs_from_corner_to_corner():
+    curve = roc(scores(50, 0.5, 0, 8), scores(80, 0.0, 1, 8))
+    for rate in (curve.false_positive, curve.true_positive):
+        assert rate[0] == 0
+        assert rate[-1] == 1
+        assert (np.diff(rate) >= 0).all()
+
+
+def test_auc_of_perfect_reversed_and_ignorant_maps():
+    low, high, half = torch.full((4,), 0.1), torch.full((3,), 0.9), torch.full((4,), 0.5)
+    assert roc(high, low).auc == 1
+    assert roc(low, high).auc == 0
+    assert roc(half, half).auc == 0.5
+
+
+@pytest.mark.parametrize(("n_occupied", "n_free"), [(0, 3), (3, 0), (0, 0)])
+def test_a_curve_of_one_class_is_refused(n_occupied, n_free):
+    with pytest.raises(InvalidArgumentError, match="at least one occupied and one free point"):
+        roc(torch.rand(n_occupied), torch.rand(n_free))
+
+
+# -- its bootstrap interval -----------------------------------------------------------------------
+
+
+def interval(occupied: Tensor, free: Tensor, seed: int = 0, **options: float) -> tuple[float, float, float]:
+    """Lower end, AUC, upper end."""
+    auc = roc(occupied, free).auc
+    low, high = auc_interval(occupied, free, auc, seed, **options)
+    return low, auc, high
+
+
+@pytest.mark.parametrize("levels", [None, 6])
+def test_the_interval_is_that_of_resampling_points_one_by_one(levels):
+    occupied, free = scores(150, 0.9, 2, levels), scores(250, 0.0, 3, levels)
+    generator = np.random.default_rng(0)
+    replicates = []
+    for _ in range(600):
+        drawn = [x[torch.from_numpy(generator.integers(0, len(x), len(x)))] for x in (occupied, free)]
+        replicates.append(roc_auc_score(*labelled(*drawn)))
+    low, _, high = interval(occupied, free)
+    expected = np.quantile(replicates, [0.025, 0.975])
+    assert low == pytest.approx(expected[0], abs=0.01)
+    assert high == pytest.approx(expected[1], abs=0.01)
+    assert high - low == pytest.approx(expected[1] - expected[0], rel=0.12)
+
+
+def test_the_interval_of_many_points_has_the_width_of_delong():
+    occupied, free = scores(20_000, 1.0, 4), scores(30_000, 0.0, 5)
+    ranks = [np.searchsorted(np.sort(b.numpy()), a.numpy()) / len(b) for a, b in
+             ((occupied, free), (free, occupied))]  # fmt: skip
+    sigma = math.sqrt(ranks[0].var() / len(occupied) + ranks[1].var() / len(free))
+    low, auc, high = interval(occupied, free)
+    assert high - low == pytest.approx(2 * 1.96 * sigma, rel=0.08)
+    assert (low + high) / 2 == pytest.approx(auc, abs=0.2 * sigma)
+
+
+def test_the_interval_depends_on_the_seed_only_and_widens_with_its_level():
+    occupied, free = scores(200, 0.7, 0), scores(200, 0.0, 1)
+    assert interval(occupied, free, seed=1) == interval(occupied, free, seed=1)
+    assert interval(occupied, free, seed=1) != interval(occupied, free, seed=2)
+    narrow, wide = (interval(occupied, free, level=level) for level in (0.5, 0.99))
+    assert wide[0] < narrow[0] < narrow[1] < narrow[2] < wide[2]
+
+
+def test_the_interval_of_scores_that_all_tie_is_a_point():
+    half = torch.full((30,), 0.5)
+    assert interval(half, half) == (0.5, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_interval_holds_its_auc_and_stays_among_the_areas_there_are(seed):
+    low, auc, high = interval(scores(8, 2.5, seed), scores(6, 0.0, 100 + seed), seed=seed)
+    assert 0 <= low <= auc <= high <= 1
+
+
+# -- the other scores -----------------------------------------------------------------------------
+
+
+def test_brier_is_the_mean_squared_error_of_the_probabilities():
+    assert brier(torch.tensor([1.0, 0.5]), torch.tensor([0.0, 0.25])) == pytest.approx(0.3125 / 4)
+    occupied, free = scores(60, 1.0, 0), scores(40, -1.0, 1)
+    assert brier(occupied, free) == pytest.approx(brier_score_loss(*labelled(occupied, free)), abs=1e-12)
+    assert brier(torch.full((3,), 0.5), torch.full((7,), 0.5)) == 0.25
+
+
+def test_scores_of_unknown_space_by_hand():
+    unknown, free = torch.tensor([0.5, 0.5, 0.125, 0.75]), torch.tensor([0.125, 0.25, 0.0625, 0.5])
+    # How far from ½: unknown 0, 0, 3/8, 1/4; free 3/8, 1/4, 7/16, 0. Pairs in the right order, ties ½:
+    right = (3 + 0.5) + (3 + 0.5) + (1 + 0.5) + (2 + 0.5)
+    assert unknown_scores(unknown, free) == {
+        "unknown_auc": pytest.approx(right / 16),
+        "unknown_called_free": 1 / 4,
+        "unknown_called_occupied": 1 / 4,
+        "free_recall": 2 / 4,
+    }
+
+
+def test_a_cell_on_the_threshold_is_called_neither_free_nor_occupied():
+    found = unknown_scores(torch.tensor([0.2, 0.65]).double(), torch.tensor([0.2, 0.1]).double())
+    assert (found["unknown_called_free"], found["unknown_called_occupied"]) == (0, 0)
+    assert found["free_recall"] == 0.5
+
+
+def test_without_unknown_points_their_scores_are_none():
+    found = unknown_scores(torch.empty(0), torch.tensor([0.1, 0.9]))
+    assert found == {
+        "unknown_auc": None,
+        "unknown_called_free": None,
+        "unknown_called_occupied": None,
+        "free_recall": 0.5,
+    }
+
+
+# -- PSNR2 ----------------------------------------------------------------------------------------
+
+
+def psnr2_by_all_pairs(x: np.ndarray, y: np.ndarray) -> float:
+    distance = cdist(x, y)
+    diagonal = np.sqrt(((x.max(0) - x.min(0)) ** 2).sum())
+    errors = [np.sqrt((distance.min(axis) ** 2).mean()) for axis in (1, 0)]
+    return float(sum(20 * np.log10(diagonal / error) for error in errors))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_psnr2_is_that_of_all_pairs_of_points(generator, dim, dtype):
+    points = torch.randn(80, dim, generator=generator, dtype=dtype) * 3 + 5
+    sampled = torch.randn(80, dim, generator=generator, dtype=dtype) * 3 + 5
+    expected = psnr2_by_all_pairs(points.double().numpy(), sampled.double().numpy())
+    assert psnr2(points, sampled) == pytest.approx(expected, rel=1e-6)
+
+
+def test_psnr2_does_not_depend_on_place_and_scale(generator):
+    points, sampled = torch.rand(2, 50, 3, generator=generator, dtype=torch.float64)
+    assert psnr2(7 * points - 3, 7 * sampled - 3) == pytest.approx(psnr2(points, sampled))
+
+
+def test_psnr2_of_the_same_cloud_is_infinite_in_any_order(generator):
+    points = torch.rand(20, 3, generator=generator)
+    assert psnr2(points, points) == math.inf
+    assert psnr2(points, points.flip(0)) == math.inf
+
+
+def test_psnr2_of_a_single_point_has_no_scale():
+    point = torch.tensor([[1.0, 2.0, 3.0]])
+    assert psnr2(point, point) == math.inf
+    assert psnr2(point, point + 1) == -math.inf

@@ -1,0 +1,294 @@
+"""The evaluation as a whole: what is built, what is asked, and what a row says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from pillar_room import room_scans
+
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.datasets import load
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.evaluation.occupancy import MapFactory, Outcome, Protocol, choose, evaluate, methods
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.scan import Scan
+
+CONTRACT: dict[str, type] = {
+    "dataset": str,
+    "method": str,
+    "resolution": float,
+    "removal": str,
+    "kept": float,
+    "auc": float,
+    "brier": float,
+    "n_train_points": int,
+    "nbytes": int,
+    "build_seconds": float,
+    "query_seconds": float,
+    "n_queries": int,
+}
+"""And n_components: int for mixtures, None for grids."""
+
+UNKNOWN_FIELDS = {"unknown_auc", "unknown_called_free", "unknown_called_occupied", "free_recall"}
+SMALL = Protocol(test_every=4, kept=(1.0, 0.3), resolution=(0.2, 0.1))
+
+
+def small_map() -> GaussianMap:
+    return GaussianMap(window=5, n_samples=20_000)
+
+
+def run(protocol: Protocol = SMALL, seed: int = 0, **options: Any) -> Outcome:
+    """All methods on the room with the pillar."""
+    return evaluate("room", room_scans(12), methods(small_map), protocol, seed, **options)
+
+
+def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows without what a clock says."""
+    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
+
+
+def test_rows_carry_every_field_of_the_contract_with_its_type():
+    rows = run().rows
+    order = [(row["kept"], row["method"], row["resolution"]) for row in rows]
+    assert order == [(k, m, r) for k in (1.0, 0.3) for m in methods(small_map) for r in (0.2, 0.1)]
+    for row in rows:
+        for name, kind in CONTRACT.items():
+            assert type(row[name]) is kind, f"{name} is {row[name]!r}"
+        assert isinstance(row["n_components"], int if row["method"] == "monte_carlo" else type(None))
+        assert 0.5 < row["auc_low"] <= row["auc"] <= row["auc_high"] <= 1.01
+        assert 0 <= row["brier"] <= 1
+        assert min(row["nbytes"], row["n_queries"], row["n_train_points"]) > 0
+        assert min(row["build_seconds"], row["query_seconds"]) >= 0
+        assert row["dataset"] == "room"
+        assert not UNKNOWN_FIELDS & row.keys()
+    json.dumps(rows, allow_nan=False)
+
+
+def test_counts_of_points_and_queries_are_those_of_the_split():
+    scans = room_scans(12)
+    rows = run().rows
+    n_train = sum(len(scan.points) for i, scan in enumerate(scans) if i % 4)
+    n_test = sum(len(scan.points) for i, scan in enumerate(scans) if i % 4 == 0)
+    assert {row["n_train_points"] for row in rows if row["kept"] == 1} == {n_train}
+    (thinned,) = {row["n_train_points"] for row in rows if row["kept"] == 0.3}
+    assert thinned == pytest.approx(0.3 * n_train, rel=0.2)
+    assert {row["n_queries"] for row in rows} == {2 * n_test}
+    assert {row["n_queries"] for row in run(replace(SMALL, max_beams=10)).rows} == {20}
+
+
+def test_the_same_seed_gives_the_same_rows_and_another_gives_others():
+    protocol = replace(SMALL, unknown=True, pose_noise=(0.05, 0.02))
+    rows = timeless(run(protocol).rows)
+    assert timeless(run(protocol).rows) == rows
+    assert timeless(run(protocol, seed=1).rows) != rows
+
+
+class Counted:
+    """A map factory that counts the maps it made and the scans they were given."""
+
+    def __init__(self, make: MapFactory) -> None:
+        self.make = make
+        self.resolutions: list[float] = []
+        self.scans: list[Scan] = []
+
+    def __call__(self, resolution: float) -> Any:
+        self.resolutions.append(resolution)
+        made = self.make(resolution)
+        insert: Callable[[Scan], None] = made.insert
+
+        def counting(scan: Scan) -> None:
+            self.scans.append(scan)
+            insert(scan)
+
+        made.insert = counting
+        return made
+
+
+def test_a_mixture_is_built_once_for_a_share_and_a_grid_once_for_a_resolution_too():
+    factories = {name: Counted(make) for name, make in methods(small_map).items()}
+    scans = room_scans(12)
+    outcome = evaluate("room", scans, factories, SMALL)
+    assert len(factories["monte_carlo"].resolutions) == 2
+    assert factories["occupancy_grid"].resolutions == [0.2, 0.1] * 2
+    assert len(factories["monte_carlo"].scans) == 2 * 9
+    assert len(factories["occupancy_grid"].scans) == 4 * 9
+    held_out = {tuple(scan.origin.tolist()) for scan in scans[::4]}
+    for counted in factories.values():  # held-out scans are never inserted
+        assert not held_out & {tuple(scan.origin.tolist()) for scan in counted.scans}
+    once = [row["build_seconds"] for row in outcome.rows if row["method"] == "monte_carlo"]
+    assert once[0] == once[1]
+
+
+def test_what_is_shown_are_the_maps_of_the_largest_share_with_their_answers():
+    outcome = run(replace(SMALL, kept=(0.3, 1.0)))
+    assert [built.row for built in outcome.shown] == [row for row in outcome.rows if row["kept"] == 1]
+    for built in outcome.shown:
+        assert built.theta.shape == built.asked.labels.shape
+        assert built.roc.auc == built.row["auc"]
+        assert torch.equal(built.map.occupancy(built.asked.points, built.row["resolution"]), built.theta)
+
+
+def test_unknown_space_adds_its_points_and_its_four_fields():
+    plain, rows = run().rows, run(replace(SMALL, unknown=True)).rows
+    for before, row in zip(plain, rows, strict=True):
+        assert row.keys() - before.keys() == UNKNOWN_FIELDS
+        assert all(type(row[name]) is float and 0 <= row[name] <= 1 for name in UNKNOWN_FIELDS)
+        assert row["n_queries"] > before["n_queries"]
+        assert row["auc"] == before["auc"]  # hit and free points are the same
+    grids = [row for row in rows if row["method"] == "occupancy_grid"]
+    # No training beam came near the unknown points, so that a grid of them answers exactly ½.
+    assert all(row["unknown_called_free"] == row["unknown_called_occupied"] == 0 for row in grids)
+
+
+def test_free_points_near_the_surface_are_harder():
+    grids = {
+        free: [r["auc"] for r in run(replace(SMALL, free=free)).rows if r["method"] == "occupancy_grid"]
+        for free in ("uniform", "near_surface")
+    }
+    assert all(near < far for near, far in zip(grids["near_surface"], grids["uniform"], strict=True))
+
+
+def test_wrong_poses_make_every_map_worse():
+    right, wrong = run().rows, run(replace(SMALL, pose_noise=(0.3, 0.2))).rows
+    assert all(bad["auc"] < good["auc"] for good, bad in zip(right, wrong, strict=True))
+
+
+def test_maps_are_saved_under_method_share_and_resolution(tmp_path):
+    run(replace(SMALL, save_map=str(tmp_path / "maps")))
+    assert {path.name for path in (tmp_path / "maps").iterdir()} == {
+        f"{method}_{kept}_{resolution}.safetensors"
+        for method in methods(small_map)
+        for kept in ("1", "0.3")
+        for resolution in ("0.2", "0.1")
+    }
+
+
+def test_progress_is_told_of_every_map_that_is_built():
+    events: list[tuple[str, int, int | None]] = []
+    run(on_event=lambda *event: events.append(event))
+    stages = {stage for stage, _, _ in events}
+    assert any("monte_carlo" in stage and "30%" in stage for stage in stages)
+    for stage in stages:
+        steps = [(done, total) for name, done, total in events if name == stage]
+        assert steps[0] == (0, 9)
+        assert steps[-1] == (9, 9)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+def test_methods_come_in_the_order_asked_for():
+    assert list(choose(["monte_carlo", "occupancy_grid"], methods(small_map))) == [
+        "monte_carlo",
+        "occupancy_grid",
+    ]
+
+
+@pytest.mark.parametrize("names", [["octree"], ["monte_carlo", "octree"]])
+def test_an_unknown_method_lists_the_known_ones(names):
+    known = methods(small_map)
+    with pytest.raises(InvalidArgumentError, match="method='octree' is not known") as caught:
+        choose(names, known)
+    assert all(name in str(caught.value) for name in known)
+
+
+def test_no_method_at_all_is_refused():
+    with pytest.raises(InvalidArgumentError, match=r"method is empty.*monte_carlo"):
+        choose([], methods(small_map))
+
+
+def test_a_data_set_of_one_scan_is_refused():
+    with pytest.raises(InvalidArgumentError, match="1 scans; at least 2 are needed"):
+        evaluate("room", room_scans(1), methods(small_map), SMALL)
+
+
+def test_held_out_scans_without_returns_are_refused():
+    scans = room_scans(8)
+    for i in (0, 4):
+        scans[i] = Scan(torch.empty(0, 2), scans[i].origin, scans[i].no_return)
+    with pytest.raises(InvalidArgumentError, match="no beam that hit anything"):
+        evaluate("room", scans, methods(small_map), SMALL)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resolution": (0.1, -0.1)}, "resolution=-0.1"),
+        ({"resolution": (0.0,)}, "resolution=0"),
+        ({"resolution": (float("nan"),)}, "resolution=nan"),
+        ({"resolution": ()}, "evaluation.resolution"),
+        ({"kept": ()}, "evaluation.kept"),
+        ({"max_beams": 0}, "max_beams=0"),
+    ],
+)
+def test_a_protocol_that_cannot_be_followed_is_refused_at_once(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Protocol(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kept": (2.0,)}, "kept=2"),
+        ({"kept": (0.0,)}, "kept=0"),
+        ({"test_every": 1}, "test_every=1"),
+        ({"removal": "rays"}, "removal='rays'"),
+        ({"free": "behind"}, "free='behind'"),
+        ({"pose_noise": (0.1,)}, "pose_noise="),
+        ({"pose_noise": (-1.0, 0.0)}, "pose_noise="),
+    ],
+)
+def test_bad_values_are_named_before_any_map_is_built(options, message):
+    built = []
+
+    def factory(resolution: float) -> OccupancyGrid:
+        built.append(resolution)
+        return OccupancyGrid(resolution)
+
+    with pytest.raises(InvalidArgumentError, match=message):
+        evaluate("room", room_scans(8), {"occupancy_grid": factory}, replace(SMALL, **options))
+    assert not built
+
+
+@pytest.mark.parametrize("seed", [-1, 2**70])
+def test_a_seed_that_cannot_be_used_is_named(seed):
+    with pytest.raises(InvalidArgumentError, match=f"seed={seed}"):
+        run(replace(SMALL, kept=(1.0,), resolution=(0.2,)), seed=seed)
+
+
+def test_training_scans_without_any_beam_give_maps_that_know_nothing():
+    """What is kept may be nothing at all, when the share is tiny."""
+    rows = run(replace(SMALL, kept=(1e-6,))).rows
+    assert {row["n_train_points"] for row in rows} == {0}
+    assert all(row["auc"] == 0.5 and row["brier"] == 0.25 for row in rows)
+
+
+# -- the mixture against the grid -----------------------------------------------------------------
+
+
+def test_on_few_beams_the_mixture_answers_better_than_the_grid():
+    scans = list(load("synthetic_building_2d"))
+    known = methods(lambda: GaussianMap(n_samples=200_000))
+    chosen = choose(["occupancy_grid", "monte_carlo"], known)
+    grid, mixture = evaluate("building", scans, chosen, Protocol(kept=(0.1,))).rows
+    assert mixture["auc"] >= grid["auc"]
+    assert mixture["nbytes"] < grid["nbytes"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_scans_on_a_gpu_give_the_rows_of_the_cpu():
+    protocol = replace(SMALL, unknown=True, pose_noise=(0.01, 0.01))
+    scans = [scan.to("cuda") for scan in room_scans(12)]
+    rows = evaluate("room", scans, methods(small_map), protocol).rows
+    for row, same in zip(rows, run(protocol).rows, strict=True):
+        assert row["auc"] == pytest.approx(same["auc"], abs=0.01)
+
+
+def test_errors_of_one_family():
+    assert issubclass(InvalidArgumentError, GmmTorchError)
+    assert issubclass(InvalidArgumentError, ValueError)

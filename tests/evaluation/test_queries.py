@@ -1,0 +1,244 @@
+"""The points that a map is asked about, and that their truth is what it is said to be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from pillar_room import room_scans
+from scipy.stats import kstest
+from sklearn.metrics import brier_score_loss, roc_auc_score
+from torch import Tensor
+
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
+from gmmtorch.evaluation.occupancy import Protocol, evaluate, methods
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries, hit_and_free, save_queries, unseen
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.scan import Scan
+
+MANY = 1_000_000
+
+
+def along(points: Tensor, origins: Tensor, ends: Tensor) -> Tensor:
+    """How far along its beam each point lies: 0 at the sensor, 1 at the hit. Checks that it is on the beam."""
+    beam = ends - origins
+    share = ((points - origins) * beam).sum(1) / (beam**2).sum(1)
+    torch.testing.assert_close(origins + share[:, None] * beam, points, atol=1e-9, rtol=0)
+    return share
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("free", ["uniform", "near_surface"])
+def test_every_beam_gives_one_hit_and_one_free_point(dim, free):
+    origins, ends = asking.test_beams(room_scans(4, dim=dim), MANY, seed=0)
+    asked = hit_and_free(origins, ends, free, 0.1, seed=0)
+    assert asked.labels.dtype == torch.int64
+    assert asked.points.dtype == torch.float64
+    assert int(asked.of(OCCUPIED).sum()) == int(asked.of(FREE).sum()) == len(ends)
+    torch.testing.assert_close(asked.points[asked.of(OCCUPIED)], ends, atol=0, rtol=0)
+    share = along(asked.points[asked.of(FREE)], origins, ends)
+    assert bool(((share >= 0) & (share <= 1)).all())
+
+
+def test_beams_without_return_are_not_asked_about():
+    scans = room_scans(3)
+    origins, ends = asking.test_beams(scans, MANY, seed=0)
+    torch.testing.assert_close(ends, torch.cat([scan.points for scan in scans]))
+    torch.testing.assert_close(
+        origins, torch.cat([scan.origin.expand(len(scan.points), -1) for scan in scans])
+    )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_free_points_are_uniform_along_the_beam(dim):
+    origins, ends = asking.test_beams(room_scans(5, n_beams=4000, dim=dim), MANY, seed=0)
+    asked = hit_and_free(origins, ends, "uniform", 0.1, seed=0)
+    share = along(asked.points[asked.of(FREE)], origins, ends)
+    assert kstest(share.numpy(), "uniform").pvalue > 0.01
+    length = (ends - origins).norm(dim=1)
+    assert abs(np.corrcoef(share.numpy(), length.numpy())[0, 1]) < 0.03
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.2])
+def test_near_surface_points_lie_half_to_two_cells_before_the_hit(resolution):
+    origins, ends = asking.test_beams(room_scans(5, n_beams=4000), MANY, seed=0)
+    asked = hit_and_free(origins, ends, "near_surface", resolution, seed=0)
+    points = asked.points[asked.of(FREE)]
+    gap = (ends - points).norm(dim=1) / resolution
+    assert float(gap.min()) >= 0.5 - 1e-9
+    assert float(gap.max()) <= 2 + 1e-9
+    assert kstest(gap.numpy(), "uniform", args=(0.5, 1.5)).pvalue > 0.01
+    assert bool((along(points, origins, ends) > 0).all())
+
+
+def test_near_surface_points_are_never_before_the_sensor():
+    length = torch.linspace(0.01, 0.5, 200, dtype=torch.float64)
+    origins = torch.tensor([[3.0, -2.0]], dtype=torch.float64).expand(200, 2)
+    ends = origins + length[:, None] * torch.tensor([0.6, 0.8], dtype=torch.float64)
+    asked = hit_and_free(origins, ends, "near_surface", 0.2, seed=0)
+    share = along(asked.points[asked.of(FREE)], origins, ends)
+    assert bool((share >= 0).all())
+    assert bool((share[length < 0.1] == 0).all())  # shorter than half a cell: the sensor itself
+
+
+def test_an_unknown_choice_of_free_points_lists_the_known_ones():
+    with pytest.raises(InvalidArgumentError, match=r"free='behind' is not one of uniform, near_surface"):
+        hit_and_free(torch.zeros(1, 2), torch.ones(1, 2), "behind", 0.1, seed=0)
+
+
+def test_points_depend_on_the_seed_only():
+    origins, ends = asking.test_beams(room_scans(2), MANY, seed=0)
+    first, again, other = (hit_and_free(origins, ends, "uniform", 0.1, seed) for seed in (0, 0, 1))
+    assert torch.equal(first.points, again.points)
+    assert not torch.equal(first.points, other.points)
+
+
+def test_more_beams_than_allowed_are_thinned_at_random():
+    scans = room_scans(6)
+    _, every_end = asking.test_beams(scans, MANY, seed=0)
+    origins, ends = asking.test_beams(scans, 50, seed=0)
+    assert len(origins) == len(ends) == 50
+    whole = {tuple(row): i for i, row in enumerate(every_end.tolist())}
+    chosen = [whole[tuple(row)] for row in ends.tolist()]
+    assert len(set(chosen)) == 50
+    assert max(chosen) > len(every_end) // 2  # from all scans, not from the first
+    for origin, end in zip(origins, ends, strict=True):  # each with its own sensor
+        scan = next(s for s in scans if bool((s.points == end).all(1).any()))
+        assert torch.equal(scan.origin, origin)
+    assert torch.equal(asking.test_beams(scans, 50, seed=0)[1], ends)
+    assert not torch.equal(asking.test_beams(scans, 50, seed=1)[1], ends)
+    assert len(asking.test_beams(scans, len(every_end), seed=0)[1]) == len(every_end)
+
+
+def test_scans_without_any_return_cannot_be_tested_on():
+    scan = Scan(torch.empty(0, 2), torch.zeros(2), torch.ones(5, 2))
+    with pytest.raises(InvalidArgumentError, match=r"no beam that hit anything.*evaluation\.test_every"):
+        asking.test_beams([scan, scan], MANY, seed=0)
+
+
+# -- unseen space ---------------------------------------------------------------------------------
+
+
+def rays_of(scans: list[Scan]) -> tuple[Tensor, Tensor]:
+    """Origins and ends (R, D) of all beams, those without return too."""
+    origins = torch.cat([scan.origin.expand(scan.n_beams, -1) for scan in scans])
+    return origins, torch.cat([scan.ends()[0] for scan in scans])
+
+
+def enters(box_low: Tensor, box_high: Tensor, origins: Tensor, ends: Tensor) -> bool:
+    """Whether any of the segments (R, D) passes through the inside of a box: the slab test."""
+    beam = ends - origins
+    near, far = (box_low - origins) / beam, (box_high - origins) / beam
+    first = torch.minimum(near, far).amax(1).clamp_min(0)
+    last = torch.maximum(near, far).amin(1).clamp_max(1)
+    return bool((last - first > 1e-12).any())
+
+
+@pytest.mark.parametrize(("dim", "n_beams", "resolution"), [(2, 90, 0.1), (2, 90, 0.3), (3, 150, 0.3)])
+def test_unseen_points_are_those_behind_hits_that_no_training_ray_came_near(dim, n_beams, resolution):
+    scans = room_scans(12, n_beams=n_beams, dim=dim)
+    train, test = scans[:8], scans[8:]
+    origins, ends = asking.test_beams(test, 250, seed=0)
+    grid = OccupancyGrid(resolution)
+    for scan in train:
+        grid.insert(scan)
+    found = unseen(origins, ends, grid.evidence(), seed=0)
+    assert bool((found.labels == UNKNOWN).all())
+    # Of a lattice without evidence all candidates are unseen, in the order of the beams.
+    candidates = unseen(origins, ends, BlockEvidence(resolution, dim), seed=0).points
+    assert len(candidates) == len(ends)
+    behind = (candidates - ends).norm(dim=1) / resolution
+    assert 2 - 1e-9 <= float(behind.min()) < 3 < 11 < float(behind.max()) <= 12 + 1e-9
+    assert bool((along(candidates, origins, ends) > 1).all())
+    starts, stops = rays_of(train)
+    low = (candidates / resolution).floor() - 1
+    touched = torch.tensor([
+        enters(corner * resolution, (corner + 3) * resolution, starts, stops) for corner in low
+    ])  # fmt: skip
+    assert 0.05 < float(touched.double().mean()) < 0.95  # or the test shows nothing
+    torch.testing.assert_close(found.points, candidates[~touched], atol=0, rtol=0)
+
+
+def test_the_tip_of_a_beam_without_return_has_been_near():
+    """A beam without return ends in cell (10, 0); points of column 11 have it for a neighbour."""
+    beam = Scan(torch.empty(0, 2), torch.tensor([0.05, 0.05]), torch.tensor([[1.03, 0.05]]))
+    grid = OccupancyGrid(0.1)
+    grid.insert(beam)
+    ends = torch.tensor([[1.15, 0.65]], dtype=torch.float64).expand(200, 2)
+    found = unseen(ends + torch.tensor([0.0, 1.4]), ends, grid.evidence(), seed=0)
+    row = (found.points[:, 1] / 0.1).floor()
+    assert set(row[(row >= 2) | (row <= -2)].tolist()) >= {3.0, 2.0, -2.0, -3.0}
+    assert not bool(((row >= -1) & (row <= 1)).any())
+
+
+# -- the file of queries --------------------------------------------------------------------------
+
+
+def some_queries(shift: float = 0.0) -> Queries:
+    return Queries(torch.tensor([[0.0, 1.0], [2.0 + shift, 3.0]]).double(), torch.tensor([OCCUPIED, FREE]))
+
+
+def test_points_that_every_resolution_shares_are_written_once(tmp_path):
+    save_queries(tmp_path / "q.npz", {0.1: some_queries(), 0.02: some_queries()}, [1, 2], [0, 3])
+    with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
+        assert set(file) == {"points", "labels", "resolution", "train_scans", "test_scans"}
+        np.testing.assert_array_equal(file["points"], some_queries().points.numpy())
+        np.testing.assert_array_equal(file["labels"], [OCCUPIED, FREE])
+        np.testing.assert_array_equal(file["resolution"], [0, 0])
+        np.testing.assert_array_equal(file["train_scans"], [1, 2])
+        np.testing.assert_array_equal(file["test_scans"], [0, 3])
+        assert file["points"].dtype == np.float64
+        assert all(file[name].dtype == np.int64 for name in ("labels", "train_scans", "test_scans"))
+
+
+def test_points_that_differ_by_resolution_say_which_they_are_for(tmp_path):
+    save_queries(tmp_path / "q.npz", {0.1: some_queries(), 0.02: some_queries(1.0)}, [1], [0])
+    with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["resolution"], [0.1, 0.1, 0.02, 0.02])
+        np.testing.assert_array_equal(file["points"][2:], some_queries(1.0).points.numpy())
+
+
+def test_the_file_gets_its_suffix_and_nothing_else_is_left(tmp_path):
+    save_queries(tmp_path / "new" / "queries", {0.1: some_queries()}, [1], [0])
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["queries.npz"]
+
+
+@pytest.mark.parametrize("free", ["uniform", "near_surface"])
+def test_saved_maps_alone_answer_the_saved_queries_as_the_rows_say(tmp_path, free):
+    protocol = Protocol(
+        test_every=4,
+        kept=(1.0, 0.3),
+        resolution=(0.2, 0.1),
+        free=free,
+        unknown=True,
+        save_queries=str(tmp_path / "q.npz"),
+        save_map=str(tmp_path / "maps"),
+    )
+    known = methods(lambda: GaussianMap(window=5, n_samples=20_000))
+    rows = evaluate("room", room_scans(16), known, protocol, seed=5).rows
+    assert len(rows) == len(known) * 4 == len(list((tmp_path / "maps").iterdir()))
+    with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
+        saved = dict(file)
+    np.testing.assert_array_equal(saved["test_scans"], [0, 4, 8, 12])
+    np.testing.assert_array_equal(saved["train_scans"], [i for i in range(16) if i % 4])
+    assert set(saved["labels"]) == {FREE, OCCUPIED, UNKNOWN}
+    for row in rows:
+        path = tmp_path / "maps" / f"{row['method']}_{row['kept']:g}_{row['resolution']:g}.safetensors"
+        assert path.stat().st_size == row["nbytes"]
+        kind = GaussianMap if row["method"] == "monte_carlo" else OccupancyGrid
+        asked = np.isin(saved["resolution"], [0, row["resolution"]])
+        theta = kind.load(path).occupancy(saved["points"][asked], row["resolution"])
+        labels = saved["labels"][asked]
+        sure = labels <= OCCUPIED
+        assert len(theta) == row["n_queries"]
+        assert roc_auc_score(labels[sure], theta[sure]) == pytest.approx(row["auc"], abs=1e-12)
+        assert brier_score_loss(labels[sure], theta[sure]) == pytest.approx(row["brier"], abs=1e-12)
+        doubt, no_hit = -np.abs(theta - 0.5), labels != OCCUPIED
+        expected = roc_auc_score(labels[no_hit] == UNKNOWN, doubt[no_hit])
+        assert expected == pytest.approx(row["unknown_auc"], abs=1e-12)
+        assert math.isfinite(expected)

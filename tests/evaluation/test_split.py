@@ -1,0 +1,189 @@
+"""Which scans are held out, what is kept of the others, and poses made worse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from pillar_room import room_scans
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.split import keep_share, perturb_poses, split_indices
+from gmmtorch.scan import Scan
+
+SHARES = (0.8, 0.3, 0.1, 0.02)
+
+
+def beams(scans: list[Scan]) -> list[set[tuple[float, ...]]]:
+    """The beam ends of each scan, returns and others."""
+    return [{tuple(row) for row in scan.ends()[0].tolist()} for scan in scans]
+
+
+def sensors(scans: list[Scan]) -> list[tuple[float, ...]]:
+    return [tuple(scan.origin.tolist()) for scan in scans]
+
+
+@pytest.mark.parametrize(("n_scans", "test_every"), [(2, 2), (10, 10), (11, 10), (45, 5), (7, 3), (5, 100)])
+def test_every_nth_scan_is_held_out_beginning_with_the_first(n_scans, test_every):
+    train, test = split_indices(n_scans, test_every)
+    assert test == [i for i in range(n_scans) if i % test_every == 0]
+    assert train == [i for i in range(n_scans) if i % test_every]
+    assert train
+
+
+@pytest.mark.parametrize("test_every", [1, 0, -2])
+def test_holding_out_every_scan_is_refused(test_every):
+    with pytest.raises(InvalidArgumentError, match=rf"test_every={test_every} must be at least 2"):
+        split_indices(10, test_every)
+
+
+@pytest.mark.parametrize("n_scans", [0, 1])
+def test_too_few_scans_to_split_are_refused(n_scans):
+    with pytest.raises(InvalidArgumentError, match=rf"has {n_scans} scans; at least 2 are needed"):
+        split_indices(n_scans, 10)
+
+
+def test_a_smaller_share_of_the_beams_is_a_subset_of_a_larger_one():
+    scans = room_scans(8)
+    larger = beams(scans)
+    for share in SHARES:
+        kept = beams(keep_share(scans, share, "beams", seed=3))
+        assert len(kept) == len(scans)
+        assert all(small <= large for small, large in zip(kept, larger, strict=True))
+        larger = kept
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_the_share_of_beams_kept_is_as_asked(share):
+    scans = room_scans(10, n_beams=2000)
+    kept = keep_share(scans, share, "beams", seed=0)
+    tolerance = 5 * math.sqrt(share * (1 - share))
+    for part in ("points", "no_return"):
+        before = sum(len(getattr(scan, part)) for scan in scans)
+        after = sum(len(getattr(scan, part)) for scan in kept)
+        assert after / before == pytest.approx(share, abs=tolerance / math.sqrt(before))
+
+
+def test_a_smaller_share_of_the_scans_is_a_subset_of_a_larger_one_in_the_same_order():
+    scans = room_scans(20)
+    larger = sensors(scans)
+    for share in SHARES:
+        kept = keep_share(scans, share, "scans", seed=3)
+        assert len(kept) == max(1, math.ceil(share * len(scans)))
+        assert sensors(kept) == [origin for origin in larger if origin in set(sensors(kept))]
+        assert all(any(scan is whole for whole in scans) for scan in kept)  # whole scans, unchanged
+        larger = sensors(kept)
+
+
+@pytest.mark.parametrize("removal", ["beams", "scans"])
+def test_keeping_everything_changes_nothing(removal):
+    scans = room_scans(3)
+    assert all(a is b for a, b in zip(keep_share(scans, 1, removal, seed=0), scans, strict=True))
+
+
+@pytest.mark.parametrize("removal", ["beams", "scans"])
+def test_what_is_kept_depends_on_the_seed_only(removal):
+    scans = room_scans(20)
+    first, again, other = (keep_share(scans, 0.3, removal, seed=seed) for seed in (1, 1, 2))
+    assert beams(first) == beams(again)
+    assert beams(first) != beams(other)
+
+
+@pytest.mark.parametrize("share", [0, -0.5, 1.01, math.nan])
+def test_a_share_outside_zero_to_one_is_refused(share):
+    with pytest.raises(InvalidArgumentError, match=r"kept=.* must be a share in \(0, 1\]"):
+        keep_share(room_scans(2), share, "beams", seed=0)
+
+
+def test_an_unknown_removal_lists_the_known_ones():
+    with pytest.raises(InvalidArgumentError, match=r"removal='rays' is not one of beams, scans"):
+        keep_share(room_scans(2), 0.5, "rays", seed=0)
+
+
+# -- pose noise -----------------------------------------------------------------------------------
+
+
+def rotation_vector(rotation: Tensor) -> Tensor:
+    """Rotation vector (3,), or angle (1,), of a rotation by less than half a turn."""
+    if rotation.shape[0] == 2:
+        return torch.atan2(rotation[1, 0], rotation[0, 0])[None]
+    axis = torch.stack([
+        rotation[2, 1] - rotation[1, 2],
+        rotation[0, 2] - rotation[2, 0],
+        rotation[1, 0] - rotation[0, 1],
+    ]) / 2  # fmt: skip
+    sine = axis.norm()
+    return axis * (torch.atan2(sine, (rotation.trace() - 1) / 2) / sine.clamp_min(1e-300))
+
+
+def gaps(points: Tensor) -> Tensor:
+    """Distances (N, N) between all pairs of points."""
+    return torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def unit_scans(n_scans: int, dim: int) -> list[Scan]:
+    """Scans far from the origin of the world, whose points are the sensor's axes."""
+    origin = torch.arange(5.0, 5.0 + dim, dtype=torch.float64)
+    return [Scan(origin + torch.eye(dim, dtype=torch.float64), origin)] * n_scans
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_noise_is_exactly_the_same_scans(dim):
+    scans = room_scans(3, dim=dim)
+    moved = perturb_poses(scans, (0.0, 0.0), seed=0)
+    assert all(a is b for a, b in zip(moved, scans, strict=True))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_scan_is_moved_as_a_rigid_body(dim):
+    scans = room_scans(5, dim=dim)
+    for before, after in zip(scans, perturb_poses(scans, (0.2, 0.3), seed=1), strict=True):
+        ends, moved = before.ends()[0], after.ends()[0]
+        assert not torch.allclose(ends, moved, atol=1e-3)
+        torch.testing.assert_close(gaps(moved), gaps(ends))
+        # The sensor moves with its points, so that ranges stay what was measured.
+        torch.testing.assert_close((moved - after.origin).norm(dim=1), (ends - before.origin).norm(dim=1))
+        frame = torch.linalg.lstsq(ends - before.origin, moved - after.origin).solution
+        assert float(torch.linalg.det(frame)) == pytest.approx(1)  # not a mirror image
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_shift_alone_does_not_turn_and_rotation_alone_does_not_shift(dim):
+    scan = room_scans(1, dim=dim)[0]
+    shifted, turned = (perturb_poses([scan], noise, seed=2)[0] for noise in ((0.1, 0.0), (0.0, 0.1)))
+    torch.testing.assert_close(shifted.points - shifted.origin, scan.points - scan.origin)
+    assert not torch.allclose(shifted.origin, scan.origin)
+    torch.testing.assert_close(turned.origin, scan.origin)
+    assert not torch.allclose(turned.points, scan.points)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_noise_has_the_standard_deviations_asked_for(dim):
+    n_scans, sigma_shift, sigma_angle = 1500, 0.3, 0.05
+    scans = unit_scans(n_scans, dim)
+    moved = perturb_poses(scans, (sigma_shift, sigma_angle), seed=4)
+    shifts = torch.stack([after.origin - before.origin for before, after in zip(scans, moved, strict=True)])
+    turns = torch.stack([rotation_vector((scan.points - scan.origin).T) for scan in moved])
+    for values, sigma in ((shifts, sigma_shift), (turns, sigma_angle)):
+        assert bool((values.mean(0).abs() < 4 * sigma / math.sqrt(n_scans)).all())
+        torch.testing.assert_close(values.std(0), torch.full_like(values[0], sigma), rtol=0.08, atol=0)
+    both = torch.cat([shifts / sigma_shift, turns / sigma_angle], 1)
+    correlation = torch.corrcoef(both.T) - torch.eye(both.shape[1], dtype=torch.float64)
+    assert float(correlation.abs().max()) < 0.12
+
+
+def test_noise_depends_on_the_seed_only():
+    scans = room_scans(3)
+    first, again, other = (perturb_poses(scans, (0.1, 0.1), seed) for seed in (0, 0, 1))
+    assert beams(first) == beams(again)
+    assert beams(first) != beams(other)
+
+
+@pytest.mark.parametrize(
+    "noise", [(-0.1, 0.0), (0.0, -0.1), (math.nan, 0.0), (math.inf, 0.0), (0.1,), (), (0.1, 0.1, 0.1)]
+)
+def test_noise_that_is_not_two_numbers_above_zero_is_refused(noise):
+    with pytest.raises(InvalidArgumentError, match=r"pose_noise=.* must be two numbers"):
+        perturb_poses(room_scans(2), noise, seed=0)
