@@ -100,7 +100,8 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
         panels = [
             MapPanel(_label(built), _answers(built, resolution), resolution, low, high) for built in shown
         ]
-        figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory)
+        # Cells that grazing beams cross are free more often than hit: half is too strict from above.
+        figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory, occupied_above=0.4)
         curves = {_label(built): built.roc for built in shown}
         figures[f"roc_{resolution:g}m"] = roc_figure(curves, f"{shown[0].row['dataset']}, {resolution:g} m")
     for built in outcome.shown:
@@ -135,7 +136,8 @@ def _write_board(
     from gmmtorch.report import Board
 
     with Board(folder) as board:
-        for row in outcome.rows:
+        # Steps are per cent of the data kept; TensorBoard takes a step back for a restart.
+        for row in sorted(outcome.rows, key=lambda row: row["kept"]):
             tag = f"{row['method']}/{row['resolution']:g}m"
             board.scalars(row, tag, step=round(100 * row["kept"]))
         for built in outcome.shown:
@@ -152,8 +154,11 @@ def _write_board(
                 surface = ~components.max_range
                 board.ellipsoids("mixture", components.means[surface], components.covariances[surface])
                 break
-        best = {f"hparam/auc_{row['method']}": row["auc"] for row in outcome.rows}
-        board.hparams(common.flat(config), best)
+        scores = {
+            f"hparam/auc_{built.row['method']}_{built.row['resolution']:g}m": built.row["auc"]
+            for built in outcome.shown
+        }
+        board.hparams(common.flat(config), scores)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """BlockEvidence: hits and misses stored only where rays went, on an unbounded voxel lattice.
 
 The lattice is cut into blocks of 8³ cells (16² in 2D). A block is allocated when a ray first
-touches it, which one coarse traversal over blocks finds out; memory follows observed space, not
-the bounding box, so a stray return at 200 m costs its ray and nothing else.
+touches it: memory follows observed space, not the bounding box, so a stray return at 200 m costs
+its ray and nothing else.
 """
 
 from __future__ import annotations
@@ -151,14 +151,12 @@ class BlockEvidence:
         self.hits.view(-1).scatter_add_(0, index[counted], source[counted])
 
     def _open_window(self, origins: Tensor, ends: Tensor) -> _Window:
-        """Allocate every block that the rays touch, and tabulate the slots of the box around them."""
+        """The box of blocks around the rays, with the blocks that they end in allocated."""
         side = self.block_side
-        starts, stops = origins.double() / self.resolution / side, ends.double() / self.resolution / side
-        both = torch.cat([starts, stops])
-        low = both.amin(0).floor()
-        if self.anchor is None:
-            self.anchor = low.long()
-        shape = (both.amax(0).floor() - low + 1).long().tolist()
+        size = self.resolution * side
+        low = torch.minimum(origins.double().amin(0), ends.double().amin(0)).div(size).floor()
+        high = torch.maximum(origins.double().amax(0), ends.double().amax(0)).div(size).floor()
+        shape = (high - low + 1).long().tolist()
         bits = tuple((n - 1).bit_length() for n in shape)
         n_bytes = 8 << sum(bits)
         if n_bytes > self.memory_limit:
@@ -168,22 +166,23 @@ class BlockEvidence:
                 f"{self.resolution * (n_bytes / self.memory_limit) ** (1 / self.dim) * 1.02:.3g} m or more "
                 "fits, or set dataset.max_range to drop stray far returns."
             )
-        strides = _power_of_two_strides(bits)
-        stride_t = torch.tensor(strides, device=low.device)
+        if self.anchor is None:
+            self.anchor = low.long()
+        window = _Window(low, bits, torch.full((1 << sum(bits),), -1, device=low.device))
+        block = (self._cells(ends).div(side).floor() - low).long()
+        index = (block * torch.tensor(_power_of_two_strides(bits), device=low.device)).sum(1)
         touched = torch.zeros(1 << sum(bits), dtype=torch.bool, device=low.device)
-        for visit in traverse(starts - low, stops - low, tuple(shape), strides=strides):
-            touched[visit.voxel] = True
-        touched[((stops.floor() - low).long() * stride_t).sum(1)] = True
-        index = touched.nonzero().squeeze(1)
-        blocks = torch.stack([(index >> shift) & ((1 << b) - 1) for shift, b in _fields(bits)], 1)
-        keys = self.pack(blocks + low.long() - self._anchored())
+        touched[index] = True
+        self._open_blocks(window, touched.nonzero().squeeze(1))
+        return window
+
+    def _open_blocks(self, window: _Window, index: Tensor) -> None:
+        """Allocate blocks (M,) of the window's table, distinct, and enter where they are stored."""
+        fields = _fields(window.bits)
+        blocks = torch.stack([(index >> shift) & ((1 << width) - 1) for shift, width in fields], 1)
+        keys = self.pack(blocks + window.low.long() - self._anchored())
         self._allocate(keys)
-        # Rounding at a corner may let the fine traversal touch a block that the coarse one did not:
-        # that visit, of no length, goes to the spare block behind the last.
-        spare = self.n_blocks * self.cells_per_block
-        offsets = torch.full((1 << sum(bits),), spare, dtype=torch.int64, device=low.device)
-        offsets[index] = self._find(keys) * self.cells_per_block
-        return _Window(low, bits, offsets)
+        window.offsets[index] = self._find(keys) * self.cells_per_block
 
     def _allocate(self, keys: Tensor) -> None:
         """Make room for the blocks `keys` that are not there yet."""
@@ -200,9 +199,9 @@ class BlockEvidence:
                 f"above the limit of {self.memory_limit:,}; a resolution of "
                 f"{self.resolution * factor * 1.1:.3g} m fits."
             )
-        if n_blocks + 1 > self._storage.shape[1]:  # one to spare
+        if n_blocks > self._storage.shape[1]:
             # Grow by half again, so that many small insertions stay cheap.
-            capacity = max(n_blocks + 1, self._storage.shape[1] * 3 // 2)
+            capacity = max(n_blocks, self._storage.shape[1] * 3 // 2)
             grown = self._storage.new_zeros(2, capacity, self.cells_per_block)
             grown[:, : self.n_blocks] = self._storage[:, : self.n_blocks]
             self._storage = grown
@@ -220,16 +219,18 @@ class BlockEvidence:
         corner = window.low * side
         starts = origins.double() / self.resolution - corner
         stops = ends.double() / self.resolution - corner
-        misses = self._storage[1].view(-1)
-        ones = torch.ones((), dtype=torch.float64, device=misses.device)
+        ones = torch.ones((), dtype=torch.float64, device=starts.device)
         weight = None if weights is None else weights.double()
-        locate = _compiled_storage_index() if self.compiled else _storage_index
+        split = _compiled_split() if self.compiled else _split
         strides = _power_of_two_strides(bits)
         for visit in traverse(starts, stops, shape, chunk_visits, strides, self.compiled):
-            index = locate(visit.voxel, window.offsets, window.bits, local_bits)
-            source = ones.expand(index.shape) if weight is None else weight[visit.ray]
-            misses.scatter_add_(0, index, source)
-        self._storage[1, self.n_blocks] = 0  # what spilled
+            block, local = split(visit.voxel, window.bits, local_bits)
+            offset = window.offsets.index_select(0, block)
+            if int(offset.min()) < 0:
+                self._open_blocks(window, block[offset < 0].long().unique())
+                offset = window.offsets.index_select(0, block)
+            source = ones.expand(offset.shape) if weight is None else weight[visit.ray]
+            self._storage[1].view(-1).scatter_add_(0, offset.add_(local), source)
 
     def fill(self, anchor: Tensor, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor) -> None:
         """Set the cells marked in `observed` (B, cells), blocks in order of `keys`, of an empty lattice."""
@@ -268,9 +269,9 @@ class BlockEvidence:
         return blocks.amin(0) * size, (blocks.amax(0) + 1) * size
 
 
-def _storage_index(voxel: Tensor, offsets: Tensor, block_bits: tuple[int, ...], local_bits: int) -> Tensor:
-    """Storage index (V,) of packed cell indices: each axis's field is cut into block bits and cell
-    bits, and either sort is gathered."""
+def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:
+    """Block in the window's table, and cell in the block, (V,) each, of packed cell indices: each
+    axis's field is cut into block bits and cell bits, and either sort is gathered."""
     bits = tuple(b + local_bits for b in block_bits)
     packed = voxel.int() if sum(bits) < 31 else voxel
     side_mask = (1 << local_bits) - 1
@@ -281,12 +282,12 @@ def _storage_index(voxel: Tensor, offsets: Tensor, block_bits: tuple[int, ...], 
         block = block | ((packed >> (shift + local_bits - above)) & (((1 << width) - 1) << above))
         place = local_bits * (len(bits) - 1 - axis)
         local = local | ((packed >> (shift - place)) & (side_mask << place))
-    return offsets.index_select(0, block).add_(local)
+    return block, local
 
 
 @functools.cache
-def _compiled_storage_index() -> Callable[..., Tensor]:
-    compiled: Callable[..., Tensor] = torch.compile(_storage_index, dynamic=True)
+def _compiled_split() -> Callable[..., tuple[Tensor, Tensor]]:
+    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(_split, dynamic=True)
     return compiled
 
 

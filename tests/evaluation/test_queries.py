@@ -25,7 +25,7 @@ MANY = 1_000_000
 
 
 def along(points: Tensor, origins: Tensor, ends: Tensor) -> Tensor:
-    """How far along its beam each point lies: 0 at the sensor, 1 at the hit. Checks that it is on the beam."""
+    """How far along its beam each point lies, 0 at the sensor, 1 at the hit; fails if it is beside it."""
     beam = ends - origins
     share = ((points - origins) * beam).sum(1) / (beam**2).sum(1)
     torch.testing.assert_close(origins + share[:, None] * beam, points, atol=1e-9, rtol=0)

@@ -39,18 +39,21 @@ def wall(n: int, seed: int = 0) -> Tensor:
     n=st.integers(1, 200),
     dim=st.integers(2, 3),
     min_weight=st.floats(1, 20),
+    min_weight_thick=st.floats(1, 20),
     limit=st.none() | st.integers(1, 12),
 )
-def test_pieces_are_whole_supported_and_no_more_than_asked_for(seed, n, dim, min_weight, limit):
+def test_pieces_are_whole_supported_and_no_more_than_asked_for(
+    seed, n, dim, min_weight, min_weight_thick, limit
+):
     points = cloud(n, dim, seed)
     weight = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 + 0.1
-    rule = FlatnessRule(0.02, 0.3, min_weight, limit)
+    rule = FlatnessRule(0.02, 0.3, min_weight, min_weight_thick, limit)
     labels, n_pieces = partition(points, weight, rule)
     assert labels.shape == (n,)
     assert labels.unique().tolist() == list(range(n_pieces))  # every label used: no piece is empty
     pieces = np.bincount(labels.numpy(), weights=weight.numpy(), minlength=n_pieces)
     if n_pieces > 1:
-        assert pieces.min() >= min_weight - 1e-9
+        assert pieces.min() >= min(min_weight, min_weight_thick) - 1e-9
     if limit is not None:
         assert n_pieces <= limit
 
@@ -65,8 +68,17 @@ def test_what_is_left_whole_is_flat_and_short_or_cannot_be_halved(seed, dim):
         flat = variances[0] <= RULE.thickness**2 * (1 + 1e-9)
         short = variances[-1] <= RULE.length**2 * (1 + 1e-9)
         beyond = ((own - own.mean(0)) @ directions[:, -1] > 0).sum()
-        too_light = min(beyond, len(own) - beyond) < RULE.min_weight
+        thick = variances[0] > (2 * RULE.thickness) ** 2
+        least = RULE.min_weight_thick if thick else RULE.min_weight
+        too_light = min(beyond, len(own) - beyond) < least
         assert (flat and short) or too_light
+
+
+def test_thin_pieces_keep_the_larger_least_weight():
+    rule = FlatnessRule(thickness=0.02, length=0.05, min_weight=40, min_weight_thick=1)
+    labels, n_pieces = cut(wall(1000), rule)
+    assert n_pieces > 4
+    assert int(torch.bincount(labels).min()) >= 40
 
 
 def test_the_same_cloud_is_cut_the_same_way():
@@ -90,7 +102,7 @@ def test_with_a_limit_the_widest_pieces_are_cut_first():
     wide = torch.randn(200, 2, generator=generator, dtype=torch.float64)
     narrow = 0.1 * torch.randn(200, 2, generator=generator, dtype=torch.float64) + 50.0
     points = torch.cat([wide, narrow])
-    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(0.001, 0.001, 2, 3))
+    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(0.001, 0.001, 2, max_components=3))
     assert n_pieces == 3
     assert len(set(labels[200:].tolist())) == 1
     assert len(set(labels[:200].tolist())) == 2

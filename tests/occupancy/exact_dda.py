@@ -34,3 +34,19 @@ def voxels_left(
     if shape is None:
         return left
     return [v for v in left if all(0 <= i < n for i, n in zip(v, shape, strict=True))]
+
+
+def voxels_crossed(start: Sequence[float], end: Sequence[float], shortest: float) -> set[Voxel]:
+    """Voxels, the last one aside, in which a piece of the segment longer than `shortest` lies."""
+    a, b = [Fraction(x) for x in start], [Fraction(x) for x in end]
+    length = math.dist(start, end)
+    crossed = set()
+    for voxel in set(voxels_left(start, end)):
+        enter, leave = Fraction(0), Fraction(1)
+        for i, x, y in zip(voxel, a, b, strict=True):
+            if x != y:
+                near, far = sorted(((i - x) / (y - x), (i + 1 - x) / (y - x)))
+                enter, leave = max(enter, near), min(leave, far)
+        if float(leave - enter) * length > shortest:
+            crossed.add(voxel)
+    return crossed

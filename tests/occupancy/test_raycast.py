@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from exact_dda import voxels_left
+from exact_dda import voxels_crossed, voxels_left
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -170,15 +170,20 @@ def test_float32_rays_are_taken_as_they_are():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_each_voxel_occurs_once_where_rounding_decides_which_plane_comes_first(dim):
-    # Through edges and corners all the way, in coordinates that are no binary fractions.
-    starts = torch.arange(0.1, 1.0, 0.1, dtype=torch.float64)[:, None].repeat(1, dim)
-    starts[:, 0] += 0.03
-    ends = starts + 12.3
-    ends[:, 0] += 0.5
-    found = visited(starts, ends, (20,) * dim)
+@pytest.mark.parametrize("slope", [1.0, 2.0, 0.5, -1.0])
+@pytest.mark.parametrize("resolution", [0.1, 0.3, 0.05])
+def test_voxels_occur_once_and_none_is_missed_where_rounding_decides_on_ties(dim, slope, resolution):
+    # Rays through edges and corners all the way, in coordinates that are no binary fractions.
+    starts = 0.01 * torch.arange(1, 60, dtype=torch.float64)[:, None].repeat(1, dim) / resolution
+    direction = torch.tensor([1.0, slope, 1.0][:dim], dtype=torch.float64)
+    ends = starts + (3.0 + 0.1 * torch.arange(1, 60, dtype=torch.float64)[:, None]) / resolution * direction
+    shift = torch.tensor([0.0, 250.0 if slope < 0 else 0.0, 0.0][:dim], dtype=torch.float64)
+    starts, ends = starts + shift, ends + shift
+    found = visited(starts, ends, (500,) * dim)
     assert len(found) == len(set(found))
-    assert len(found) == len(expected(starts, ends, (20,) * dim))
+    rays = zip(starts.tolist(), ends.tolist(), strict=True)
+    needed = {(r, voxel) for r, (a, b) in enumerate(rays) for voxel in voxels_crossed(a, b, 1e-6)}
+    assert needed <= set(found)
 
 
 # -- chunks, strides, work ----------------------------------------------------------------------------

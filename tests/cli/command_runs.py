@@ -1,0 +1,109 @@
+"""Running a command inside the test's own process, and in one of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from gmmtorch.cli import fit, occupancy
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+COMMANDS = {"occupancy": occupancy, "fit": fit}
+QUIET = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
+TINY = {
+    "occupancy": ["dataset.n_scans=10", "map.n_samples=20000"],
+    "fit": ["max_points=400", "mixture.n_components=5", "mixture.max_iter=20"],
+}
+
+
+@dataclass
+class Finished:
+    """How a command ended: exit status, what it printed, and its run directory."""
+
+    status: int
+    stdout: str
+    stderr: str
+    folder: Path
+
+    def results(self) -> dict[str, Any]:
+        """results.json; NaN and infinity, which JSON has not, are errors."""
+
+        def refuse(text: str) -> float:
+            raise ValueError(f"results.json holds {text}")
+
+        found: dict[str, Any] = json.loads((self.folder / "results.json").read_text(), parse_constant=refuse)
+        return found
+
+    def files(self) -> set[str]:
+        """Every file of the run directory, the hidden ones too."""
+        return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
+
+
+@contextlib.contextmanager
+def as_it_was() -> Iterator[None]:
+    """Hydra's own state and the loggers that it sets up are put back."""
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().clear()
+        for handler in set(root.handlers) - set(handlers):
+            handler.close()
+        root.handlers, root.level = handlers, level
+
+
+def run_here(monkeypatch: pytest.MonkeyPatch, command: str, folder: Path, *options: str) -> Finished:
+    """Run a command in this process: quick, as torch is loaded already."""
+    flags = [option for option in options if option.startswith("-")]  # which Hydra wants first
+    overrides = [option for option in options if option not in flags]
+    monkeypatch.setattr(sys, "argv", [command, *flags, f"hydra.run.dir={folder}", *overrides])
+    stdout, stderr = io.StringIO(), io.StringIO()
+    status: Any = 0
+    with as_it_was(), contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
+        try:
+            COMMANDS[command].main()
+        except SystemExit as end:
+            status = end.code
+            if isinstance(status, str):  # what the interpreter does with it
+                print(status, file=sys.stderr)
+                status = 1
+    return Finished(status or 0, stdout.getvalue(), stderr.getvalue(), folder)
+
+
+def environment() -> dict[str, str]:
+    """For subprocesses: no display, no paths that the checkout's scripts would not have themselves."""
+    return {**os.environ, "MPLBACKEND": "agg", "OMP_NUM_THREADS": "1", "PYTHONPATH": ""}
+
+
+def run_script(command: str, folder: Path, *options: str) -> Finished:
+    """Run scripts/COMMAND.py of the checkout in a process of its own, from some other directory."""
+    arguments = [str(CHECKOUT / "scripts" / f"{command}.py"), f"hydra.run.dir={folder}", *options]
+    done = run_python(arguments, cwd=folder.parent)
+    return Finished(done.returncode, done.stdout, done.stderr, folder)
+
+
+def run_python(arguments: Sequence[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments."""
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment(), capture_output=True, text=True, timeout=120
+    )
+
+
+def timeless(results: dict[str, Any]) -> dict[str, Any]:
+    """results.json without what a clock says."""
+    rows = [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in results["rows"]]
+    return {**results, "rows": rows}

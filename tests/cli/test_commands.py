@@ -1,0 +1,429 @@
+"""The commands end to end: what they write, what they print, and how they fail."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from command_runs import CHECKOUT, QUIET, TINY, Finished, environment, run_here, run_script, timeless
+
+import gmmtorch
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+
+Run = Callable[..., Finished]
+OCCUPANCY_FIELDS = {
+    "dataset", "method", "resolution", "removal", "kept", "auc", "brier", "n_train_points", "n_components",
+    "nbytes", "build_seconds", "query_seconds", "n_queries",
+}  # fmt: skip
+FIT_FIELDS = {
+    "dataset", "method", "n_points", "n_components", "seconds", "n_iterations", "log_likelihood", "psnr2_db",
+    "nbytes",
+}  # fmt: skip
+CARMEN_LOG = "FLASER 3 1.0 2.0 1.5 {x} 0 0 {x} 0 0 0.1 host 0.1\n"
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs a command in this process, small and without figures unless the options say otherwise."""
+
+    def run_command(command: str, *options: str, name: str = "run") -> Finished:
+        return run_here(monkeypatch, command, tmp_path / name, *TINY[command], *QUIET, *options)
+
+    return run_command
+
+
+def succeeded(done: Finished) -> Finished:
+    assert done.status == 0, done.stderr
+    return done
+
+
+# -- a whole run, from the checkout's scripts -----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def occupancy_run(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    folder = tmp_path_factory.mktemp("occupancy") / "run"
+    return succeeded(run_script("occupancy", folder, *TINY["occupancy"]))
+
+
+@pytest.fixture(scope="module")
+def fit_run(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    folder = tmp_path_factory.mktemp("fit") / "run"
+    return succeeded(run_script("fit", folder, *TINY["fit"], "method=[em,scikit_learn]"))
+
+
+@pytest.fixture(params=["occupancy", "fit"])
+def whole_run(request: pytest.FixtureRequest) -> tuple[str, Finished]:
+    finished: Finished = request.getfixturevalue(f"{request.param}_run")
+    return request.param, finished
+
+
+def test_results_are_as_the_contract_says(whole_run):
+    command, done = whole_run
+    results = done.results()
+    assert list(results) == ["command", "version", "seed", "config", "rows"]
+    assert results["command"] == command
+    assert results["version"] == gmmtorch.__version__
+    assert results["seed"] == results["config"]["seed"] == 0
+    assert results["config"]["report"] == {"progress": True, "figures": True, "tensorboard": True}
+    fields = OCCUPANCY_FIELDS if command == "occupancy" else FIT_FIELDS
+    assert len(results["rows"]) == 2
+    for row in results["rows"]:
+        assert fields <= row.keys()
+        assert all(isinstance(value, str | int | float | bool | None) for value in row.values())
+
+
+def test_components_are_null_for_grids_only(occupancy_run):
+    rows = {row["method"]: row for row in occupancy_run.results()["rows"]}
+    assert rows["occupancy_grid"]["n_components"] is None
+    assert rows["monte_carlo"]["n_components"] > 0
+
+
+def test_the_run_directory_holds_results_figures_events_and_configuration(whole_run):
+    command, done = whole_run
+    files = done.files()
+    assert {"results.json", ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml"} <= files
+    expected = {
+        "occupancy": {"auc_against_kept.png", "map_0.1m.png", "roc_0.1m.png", "mixture.png"},
+        "fit": {"convergence.png", "mixture_em.png", "mixture_scikit_learn.png"},
+    }[command]
+    assert {name for name in files if name.endswith(".png")} == expected
+    for name in expected:
+        assert (done.folder / name).read_bytes().startswith(b"\x89PNG")
+    assert any(name.startswith("tensorboard/events.out.tfevents") for name in files)
+    assert not [name for name in files if Path(name).name.startswith(".") and "/" not in name]
+
+
+def test_a_table_and_where_to_look_are_printed(whole_run):
+    _, done = whole_run
+    rows = done.results()["rows"]
+    lines = done.stdout.splitlines()
+    heading = next(i for i, line in enumerate(lines) if line.startswith("method "))
+    assert set(lines[heading + 1]) == {"-", " "}
+    for line, row in zip(lines[heading + 2 :], rows, strict=False):
+        assert line.split()[0] == row["method"]
+    assert rows[0]["dataset"] in done.stdout
+    assert str(done.folder / "results.json") in done.stdout
+    assert f"tensorboard --logdir {done.folder / 'tensorboard'}" in done.stdout
+    assert "nan" not in done.stdout.lower()
+
+
+def test_progress_goes_to_standard_error_and_leaves_no_trace(whole_run):
+    command, done = whole_run
+    assert ("monte_carlo" if command == "occupancy" else "em") in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr
+    assert "%|" not in done.stdout
+
+
+def test_the_event_files_hold_scalars_figures_and_hyperparameters(occupancy_run, fit_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    for done, method in ((occupancy_run, "monte_carlo"), (fit_run, "em")):
+        events = EventAccumulator(str(done.folder / "tensorboard")).Reload()
+        tags = events.Tags()
+        assert any(method in tag for tag in tags["scalars"])
+        assert any(tag.startswith("figures/") for tag in tags["images"])
+        assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
+
+
+def test_mixtures_that_were_fitted_are_saved(fit_run):
+    for row in fit_run.results()["rows"]:
+        path = fit_run.folder / f"{row['method']}.safetensors"
+        assert path.stat().st_size == row["nbytes"]
+        assert GaussianMixture.load(path).means_.shape == (row["n_components"], 3)
+
+
+def test_the_same_seed_gives_the_same_results_in_another_process(whole_run, run):
+    command, done = whole_run
+    options = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
+    extra = ["method=[em,scikit_learn]"] if command == "fit" else []
+    again = succeeded(run(command, *options, *extra))
+    assert timeless(again.results()) == timeless(done.results())
+    assert again.files() == {
+        name if "tfevents" not in name else next(n for n in again.files() if "tfevents" in n)
+        for name in done.files()
+    }
+
+
+# -- options --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["occupancy", "fit"])
+def test_runs_repeat_and_another_seed_gives_other_results(command, run):
+    first, again, other = (
+        succeeded(run(command, f"seed={seed}", name=name)).results()
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert timeless(first) == timeless(again)
+    assert timeless(first)["rows"] != timeless(other)["rows"]
+
+
+@pytest.mark.parametrize("command", ["occupancy", "fit"])
+def test_figures_and_events_are_written_only_if_wanted(command, run):
+    files = succeeded(run(command)).files()
+    assert "results.json" in files
+    assert not [name for name in files if name.endswith(".png") or "tfevents" in name]
+    files = succeeded(run(command, "report.figures=true", name="figures")).files()
+    assert any(name.endswith(".png") for name in files)
+    assert not any("tfevents" in name for name in files)
+
+
+def test_without_progress_nothing_is_said_on_standard_error(run):
+    assert succeeded(run("occupancy")).stderr == ""
+
+
+def test_every_share_resolution_and_method_has_its_row(run, tmp_path):
+    done = succeeded(
+        run(
+            "occupancy",
+            "method=[occupancy_log_odds,monte_carlo,occupancy_grid]",
+            "evaluation.kept=[1.0,0.5]",
+            "evaluation.resolution=[0.2,0.1]",
+            "evaluation.unknown=true",
+            "evaluation.removal=scans",
+            "evaluation.pose_noise=[0.01,0.01]",
+            f"evaluation.save_map={tmp_path / 'maps'}",
+            f"evaluation.save_queries={tmp_path / 'queries.npz'}",
+            "map=per_scan",
+        )
+    )
+    rows = done.results()["rows"]
+    assert len({(row["method"], row["kept"], row["resolution"]) for row in rows}) == len(rows) == 12
+    assert all("unknown_auc" in row and row["removal"] == "scans" for row in rows)
+    assert (tmp_path / "queries.npz").is_file()
+    for row in rows:
+        path = tmp_path / "maps" / f"{row['method']}_{row['kept']:g}_{row['resolution']:g}.safetensors"
+        kind = GaussianMap if row["method"] == "monte_carlo" else OccupancyGrid
+        assert kind.load(path).nbytes == row["nbytes"] == path.stat().st_size
+
+
+def test_a_log_of_ones_own_can_be_mapped(monkeypatch, tmp_path):
+    log = tmp_path / "own.log"
+    log.write_text("".join(CARMEN_LOG.format(x=0.1 * i) for i in range(6)))
+    options = [*QUIET, "map.n_samples=20000", "dataset=carmen", f"dataset.path={log}"]
+    done = succeeded(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
+    assert {row["dataset"] for row in done.results()["rows"]} == {"own"}
+
+
+@pytest.mark.parametrize(("name", "window", "max_origins"), [("per_scan", 1, 1), ("windowed", 20, 8)])
+def test_the_map_is_made_with_the_options_of_its_group(name, window, max_origins, run, tmp_path):
+    options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
+    succeeded(
+        run(
+            "occupancy",
+            "method=[monte_carlo]",
+            f"map={name}",
+            f"evaluation.save_map={tmp_path / 'maps'}",
+            *options,
+        )
+    )
+    made = GaussianMap.load(tmp_path / "maps" / "monte_carlo_1_0.1.safetensors")
+    assert (made.window, made.learning.max_origins) == (window, max_origins)
+    assert (made.learning.noise, made.learning.dtype) == (0.02, "float64")
+    assert (made.n_samples, made.sampling, made.prior, made.random_state) == (20_000, "plain", 0.5, 7)
+
+
+def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
+    done = succeeded(run("occupancy", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path / 'sweep'}"))
+    for number in (0, 1):
+        job = Finished(0, "", "", tmp_path / "sweep" / str(number))
+        assert job.results()["seed"] == number
+        assert ".hydra/overrides.yaml" in job.files()
+    assert not (done.folder / "results.json").exists()
+
+
+# -- failing --------------------------------------------------------------------------------------
+
+
+def refused(done: Finished) -> str:
+    """The one line that a command ends with when something is wrong."""
+    assert done.status == 1
+    assert not (done.folder / "results.json").exists()
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr[-2000:]
+    assert lines[0].startswith("gmmtorch: error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("method=[octree]", "method='octree' known monte_carlo occupancy_grid occupancy_log_odds"),
+        ("method=[]", "method monte_carlo"),
+        ("evaluation.resolution=[-0.1]", "resolution=-0.1"),
+        ("evaluation.resolution=[0]", "resolution=0.0"),
+        ("evaluation.resolution=[nan]", "resolution=nan"),
+        ("evaluation.resolution=[]", "resolution"),
+        ("evaluation.resolution=[1e-9]", "resolution=1e-09 fits"),
+        ("evaluation.kept=[0]", "kept=0.0 share"),
+        ("evaluation.kept=[2]", "kept=2.0 share"),
+        ("evaluation.test_every=1", "test_every=1"),
+        ("evaluation.removal=rays", "removal='rays' beams scans"),
+        ("evaluation.free=behind", "free='behind' uniform near_surface"),
+        ("evaluation.max_beams=0", "max_beams=0"),
+        ("evaluation.pose_noise=[-1,0]", "pose_noise"),
+        ("evaluation.pose_noise=[0.1]", "pose_noise"),
+        ("map.noise=0", "noise=0.0"),
+        ("map.length=inf", "length=inf"),
+        ("map.window=0", "window=0"),
+        ("map.n_samples=0", "n_samples=0"),
+        ("map.sampling=halton", "sampling='halton' sobol"),
+        ("map.prior=-1", "prior=-1"),
+        ("map.max_origins=0", "max_origins=0"),
+        ("dataset.stride=0", "stride=0"),
+        ("dataset.n_scans=1", "1 scans at least 2"),
+        ("dataset.max_range=-1", "max_range=-1"),
+        ("dataset.max_range=0.01", "no beam that hit anything dataset.max_range"),
+        ("runtime.threads=0", "runtime.threads=0"),
+        ("runtime.device=foo", "runtime.device=foo cpu"),
+        ("runtime.device=meta", "runtime.device=meta"),
+        ("runtime.dtype=float16", "dtype='float16' float32 float64"),
+        ("runtime.memory_limit=0", "runtime.memory_limit=0"),
+        ("runtime.memory_limit=1000", "1,000"),
+        ("runtime.memory_limit=1000 method=[occupancy_grid]", "1,000"),
+        ("seed=-1", "seed=-1"),
+        ("evaluation.save_map=/dev/null/maps", "/dev/null/maps"),
+        ("evaluation.save_queries=/dev/null/queries.npz", "/dev/null"),
+    ],
+)
+def test_a_bad_value_for_a_map_is_named_in_one_line(options, words, run):
+    line = refused(run("occupancy", *options.split()))
+    assert all(word in line for word in words.split()), line
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("method=[kmeans]", "method='kmeans' em scikit_learn"),
+        ("method=[]", "method"),
+        ("scans=[99]", "scans=[99] 0 39"),
+        ("scans=[]", "scans"),
+        ("test_share=1", "test_share=1.0"),
+        ("max_points=0", "max_points=0"),
+        ("mixture.n_components=0", "n_components=0"),
+        ("mixture.n_components=9999", "n_components=9999"),
+        ("mixture.n_components=9999 method=[scikit_learn]", "n_components=9999"),
+        ("mixture.init_params=sorted", "init_params='sorted' kmeans"),
+        ("mixture.tol=-1", "tol=-1"),
+        ("mixture.max_iter=0", "max_iter=0"),
+        ("runtime.dtype=float16", "dtype='float16'"),
+        ("seed=-1", "-1"),
+    ],
+)
+def test_a_bad_value_for_a_fit_is_named_in_one_line(options, words, run):
+    line = refused(run("fit", *options.split()))
+    assert all(word in line for word in words.split()), line
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("carmen", "FLASER"),
+        ("scan_folder", "poses.txt"),
+        ("pcd_viewpoint", "VIEWPOINT"),
+        ("depth_frames", "camera-intrinsics.txt"),
+        ("octomap_log", "NODE"),
+    ],
+)
+@pytest.mark.parametrize("command", ["occupancy", "fit"])
+def test_a_path_that_was_not_given_or_is_not_there_says_what_was_looked_for(
+    command, name, kind, monkeypatch, tmp_path
+):
+    for path, message in (
+        ([], "dataset.path is not set"),
+        (["dataset.path=/no/where"], "/no/where does not"),
+    ):
+        done = run_here(monkeypatch, command, tmp_path / "run", *QUIET, f"dataset={name}", *path)
+        line = refused(done)
+        assert message in line
+        assert kind in line
+
+
+def test_a_damaged_file_is_named(monkeypatch, tmp_path):
+    log = tmp_path / "broken.log.gz"
+    log.write_bytes(b"\x1f\x8b broken")
+    options = [*QUIET, "dataset=carmen", f"dataset.path={log}"]
+    assert str(log) in refused(run_here(monkeypatch, "occupancy", tmp_path / "run", *options))
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("evaluation.test_every=often", "evaluation.test_every=often could not be converted to Integer"),
+        ("map.noise=loud", "map.noise=loud could not be converted to Float"),
+        ("dataset.stride=two", "dataset.stride=two could not be converted to Integer"),
+        ("evaluation.kept=0.5", "evaluation.kept=0.5 list"),
+        ("resolution=0.1", "Could not override 'resolution'"),
+        ("map=mosaic", "Could not find 'map/mosaic' per_scan windowed"),
+        ("dataset=intel", "Could not find 'dataset/intel' carmen"),
+    ],
+)
+def test_wrong_types_and_unknown_options_are_explained_without_a_traceback(
+    option, words, monkeypatch, tmp_path
+):
+    done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, option)
+    assert done.status == 1
+    assert "Traceback" not in done.stderr
+    assert all(word in done.stderr for word in words.split()), done.stderr
+    assert not done.folder.exists()
+
+
+def test_the_error_of_a_process_is_one_line_and_its_status_one(tmp_path):
+    done = run_script("occupancy", tmp_path / "run", "method=[octree]")
+    assert "octree" in refused(done)
+    assert done.stdout == ""
+
+
+def test_an_error_in_a_sweep_ends_it(run, tmp_path):
+    done = run("occupancy", "-m", "evaluation.test_every=1,2", f"hydra.sweep.dir={tmp_path / 'sweep'}")
+    assert "test_every=1" in refused(done)
+    assert not list((tmp_path / "sweep").rglob("results.json"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
+def test_ctrl_c_leaves_no_half_written_file(tmp_path):
+    maps, folder = tmp_path / "maps", tmp_path / "run"
+    shares = ",".join(f"{0.9 - 0.001 * i:.3f}" for i in range(500))
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            str(CHECKOUT / "scripts" / "occupancy.py"),
+            f"hydra.run.dir={folder}",
+            f"evaluation.save_map={maps}",
+            f"evaluation.kept=[{shares}]",
+            *TINY["occupancy"],
+            *QUIET,
+        ],
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and process.poll() is None:
+            if len(list(maps.glob("*.safetensors"))) >= 3:
+                break
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert stderr.splitlines() == ["gmmtorch: interrupted; nothing half-written is left."]
+    assert not (folder / "results.json").exists()
+    written = list(maps.iterdir())
+    assert 3 <= len(written) < 1000
+    assert all(path.suffix == ".safetensors" and not path.name.startswith(".") for path in written)
+    for path in written:
+        kind = GaussianMap if path.name.startswith("monte_carlo") else OccupancyGrid
+        assert kind.load(path).nbytes > 0

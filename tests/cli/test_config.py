@@ -1,0 +1,299 @@
+"""Every configuration composes, agrees with the library's own defaults, and is documented."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING as REQUIRED
+from dataclasses import asdict, fields, is_dataclass
+from functools import partial
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_runs import CHECKOUT, as_it_was, run_python
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch import datasets
+from gmmtorch.cli import common, schema
+from gmmtorch.errors import InvalidArgumentError, MissingDataError
+from gmmtorch.evaluation.fitting import FitOptions
+from gmmtorch.evaluation.occupancy import Protocol
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning import LearningRule
+
+CONF = Path(common.conf_dir())
+COMMANDS = ["occupancy", "fit"]
+
+
+def choices(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+@pytest.fixture(autouse=True)
+def hydra_as_it_was() -> Iterator[None]:
+    with as_it_was():
+        yield
+
+
+def composed(command: str, *overrides: str) -> DictConfig:
+    schema.register()
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return compose(command, overrides=list(overrides))
+
+
+def plain(node: DictConfig) -> dict[str, Any]:
+    return {str(key): None if OmegaConf.is_missing(node, key) else node[key] for key in node}
+
+
+def leaves(node: type, prefix: str = "") -> Iterator[str]:
+    """Dotted names of the options of a schema."""
+    for item in fields(node):
+        factory = item.default_factory
+        if factory is not REQUIRED and is_dataclass(factory):
+            yield from leaves(factory, f"{prefix}{item.name}.")  # type: ignore[arg-type]
+        else:
+            yield f"{prefix}{item.name}"
+
+
+# -- composing ------------------------------------------------------------------------------------
+
+
+def test_the_groups_hold_what_is_promised():
+    assert {"carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log"} <= set(
+        choices("dataset")
+    )
+    assert {"synthetic_building", "synthetic_building_2d"} <= set(choices("dataset"))
+    assert {"per_scan", "windowed"} <= set(choices("map"))
+
+
+@pytest.mark.parametrize("dataset", choices("dataset"))
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_data_set_composes_and_its_reader_takes_its_options(command, dataset, tmp_path):
+    config = composed(command, f"dataset={dataset}").dataset
+    assert config.name == dataset
+    if "path" not in list(config):  # `in` alone does not see what has no value yet
+        assert len(common.open_dataset(config)) > 1
+        return
+    assert OmegaConf.is_missing(config, "path")
+    with pytest.raises(InvalidArgumentError, match=r"dataset\.path is not set"):
+        common.open_dataset(config)
+    config.path = str(tmp_path / "nowhere")
+    with pytest.raises(MissingDataError, match=r"nowhere does not exist; looked for"):
+        common.open_dataset(config)
+
+
+@pytest.mark.parametrize("name", choices("map"))
+def test_every_map_composes_under_its_name(name):
+    config = composed("occupancy", f"map={name}", "map.noise=0.02").map
+    assert config.name == name
+    assert config.noise == 0.02
+    assert set(config) == {item.name for item in fields(schema.Map)}
+
+
+@pytest.mark.parametrize("name", choices("dataset"))
+def test_missing_readings_mean_the_same_with_and_without_a_configuration(name, tmp_path):
+    """The values in conf/ are those that the library takes when it is called without options."""
+    config = plain(composed("occupancy", f"dataset={name}").dataset)
+    source = datasets._SOURCES[name]
+    assert config["no_return_range"] == source.no_return_range
+    assert config["max_range"] == source.max_range
+    assert config["stride"] == 1
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_nothing_is_missing_from_the_default_configuration(command):
+    assert not OmegaConf.missing_keys(composed(command))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_results_go_to_outputs_unless_told_otherwise(command):
+    schema.register()
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        node = compose(command, return_hydra_config=True, overrides=["hydra.job.num=3"]).hydra
+        assert node.job.name == command
+        assert node.job.chdir is False
+        assert node.run.dir.startswith(f"outputs/{command}/")
+        assert node.sweep.dir.startswith(f"outputs/{command}/")
+        assert node.sweep.subdir == "3"
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "evaluation.test_every=often",
+        "evaluation.kept=0.5",
+        "evaluation.resolution=[fine]",
+        "map.noise=loud",
+        "dataset.stride=two",
+        "method=monte_carlo",
+        "runtime.threads=many",
+        "evaluation.tests_every=3",
+        "map.windw=3",
+        "dataset.n_scan=3",
+        "map=nonsense",
+    ],
+)
+def test_wrong_types_and_names_are_refused_and_named(override):
+    name = override.split("=")[0]
+    with pytest.raises(ConfigCompositionException, match=name.split(".")[-1]):
+        composed("occupancy", override)
+
+
+# -- one truth about defaults ---------------------------------------------------------------------
+
+
+def test_the_protocol_takes_what_the_options_offer_with_the_same_defaults():
+    ours, theirs = asdict(schema.Evaluation()), asdict(Protocol())
+    assert {k: tuple(v) if isinstance(v, list) else v for k, v in ours.items()} == theirs
+    assert dict(plain(composed("occupancy").evaluation)) == ours
+
+
+def test_the_learning_rule_takes_what_the_options_offer_with_the_same_defaults():
+    options = asdict(schema.Map())
+    for name, value in asdict(LearningRule()).items():
+        assert options.pop(name, value) == value, name
+    made = GaussianMap()
+    for name in ("window", "n_samples", "sampling", "prior"):
+        assert options.pop(name) == getattr(made, name), name
+    assert set(options) == {"name"}
+    assert plain(composed("occupancy").map) == {**asdict(schema.Map()), "name": "windowed"}
+
+
+def test_the_mixture_takes_what_the_options_offer_with_the_same_defaults():
+    ours, theirs = asdict(schema.Mixture()), asdict(FitOptions())
+    assert theirs == {**ours, "dtype": schema.Runtime().dtype}
+    assert plain(composed("fit").mixture) == ours
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_files_repeat_the_defaults_of_the_schema(command):
+    config = composed(command)
+    assert plain(config.report) == asdict(schema.Report())
+    assert plain(config.runtime) == asdict(schema.Runtime())
+
+
+# -- documentation --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [schema.Occupancy, schema.Fit])
+def test_the_configuration_file_shows_every_option(options):
+    """So that --help, which prints the composed file, and the file itself say the same."""
+    text = (CONF / f"{options.__name__.lower()}.yaml").read_text(encoding="utf-8")
+    for name in leaves(options):
+        if not name.startswith(("map.", "dataset")):
+            assert re.search(rf"^ *{name.split('.')[-1]}:", text, re.MULTILINE), name
+
+
+@pytest.mark.parametrize(
+    "options", [schema.Occupancy, schema.Fit, schema.DepthFramesDataset, schema.SyntheticBuildingDataset]
+)
+def test_every_option_is_documented(options):
+    path = CHECKOUT / "docs" / "commands.md"
+    assert path.is_file(), "the options are to be described in docs/commands.md"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    prefix = "dataset." if issubclass(options, schema.FileDataset | schema.SyntheticDataset) else ""
+    silent = {"map.name", "dataset.name"}  # the choice in the group says it
+    missing = [name for name in leaves(options, prefix) if not any(map(partial(speaks_of, name), lines))]
+    assert not set(missing) - silent
+
+
+def speaks_of(name: str, line: str) -> bool:
+    """Whether a line names an option, in full or as `.last` after another of its group."""
+    group, _, last = name.rpartition(".")
+    return f"`{name}`" in line or bool(group and f"`{group}." in line and f"`.{last}`" in line)
+
+
+# -- where conf/ is -------------------------------------------------------------------------------
+
+
+def pretend_package(root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    package = root / "gmmtorch"
+    (package / "cli").mkdir(parents=True)
+    monkeypatch.setattr(common, "__file__", str(package / "cli" / "common.py"))
+    return package
+
+
+def put_conf(folder: Path) -> Path:
+    (folder / "conf").mkdir()
+    (folder / "conf" / "occupancy.yaml").touch()
+    return folder / "conf"
+
+
+def test_conf_is_looked_up_in_the_package_first_and_then_beside_it(tmp_path, monkeypatch):
+    package = pretend_package(tmp_path, monkeypatch)
+    beside = put_conf(tmp_path)
+    assert common.conf_dir() == str(beside)
+    inside = put_conf(package)
+    assert common.conf_dir() == str(inside)
+
+
+def test_a_folder_that_is_only_called_conf_is_not_taken_for_it(tmp_path, monkeypatch):
+    package = pretend_package(tmp_path, monkeypatch)
+    (package / "conf").mkdir()
+    beside = put_conf(tmp_path)
+    assert common.conf_dir() == str(beside)
+
+
+def test_a_missing_conf_says_where_it_was_looked_for(tmp_path, monkeypatch):
+    package = pretend_package(tmp_path, monkeypatch)
+    with pytest.raises(FileNotFoundError, match=re.escape(str(package))) as caught:
+        common.conf_dir()
+    assert "install gmmtorch again" in str(caught.value)
+
+
+# -- answering at once ----------------------------------------------------------------------------
+
+_HEAVY = {"torch", "numpy", "scipy", "sklearn", "matplotlib", "open3d", "safetensors", "tensorboard"}
+_THEN_LIST_MODULES = """
+import sys
+from gmmtorch.cli.{command} import main
+sys.argv = ["gmmtorch-{command}", *{arguments}]
+try:
+    main()
+finally:
+    sys.stdout.flush()
+    print(*sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("arguments", [["--help"], ["--cfg", "job"]], ids=" ".join)
+def test_help_and_configuration_are_shown_without_loading_anything_heavy(command, arguments, tmp_path):
+    code = _THEN_LIST_MODULES.format(command=command, arguments=arguments)
+    done = run_python(["-c", code], cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    modules = set(done.stderr.split())
+    assert {"hydra", "gmmtorch.cli.common"} <= modules
+    assert not _HEAVY & modules
+    assert not list(tmp_path.iterdir())  # nothing was run
+    if arguments == ["--help"]:
+        assert f"gmmtorch-{command}" in done.stdout
+        assert "Examples:" in done.stdout
+        for choice in choices("dataset"):
+            assert choice in done.stdout
+    else:
+        shown = OmegaConf.to_container(OmegaConf.create(done.stdout))
+        assert shown == OmegaConf.to_container(composed(command))
+
+
+def test_the_examples_of_the_help_compose():
+    for command in COMMANDS:
+        text = (CONF / f"{command}.yaml").read_text(encoding="utf-8").replace("\\\n", " ")
+        examples = re.findall(rf"^ +gmmtorch-{command}\b(.*)$", text, re.MULTILINE)
+        assert len(examples) >= 5
+        for example in examples:
+            words = example.split("(shows")[0].replace("'", "").split()
+            overrides = [word for word in words if not word.startswith("-") and word != "job"]
+            if "-m" in words:  # of a sweep, the first value of each
+                overrides = [re.sub(r"=([^,\[]*),.*", r"=\1", word) for word in overrides]
+            composed(command, *overrides)
+
+
+def test_the_commands_are_installed_under_their_names():
+    scripts = {point.name: point.value for point in entry_points(group="console_scripts")}
+    for command in COMMANDS:
+        assert scripts[f"gmmtorch-{command}"] == f"gmmtorch.cli.{command}:main"
