@@ -21,13 +21,13 @@ def hardware() -> str:
     model = platform.processor() or platform.machine()
     cpu_info = Path("/proc/cpuinfo")
     if cpu_info.exists():
-        names = [
-            line.split(":")[1].strip() for line in cpu_info.read_text().splitlines() if "model name" in line
-        ]
+        lines = cpu_info.read_text().splitlines()
+        names = [line.split(":")[1].strip() for line in lines if "model name" in line]
         model = names[0] if names else model
     return (
-        f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used; torch {torch.__version__}, "
-        f"scikit-learn {sklearn.__version__}, numpy {numpy.__version__}, Python {platform.python_version()}"
+        f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used; "
+        f"torch {torch.__version__}, scikit-learn {sklearn.__version__}, "
+        f"numpy {numpy.__version__}, Python {platform.python_version()}"
     )
 
 

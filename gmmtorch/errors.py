@@ -22,6 +22,13 @@ class MissingDataError(GmmTorchError, FileNotFoundError):
         return str(self.args[0]) if self.args else ""
 
 
+class OutputError(GmmTorchError, OSError):
+    """A file could not be written."""
+
+    def __str__(self) -> str:  # OSError would print a bare tuple
+        return str(self.args[0]) if self.args else ""
+
+
 class MemoryLimitError(GmmTorchError, MemoryError):
     """What was asked for does not fit into the memory allowed for it."""
 

@@ -15,28 +15,34 @@ from safetensors.torch import load as safetensors_load
 from safetensors.torch import save as safetensors_save
 from torch import Tensor
 
-from gmmtorch.errors import DataError, MissingDataError
+from gmmtorch.errors import DataError, MissingDataError, OutputError
 
 MAX_FILE_BYTES = 8 << 30
-_MAX_HEADER_BYTES = 1 << 20
 NARROW_DTYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary file beside `path`, then rename it; on any failure nothing is left.
 
-    The temporary file has the same suffix as `path`, as some writers go by it.
+    The temporary file has the same suffix as `path`, as some writers go by it. Raises `OutputError`
+    when the place cannot be written to, or the disk is full.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}; choose another place.") from error
     os.close(handle)
     temporary = Path(name)
     try:
         write(temporary)
         temporary.chmod(0o644)
         temporary.replace(path)
-    except BaseException:  # Ctrl-C and a full disk must not leave a fragment either
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; nothing was.") from error
+    except BaseException:  # Ctrl-C must not leave a fragment either
         temporary.unlink(missing_ok=True)
         raise
     return path
@@ -59,8 +65,11 @@ def write_json(path: str | Path, value: Any) -> Path:
 
 def pack_tensors(tensors: Mapping[str, Tensor], kind: str, version: int, **facts: Any) -> bytes:
     """A safetensors file that says what it holds. `facts` must be JSON."""
-    header = {"format": kind, "version": str(version), "facts": json.dumps(facts)}
-    return safetensors_save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, header)
+    # One entry: with several, their order, and so the file's bytes, would change from run to run.
+    about = json.dumps({"format": kind, "version": version, "facts": facts}, sort_keys=True)
+    return safetensors_save(
+        {k: v.detach().cpu().contiguous() for k, v in tensors.items()}, {"gmmtorch": about}
+    )
 
 
 def read_tensors(path: str | Path, kind: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -76,32 +85,37 @@ def read_tensors(path: str | Path, kind: str, version: int) -> tuple[dict[str, T
     if size > MAX_FILE_BYTES:
         raise DataError(f"{path} has {size:,} bytes, more than the {MAX_FILE_BYTES:,} that are read.")
     data = path.read_bytes()
-    header = _header(data, path)
-    if header.get("format") != kind:
-        raise DataError(f"{path} holds {header.get('format', 'something else')!r}; expected {kind!r}.")
-    if header.get("version") != str(version):
+    about = _about(data, path, kind)
+    if about.get("format") != kind:
+        raise DataError(f"{path} holds {about.get('format', 'something else')!r}; expected {kind!r}.")
+    if about.get("version") != version:
         raise DataError(
-            f"{path} is version {header.get('version')!r} of {kind}; this gmmtorch reads version {version}. "
+            f"{path} is version {about.get('version')!r} of {kind}; this gmmtorch reads version {version}. "
             "Update gmmtorch, or write the file again."
         )
+    facts = about.get("facts")
+    if not isinstance(facts, dict):
+        raise DataError(f"{path}: its facts are no table; the file is damaged.")
     try:
-        return safetensors_load(data), json.loads(header.get("facts", "{}"))
-    except (SafetensorError, ValueError) as error:
+        return safetensors_load(data), facts
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{path} is damaged: {error}") from error
 
 
-def _header(data: bytes, path: Path) -> dict[str, str]:
-    """The `__metadata__` of a safetensors file."""
+def _about(data: bytes, path: Path, kind: str) -> dict[str, Any]:
+    """What `pack_tensors` wrote into the header of a safetensors file."""
     try:
         length = int.from_bytes(data[:8], "little")
-        if len(data) < 8 or length > min(_MAX_HEADER_BYTES, len(data) - 8):
+        if len(data) < 8 or length > len(data) - 8:
             raise ValueError("its header is longer than the file")
-        header = json.loads(data[8 : 8 + length]).get("__metadata__", {})
-        if not isinstance(header, dict):
+        about = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["gmmtorch"])
+        if not isinstance(about, dict):
             raise ValueError("its header is not a table")
-        return header
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise DataError(f"{path} is truncated, or not a safetensors file: {error}") from error
+        return about
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(
+            f"{path} is truncated, or not a file of gmmtorch ({error!r}); expected {kind!r}."
+        ) from error
 
 
 def narrowest(values: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import NumericalError
+from gmmtorch.errors import InvalidArgumentError, NumericalError
 
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
 
@@ -69,3 +69,42 @@ def inverse_factor(factors: Tensor) -> Tensor:
     eye = torch.eye(factors.shape[-1], dtype=factors.dtype, device=factors.device)
     inverse = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)
     return inverse.transpose(-2, -1)
+
+
+def check_symmetric(matrices: Tensor, name: str) -> Tensor:
+    """The matrices (K, D, D), if they are symmetric to rounding; else `InvalidArgumentError`."""
+    difference = (matrices - matrices.transpose(-2, -1)).abs()
+    scale = matrices.diagonal(dim1=-2, dim2=-1).abs().amax(-1)[..., None, None] if matrices.numel() else 1.0
+    if bool((difference > 1e-6 * scale).any()):
+        raise InvalidArgumentError(
+            f"{name} are not symmetric; use (C + C.transpose(-2, -1)) / 2 if that is meant."
+        )
+    return matrices
+
+
+def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Rotation (D, D) and translation (D,) of a rigid motion (D+1, D+1), float64.
+
+    Raises `InvalidArgumentError` unless it is one: finite, its rotation orthonormal with
+    determinant +1, its last row 0 … 0 1.
+    """
+    shape = (dim + 1, dim + 1)
+    if tuple(transform.shape) != shape:
+        raise InvalidArgumentError(
+            f"transform has shape {tuple(transform.shape)}; a rigid motion in {dim}D is {shape}."
+        )
+    matrix = transform.double()
+    rotation, translation = matrix[:dim, :dim], matrix[:dim, dim]
+    identity = torch.eye(dim + 1, dtype=torch.float64, device=matrix.device)
+    rigid = (
+        bool(torch.isfinite(matrix).all())
+        and torch.allclose(rotation @ rotation.T, identity[:dim, :dim], atol=1e-6)
+        and float(torch.linalg.det(rotation)) > 0
+        and torch.equal(matrix[dim], identity[dim])
+    )
+    if not rigid:
+        raise InvalidArgumentError(
+            f"transform={matrix.tolist()} is not rigid; give a rotation (orthonormal, determinant 1), a "
+            "translation in metres, and a last row of 0 … 0 1."
+        )
+    return rotation, translation

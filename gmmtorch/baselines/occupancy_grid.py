@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.files import NARROW_DTYPES, narrowest, pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.evidence import check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
+from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike, Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1
@@ -27,6 +29,11 @@ class LogOdds:
 
     hit: float = math.log(0.9 / 0.1)
     miss: float = math.log(0.4 / 0.6)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                raise InvalidArgumentError(f"LogOdds: {name}={value!r} must be a finite number.")
 
 
 class OccupancyGrid:
@@ -55,7 +62,7 @@ class OccupancyGrid:
     ) -> None:
         self.resolution = check_resolution(resolution)
         self.log_odds = log_odds
-        self.prior = float(prior)
+        self.prior = check_prior(prior)
         self.memory_limit = memory_limit
         self.compiled = compiled
         self._blocks: BlockEvidence | None = None
@@ -98,16 +105,17 @@ class OccupancyGrid:
 
         `resolution` is ignored: a grid answers with its own cells.
         """
-        query = torch.as_tensor(points).double()
-        if bool(torch.isnan(query).any()):
-            raise InvalidArgumentError("points holds NaN; drop such rows before asking.")
+        query = check_queries(points, None if self._blocks is None else self._blocks.dim)
+        device = query.device
+        if self._blocks is not None:
+            query = query.to(self._blocks.keys.device)
         if self._blocks is None:
             theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64)
         elif self.log_odds is None:
             theta = self.evidence().lookup(query, self.prior)
         else:
             theta = torch.sigmoid(self._sum(*self.evidence().evidence_at(query), self.log_odds))
-        return theta if isinstance(points, Tensor) else theta.cpu().numpy()
+        return theta.to(device) if isinstance(points, Tensor) else theta.cpu().numpy()
 
     @staticmethod
     def _sum(hits: Tensor, misses: Tensor, rule: LogOdds) -> Tensor:
@@ -160,14 +168,22 @@ class OccupancyGrid:
         bits = require(tensors, "observed", (keys.shape[0], blocks.cells_per_block // 8), torch.uint8, path)
         observed = _unpack_bits(bits)
         n = int(observed.sum())
-        counts = [tensors[name].double() for name in ("hits", "misses") if name in tensors]
-        if len(counts) != 2 or any(c.shape != (n,) or bool((c < 0).any()) for c in counts):
-            raise DataError(f"{path}: hits and misses should hold {n} counts each; the file is damaged.")
+        counts = [_counts(tensors, name, n, path) for name in ("hits", "misses")]
         if bool((keys[1:] <= keys[:-1]).any()):
             raise DataError(f"{path}: the block keys are not sorted; the file is damaged.")
         blocks.fill(anchor, keys, observed, *counts)
         grid._blocks = blocks
         return grid
+
+
+def _counts(tensors: dict[str, Tensor], name: str, n: int, path: str | Path) -> Tensor:
+    """Counts (n,) ≥ 0 in any of the types that `narrowest` writes, as float64."""
+    stored = tensors.get(name)
+    dtype = stored.dtype if stored is not None and stored.dtype in NARROW_DTYPES else torch.uint8
+    counts = require(tensors, name, (n,), dtype, path)
+    if bool((counts < 0).any()):
+        raise DataError(f"{path}: {name} holds negative counts; the file is damaged.")
+    return counts.double()
 
 
 def _pack_bits(mask: Tensor) -> Tensor:

@@ -67,8 +67,8 @@ def set_up(runtime: DictConfig) -> str:
     if runtime.memory_limit < 1:
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
     try:
-        torch.empty(0, device=runtime.device)
-    except (RuntimeError, AssertionError) as error:
+        torch.zeros(1, device=runtime.device).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidArgumentError(
             f"runtime.device={runtime.device} cannot be used here ({reason}); use cpu, or a torch "

@@ -56,7 +56,8 @@ def run(config: DictConfig) -> float:
     common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {points.shape[0]} points")
     common.print_files(folder, path)
     last = outcome.rows[-1]
-    return float(last["held_out_log_likelihood"] or last["log_likelihood"])
+    held_out = last["held_out_log_likelihood"]
+    return float(last["log_likelihood"] if held_out is None else held_out)
 
 
 def _points(config: DictConfig, dataset: Any, device: str, bars: Any) -> Tensor:

@@ -66,6 +66,7 @@ def fit_scikit_learn(points: Tensor, options: FitOptions, seed: int, on_event: E
         raise InvalidArgumentError(
             f"mixture.init_params={options.init_params!r}: method scikit_learn is compared from kmeans only."
         )
+    GaussianMixture(**vars(options), random_state=seed).check_parameters(points.shape[0])
     on_event("scikit_learn", 0, 1)
     peer = ScikitLearnMixture(
         options.n_components,

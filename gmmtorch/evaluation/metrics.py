@@ -59,7 +59,7 @@ def auc_interval(
     replicates = (above * (np.cumsum(below, 1) - below / 2)).sum(1)
     tail = (1 - level) / 2
     low, high = np.quantile(replicates - replicates.mean(), [tail, 1 - tail]) + auc
-    return float(low), float(high)
+    return max(0.0, float(low)), min(1.0, float(high))
 
 
 def brier(occupied: Tensor, free: Tensor) -> float:

@@ -51,8 +51,15 @@ class Protocol:
             raise InvalidArgumentError(
                 "evaluation.kept and evaluation.resolution need at least one value each."
             )
+        # All at once and before any map is built, which may take hours.
         for value in self.resolution:
             check_resolution(value)
+        for share in self.kept:
+            split.check_share(share)
+        split.check_removal(self.removal)
+        split.check_test_every(self.test_every)
+        split.check_noise(self.pose_noise)
+        queries.check_free(self.free)
         if self.max_beams < 1:
             raise InvalidArgumentError(f"max_beams={self.max_beams} must be at least 1.")
 
@@ -122,6 +129,8 @@ def evaluate(
         seed: of the split's thinning, the free points and the bootstrap.
         on_event: told of progress.
     """
+    if not 0 <= seed < 2**63:
+        raise InvalidArgumentError(f"seed={seed} must be a whole number from 0 to 2⁶³ − 1.")
     train_index, test_index = split.split_indices(len(scans), protocol.test_every)
     train = split.perturb_poses([scans[i] for i in train_index], protocol.pose_noise, seed)
     origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
@@ -169,10 +178,8 @@ def _questions(
     asked = queries.hit_and_free(origins, ends, protocol.free, resolution, seed)
     if not protocol.unknown:
         return asked
-    seen = OccupancyGrid(resolution)  # of all training rays: what is unseen by them is unseen by any share
-    for scan in train:
-        seen.insert(scan)
-    extra = queries.unseen(origins, ends, seen.evidence(), seed)
+    # Of all training rays, at their true poses: what they did not see, no share of them saw.
+    extra = queries.unseen(origins, ends, queries.touched(train, resolution), seed)
     return Queries(torch.cat([asked.points, extra.points]), torch.cat([asked.labels, extra.labels]))
 
 
@@ -191,7 +198,7 @@ def _build(
 
 def _score(built: OccupancyMap, asked: Queries, resolution: float, seed: int, unknown: bool) -> Built:
     begin = time.perf_counter()
-    theta = torch.as_tensor(built.occupancy(asked.points, resolution))
+    theta = torch.as_tensor(built.occupancy(asked.points, resolution)).cpu()
     seconds = time.perf_counter() - begin
     occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
     curve = metrics.roc(occupied, free)

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -34,13 +34,22 @@ class Queries:
         return self.labels == label
 
 
+def check_free(free: str) -> None:
+    """Raises for a choice of free points that is not known."""
+    if free not in get_args(FreePoints):
+        raise InvalidArgumentError(f"free={free!r} is not one of {', '.join(get_args(FreePoints))}.")
+
+
 def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor, Tensor]:
     """Origins and ends (B, D) of the beams of the test scans that hit something.
 
     More than `max_beams` are thinned to that many at random.
     """
-    ends = torch.cat([scan.points.double() for scan in scans])
-    origins = torch.cat([scan.origin.double().expand(scan.points.shape[0], -1) for scan in scans])
+    # On the CPU, where the random numbers are: so every device is asked about the same points.
+    ends = torch.cat([scan.points.double().cpu() for scan in scans])
+    origins = torch.cat([scan.origin.double().cpu().expand(scan.points.shape[0], -1) for scan in scans])
+    measured = (ends != origins).any(1)
+    origins, ends = origins[measured], ends[measured]
     if ends.shape[0] == 0:
         raise InvalidArgumentError(
             "The held-out scans have no beam that hit anything, so there is nothing to test on; "
@@ -59,8 +68,7 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
     The free point is uniform along the beam, or half to two cells before the hit ("near_surface",
     which shows how thick a map's surfaces are), never before the sensor.
     """
-    if free not in ("uniform", "near_surface"):
-        raise InvalidArgumentError(f"free={free!r} is not one of uniform, near_surface.")
+    check_free(free)
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
     if free == "near_surface":
@@ -71,11 +79,20 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
     return Queries(torch.cat([ends, points]), labels)
 
 
+def touched(scans: Sequence[Scan], resolution: float) -> BlockEvidence:
+    """Evidence in every cell that a beam of the scans touched, the ends of empty beams included."""
+    seen = BlockEvidence(resolution, scans[0].dim)
+    for scan in scans:
+        ends = torch.cat([scan.points, scan.no_return]).double().cpu()
+        seen.add_rays(scan.origin.double().cpu().expand_as(ends), ends)
+    return seen
+
+
 def unseen(origins: Tensor, ends: Tensor, seen: BlockEvidence, seed: int) -> Queries:
     """Points 2 to 12 cells behind test hits that no training ray came near.
 
-    `seen` counts all training rays at the resolution in question; a point stays only if its cell
-    and all its neighbours (8 in 2D, 26 in 3D) have no evidence.
+    `seen` is what `touched` makes of the training scans at the resolution in question; a point
+    stays only if its cell and all its neighbours (8 in 2D, 26 in 3D) have no evidence.
     """
     generator = torch.Generator().manual_seed(seed + 1)
     behind = 2 + 10 * torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)

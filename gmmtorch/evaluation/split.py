@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
@@ -15,10 +16,7 @@ Removal = Literal["beams", "scans"]
 
 def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
     """Indices of training and test scans: 0, n, 2n, … are held out."""
-    if test_every < 2:
-        raise InvalidArgumentError(
-            f"test_every={test_every} must be at least 2: with 1 every scan is held out and none is left."
-        )
+    check_test_every(test_every)
     if n_scans < 2:
         raise InvalidArgumentError(
             f"The data set has {n_scans} scans; at least 2 are needed, one to learn from and one to test on."
@@ -28,15 +26,40 @@ def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
     return [i for i in range(n_scans) if i not in held_out], test
 
 
+def check_share(share: float) -> None:
+    """Raises unless the share kept lies in (0, 1]."""
+    if not 0 < share <= 1:
+        raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
+
+
+def check_removal(removal: str) -> None:
+    """Raises for a removal that is not known."""
+    if removal not in get_args(Removal):
+        raise InvalidArgumentError(f"removal={removal!r} is not one of {', '.join(get_args(Removal))}.")
+
+
+def check_noise(noise: Sequence[float]) -> tuple[float, float]:
+    """Standard deviations (m, rad); raises unless they are two finite numbers ≥ 0."""
+    if len(noise) != 2 or not all(math.isfinite(x) and x >= 0 for x in noise):
+        raise InvalidArgumentError(f"pose_noise={list(noise)} must be two numbers ≥ 0: metres and radians.")
+    return float(noise[0]), float(noise[1])
+
+
+def check_test_every(test_every: int) -> None:
+    """Raises unless some scans are left to train on."""
+    if test_every < 2:
+        raise InvalidArgumentError(
+            f"test_every={test_every} must be at least 2: with 1 every scan is held out and none is left."
+        )
+
+
 def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int) -> list[Scan]:
     """The scans with a random share of their beams, or a random share of the scans.
 
     Smaller shares are subsets of larger ones with the same seed.
     """
-    if not 0 < share <= 1:
-        raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
-    if removal not in ("beams", "scans"):
-        raise InvalidArgumentError(f"removal={removal!r} is not one of beams, scans.")
+    check_share(share)
+    check_removal(removal)
     if share == 1:
         return list(scans)
     generator = torch.Generator().manual_seed(seed)
@@ -52,9 +75,7 @@ def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> l
     `noise`: standard deviations of the shift along each axis (m) and of the rotation about each
     axis (rad).
     """
-    shift, angle = noise
-    if not (shift >= 0 and angle >= 0):
-        raise InvalidArgumentError(f"pose_noise={list(noise)} must be two numbers ≥ 0: metres and radians.")
+    shift, angle = check_noise(noise)
     if shift == 0 and angle == 0:
         return list(scans)
     generator = torch.Generator().manual_seed(seed)
@@ -65,7 +86,7 @@ def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> l
         turn = torch.randn(1 if dim == 2 else 3, generator=generator, dtype=torch.float64) * angle
         transform = torch.eye(dim + 1, dtype=torch.float64)
         transform[:dim, :dim] = _rotation(turn)
-        origin = scan.origin.double()
+        origin = scan.origin.double().cpu()
         transform[:dim, dim] = origin + translation - transform[:dim, :dim] @ origin
         moved.append(scan.transformed(transform))
     return moved

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import safe_cholesky
+from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.occupancy.monte_carlo import Cones
 
 
@@ -127,5 +127,5 @@ class Components:
         if bool((self.support < 0).any()) or bool((self.seen_count < 0).any()):
             raise InvalidArgumentError("support and counts must not be negative.")
         if k:
-            safe_cholesky(self.covariances)
+            safe_cholesky(check_symmetric(self.covariances, "covariances"))
         return self

@@ -13,13 +13,15 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import write_bytes
+from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning import LearningRule, learn_window
 from gmmtorch.occupancy.blocks import BlockEvidence
-from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.evidence import Evidence, check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
 from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
+from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike, Scan
 
 METHODS = ("monte_carlo",)
@@ -83,7 +85,9 @@ class GaussianMap(nn.Module):
         self.resolution = check_resolution(resolution)
         self.n_samples = n_samples
         self.sampling: Sampling = sampling
-        self.prior = float(prior)
+        self.prior = check_prior(prior)
+        if not 0 <= random_state < 2**63:
+            raise InvalidArgumentError(f"random_state={random_state} must be a seed from 0 to 2⁶³ − 1.")
         self.random_state = int(random_state)
         self.robot = robot
         self.memory_limit = memory_limit
@@ -114,15 +118,19 @@ class GaussianMap(nn.Module):
             options: as for `GaussianMap`.
         """
         mean = _tensor(means)
+        if mean.ndim != 2 or mean.shape[1] not in (2, 3):
+            raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
         k = mean.shape[0]
-        sightings = _sightings(origins, _tensor(support))
+        weight = _tensor(support)
+        if weight.shape != (k,):
+            raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
         flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
         robot = int(options.get("robot", 0))
         ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
-        covariance = _tensor(covariances)
+        sightings = _sightings(origins, weight, mean.shape[1])
+        components = Components(mean, _tensor(covariances), weight, flags, ids, *sightings).checked()
         made = cls(**options)
-        made._set(Components(mean, covariance, _tensor(support), flags, ids, *sightings).checked())
-        made.frame = made.origins[0].round() if len(made.origins) else mean.new_zeros(mean.shape[1])
+        made._place(components)
         return made
 
     # -- learning ---------------------------------------------------------------------------------
@@ -175,6 +183,12 @@ class GaussianMap(nn.Module):
             self.register_buffer(name, getattr(components, name))
         self._forget_answers()
 
+    def _place(self, components: Components) -> None:
+        """Take over components, rounded as they are stored, about a frame near their origins."""
+        center = components.origins if len(components.origins) else components.means
+        self.frame = center.median(0).values.round() if len(center) else center.new_zeros(components.dim)
+        self._set(storage.storable(components, self.frame))
+
     def _forget_answers(self) -> None:
         self._answers, self._provisional = {}, None
 
@@ -204,17 +218,7 @@ class GaussianMap(nn.Module):
         """
         matrix = _tensor(transform)
         components = self.components()
-        if matrix.shape != (components.dim + 1,) * 2:
-            raise InvalidArgumentError(
-                f"transform has shape {tuple(matrix.shape)}; expected {(components.dim + 1,) * 2}."
-            )
-        rotation = matrix[:-1, :-1]
-        if not torch.allclose(
-            rotation @ rotation.T, torch.eye(components.dim, dtype=torch.float64), atol=1e-6
-        ):
-            raise InvalidArgumentError(
-                f"transform={matrix.tolist()} is not rigid: its rotation is not orthonormal."
-            )
+        check_rigid(matrix, components.dim)
         if self._pending:
             self._pending, self._n_windows = [], self._n_windows + 1
         chosen = torch.ones(len(components), dtype=torch.bool)
@@ -222,7 +226,7 @@ class GaussianMap(nn.Module):
             wanted = torch.as_tensor(ids).reshape(-1, 2).to(components.ids)
             chosen = (components.ids[:, None] == wanted).all(2).any(1)
         moved = components.transformed(matrix.to(components.means), chosen.to(components.means.device))
-        self._set(storage.storable(moved, cast(Tensor, self.frame)))
+        self._place(moved)
 
     # -- answering --------------------------------------------------------------------------------
 
@@ -234,13 +238,7 @@ class GaussianMap(nn.Module):
         Exactly ½ where no evidence is, and everywhere while the map is empty. Arrays in, arrays
         out. The evidence is computed once for each resolution, and kept until the map changes.
         """
-        query = _tensor(points)
-        if query.ndim != 2 or (self.dim is not None and query.shape[1] != self.dim):
-            raise InvalidArgumentError(
-                f"points has shape {tuple(query.shape)}; expected (M, {self.dim or 'D'})."
-            )
-        if bool(torch.isnan(query).any()):
-            raise InvalidArgumentError("points holds NaN; drop such rows before asking.")
+        query = check_queries(points, self.dim)
         if self.dim is None:
             theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64, device=query.device)
         else:
@@ -325,30 +323,42 @@ def _tensor(value: ArrayLike) -> Tensor:
 
 
 def _sightings(
-    origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor
+    origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Table of origins, and seen_by, seen_from, seen_count, of the `origins` of `from_components`."""
     k = support.shape[0]
-    if isinstance(origins, Tensor | np.ndarray):
-        return _tensor(origins), torch.arange(k), torch.arange(k), support
+    if len(origins) != k:
+        raise InvalidArgumentError(
+            f"origins has {len(origins)} entries for {k} components; one each is needed."
+        )
+    if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
+        table = _tensor(cast(ArrayLike, origins)) if k else torch.zeros(0, dim, dtype=torch.float64)
+        return table, torch.arange(k), torch.arange(k), support
     rows: list[Tensor] = []
     by: list[int] = []
     counts: list[float] = []
     for component, seen in enumerate(origins):
-        if torch.as_tensor(seen[0]).ndim == 0:  # one plain position each
-            seen = [(cast(ArrayLike, seen), 1.0)]
         total = sum(float(count) for _, count in seen)
-        if not total > 0:
+        if not total > 0 or min(float(count) for _, count in seen) < 0:
             raise InvalidArgumentError(
-                f"origins[{component}] has counts that add up to {total}; they must be > 0."
+                f"origins[{component}] needs counts of at least zero that add up to more than zero."
             )
         for origin, count in seen:
             rows.append(_tensor(origin))
             by.append(component)
             counts.append(float(count) / total * float(support[component]))
-    if len(origins) != k:
-        raise InvalidArgumentError(
-            f"origins has {len(origins)} entries for {k} components; one each is needed."
-        )
-    table = torch.stack(rows) if rows else torch.zeros(0, 2, dtype=torch.float64)
-    return table, torch.tensor(by), torch.arange(len(by)), torch.tensor(counts, dtype=torch.float64)
+            if rows[-1].shape != (dim,):
+                raise InvalidArgumentError(
+                    f"origins[{component}] holds a position of shape {tuple(rows[-1].shape)}; "
+                    f"expected ({dim},)."
+                )
+    shares = torch.tensor(counts, dtype=torch.float64)
+    return torch.stack(rows), torch.tensor(by), torch.arange(len(by)), shares
+
+
+def _is_position(entry: Any) -> bool:
+    """Whether an entry is one plain position (D,), rather than a list of (position, count)."""
+    try:
+        return torch.as_tensor(entry).ndim == 1
+    except (TypeError, ValueError, RuntimeError):
+        return False

@@ -45,7 +45,7 @@ class LearningRule:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
         for name in ("n_components", "max_origins", "iterations", "max_cells", "min_points"):
             value = getattr(self, name)
-            if value is not None and value < 1:
+            if value is not None and not 1 <= value < float("inf"):
                 raise InvalidArgumentError(f"{name}={value} must be at least 1, or null for the default.")
         if self.dtype not in em.SOFTMAX_DTYPES:
             raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")

@@ -98,6 +98,8 @@ def from_file(path: str | Path) -> tuple[Components, Tensor, dict[str, Any]]:
     sightings = _index(tensors, "sightings", (k,), path)
     seen_from = _index(tensors, "seen_from", (None,), path)
     share = require(tensors, "seen_share", (seen_from.shape[0],), torch.uint8, path).double()
+    if bool((share < 1).any()):
+        raise DataError(f"{path}: seen_share holds zeros; the file is damaged.")
     support = require(tensors, "support", (k,), single, path).double()
     runs = require(tensors, "id_runs", (None, 3), torch.int64, path)
     if int(sightings.sum()) != seen_from.shape[0]:

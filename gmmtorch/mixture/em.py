@@ -70,7 +70,8 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(-1)
     constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
     rows, cols = triangle_indices(dim, means.device)
-    doubled = torch.where(rows == cols, 0.5, 1.0).to(means.dtype)  # off-diagonal products occur once in φ
+    doubled = means.new_ones(rows.shape[0])
+    doubled[rows == cols] = 0.5  # off-diagonal products occur once in φ, and stand for two
     return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
 
 
@@ -153,6 +154,18 @@ def is_ill_conditioned(parameters: Parameters) -> bool:
     return bool((size * parameters.weights.sign()).max() * torch.finfo(whiten.dtype).eps > 1e-6)
 
 
+def _has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
+    """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance needs, or the next step would.
+
+    Works on what may be no covariance at all: nothing is factorised.
+    """
+    alive = parameters.weights > 0
+    variance = torch.linalg.eigvalsh(parameters.covariances)[:, 0]
+    second = statistics[:, 1:].abs().amax(1) / statistics[:, 0].clamp_min(1e-300)
+    lost = torch.finfo(variance.dtype).eps * second > 1e-6 * variance
+    return bool((lost & alive).any())
+
+
 def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
     """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖²: no cancellation, however far out."""
     weights, means, covariances = parameters
@@ -228,7 +241,7 @@ def natural_step(
                 features, sample_weight, natural_parameters(parameters), softmax_dtype
             )
             new = maximization(statistics, reg_covar, parameters)
-            if points is None or not is_ill_conditioned(new):
+            if points is None or not _has_cancelled(statistics, new):
                 return new, float(value / total)
         new, value = direct_step(points, sample_weight, parameters, reg_covar)
         return new, float(value / total)

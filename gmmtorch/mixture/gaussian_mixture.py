@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
-from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.linalg import check_rigid, check_symmetric, inverse_factor, safe_cholesky
 from gmmtorch.mixture import em
 from gmmtorch.mixture.em import EMResult, Parameters
 from gmmtorch.mixture.initialization import INITIALIZATIONS, start
@@ -128,7 +128,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         weight, mean, covariance = checked
         if bool((weight < 0).any()) or abs(float(weight.sum()) - 1) > 1e-6:
             raise InvalidArgumentError(f"weights={weight.tolist()} must be at least zero and add up to one.")
-        safe_cholesky(covariance)
+        safe_cholesky(check_symmetric(covariance, "covariances"))
         mixture._tensors = isinstance(means, Tensor)
         mixture.n_features_in_ = dim
         mixture._set_history(lower_bounds, converged)
@@ -157,15 +157,11 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
                 number of points of non-zero weight.
             NumericalError: a component collapsed, as happens with reg_covar = 0.
         """
-        self._check_parameters()
+        self.check_parameters()
         points = self._as_points(X, reset=True)
         weight = self._as_weight(sample_weight, points)
         points, weight = points[weight > 0], weight[weight > 0]
-        if points.shape[0] < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={points.shape[0]} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        self.check_parameters(points.shape[0])
         center = (points * (weight / weight.sum())[:, None]).sum(0)
         centered = points - center
         dtype = em.SOFTMAX_DTYPES[self.dtype]
@@ -199,6 +195,12 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
     ) -> Parameters:
         """Where EM begins, in the centred frame."""
         if self._continues():
+            if self.means.shape != (self.n_components, points.shape[1]):
+                raise InvalidArgumentError(
+                    f"warm_start=True goes on from means of shape {tuple(self.means.shape)}, but "
+                    f"n_components={self.n_components} and the points have {points.shape[1]} dimensions; "
+                    "set it to False."
+                )
             means = self.means.to(points.device) - center
             return Parameters(self.weights.to(points.device), means, self.covariances.to(points.device))
         given = (self.weights_init, self.means_init, self.precisions_init)
@@ -233,6 +235,11 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         self.lower_bound_ = self.lower_bounds_[-1] if self.lower_bounds_ else math.nan
         self.n_iter_ = len(self.lower_bounds_)
         self.converged_ = bool(converged)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMixture:
+        """Moves between devices; parameters stay float64 whatever dtype a network around them takes."""
+        super()._apply(lambda tensor: fn(tensor).double(), recurse)
+        return self
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
@@ -338,18 +345,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         """A copy moved by a rigid motion (D+1, D+1): means R μ + t, covariances R Σ Rᵀ."""
         means = self._fitted()
         matrix = torch.as_tensor(transform, dtype=torch.float64, device=means.device)
-        dim = means.shape[1]
-        if matrix.shape != (dim + 1, dim + 1):
-            raise InvalidArgumentError(
-                f"transform has shape {tuple(matrix.shape)}; a rigid motion of this mixture is "
-                f"{(dim + 1, dim + 1)}."
-            )
-        rotation, translation = matrix[:dim, :dim], matrix[:dim, dim]
-        identity = torch.eye(dim, dtype=torch.float64, device=means.device)
-        if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6):
-            raise InvalidArgumentError(
-                f"transform={matrix.tolist()} is not rigid: its rotation is not orthonormal."
-            )
+        rotation, translation = check_rigid(matrix, means.shape[1])
         moved = GaussianMixture(**BaseEstimator.get_params(self, deep=False))
         facts = ("_tensors", "n_features_in_", "lower_bounds_", "lower_bound_", "n_iter_", "converged_")
         for name in facts:
@@ -400,7 +396,8 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
 
     # -- arguments --------------------------------------------------------------------------------
 
-    def _check_parameters(self) -> None:
+    def check_parameters(self, n_points: int | None = None) -> None:
+        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
         for name in ("n_components", "max_iter", "n_init"):
             value = getattr(self, name)
             if not isinstance(value, numbers.Integral) or int(value) < 1:
@@ -409,12 +406,18 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             value = getattr(self, name)
             if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
                 raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
-        if self.init_params not in INITIALIZATIONS:
+        if not isinstance(self.init_params, str) or self.init_params not in INITIALIZATIONS:
             raise InvalidArgumentError(
                 f"init_params={self.init_params!r} is not one of {', '.join(INITIALIZATIONS)}."
             )
-        if self.dtype not in em.SOFTMAX_DTYPES:
+        if not isinstance(self.dtype, str) or self.dtype not in em.SOFTMAX_DTYPES:
             raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
+        as_generator(self.random_state)
+        if n_points is not None and n_points < self.n_components:
+            raise InvalidArgumentError(
+                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
+                "non-zero weight; ask for fewer components, or give more points."
+            )
 
     def _as_points(self, X: Array, reset: bool = False) -> Tensor:
         """X as a float64 tensor (N, D), checked; with `reset`, D and the kind of X are remembered."""
@@ -428,6 +431,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             points = points if reset else points.to(self.means.device)
         else:
             points = _checked_tensor(X).double()
+            points = points.detach() if reset else points
             if reset:
                 self.n_features_in_ = points.shape[1]
         if reset:

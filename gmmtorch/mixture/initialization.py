@@ -24,8 +24,8 @@ Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator], Paramet
 
 def distinct_points(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Distinct rows in lexicographic order, and the sum of the weights of each."""
-    unique, inverse = np.unique(points.cpu().numpy(), axis=0, return_inverse=True)
-    sums = np.bincount(inverse.reshape(-1), weights=weight.cpu().numpy(), minlength=unique.shape[0])
+    unique, inverse = np.unique(points.detach().cpu().numpy(), axis=0, return_inverse=True)
+    sums = np.bincount(inverse.reshape(-1), weights=weight.detach().cpu().numpy(), minlength=unique.shape[0])
     return torch.from_numpy(unique).to(points.device), torch.from_numpy(sums).to(points.device)
 
 
@@ -39,8 +39,13 @@ def from_kmeans(
         warnings.simplefilter("ignore", ConvergenceWarning)  # fewer clusters than asked for: see start()
         labels = kmeans.fit(points.cpu().numpy(), sample_weight=weight.cpu().numpy()).labels_
     labels = torch.from_numpy(labels.astype(np.int64)).to(points.device)
-    statistics = pool(quadratic_features(points), weight, labels, n_components)
-    return maximization(statistics, reg_covar)
+    # Second moments about each cluster's own mean: clusters may be thin, and far apart.
+    count = points.new_zeros(n_components).index_add_(0, labels, weight).clamp_min(1e-300)
+    means = points.new_zeros(n_components, points.shape[1])
+    means = means.index_add_(0, labels, points * weight[:, None]) / count[:, None]
+    statistics = pool(quadratic_features(points - means[labels]), weight, labels, n_components)
+    found = maximization(statistics, reg_covar)
+    return Parameters(found.weights, means + found.means, found.covariances)
 
 
 def from_random_points(

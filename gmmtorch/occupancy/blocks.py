@@ -8,6 +8,7 @@ its ray and nothing else.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -29,6 +30,10 @@ class _Window(NamedTuple):
     low: Tensor  # (D,) lowest block coordinate
     bits: tuple[int, ...]  # bits of the block coordinate along each axis, within the window
     offsets: Tensor  # flat table, block in window → storage index of its first cell
+
+
+class _Full(Exception):  # noqa: N818  # never leaves this file
+    """The blocks do not fit the memory limit."""
 
 
 class BlockEvidence:
@@ -143,19 +148,47 @@ class BlockEvidence:
         """
         if ends.shape[0] == 0:
             return
-        window = self._open_window(origins, ends)
-        self._add_misses(window, origins, ends, weights, chunk_visits)
+        try:
+            window = self._open_window(origins, ends)
+            self._add_misses(window, origins, ends, weights, chunk_visits)
+        except _Full:
+            raise MemoryLimitError(
+                f"resolution={self.resolution} m takes more bytes for the cells that rays touch than the "
+                f"limit of {self.memory_limit:,}; a resolution of "
+                f"{self._fitting_resolution(origins, ends):.3g} m fits."
+            ) from None
         index, stored = self._locate(ends)
         counted = stored if is_hit is None else stored & is_hit
         source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
         self.hits.view(-1).scatter_add_(0, index[counted], source[counted])
 
+    def _fitting_resolution(self, origins: Tensor, ends: Tensor) -> float:
+        """A coarser resolution, of three digits, at which the blocks that these rays touch fit."""
+        resolution = self.resolution
+        while True:
+            resolution = float(f"{resolution * 1.3:.3g}")
+            side = resolution * self.block_side
+            starts, stops = origins.double() / side, ends.double() / side
+            both = torch.cat([starts, stops]).floor()
+            low = both.amin(0)
+            shape = tuple((both.amax(0) - low + 1).long().tolist())
+            touched = torch.zeros(math.prod(shape), dtype=torch.bool, device=low.device)
+            for visit in traverse(starts, stops, shape, low=low):
+                touched[visit.voxel] = True
+            # The end blocks come on top, and what is stored of earlier rays, which shrinks at least so.
+            n_ends = torch.unique(stops.floor(), dim=0).shape[0]
+            earlier = self.n_blocks * self.resolution / resolution
+            if (
+                int(touched.sum()) + n_ends + earlier
+            ) * self.cells_per_block * BYTES_PER_CELL <= self.memory_limit:
+                return resolution
+
     def _open_window(self, origins: Tensor, ends: Tensor) -> _Window:
         """The box of blocks around the rays, with the blocks that they end in allocated."""
         side = self.block_side
-        size = self.resolution * side
-        low = torch.minimum(origins.double().amin(0), ends.double().amin(0)).div(size).floor()
-        high = torch.maximum(origins.double().amax(0), ends.double().amax(0)).div(size).floor()
+        starts, stops = self._cells(origins), self._cells(ends)
+        low = torch.minimum(starts.amin(0), stops.amin(0)).div(side).floor()
+        high = torch.maximum(starts.amax(0), stops.amax(0)).div(side).floor()
         shape = (high - low + 1).long().tolist()
         bits = tuple((n - 1).bit_length() for n in shape)
         n_bytes = 8 << sum(bits)
@@ -169,7 +202,7 @@ class BlockEvidence:
         if self.anchor is None:
             self.anchor = low.long()
         window = _Window(low, bits, torch.full((1 << sum(bits),), -1, device=low.device))
-        block = (self._cells(ends).div(side).floor() - low).long()
+        block = (stops.div(side).floor() - low).long()
         index = (block * torch.tensor(_power_of_two_strides(bits), device=low.device)).sum(1)
         touched = torch.zeros(1 << sum(bits), dtype=torch.bool, device=low.device)
         touched[index] = True
@@ -193,12 +226,7 @@ class BlockEvidence:
         n_blocks = self.n_blocks + fresh.numel()
         n_bytes = n_blocks * self.cells_per_block * BYTES_PER_CELL
         if n_bytes > self.memory_limit:
-            factor = (n_bytes / self.memory_limit) ** (1 / self.dim)
-            raise MemoryLimitError(
-                f"resolution={self.resolution} m takes {n_bytes:,} bytes for the cells that rays touch, "
-                f"above the limit of {self.memory_limit:,}; a resolution of "
-                f"{self.resolution * factor * 1.1:.3g} m fits."
-            )
+            raise _Full
         if n_blocks > self._storage.shape[1]:
             # Grow by half again, so that many small insertions stay cheap.
             capacity = max(n_blocks, self._storage.shape[1] * 3 // 2)
@@ -216,14 +244,14 @@ class BlockEvidence:
         # Cell indices are packed into powers of two, so that bit fields give block and cell.
         bits = tuple(b + local_bits for b in window.bits)
         shape = tuple(1 << b for b in bits)
-        corner = window.low * side
-        starts = origins.double() / self.resolution - corner
-        stops = ends.double() / self.resolution - corner
+        # In lattice units, not relative to the window: every cell is the one that a query would name.
+        starts, stops = origins.double() / self.resolution, ends.double() / self.resolution
+        low = window.low * side
         ones = torch.ones((), dtype=torch.float64, device=starts.device)
         weight = None if weights is None else weights.double()
         split = _compiled_split() if self.compiled else _split
         strides = _power_of_two_strides(bits)
-        for visit in traverse(starts, stops, shape, chunk_visits, strides, self.compiled):
+        for visit in traverse(starts, stops, shape, chunk_visits, strides, self.compiled, low):
             block, local = split(visit.voxel, window.bits, local_bits)
             offset = window.offsets.index_select(0, block)
             if int(offset.min()) < 0:

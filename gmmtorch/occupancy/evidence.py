@@ -22,13 +22,20 @@ class CellClass(IntEnum):
     OCCUPIED = 1
 
 
+def check_prior(prior: float) -> float:
+    """The prior count; raises `InvalidArgumentError` when it is negative or not finite."""
+    value = float(prior)
+    if not (math.isfinite(value) and value >= 0):
+        raise InvalidArgumentError(f"prior={prior} must be a count of at least zero; the thesis uses 1.")
+    return value
+
+
 def occupancy_probability(hits: Tensor, misses: Tensor, prior: float = 1.0) -> Tensor:
     """θ = (H + N_p)/(H + M + 2N_p), thesis (3.9); ½ where there is no evidence at all.
 
     Raises `InvalidArgumentError` when the prior count N_p is negative or not finite.
     """
-    if not (math.isfinite(prior) and prior >= 0):
-        raise InvalidArgumentError(f"prior={prior} must be a count of at least zero; the thesis uses 1.")
+    check_prior(prior)
     total = hits + misses + 2 * prior
     return torch.where(total > 0, (hits + prior) / total.clamp_min(torch.finfo(total.dtype).tiny), 0.5)
 

@@ -45,6 +45,8 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))  # a tensor will do
+        if any(int(n) != n for n in self.shape):
+            raise InvalidArgumentError(f"shape={self.shape} must be whole numbers of cells.")
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         object.__setattr__(self, "resolution", check_resolution(self.resolution))
         if len(self.origin) != len(self.shape) or len(self.shape) not in (2, 3):
@@ -83,16 +85,14 @@ class VoxelGrid:
             b < a for a, b in zip(low, high, strict=True)
         ):
             raise InvalidArgumentError(f"low={low}, high={high} is not a box of finite metres.")
-        first = [math.floor(x / resolution) for x in low]
-        shape = tuple(max(1, math.floor(x / resolution) + 1 - i) for x, i in zip(high, first, strict=True))
+        first, shape = _covering_cells(low, high, resolution)
         n_bytes = math.prod(shape) * BYTES_PER_CELL
         if n_bytes > memory_limit:
-            factor = (n_bytes / memory_limit) ** (1 / len(shape))
+            size = " × ".join(f"{b - a:.1f}" for a, b in zip(low, high, strict=True))
             raise MemoryLimitError(
-                f"resolution={resolution} m over a box of "
-                f"{' × '.join(f'{b - a:.1f}' for a, b in zip(low, high, strict=True))} m takes "
-                f"{' × '.join(map(str, shape))} cells = {n_bytes:,} bytes, above the limit of "
-                f"{memory_limit:,}; a resolution of {resolution * factor * 1.02:.3g} m or more fits."
+                f"resolution={resolution} m over a box of {size} m takes {' × '.join(map(str, shape))} "
+                f"cells = {n_bytes:,} bytes, above the limit of {memory_limit:,}; a resolution of "
+                f"{_fitting_resolution(low, high, resolution, memory_limit):.3g} m or more fits."
             )
         return cls(tuple(i * resolution for i in first), resolution, shape)
 
@@ -119,3 +119,18 @@ class VoxelGrid:
             for o, n in zip(self.origin, self.shape, strict=True)
         ]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.dim)
+
+
+def _covering_cells(
+    low: list[float], high: list[float], resolution: float
+) -> tuple[list[int], tuple[int, ...]]:
+    """Lowest cell of the box, and the number of cells along each axis."""
+    first = [math.floor(x / resolution) for x in low]
+    return first, tuple(math.floor(x / resolution) + 1 - i for x, i in zip(high, first, strict=True))
+
+
+def _fitting_resolution(low: list[float], high: list[float], resolution: float, memory_limit: int) -> float:
+    """A coarser resolution, of three digits, at which the box's evidence fits the limit."""
+    while math.prod(_covering_cells(low, high, resolution)[1]) * BYTES_PER_CELL > memory_limit:
+        resolution = float(f"{resolution * 1.05:.3g}")
+    return resolution

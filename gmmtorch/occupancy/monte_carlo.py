@@ -66,7 +66,9 @@ def sample_rays(
     if n_samples < 1:
         raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
     device, dim = cones.means.device, cones.means.shape[1]
-    if sampling == "plain":
+    if not bool((cones.counts > 0).any()):
+        cone, weights = torch.empty(0, dtype=torch.int64, device=device), cones.counts.double()[:0]
+    elif sampling == "plain":
         total = cones.counts.double().sum()
         cone = torch.multinomial(cones.counts.double().cpu(), n_samples, True, generator=generator).to(device)
         weights = (total / n_samples).expand(n_samples)

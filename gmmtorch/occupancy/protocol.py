@@ -5,7 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import ArrayLike, Scan
+
+
+def check_queries(points: ArrayLike, dim: int | None) -> Tensor:
+    """Points (M, D) to ask about, as float64; `dim` is the map's, None while it is empty.
+
+    Raises `InvalidArgumentError` for another shape, and for NaN. Infinite points are unknown space.
+    """
+    query = torch.as_tensor(points).double()
+    if query.ndim != 2 or query.shape[1] != (dim or query.shape[1]):
+        raise InvalidArgumentError(f"points has shape {tuple(query.shape)}; expected (M, {dim or 'D'}).")
+    if bool(torch.isnan(query).any()):
+        raise InvalidArgumentError("points holds NaN; drop such rows before asking.")
+    return query
 
 
 @runtime_checkable

@@ -6,7 +6,8 @@ tensor; the voxel that is left follows from the plane on that axis and from `flo
 Every voxel that a ray passes through, save the one it ends in, is left exactly once.
 
 Coordinates here are *grid units*: voxel (i, j, k) is [i, i+1) × [j, j+1) × [k, k+1).
-Where a ray crosses two planes in the same point it crosses the lower axis first.
+Where a ray crosses two planes in the same point it crosses the lower axis first; points closer than
+rounding can tell count as the same, so that both axes decide alike.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+_TIE = 1e-13  # of the size of the terms: some hundred times their rounding
 
 CHUNK_VISITS = 1 << 18
 """Voxel visits worked on at once: small enough to stay in a core's cache, whatever the ray count."""
@@ -31,7 +34,7 @@ class Visits(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Rays mirrored so that every direction component is ≥ 0 (shapes (R, D))."""
+    """Rays mirrored so that no direction component is negative, the grid at [0, size); (R, D) each."""
 
     start: Tensor
     delta: Tensor
@@ -40,44 +43,46 @@ class _Rays(NamedTuple):
     flipped: Tensor  # which axes were mirrored
 
 
-def _mirrored(starts: Tensor, ends: Tensor) -> _Rays:
-    first, last = starts.floor(), ends.floor()
+def _mirrored(starts: Tensor, ends: Tensor, low: Tensor, size: Tensor) -> _Rays:
     delta = ends - starts
     flipped = delta < 0
+    # Voxels are named before the grid's corner is taken off, so that rounding cannot rename them.
     # Voxel i = [i, i+1) becomes (−i−1, −i] under x → −x: closed on the other side, which is what
-    # the tie rule below wants, since a mirrored start on a plane has that plane still to cross.
-    mirror = lambda x: torch.where(flipped, -x, x)  # noqa: E731
-    mirror_index = lambda i: torch.where(flipped, -i - 1, i)  # noqa: E731
-    return _Rays(mirror(starts), delta.abs(), mirror_index(first), mirror_index(last), flipped)
+    # the tie rule wants, since a mirrored start on a plane has that plane still to cross.
+    first, last = starts.floor() - low, ends.floor() - low
+    start = starts - low
+    return _Rays(
+        torch.where(flipped, size - start, start),
+        delta.abs(),
+        torch.where(flipped, size - 1 - first, first),
+        torch.where(flipped, size - 1 - last, last),
+        flipped,
+    )
 
 
-def _planes_inside(rays: _Rays, shape: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """First crossing and number of crossings on `axis` that can touch the grid, each (R,).
 
     Crossing k goes from mirrored voxel first+k to first+k+1. Those whose voxel lies outside the
     grid on this axis are cut off; on the other axes an interval of crossings that certainly
     contains every inside one is kept, so work is bounded by the grid however long the ray is.
     """
-    size = shape[axis]
-    low = torch.where(rays.flipped[:, axis], -size, torch.zeros_like(size))
     first, last = rays.first[:, axis], rays.last[:, axis]
-    begin = torch.maximum(low, first)
-    stop = torch.minimum(low + size, last)  # crossings leave voxels begin … stop−1
+    begin = first.clamp_min(0)
+    stop = torch.minimum(size[axis], last)  # crossings leave voxels begin … stop−1
     for other in range(rays.start.shape[1]):
         if other == axis:
             continue
-        low_o = torch.where(rays.flipped[:, other], -shape[other], torch.zeros_like(size))
         step = rays.delta[:, other]
         ratio = rays.delta[:, axis] / step
-        enter = rays.start[:, axis] + (low_o - rays.start[:, other]) * ratio
-        leave = rays.start[:, axis] + (low_o + shape[other] - rays.start[:, other]) * ratio
+        enter = rays.start[:, axis] - rays.start[:, other] * ratio
+        leave = rays.start[:, axis] + (size[other] - rays.start[:, other]) * ratio
         slack = 2 + 1e-9 * (enter.abs() + leave.abs())  # only a bound: the mask decides
         moving = (step > 0) & torch.isfinite(enter) & torch.isfinite(leave)
         begin = torch.where(moving, torch.maximum(begin, (enter - slack).floor()), begin)
         stop = torch.where(moving, torch.minimum(stop, (leave + slack).ceil()), stop)
-        parallel_outside = (step == 0) & (
-            (rays.first[:, other] < low_o) | (rays.first[:, other] >= low_o + shape[other])
-        )
+        first_o = rays.first[:, other]
+        parallel_outside = (step == 0) & ((first_o < 0) | (first_o >= size[other]))
         stop = torch.where(parallel_outside, begin, stop)
     return begin - first, (stop - begin).clamp_min(0).long()
 
@@ -92,14 +97,17 @@ class _Progression(NamedTuple):
 
 
 class _Other(NamedTuple):
-    """Per-ray constants of another axis, (R,) each: its position at crossing k is (a + k·b)/step."""
+    """Per-ray constants of another axis, (R,) each: its position at crossing k is (a + k·b)/step.
+
+    `a` holds the slack of the tie rule: a plane of a lower axis, which is crossed first in a tie,
+    counts as crossed slightly before it is reached, one of a higher axis only slightly after.
+    """
 
     a: Tensor
     b: Tensor
     first: Tensor
     last: Tensor
     stride: Tensor
-    low: Tensor  # the grid's lowest index, mirrored like the ray
     size: int
     is_lower_axis: bool
 
@@ -113,15 +121,11 @@ def _voxels_left(
     step = along.step.index_select(0, ray)
     inside: Tensor | None = None
     for other in others:
-        # Scaled by step, the two terms of the position are exact for coordinates of up to 24
-        # significant bits, so that ties fall as the rule says.
         position = torch.addcmul(other.a.index_select(0, ray), k, other.b.index_select(0, ray)).div_(step)
-        # Planes of a lower axis are crossed first in a tie, those of a higher axis afterwards.
         index = position.floor_() if other.is_lower_axis else position.ceil_().sub_(1)
         index = torch.clamp(index, other.first.index_select(0, ray), other.last.index_select(0, ray))
         if masked:
-            low = other.low.index_select(0, ray)
-            within = (index >= low) & (index < low + other.size)
+            within = (index >= 0) & (index < other.size)
             inside = within if inside is None else inside & within
         voxel = torch.addcmul(voxel, index, other.stride.index_select(0, ray))
     return voxel.long(), inside
@@ -140,19 +144,18 @@ def _crossings(
     device = rays.start.device
     size = torch.tensor(shape, dtype=torch.float64, device=device)
     if masked:
-        offset, count = _planes_inside(rays, size, axis)
+        skipped, count = _planes_inside(rays, size, axis)
     else:
-        offset = torch.zeros_like(rays.start[:, axis])
+        skipped = torch.zeros_like(rays.start[:, axis])
         count = (rays.last[:, axis] - rays.first[:, axis]).long()
     ray = torch.repeat_interleave(count)
-    signed = torch.where(rays.flipped, -1.0, 1.0).double() * torch.tensor(
-        strides, dtype=torch.float64, device=device
-    )  # mirrored index i is voxel i, or −i−1 where flipped
-    shift = (rays.flipped * signed).sum(1)
+    stride_t = torch.tensor(strides, dtype=torch.float64, device=device)
+    signed = torch.where(rays.flipped, -stride_t, stride_t)  # mirrored voxel i is size − 1 − i
+    shift = (rays.flipped * stride_t * (size - 1)).sum(1)
     step = rays.delta[:, axis]
     # Along this axis the plane of crossing k is first + k + 1, and the voxel left is first + k.
     along = _Progression(
-        begin=torch.cumsum(count, 0) - count - offset.long(),
+        begin=torch.cumsum(count, 0) - count - skipped.long(),
         base=signed[:, axis] * rays.first[:, axis] + shift,
         stride=signed[:, axis].contiguous(),
         step=step.contiguous(),
@@ -160,12 +163,13 @@ def _crossings(
     to_first = rays.first[:, axis] + 1 - rays.start[:, axis]  # from the start to the first plane
     others = [
         _Other(
-            a=rays.start[:, other] * step + to_first * rays.delta[:, other],
+            a=rays.start[:, other] * step
+            + to_first * rays.delta[:, other]
+            + _slack(rays, axis, other) * (1 if other < axis else -1),
             b=rays.delta[:, other].contiguous(),
             first=rays.first[:, other].contiguous(),
             last=rays.last[:, other].contiguous(),
             stride=signed[:, other].contiguous(),
-            low=-size[other] * rays.flipped[:, other],
             size=shape[other],
             is_lower_axis=other < axis,
         )
@@ -174,6 +178,14 @@ def _crossings(
     ]
     voxel, inside = (_compiled_voxels_left() if compiled else _voxels_left)(ray, along, others, masked)
     return Visits(voxel, ray) if inside is None else Visits(voxel[inside], ray[inside])
+
+
+def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
+    """How far apart (R,) crossings of two axes may be, in units of the product of their steps, to be
+    taken for one: the same for (axis, other) and (other, axis), so that either decides alike."""
+    size_a = rays.start[:, axis].abs() + rays.delta[:, axis] + 1
+    size_o = rays.start[:, other].abs() + rays.delta[:, other] + 1
+    return _TIE * (size_o * rays.delta[:, axis] + size_a * rays.delta[:, other])
 
 
 def row_major_strides(shape: tuple[int, ...]) -> list[int]:
@@ -190,6 +202,7 @@ def traverse(
     chunk_visits: int = CHUNK_VISITS,
     strides: list[int] | None = None,
     compiled: bool = False,
+    low: Tensor | None = None,
 ) -> Iterator[Visits]:
     """Voxels passed through and left by each segment, the end voxel excluded.
 
@@ -201,6 +214,7 @@ def traverse(
         strides: of the flat voxel index, one for each axis; row-major if not given.
         compiled: enumerate with torch.compile: the same voxels several times faster, after some
             tens of seconds for its first use in a process. Needs a C++ compiler.
+        low: (D,) index of the grid's lowest voxel, whose flat index is 0; zeros if not given.
 
     Yields:
         `Visits` of flat voxel indices and ray indices. Within a ray each voxel occurs once;
@@ -208,11 +222,11 @@ def traverse(
     """
     if starts.shape[0] == 0:
         return
-    rays = _mirrored(starts.double(), ends.double())
-    size = torch.tensor(shape, dtype=torch.float64, device=starts.device)
     strides = strides or row_major_strides(shape)
-    low = torch.where(rays.flipped, -size, torch.zeros_like(size))
-    fits = ((rays.first >= low) & (rays.last < low + size)).all(1)
+    size = torch.tensor(shape, dtype=torch.float64, device=starts.device)
+    lowest = torch.zeros_like(size) if low is None else low.double()
+    rays = _mirrored(starts.double(), ends.double(), lowest, size)
+    fits = ((rays.first >= 0) & (rays.last < size)).all(1)
     # A ray that leaves the grid visits at most sum(shape) of its voxels.
     visits = torch.minimum((rays.last - rays.first).sum(1), size.sum() + 4 * len(shape))
     for begin, stop in itertools.pairwise(_chunk_bounds(visits, chunk_visits)):

@@ -143,14 +143,12 @@ def test_mixtures_that_were_fitted_are_saved(fit_run):
 
 def test_the_same_seed_gives_the_same_results_in_another_process(whole_run, run):
     command, done = whole_run
-    options = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
     extra = ["method=[em,scikit_learn]"] if command == "fit" else []
-    again = succeeded(run(command, *options, *extra))
-    assert timeless(again.results()) == timeless(done.results())
-    assert again.files() == {
-        name if "tfevents" not in name else next(n for n in again.files() if "tfevents" in n)
-        for name in done.files()
-    }
+    again, results = timeless(succeeded(run(command, *extra)).results()), timeless(done.results())
+    assert again["rows"] == results["rows"]
+    for config in (again["config"], results["config"]):
+        del config["report"]  # only what is shown differs
+    assert again == results
 
 
 # -- options --------------------------------------------------------------------------------------
@@ -259,25 +257,16 @@ def refused(done: Finished) -> str:
         ("method=[octree]", "method='octree' known monte_carlo occupancy_grid occupancy_log_odds"),
         ("method=[]", "method monte_carlo"),
         ("evaluation.resolution=[-0.1]", "resolution=-0.1"),
-        ("evaluation.resolution=[0]", "resolution=0.0"),
-        ("evaluation.resolution=[nan]", "resolution=nan"),
-        ("evaluation.resolution=[]", "resolution"),
         ("evaluation.resolution=[1e-9]", "resolution=1e-09 fits"),
         ("evaluation.kept=[0]", "kept=0.0 share"),
         ("evaluation.kept=[2]", "kept=2.0 share"),
         ("evaluation.test_every=1", "test_every=1"),
         ("evaluation.removal=rays", "removal='rays' beams scans"),
-        ("evaluation.free=behind", "free='behind' uniform near_surface"),
         ("evaluation.max_beams=0", "max_beams=0"),
-        ("evaluation.pose_noise=[-1,0]", "pose_noise"),
         ("evaluation.pose_noise=[0.1]", "pose_noise"),
         ("map.noise=0", "noise=0.0"),
-        ("map.length=inf", "length=inf"),
-        ("map.window=0", "window=0"),
         ("map.n_samples=0", "n_samples=0"),
-        ("map.sampling=halton", "sampling='halton' sobol"),
         ("map.prior=-1", "prior=-1"),
-        ("map.max_origins=0", "max_origins=0"),
         ("dataset.stride=0", "stride=0"),
         ("dataset.n_scans=1", "1 scans at least 2"),
         ("dataset.max_range=-1", "max_range=-1"),
@@ -286,7 +275,6 @@ def refused(done: Finished) -> str:
         ("runtime.device=foo", "runtime.device=foo cpu"),
         ("runtime.device=meta", "runtime.device=meta"),
         ("runtime.dtype=float16", "dtype='float16' float32 float64"),
-        ("runtime.memory_limit=0", "runtime.memory_limit=0"),
         ("runtime.memory_limit=1000", "1,000"),
         ("runtime.memory_limit=1000 method=[occupancy_grid]", "1,000"),
         ("seed=-1", "seed=-1"),
@@ -305,15 +293,11 @@ def test_a_bad_value_for_a_map_is_named_in_one_line(options, words, run):
         ("method=[kmeans]", "method='kmeans' em scikit_learn"),
         ("method=[]", "method"),
         ("scans=[99]", "scans=[99] 0 39"),
-        ("scans=[]", "scans"),
         ("test_share=1", "test_share=1.0"),
         ("max_points=0", "max_points=0"),
-        ("mixture.n_components=0", "n_components=0"),
         ("mixture.n_components=9999", "n_components=9999"),
         ("mixture.n_components=9999 method=[scikit_learn]", "n_components=9999"),
         ("mixture.init_params=sorted", "init_params='sorted' kmeans"),
-        ("mixture.tol=-1", "tol=-1"),
-        ("mixture.max_iter=0", "max_iter=0"),
         ("runtime.dtype=float16", "dtype='float16'"),
         ("seed=-1", "-1"),
     ],
@@ -324,27 +308,21 @@ def test_a_bad_value_for_a_fit_is_named_in_one_line(options, words, run):
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("command", "options", "words"),
     [
-        ("carmen", "FLASER"),
-        ("scan_folder", "poses.txt"),
-        ("pcd_viewpoint", "VIEWPOINT"),
-        ("depth_frames", "camera-intrinsics.txt"),
-        ("octomap_log", "NODE"),
+        ("occupancy", "dataset=carmen", "dataset.path is not set FLASER"),
+        (
+            "fit",
+            "dataset=scan_folder dataset.path=/no/where",
+            "dataset.path=/no/where does not exist poses.txt",
+        ),
     ],
 )
-@pytest.mark.parametrize("command", ["occupancy", "fit"])
 def test_a_path_that_was_not_given_or_is_not_there_says_what_was_looked_for(
-    command, name, kind, monkeypatch, tmp_path
+    command, options, words, monkeypatch, tmp_path
 ):
-    for path, message in (
-        ([], "dataset.path is not set"),
-        (["dataset.path=/no/where"], "/no/where does not"),
-    ):
-        done = run_here(monkeypatch, command, tmp_path / "run", *QUIET, f"dataset={name}", *path)
-        line = refused(done)
-        assert message in line
-        assert kind in line
+    line = refused(run_here(monkeypatch, command, tmp_path / "run", *QUIET, *options.split()))
+    assert all(word in line for word in words.split()), line
 
 
 def test_a_damaged_file_is_named(monkeypatch, tmp_path):

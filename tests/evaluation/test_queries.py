@@ -16,7 +16,16 @@ from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
 from gmmtorch.evaluation.occupancy import Protocol, evaluate, methods
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries, hit_and_free, save_queries, unseen
+from gmmtorch.evaluation.queries import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    Queries,
+    hit_and_free,
+    save_queries,
+    touched,
+    unseen,
+)
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.scan import Scan
@@ -167,10 +176,8 @@ def test_unseen_points_are_those_behind_hits_that_no_training_ray_came_near(dim,
 def test_the_tip_of_a_beam_without_return_has_been_near():
     """A beam without return ends in cell (10, 0); points of column 11 have it for a neighbour."""
     beam = Scan(torch.empty(0, 2), torch.tensor([0.05, 0.05]), torch.tensor([[1.03, 0.05]]))
-    grid = OccupancyGrid(0.1)
-    grid.insert(beam)
     ends = torch.tensor([[1.15, 0.65]], dtype=torch.float64).expand(200, 2)
-    found = unseen(ends + torch.tensor([0.0, 1.4]), ends, grid.evidence(), seed=0)
+    found = unseen(ends + torch.tensor([0.0, 1.4]), ends, touched([beam], 0.1), seed=0)
     row = (found.points[:, 1] / 0.1).floor()
     assert set(row[(row >= 2) | (row <= -2)].tolist()) >= {3.0, 2.0, -2.0, -3.0}
     assert not bool(((row >= -1) & (row <= 1)).any())
