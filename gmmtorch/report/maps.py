@@ -105,7 +105,9 @@ def map_figure(
         _bar(figure, band[0], ScalarMappable(Normalize(0, 1), _greys()), "occupancy probability θ")
     if dim == 3:
         views = np.concatenate([band[1] for band in bands])
-        cut = [_below(panel, _ceiling(panel, path, ceiling, occupied_above)) for panel in panels]
+        # One height for all: panels that are cut differently cannot be compared.
+        top = min(_ceiling(panel, path, ceiling, occupied_above) for panel in panels)
+        cut = [_below(panel, top) for panel in panels]
         images = [height_image(panel, occupied_above, shown_pixels, max_queries) for panel in cut]
         heights = _draw_heights(views, panels, cut, images, occupied_above)
         for band in bands:

@@ -249,8 +249,9 @@ def _draw_perspective(
     axes.set_box_aspect(box[1] - box[0], zoom=1.1)
     axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     axes.set_title("perspective", fontsize=TITLE_SIZE)
+    axes.set_xlabel("x [m]", fontsize=LABEL_SIZE)
+    axes.set_ylabel("y [m]", fontsize=LABEL_SIZE)  # z: the colour bar says it, and its label has no room
     for name in "xyz":
-        getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=LABEL_SIZE)
         getattr(axes, f"{name}axis").set_pane_color((0.97, 0.97, 0.97, 1.0))
     axes.tick_params(labelsize=TICK_SIZE - 1)
 
