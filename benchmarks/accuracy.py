@@ -3,7 +3,7 @@
     python benchmarks/accuracy.py --data FOLDER
 
 FOLDER holds laser2d/*.log.gz, hall/, courtyard/ and kinect/. The same settings for every data set.
-Writes its table into BENCHMARKS.md.
+Writes its tables into BENCHMARKS.md and README.md.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import torch
-from tables import hardware, markdown, publish
+from tables import ROOT, hardware, markdown, publish
 
 from gmmtorch import GaussianMap, LearningRule, datasets
 from gmmtorch.datasets import Dataset
@@ -42,6 +42,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows: list[list[object]] = []
+    short: list[list[object]] = []
     factories = {
         **methods(GaussianMap),
         "monte_carlo, per scan": lambda resolution: GaussianMap(1, LearningRule(max_origins=1)),
@@ -51,6 +52,7 @@ def main() -> None:
             continue
         outcome = evaluate(name, list(dataset), factories, Protocol(test_every, KEPT, "beams", resolutions))
         for resolution in resolutions:
+            short.append([name, f"{resolution:g} m", *brief(outcome.rows, resolution)])
             for kept in KEPT:
                 cells = {
                     row["method"]: row
@@ -62,6 +64,20 @@ def main() -> None:
     header = ["data", "cell (m)", "beams kept", *factories]
     note = "AUC ± half the width of its 95 % bootstrap interval, components, file size."
     publish("accuracy", f"{note} {hardware()}\n\n{markdown(header, rows)}")
+    header = ["data", "cell", "100 %", "30 %", "10 %", "grid", "mixture"]
+    publish("readme-accuracy", markdown(header, short), ROOT / "README.md")
+
+
+def brief(rows: list[dict], resolution: float) -> list[str]:
+    """AUC of grid → mixture at three shares, and their bytes with all beams."""
+
+    def find(method: str, kept: float) -> dict:
+        wanted = (method, kept, resolution)
+        return next(row for row in rows if (row["method"], row["kept"], row["resolution"]) == wanted)
+
+    pairs = [(find("occupancy_grid", kept), find("monte_carlo", kept)) for kept in (1.0, 0.3, 0.1)]
+    cells = [f"{grid['auc']:.3f} → {ours['auc']:.3f}" for grid, ours in pairs]
+    return [*cells, *(f"{row['nbytes'] / 1e3:,.0f} KB" for row in pairs[0])]
 
 
 def summary(row: dict) -> str:

@@ -13,7 +13,8 @@ import torch
 
 from gmmtorch.files import write_bytes
 
-PAGE = Path(__file__).resolve().parent.parent / "BENCHMARKS.md"
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "BENCHMARKS.md"
 
 
 def hardware() -> str:
@@ -38,13 +39,13 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     return "\n".join(lines)
 
 
-def publish(name: str, text: str) -> None:
-    """Put `text` between the markers of `name` in BENCHMARKS.md, which must be there."""
-    page = PAGE.read_text()
+def publish(name: str, text: str, file: Path = PAGE) -> None:
+    """Put `text` between the markers of `name` in a page, which must have them."""
+    page = file.read_text()
     begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
     if begin not in page or end not in page:
-        raise SystemExit(f"BENCHMARKS.md has no place for {name!r}: add {begin} and {end}.")
+        raise SystemExit(f"{file.name} has no place for {name!r}: add {begin} and {end}.")
     before, rest = page.split(begin)
     after = rest.split(end)[1]
-    write_bytes(PAGE, f"{before}{begin}\n{text}\n{end}{after}".encode())
+    write_bytes(file, f"{before}{begin}\n{text}\n{end}{after}".encode())
     print(f"\n{name}\n{text}")

@@ -159,6 +159,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         """
         self.check_parameters()
         points = self._as_points(X, reset=True)
+        _warn_if_coarse(X, points)
         weight = self._as_weight(sample_weight, points)
         points, weight = points[weight > 0], weight[weight > 0]
         self.check_parameters(points.shape[0])
@@ -499,6 +500,21 @@ def as_generator(random_state: RandomState) -> torch.Generator:
             "a numpy RandomState or a torch Generator."
         )
     return generator
+
+
+def _warn_if_coarse(X: Array, points: Tensor) -> None:
+    """Warn about float32 points so far from the origin that rounding is over 1 % of their spread."""
+    if getattr(X, "dtype", None) not in (torch.float32, np.float32):
+        return
+    rounding = torch.finfo(torch.float32).eps * points.abs().amax(0)
+    spread = points.std(0, correction=0)
+    if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):
+        warnings.warn(
+            f"X is float32 and up to {float(points.abs().max()):.3g} from the origin, where it is rounded to "
+            f"{float(rounding.max()):.1g}; give float64, or subtract an offset before it becomes float32.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _checked_tensor(X: Tensor) -> Tensor:

@@ -905,3 +905,14 @@ def test_a_damaged_file_is_refused_or_is_a_mixture(tmp_path, sound_bytes, place,
         return
     assert bool(torch.isfinite(torch.as_tensor(gmm.score_samples(torch.zeros(2, 2)))).all())
     json.dumps(gmm.get_params(), default=str)
+
+
+def test_float32_points_far_out_warn_and_float64_ones_do_not():
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    far = points + 5e5
+    with pytest.warns(UserWarning, match=r"float32 and up to 5e\+05.*give float64"):
+        GaussianMixture(2, random_state=0).fit(far.astype(np.float32))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        GaussianMixture(2, random_state=0, max_iter=500).fit(far)
+        GaussianMixture(2, random_state=0, max_iter=500).fit(points.astype(np.float32))
