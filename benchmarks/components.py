@@ -25,7 +25,8 @@ RULES: dict[str, dict[str, float]] = {
     "noise 20 mm": {"noise": 0.02},
     "length 0.15 m": {"length": 0.15},
     "length 0.6 m": {"length": 0.6},
-    "twice min_points": {"min_points": 2},  # times the default of the dimension
+    "half min_points": {"min_points": 0.5},  # times the default of the dimension
+    "twice min_points": {"min_points": 2},
     "no EM after the cuts": {"iterations": 1},
     "20 iterations of EM": {"iterations": 20},
     "2 origins": {"max_origins": 2},
@@ -52,7 +53,6 @@ def main() -> None:
     parser.add_argument("--names", nargs="+", default=["intel", "aces", "hall", "kinect"])
     options = parser.parse_args()
     torch.set_num_threads(1)
-    tables = []
     for name in options.names:
         scans, protocol = data(options.data, name)
         rows: list[list[object]] = []
@@ -63,9 +63,7 @@ def main() -> None:
             rows.append(row)
         grid = evaluate(name, scans, {"occupancy_grid": methods(GaussianMap)["occupancy_grid"]}, protocol)
         rows.append(columns("(count grid)", grid.rows)[1])
-        tables.append(f"**{name}**\n\n{markdown(header, rows)}")
-        print(tables[-1], flush=True)
-    publish("components", f"{hardware()}\n\n" + "\n\n".join(tables))
+        publish(f"components-{name}", f"{name}. {hardware()}\n\n{markdown(header, rows)}")
 
 
 def factory(changes: dict[str, float], dim: int):
@@ -73,7 +71,7 @@ def factory(changes: dict[str, float], dim: int):
     options = dict(changes)
     window = int(options.pop("window", 20))
     if "min_points" in options:
-        options["min_points"] *= 3 if dim == 2 else 10
+        options["min_points"] *= 6 if dim == 2 else 20
     for whole in ("iterations", "max_origins"):
         if whole in options:
             options[whole] = int(options[whole])

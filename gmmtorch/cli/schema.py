@@ -45,7 +45,7 @@ class Map:
     n_components: int | None = None  # of a window at most; null: as many as its surfaces ask for
     noise: float = 0.01  # standard deviation of the range sensor (m)
     length: float = 0.3  # largest standard deviation (m) along a component
-    min_points: float | None = None  # fewest points a component is made of; null: 3 in 2D, 10 in 3D
+    min_points: float | None = None  # fewest points a component is made of; null: 6 in 2D, 20 in 3D
     max_origins: int = 8  # sensor positions kept for a component
     iterations: int = 5  # of EM
     max_cells: int = 20000  # more points than this are first summed into cells
