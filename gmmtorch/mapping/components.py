@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.occupancy.monte_carlo import Cones
+from gmmtorch.scan import ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,3 +132,45 @@ class Components:
         if k:
             safe_cholesky(check_symmetric(self.covariances, "covariances"))
         return self
+
+
+def sightings_of(
+    origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Table of origins, and seen_by, seen_from, seen_count, of the `origins` of `from_components`."""
+    k = support.shape[0]
+    if len(origins) != k:
+        raise InvalidArgumentError(
+            f"origins has {len(origins)} entries for {k} components; one each is needed."
+        )
+    if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
+        table = torch.as_tensor(origins).double() if k else torch.zeros(0, dim, dtype=torch.float64)
+        return table, torch.arange(k), torch.arange(k), support
+    rows: list[Tensor] = []
+    by: list[int] = []
+    counts: list[float] = []
+    for component, seen in enumerate(origins):
+        total = sum(float(count) for _, count in seen)
+        if not total > 0 or min(float(count) for _, count in seen) < 0:
+            raise InvalidArgumentError(
+                f"origins[{component}] needs counts of at least zero that add up to more than zero."
+            )
+        for origin, count in seen:
+            rows.append(torch.as_tensor(origin).double())
+            by.append(component)
+            counts.append(float(count) / total * float(support[component]))
+            if rows[-1].shape != (dim,):
+                raise InvalidArgumentError(
+                    f"origins[{component}] holds a position of shape {tuple(rows[-1].shape)}; "
+                    f"expected ({dim},)."
+                )
+    shares = torch.tensor(counts, dtype=torch.float64)
+    return torch.stack(rows), torch.tensor(by), torch.arange(len(by)), shares
+
+
+def _is_position(entry: Any) -> bool:
+    """Whether an entry is one plain position (D,), rather than a list of (position, count)."""
+    try:
+        return torch.as_tensor(entry).ndim == 1
+    except (TypeError, ValueError, RuntimeError):
+        return False

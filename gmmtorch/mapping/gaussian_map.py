@@ -15,7 +15,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import Components, sightings_of
 from gmmtorch.mapping.learning import LearningRule, learn_window
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence, check_prior
@@ -127,7 +127,7 @@ class GaussianMap(nn.Module):
         flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
         robot = int(options.get("robot", 0))
         ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
-        sightings = _sightings(origins, weight, mean.shape[1])
+        sightings = sightings_of(origins, weight, mean.shape[1])
         components = Components(mean, _tensor(covariances), weight, flags, ids, *sightings).checked()
         made = cls(**options)
         made._place(components)
@@ -320,45 +320,3 @@ def _check_method(method: str) -> None:
 
 def _tensor(value: ArrayLike) -> Tensor:
     return torch.as_tensor(value).double()
-
-
-def _sightings(
-    origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Table of origins, and seen_by, seen_from, seen_count, of the `origins` of `from_components`."""
-    k = support.shape[0]
-    if len(origins) != k:
-        raise InvalidArgumentError(
-            f"origins has {len(origins)} entries for {k} components; one each is needed."
-        )
-    if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
-        table = _tensor(cast(ArrayLike, origins)) if k else torch.zeros(0, dim, dtype=torch.float64)
-        return table, torch.arange(k), torch.arange(k), support
-    rows: list[Tensor] = []
-    by: list[int] = []
-    counts: list[float] = []
-    for component, seen in enumerate(origins):
-        total = sum(float(count) for _, count in seen)
-        if not total > 0 or min(float(count) for _, count in seen) < 0:
-            raise InvalidArgumentError(
-                f"origins[{component}] needs counts of at least zero that add up to more than zero."
-            )
-        for origin, count in seen:
-            rows.append(_tensor(origin))
-            by.append(component)
-            counts.append(float(count) / total * float(support[component]))
-            if rows[-1].shape != (dim,):
-                raise InvalidArgumentError(
-                    f"origins[{component}] holds a position of shape {tuple(rows[-1].shape)}; "
-                    f"expected ({dim},)."
-                )
-    shares = torch.tensor(counts, dtype=torch.float64)
-    return torch.stack(rows), torch.tensor(by), torch.arange(len(by)), shares
-
-
-def _is_position(entry: Any) -> bool:
-    """Whether an entry is one plain position (D,), rather than a list of (position, count)."""
-    try:
-        return torch.as_tensor(entry).ndim == 1
-    except (TypeError, ValueError, RuntimeError):
-        return False

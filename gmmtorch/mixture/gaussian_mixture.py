@@ -22,11 +22,17 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_rigid, check_symmetric, inverse_factor, safe_cholesky
 from gmmtorch.mixture import em
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    checked_parameter,
+    checked_tensor,
+    checked_weight,
+    warn_if_coarse,
+)
 from gmmtorch.mixture.em import EMResult, Parameters
 from gmmtorch.mixture.initialization import INITIALIZATIONS, start
-
-Array = Tensor | np.ndarray
-RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
 
@@ -118,7 +124,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         k, dim = mean.shape
         mixture = cls(k, **options)
         checked = (
-            _checked_init(value, shape, name, mean.device)
+            checked_parameter(value, shape, name, mean.device)
             for value, shape, name in (
                 (weights, (k,), "weights"),
                 (means, (k, dim), "means"),
@@ -159,8 +165,8 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         """
         self.check_parameters()
         points = self._as_points(X, reset=True)
-        _warn_if_coarse(X, points)
-        weight = self._as_weight(sample_weight, points)
+        warn_if_coarse(X, points)
+        weight = checked_weight(sample_weight, points)
         points, weight = points[weight > 0], weight[weight > 0]
         self.check_parameters(points.shape[0])
         center = (points * (weight / weight.sum())[:, None]).sum(0)
@@ -209,7 +215,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         shapes = ((k,), (k, dim), (k, dim, dim))
         names = ("weights_init", "means_init", "precisions_init")
         first_weights, first_means, precisions = (
-            None if value is None else _checked_init(value, shape, name, points.device)
+            None if value is None else checked_parameter(value, shape, name, points.device)
             for value, shape, name in zip(given, shapes, names, strict=True)
         )
         if first_weights is None or first_means is None or precisions is None:
@@ -431,7 +437,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
             points = torch.from_numpy(np.array(checked, dtype=np.float64))
             points = points if reset else points.to(self.means.device)
         else:
-            points = _checked_tensor(X).double()
+            points = checked_tensor(X).double()
             points = points.detach() if reset else points
             if reset:
                 self.n_features_in_ = points.shape[1]
@@ -443,25 +449,6 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
                 "features as input."
             )
         return points
-
-    def _as_weight(self, sample_weight: Array | None, points: Tensor) -> Tensor:
-        n = points.shape[0]
-        if sample_weight is None:
-            return points.new_ones(n)
-        if not isinstance(sample_weight, Tensor):
-            sample_weight = torch.from_numpy(np.array(sample_weight, dtype=np.float64))
-        weight = sample_weight.to(points.device, torch.float64)
-        if weight.shape != (n,):
-            raise InvalidArgumentError(
-                f"sample_weight has shape {tuple(weight.shape)}; expected ({n},), one weight for each point."
-            )
-        if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()):
-            raise InvalidArgumentError(
-                "sample_weight holds NaN, infinite or negative weights; make them ≥ 0."
-            )
-        if float(weight.sum()) == 0:
-            raise InvalidArgumentError("sample_weight is all zero; at least one point must count.")
-        return weight
 
     def _fitted(self) -> Tensor:
         """The means, if there are any."""
@@ -481,62 +468,3 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
 
     def __sklearn_is_fitted__(self) -> bool:
         return "means" in self._buffers
-
-
-def as_generator(random_state: RandomState) -> torch.Generator:
-    """A CPU generator from a seed, a NumPy RandomState, a generator (returned as it is), or None (fresh)."""
-    if isinstance(random_state, torch.Generator):
-        return random_state
-    generator = torch.Generator()
-    if random_state is None:
-        generator.seed()
-    elif isinstance(random_state, np.random.RandomState):
-        generator.manual_seed(int(random_state.randint(2**31 - 1)))
-    elif isinstance(random_state, int | np.integer) and 0 <= int(random_state) < 2**63:
-        generator.manual_seed(int(random_state))
-    else:
-        raise InvalidArgumentError(
-            f"random_state={random_state!r} must be None, a whole number of at least 0, "
-            "a numpy RandomState or a torch Generator."
-        )
-    return generator
-
-
-def _warn_if_coarse(X: Array, points: Tensor) -> None:
-    """Warn about float32 points so far from the origin that rounding is over 1 % of their spread."""
-    if getattr(X, "dtype", None) not in (torch.float32, np.float32):
-        return
-    rounding = torch.finfo(torch.float32).eps * points.abs().amax(0)
-    spread = points.std(0, correction=0)
-    if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):
-        warnings.warn(
-            f"X is float32 and up to {float(points.abs().max()):.3g} from the origin, where it is rounded to "
-            f"{float(rounding.max()):.1g}; give float64, or subtract an offset before it becomes float32.",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
-def _checked_tensor(X: Tensor) -> Tensor:
-    if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
-        raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
-    if X.is_complex():
-        raise InvalidArgumentError("X is complex; Complex data not supported.")
-    finite = torch.isfinite(X).all(1)
-    if not bool(finite.all()):
-        row = int((~finite).nonzero()[0])
-        raise InvalidArgumentError(
-            f"X[{row}] = {X[row].tolist()} is not finite; drop such rows: X = X[torch.isfinite(X).all(1)]."
-        )
-    return X
-
-
-def _checked_init(value: Array, shape: tuple[int, ...], name: str, device: torch.device) -> Tensor:
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
-    if tuple(tensor.shape) != shape or not bool(torch.isfinite(tensor).all()):
-        raise InvalidArgumentError(
-            f"{name} has shape {tuple(tensor.shape)}; expected finite numbers of shape {shape}."
-        )
-    if name == "weights_init" and (bool((tensor < 0).any()) or float(tensor.sum()) <= 0):
-        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be ≥ 0 and not all zero.")
-    return tensor

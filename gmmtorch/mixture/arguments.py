@@ -1,0 +1,92 @@
+"""What the arguments of a mixture may be: types, checks, and the errors of those that cannot be."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+Array = Tensor | np.ndarray
+RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
+
+
+def as_generator(random_state: RandomState) -> torch.Generator:
+    """A CPU generator from a seed, a NumPy RandomState, a generator (returned as it is), or None (fresh)."""
+    if isinstance(random_state, torch.Generator):
+        return random_state
+    generator = torch.Generator()
+    if random_state is None:
+        generator.seed()
+    elif isinstance(random_state, np.random.RandomState):
+        generator.manual_seed(int(random_state.randint(2**31 - 1)))
+    elif isinstance(random_state, int | np.integer) and 0 <= int(random_state) < 2**63:
+        generator.manual_seed(int(random_state))
+    else:
+        raise InvalidArgumentError(
+            f"random_state={random_state!r} must be None, a whole number of at least 0, "
+            "a numpy RandomState or a torch Generator."
+        )
+    return generator
+
+
+def warn_if_coarse(X: Array, points: Tensor) -> None:
+    """Warn about float32 points so far from the origin that rounding is over 1 % of their spread."""
+    if getattr(X, "dtype", None) not in (torch.float32, np.float32):
+        return
+    rounding = torch.finfo(torch.float32).eps * points.abs().amax(0)
+    spread = points.std(0, correction=0)
+    if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):
+        warnings.warn(
+            f"X is float32 and up to {float(points.abs().max()):.3g} from the origin, where it is rounded to "
+            f"{float(rounding.max()):.1g}; give float64, or subtract an offset before it becomes float32.",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def checked_tensor(X: Tensor) -> Tensor:
+    if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
+        raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
+    if X.is_complex():
+        raise InvalidArgumentError("X is complex; Complex data not supported.")
+    finite = torch.isfinite(X).all(1)
+    if not bool(finite.all()):
+        row = int((~finite).nonzero()[0])
+        raise InvalidArgumentError(
+            f"X[{row}] = {X[row].tolist()} is not finite; drop such rows: X = X[torch.isfinite(X).all(1)]."
+        )
+    return X
+
+
+def checked_parameter(value: Array, shape: tuple[int, ...], name: str, device: torch.device) -> Tensor:
+    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
+    if tuple(tensor.shape) != shape or not bool(torch.isfinite(tensor).all()):
+        raise InvalidArgumentError(
+            f"{name} has shape {tuple(tensor.shape)}; expected finite numbers of shape {shape}."
+        )
+    if name == "weights_init" and (bool((tensor < 0).any()) or float(tensor.sum()) <= 0):
+        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be ≥ 0 and not all zero.")
+    return tensor
+
+
+def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
+    """Weights (N,) of the points, float64; ones if not given."""
+    n = points.shape[0]
+    if sample_weight is None:
+        return points.new_ones(n)
+    if not isinstance(sample_weight, Tensor):
+        sample_weight = torch.from_numpy(np.array(sample_weight, dtype=np.float64))
+    weight = sample_weight.detach().to(points.device, torch.float64)
+    if weight.shape != (n,):
+        raise InvalidArgumentError(
+            f"sample_weight has shape {tuple(weight.shape)}; expected ({n},), one weight for each point."
+        )
+    if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()):
+        raise InvalidArgumentError("sample_weight holds NaN, infinite or negative weights; make them ≥ 0.")
+    if float(weight.sum()) == 0:
+        raise InvalidArgumentError("sample_weight is all zero; at least one point must count.")
+    return weight
