@@ -72,8 +72,9 @@ def partition(points: Tensor, weight: Tensor, rule: FlatnessRule) -> Partition:
         cut = fresh & wanted & (count >= 2 * least) & (deviation[:, -1] > 0)
         cut = _within_budget(cut, count * variances[:, -1], n_pieces, rule.max_components)
         across = directions[:, :, -1]
-        beyond = ((points - means[labels]) * across[labels]).sum(1) > 0
-        cut, beyond = _only_supported(cut, beyond, labels, weight, n_pieces, least)
+        along = ((points - means[labels]) * across[labels]).sum(1)
+        beyond = along > 0
+        cut &= _is_supported(along, labels, weight, n_pieces, least, 10 * rule.length)
         n_new = int(cut.sum())
         if n_new == 0:
             break
@@ -94,12 +95,21 @@ def _within_budget(cut: Tensor, scatter: Tensor, n_pieces: int, limit: int | Non
     return chosen & cut
 
 
-def _only_supported(
-    cut: Tensor, beyond: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Drop cuts that would leave less than `least` (n_pieces,) on either side."""
-    far = torch.zeros(n_pieces, dtype=weight.dtype, device=weight.device).index_add_(
-        0, labels, weight * beyond
-    )
-    near = torch.zeros_like(far).index_add_(0, labels, weight * ~beyond)
-    return cut & (far >= least) & (near >= least) & (far > 0) & (near > 0), beyond
+def _is_supported(
+    along: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor, far: float
+) -> Tensor:
+    """Whether a cut at 0 of positions (N,) along each piece's axis is worth it, (n_pieces,).
+
+    Both sides must weigh `least` (n_pieces,). A smaller side is cut off all the same if it lies apart:
+    further than `far` (m) and than six deviations of the larger side. Else a few stray returns would
+    keep the cloud that they belong to whole.
+    """
+    moments = torch.stack([torch.ones_like(along), along, along**2], 1) * weight[:, None]
+    side = labels * 2 + (along > 0)
+    sums = moments.new_zeros(2 * n_pieces, 3).index_add_(0, side, moments).view(n_pieces, 2, 3)
+    count = sums[..., 0]
+    mean, square = (sums[..., i] / count.clamp_min(1e-300) for i in (1, 2))
+    deviation = (square - mean**2).clamp_min(0).sqrt().gather(1, count.argmax(1, keepdim=True)).squeeze(1)
+    gap = mean[:, 1] - mean[:, 0]
+    apart = (gap > far) & (gap > 6 * deviation)
+    return (count.amin(1) > 0) & ((count.amin(1) >= least) | apart)
