@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+
 
 class GmmTorchError(Exception):
     """Base of every error that gmmtorch raises on purpose."""
@@ -35,3 +37,10 @@ class MemoryLimitError(GmmTorchError, MemoryError):
 
 class NumericalError(GmmTorchError, ArithmeticError):
     """A matrix could not be factorised, even with the largest permitted jitter."""
+
+
+def check_whole(name: str, value: object, least: int) -> int:
+    """`value` as a whole number of at least `least`, below 2⁶³; else `InvalidArgumentError`."""
+    if not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
+        raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least {least}.")
+    return int(value)

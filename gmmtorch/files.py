@@ -48,6 +48,12 @@ def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
     return path
 
 
+def check_writable(folder: Path) -> None:
+    """Make the folder, and raise `OutputError` if files cannot be written there."""
+    probe = write_atomically(folder / ".probe", lambda temporary: None)
+    probe.unlink()
+
+
 def write_bytes(path: str | Path, data: bytes) -> Path:
     """Write bytes atomically."""
     return write_atomically(path, lambda temporary: _write_all(temporary, data))
@@ -144,3 +150,15 @@ def require(
     if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
         raise DataError(f"{path}: {name} holds NaN or infinite values; the file is damaged.")
     return tensor
+
+
+def require_counts(
+    tensors: Mapping[str, Tensor], name: str, shape: tuple[int | None, ...], path: str | Path
+) -> Tensor:
+    """The tensor `name`, whole numbers ≥ 0 in whichever type `narrowest` chose, as int64."""
+    stored = tensors.get(name)
+    dtype = stored.dtype if stored is not None and stored.dtype in NARROW_DTYPES else torch.uint8
+    counts = require(tensors, name, shape, dtype, path).long()
+    if counts.numel() and int(counts.min()) < 0:
+        raise DataError(f"{path}: {name} holds negative numbers; the file is damaged.")
+    return counts

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import check_rigid
 
 ArrayLike = Tensor | np.ndarray | list | tuple
 
@@ -17,10 +18,19 @@ _FLOAT32_WARNING_METRES = 1e4
 """Beyond this distance from the origin float32 coordinates are coarser than about a millimetre."""
 
 
+def _as_tensor(name: str, value: ArrayLike) -> Tensor:
+    try:
+        return torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidArgumentError(
+            f"{name} is {type(value).__name__}, not an array of numbers: {error}."
+        ) from error
+
+
 def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
     if value is None:
         return torch.empty(0, dim or 0, dtype=torch.float64)
-    tensor = torch.as_tensor(value)
+    tensor = _as_tensor(name, value)
     if not tensor.is_floating_point():
         tensor = tensor.double()
     if tensor.numel() == 0 and tensor.ndim < 2:
@@ -65,7 +75,7 @@ class Scan:
     no_return: Tensor = None  # type: ignore[assignment]  # becomes an empty (0, D) tensor
 
     def __post_init__(self) -> None:
-        origin = torch.as_tensor(self.origin)
+        origin = _as_tensor("origin", self.origin)
         origin = origin if origin.is_floating_point() else origin.double()
         if origin.shape not in ((2,), (3,)):
             raise InvalidArgumentError(f"origin has shape {tuple(origin.shape)}; expected (2,) or (3,).")
@@ -97,15 +107,23 @@ class Scan:
         n = self.points.shape[0]
         return replace(self, points=self.points[keep[:n]], no_return=self.no_return[keep[n:]])
 
-    def transformed(self, transform: Tensor) -> Scan:
+    def transformed(self, transform: ArrayLike) -> Scan:
         """The scan moved by a rigid motion (D+1, D+1): x → R x + t."""
-        matrix = torch.as_tensor(transform, dtype=torch.float64)
-        rotation, translation = matrix[:-1, :-1], matrix[:-1, -1]
+        matrix = torch.as_tensor(transform, dtype=torch.float64, device=self.points.device)
+        rotation, translation = check_rigid(matrix, self.dim)
 
         def move(x: Tensor) -> Tensor:
             return (x.double() @ rotation.T + translation).to(x.dtype)
 
         return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return))
+
+    def copied(self, device: torch.device | str | None = None) -> Scan:
+        """A copy of its own: arrays that scans are read into may be used again for the next one."""
+
+        def copy(x: Tensor) -> Tensor:
+            return x.detach().to(device or x.device, copy=True)
+
+        return Scan(copy(self.points), copy(self.origin), copy(self.no_return))
 
     def to(self, device: torch.device | str) -> Scan:
         """The scan on another device."""

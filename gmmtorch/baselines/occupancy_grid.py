@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import NARROW_DTYPES, narrowest, pack_tensors, read_tensors, require, write_bytes
+from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, require_counts, write_bytes
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.protocol import check_queries
+from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1
@@ -70,6 +70,7 @@ class OccupancyGrid:
 
     def insert(self, scan: Scan) -> None:
         """Count the beams of a scan."""
+        check_scan(scan)
         if self._blocks is None:
             self._blocks = BlockEvidence(
                 self.resolution, scan.dim, scan.points.device, self.memory_limit, self.compiled
@@ -78,7 +79,7 @@ class OccupancyGrid:
             raise InvalidArgumentError(
                 f"scan is {scan.dim}-dimensional, but the grid is {self._blocks.dim}-dimensional."
             )
-        self._waiting.append(scan)
+        self._waiting.append(scan.copied(self._blocks.keys.device))
         if sum(waiting.n_beams for waiting in self._waiting) > _RAYS_AT_ONCE:
             self.evidence()
 
@@ -91,13 +92,14 @@ class OccupancyGrid:
         """Hits and misses counted so far."""
         if self._blocks is None:
             raise InvalidArgumentError("The grid is empty; insert a scan first.")
-        scans, self._waiting = self._waiting, []
+        scans = self._waiting
         if scans:
             ends = [scan.ends() for scan in scans]
             origins = torch.cat([scan.origin.double().expand(scan.n_beams, -1) for scan in scans])
             self._blocks.add_rays(
                 origins, torch.cat([e[0] for e in ends]), None, torch.cat([e[1] for e in ends])
             )
+            self._waiting = []  # only now: what could not be counted is still there to be
         return self._blocks
 
     def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Tensor | np.ndarray:
@@ -168,22 +170,12 @@ class OccupancyGrid:
         bits = require(tensors, "observed", (keys.shape[0], blocks.cells_per_block // 8), torch.uint8, path)
         observed = _unpack_bits(bits)
         n = int(observed.sum())
-        counts = [_counts(tensors, name, n, path) for name in ("hits", "misses")]
+        counts = [require_counts(tensors, name, (n,), path).double() for name in ("hits", "misses")]
         if bool((keys[1:] <= keys[:-1]).any()):
             raise DataError(f"{path}: the block keys are not sorted; the file is damaged.")
         blocks.fill(anchor, keys, observed, *counts)
         grid._blocks = blocks
         return grid
-
-
-def _counts(tensors: dict[str, Tensor], name: str, n: int, path: str | Path) -> Tensor:
-    """Counts (n,) ≥ 0 in any of the types that `narrowest` writes, as float64."""
-    stored = tensors.get(name)
-    dtype = stored.dtype if stored is not None and stored.dtype in NARROW_DTYPES else torch.uint8
-    counts = require(tensors, name, (n,), dtype, path)
-    if bool((counts < 0).any()):
-        raise DataError(f"{path}: {name} holds negative counts; the file is damaged.")
-    return counts.double()
 
 
 def _pack_bits(mask: Tensor) -> Tensor:

@@ -43,8 +43,17 @@ def run(config: DictConfig) -> float:
     dataset = common.open_dataset(config.dataset)
     with ProgressBars(enabled=config.report.progress) as bars:
         scans = common.read_scans(dataset, range(len(dataset)), device, bars)
-        outcome = occupancy.evaluate(dataset.name, scans, factories, protocol, config.seed, bars)
-    path = common.write_results("occupancy", config, outcome.rows, folder)
+        outcome = occupancy.evaluate(
+            dataset.name,
+            scans,
+            factories,
+            protocol,
+            config.seed,
+            bars,
+            # Each row is kept at once: hours of work must not hang on the last of them.
+            lambda rows: common.write_results("occupancy", config, rows, folder),
+        )
+    path = folder / "results.json"
     _show(config, scans, outcome, folder)
     common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {len(scans)} scans")
     common.print_files(folder, path)

@@ -33,7 +33,7 @@ class Ranges:
     def __post_init__(self) -> None:
         if self.max_range is not None and not self.max_range > 0:
             raise InvalidArgumentError(
-                f"max_range={self.max_range} must be above zero metres, or null for no limit."
+                f"max_range={self.max_range} must be above zero metres, or .inf (math.inf) for no limit."
             )
         if not (math.isfinite(self.no_return_range) and self.no_return_range >= 0):
             raise InvalidArgumentError(

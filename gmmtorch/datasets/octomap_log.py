@@ -1,8 +1,8 @@
 """OctoMap's text logs, in which the Freiburg campus scans are published.
 
 `NODE x y z roll pitch yaw` (metres, radians: R = Rz(yaw) Ry(pitch) Rx(roll), world ← sensor) opens
-a scan; the lines that follow, up to a blank line or the next NODE, are its points in the sensor
-frame, three numbers each.
+a scan; the lines that follow, up to the next NODE, are its points in the sensor frame, three
+numbers each; blank lines and comments (#) are passed over.
 """
 
 from __future__ import annotations

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.events import Event
 from gmmtorch.evaluation.metrics import psnr2
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-
-Event = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,17 @@ from torch import Tensor
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
+from gmmtorch.files import check_writable
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.scan import Scan
 
-Event = Callable[[str, int, int | None], None]
-"""Called with a stage's name, how much of it is done, and how much there is."""
 
-
-def _ignore(stage: str, done: int, total: int | None) -> None:
-    """Nobody listens."""
+def _ignore_rows(rows: list[dict[str, Any]]) -> None:
+    """Nobody wants them before the end."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,8 @@ def evaluate(
     factories: dict[str, MapFactory],
     protocol: Protocol,
     seed: int = 0,
-    on_event: Event = _ignore,
+    on_event: Event = ignore,
+    on_row: Callable[[list[dict[str, Any]]], object] = _ignore_rows,
 ) -> Outcome:
     """Build every method's map for every share kept and resolution, and score each on the same test.
 
@@ -128,6 +128,8 @@ def evaluate(
         protocol: the test.
         seed: of the split's thinning, the free points and the bootstrap.
         on_event: told of progress.
+        on_row: given all rows so far, whenever there is another: so that a run that fails late has
+            something to show.
     """
     if not 0 <= seed < 2**63:
         raise InvalidArgumentError(f"seed={seed} must be a whole number from 0 to 2⁶³ − 1.")
@@ -140,6 +142,8 @@ def evaluate(
     }
     if protocol.save_queries:
         queries.save_queries(protocol.save_queries, asked, train_index, test_index)
+    if protocol.save_map:
+        check_writable(Path(protocol.save_map))
     outcome = Outcome()
     largest = max(protocol.kept)
     for kept in protocol.kept:
@@ -163,13 +167,21 @@ def evaluate(
                     n_train_points=sum(scan.points.shape[0] for scan in shown),
                     build_seconds=seconds,
                 )
-                outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
                 if protocol.save_map:
                     file = Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}.safetensors"
-                    built.save(file)
+                    _save_for(built, file, resolution)
+                outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
+                on_row(outcome.rows)
                 if kept == largest:
                     outcome.shown.append(made)
     return outcome
+
+
+def _save_for(built: OccupancyMap, file: Path, resolution: float) -> None:
+    """Save a map so that, loaded, it answers at this resolution unless asked for another."""
+    if isinstance(built, GaussianMap):
+        built.resolution = resolution
+    built.save(file)
 
 
 def _questions(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
@@ -21,7 +21,7 @@ from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence, check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
 from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
-from gmmtorch.occupancy.protocol import check_queries
+from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
 METHODS = ("monte_carlo",)
@@ -48,7 +48,9 @@ class GaussianMap(nn.Module):
         compiled: cast rays with torch.compile, see `traverse`.
 
     Asking a map does not change it: scans of a window that is not full yet are fitted for the
-    answer, and again when the window is.
+    answer, and again when the window is. The first question after an insertion casts `n_samples`
+    rays of the whole map (about a second for a million): ask seldom, or lower `n_samples`.
+    To keep a map in a file use `save`; `state_dict` restores into a map that has its components.
     """
 
     means: Tensor
@@ -76,8 +78,10 @@ class GaussianMap(nn.Module):
         compiled: bool = False,
     ) -> None:
         super().__init__()
-        if window < 1 or n_samples < 1:
-            raise InvalidArgumentError(f"window={window} and n_samples={n_samples} must be at least 1.")
+        check_whole("window", window, 1)
+        check_whole("n_samples", n_samples, 1)
+        check_whole("memory_limit", memory_limit, 1)
+        check_whole("random_state", random_state, 0)
         if sampling not in SAMPLINGS:
             raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
         self.window = window
@@ -86,8 +90,6 @@ class GaussianMap(nn.Module):
         self.n_samples = n_samples
         self.sampling: Sampling = sampling
         self.prior = check_prior(prior)
-        if not 0 <= random_state < 2**63:
-            raise InvalidArgumentError(f"random_state={random_state} must be a seed from 0 to 2⁶³ − 1.")
         self.random_state = int(random_state)
         self.robot = robot
         self.memory_limit = memory_limit
@@ -127,8 +129,9 @@ class GaussianMap(nn.Module):
         flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
         robot = int(options.get("robot", 0))
         ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
-        sightings = sightings_of(origins, weight, mean.shape[1])
-        components = Components(mean, _tensor(covariances), weight, flags, ids, *sightings).checked()
+        sightings = sightings_of(origins, weight.cpu(), mean.shape[1])
+        parts = (_tensor(covariances), weight, flags, ids, *sightings)
+        components = Components(mean, *(part.to(mean.device) for part in parts)).checked()
         made = cls(**options)
         made._place(components)
         return made
@@ -137,14 +140,15 @@ class GaussianMap(nn.Module):
 
     def insert(self, scan: Scan) -> None:
         """Learn from a scan. It counts at once; the components of its window are final when it is full."""
+        check_scan(scan)
         if self.dim is not None and scan.dim != self.dim:
             raise InvalidArgumentError(
                 f"scan is {scan.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
         if self.frame is None:
-            self.frame = scan.origin.double().round()
+            self.frame = scan.origin.detach().double().round()
             self._set(Components.empty(scan.dim, scan.points.device))
-        self._pending.append(scan)
+        self._pending.append(scan.copied(self.means.device))
         self._forget_answers()
         if len(self._pending) == self.window:
             self._set(Components.concatenate([self._committed(), self._learn_pending()]))
@@ -193,8 +197,9 @@ class GaussianMap(nn.Module):
         self._answers, self._provisional = {}, None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
-        """Moving the module moves the waiting scans too (and keeps nothing computed elsewhere)."""
-        super()._apply(fn, recurse)
+        """Moves between devices, waiting scans too; positions stay float64 whatever dtype a network
+        around the map takes."""
+        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if "means" in self._buffers:
             self._pending = [scan.to(self.means.device) for scan in self._pending]
             self.frame = cast(Tensor, self.frame).to(self.means.device)
@@ -213,20 +218,33 @@ class GaussianMap(nn.Module):
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
         """Move components by a rigid motion (D+1, D+1), and with them the origins they were seen from.
 
-        `ids` (J, 2) names the components, as in the buffer of that name; all if not given. A pose
+        `ids` (J, 2) names the components, as in the buffer of that name; all if not given. Ids that
+        no component has (of records not received, say) are passed over. A pose
         correction is this; nothing is fitted again. Scans of an unfinished window are fitted first.
         """
-        matrix = _tensor(transform)
         components = self.components()
+        matrix = _tensor(transform).to(components.means.device)
         check_rigid(matrix, components.dim)
+        moved = components.transformed(matrix, self._chosen(components, ids))
         if self._pending:
             self._pending, self._n_windows = [], self._n_windows + 1
-        chosen = torch.ones(len(components), dtype=torch.bool)
-        if ids is not None:
-            wanted = torch.as_tensor(ids).reshape(-1, 2).to(components.ids)
-            chosen = (components.ids[:, None] == wanted).all(2).any(1)
-        moved = components.transformed(matrix.to(components.means), chosen.to(components.means.device))
         self._place(moved)
+
+    @staticmethod
+    def _chosen(components: Components, ids: ArrayLike | None) -> Tensor:
+        """Which components (K,) have one of the ids (J, 2); all if none are given."""
+        if ids is None:
+            return torch.ones_like(components.max_range)
+        wanted = torch.as_tensor(ids).to(components.ids)
+        wanted = wanted if wanted.numel() else wanted.reshape(0, 2)
+        if wanted.ndim != 2 or wanted.shape[1] != 2:
+            raise InvalidArgumentError(
+                f"ids has shape {tuple(wanted.shape)}; expected (J, 2): robot, sequence."
+            )
+        # One number for each id that occurs, so that pairs are compared in one sorted pass.
+        known = len(components)
+        _, number = torch.unique(torch.cat([components.ids, wanted]), dim=0, return_inverse=True)
+        return torch.isin(number[:known], number[known:])
 
     # -- answering --------------------------------------------------------------------------------
 
@@ -273,8 +291,12 @@ class GaussianMap(nn.Module):
             return
         generator = torch.Generator().manual_seed(self.random_state)
         rays = sample_rays(self.components().cones(), self.n_samples, generator, self.sampling)
-        for part in zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True):
-            evidence.add_rays(*part)
+        parts = zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True)
+        for origins, ends, weights, is_hit in parts:
+            if isinstance(evidence, Evidence):
+                evidence.add_rays(origins, ends, weights, is_hit, compiled=self.compiled)
+            else:
+                evidence.add_rays(origins, ends, weights, is_hit)
 
     # -- keeping ----------------------------------------------------------------------------------
 

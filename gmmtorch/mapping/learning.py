@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture import em
 from gmmtorch.mixture.cells import pool_into_cells
@@ -43,10 +43,12 @@ class LearningRule:
         for name in ("noise", "length"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        for name in ("n_components", "max_origins", "iterations", "max_cells", "min_points"):
-            value = getattr(self, name)
-            if value is not None and not 1 <= value < float("inf"):
-                raise InvalidArgumentError(f"{name}={value} must be at least 1, or null for the default.")
+        for name in ("max_origins", "iterations", "max_cells"):
+            check_whole(name, getattr(self, name), 1)
+        if self.n_components is not None:
+            check_whole("n_components", self.n_components, 1)
+        if self.min_points is not None and not 1 <= self.min_points < float("inf"):
+            raise InvalidArgumentError(f"min_points={self.min_points} must be at least 1, or null.")
         if self.dtype not in em.SOFTMAX_DTYPES:
             raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.files import NARROW_DTYPES, narrowest, pack_tensors, read_tensors, require
+from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, require_counts
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.mapping.components import Components
 
@@ -95,8 +95,8 @@ def from_file(path: str | Path) -> tuple[Components, Tensor, dict[str, Any]]:
     frame = require(tensors, "frame", (dim,), torch.float64, path)
     packed = require(tensors, "covariances", (k, dim * (dim + 1) // 2), single, path)
     origins = require(tensors, "origins", (None, dim), single, path)
-    sightings = _index(tensors, "sightings", (k,), path)
-    seen_from = _index(tensors, "seen_from", (None,), path)
+    sightings = require_counts(tensors, "sightings", (k,), path)
+    seen_from = require_counts(tensors, "seen_from", (None,), path)
     share = require(tensors, "seen_share", (seen_from.shape[0],), torch.uint8, path).double()
     if bool((share < 1).any()):
         raise DataError(f"{path}: seen_share holds zeros; the file is damaged.")
@@ -142,15 +142,3 @@ def _ids(runs: Tensor, k: int, path: str | Path) -> Tensor:
     run = torch.repeat_interleave(length)
     within = torch.arange(k) - (torch.cumsum(length, 0) - length)[run]
     return torch.stack([runs[run, 0], runs[run, 1] + within], 1)
-
-
-def _index(tensors: dict[str, Tensor], name: str, shape: tuple[int | None, ...], path: str | Path) -> Tensor:
-    """Whole numbers ≥ 0, in whichever type `narrowest` chose, as int64."""
-    stored = tensors.get(name)
-    allowed = stored is not None and stored.dtype in NARROW_DTYPES
-    value = require(
-        tensors, name, shape, stored.dtype if allowed and stored is not None else torch.uint8, path
-    )
-    if value.numel() and int(value.min()) < 0:
-        raise DataError(f"{path}: {name} holds negative numbers; the file is damaged.")
-    return value.long()

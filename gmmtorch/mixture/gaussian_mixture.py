@@ -18,7 +18,7 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_rigid, check_symmetric, inverse_factor, safe_cholesky
 from gmmtorch.mixture import em
@@ -245,8 +245,20 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMixture:
         """Moves between devices; parameters stay float64 whatever dtype a network around them takes."""
-        super()._apply(lambda tensor: fn(tensor).double(), recurse)
+        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         return self
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Takes the state of a fitted mixture, whatever this one was fitted to, if at all."""
+        given = [state_dict.get(prefix + name) for name in ("weights", "means", "covariances")]
+        if all(isinstance(value, Tensor) for value in given):
+            weights, means, covariances = (cast(Tensor, value).double().clone() for value in given)
+            self._set_buffers(weights, means, covariances)
+            self.n_components, self.n_features_in_ = means.shape[0], means.shape[1]
+            if not hasattr(self, "lower_bounds_"):
+                self._tensors = True
+                self._set_history((), True)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
@@ -308,8 +320,7 @@ class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
         `random_state` defaults to the estimator's own: with a seed, every call gives the same.
         """
         means = self._fitted()
-        if n_samples < 1:
-            raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
+        check_whole("n_samples", n_samples, 1)
         generator = as_generator(self.random_state if random_state is None else random_state)
         weights = self.weights.cpu()
         labels = torch.multinomial(weights, n_samples, True, generator=generator).sort().values

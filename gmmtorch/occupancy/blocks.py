@@ -1,8 +1,8 @@
 """BlockEvidence: hits and misses stored only where rays went, on an unbounded voxel lattice.
 
 The lattice is cut into blocks of 8³ cells (16² in 2D). A block is allocated when a ray first
-touches it: memory follows observed space, not the bounding box, so a stray return at 200 m costs
-its ray and nothing else.
+touches it: memory follows observed space, not the bounding box. (While rays are cast there is also a
+table of the blocks in the box around those rays, 8 bytes each.)
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class BlockEvidence:
     """Hits and misses on the lattice of cells [i·resolution, (i+1)·resolution) of the world frame.
 
     Raises `InvalidArgumentError` for a resolution that is not above zero, and `MemoryLimitError`
-    when the observed cells would take more than `memory_limit` bytes.
+    when the observed cells would take more than `memory_limit` bytes; the rays at hand are then
+    counted in part, and more cannot be.
     """
 
     def __init__(
@@ -229,7 +230,8 @@ class BlockEvidence:
             raise _Full
         if n_blocks > self._storage.shape[1]:
             # Grow by half again, so that many small insertions stay cheap.
-            capacity = max(n_blocks, self._storage.shape[1] * 3 // 2)
+            largest = self.memory_limit // (self.cells_per_block * BYTES_PER_CELL)
+            capacity = max(n_blocks, min(self._storage.shape[1] * 3 // 2, largest))
             grown = self._storage.new_zeros(2, capacity, self.cells_per_block)
             grown[:, : self.n_blocks] = self._storage[:, : self.n_blocks]
             self._storage = grown
@@ -287,6 +289,13 @@ class BlockEvidence:
 
     def dense(self, grid: VoxelGrid) -> Evidence:
         """The evidence of a grid of lattice cells, as `VoxelGrid.covering` makes them."""
+        offset = [x / self.resolution for x in grid.origin]
+        aligned = all(abs(x - round(x)) < 1e-6 for x in offset)
+        if grid.dim != self.dim or not aligned or not math.isclose(grid.resolution, self.resolution):
+            raise InvalidArgumentError(
+                f"grid has cells of {grid.resolution} m from {grid.origin}, which are not the lattice's of "
+                f"{self.resolution} m; make it with VoxelGrid.covering."
+            )
         hits, misses = self.evidence_at(grid.centers(self.keys.device))
         return Evidence(grid, hits.reshape(grid.shape), misses.reshape(grid.shape))
 

@@ -130,11 +130,12 @@ class Evidence:
         starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)
         misses = self.misses.view(-1)
         ones = torch.ones((), dtype=torch.float64, device=misses.device)
+        weights = None if weights is None else weights.double()
         for visit in traverse(starts, stops, self.grid.shape, chunk_visits, compiled=compiled):
-            source = ones.expand(visit.voxel.shape) if weights is None else weights.double()[visit.ray]
+            source = ones.expand(visit.voxel.shape) if weights is None else weights[visit.ray]
             misses.scatter_add_(0, visit.voxel, source)
         cell, counted = self.grid.flat_index(ends)
         if is_hit is not None:
             counted = counted & is_hit
-        source = torch.ones_like(cell, dtype=torch.float64) if weights is None else weights.double()
+        source = torch.ones_like(cell, dtype=torch.float64) if weights is None else weights
         self.hits.view(-1).scatter_add_(0, cell[counted], source[counted])

@@ -81,8 +81,10 @@ class VoxelGrid:
         """
         resolution = check_resolution(resolution)
         low, high = [float(x) for x in low], [float(x) for x in high]
-        if not all(math.isfinite(x) for x in (*low, *high)) or any(
-            b < a for a, b in zip(low, high, strict=True)
+        if (
+            len(low) != len(high)
+            or not all(math.isfinite(x) for x in (*low, *high))
+            or any(b < a for a, b in zip(low, high, strict=True))
         ):
             raise InvalidArgumentError(f"low={low}, high={high} is not a box of finite metres.")
         first, shape = _covering_cells(low, high, resolution)

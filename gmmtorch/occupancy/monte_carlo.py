@@ -56,7 +56,7 @@ def sample_rays(
     Args:
         cones: the components and whence they were seen.
         n_samples: about how many rays to draw in all (rounded per cone, at least one each).
-        generator: seeded source of randomness, on the CPU.
+        generator: seeded source of randomness, on the CPU; seed 0 if not given.
 
     Raises:
         InvalidArgumentError: fewer than one sample, or an unknown kind of sampling.
@@ -66,6 +66,7 @@ def sample_rays(
     if n_samples < 1:
         raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
     device, dim = cones.means.device, cones.means.shape[1]
+    generator = generator or torch.Generator().manual_seed(0)
     if not bool((cones.counts > 0).any()):
         cone, weights = torch.empty(0, dtype=torch.int64, device=device), cones.counts.double()[:0]
     elif sampling == "plain":

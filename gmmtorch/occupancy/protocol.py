@@ -12,6 +12,12 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import ArrayLike, Scan
 
 
+def check_scan(scan: Scan) -> None:
+    """Raises unless it is a `Scan`."""
+    if not isinstance(scan, Scan):
+        raise InvalidArgumentError(f"scan is {type(scan).__name__}; give a gmmtorch.Scan(points, origin).")
+
+
 def check_queries(points: ArrayLike, dim: int | None) -> Tensor:
     """Points (M, D) to ask about, as float64; `dim` is the map's, None while it is empty.
 

@@ -25,6 +25,7 @@ from occupancy.protocol_contract import (
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.components import Components
@@ -700,3 +701,44 @@ def test_the_settings_of_the_file_are_all_there_is_to_set():
     made = make()
     made.insert(wall_scan(2))
     assert asdict(made.learning).keys() == set(LearningRule.__dataclass_fields__)
+
+
+def test_arrays_that_are_used_again_do_not_change_what_was_inserted():
+    points = np.random.default_rng(0).normal(size=(50, 2)) * 0.01 + [3.0, 0.0]
+    for empty in (GaussianMap(window=2), OccupancyGrid(0.1)):
+        buffer = points.copy()
+        empty.insert(Scan(buffer, np.zeros(2)))
+        buffer[:] = -100.0
+        empty.insert(Scan(points, np.zeros(2)))
+        theta = empty.occupancy(np.array([[3.0, 0.02], [-100.0, -100.0]]), 0.1)
+        assert theta[0] > 0.5
+        assert theta[1] == 0.5
+
+
+def test_a_transform_that_fails_leaves_the_map_as_it_was():
+    built = GaussianMap(window=5)
+    built.insert(Scan(np.random.default_rng(0).normal(3.0, size=(50, 2)), np.zeros(2)))
+    before = built.n_components
+    with pytest.raises(InvalidArgumentError, match=r"ids has shape"):
+        built.transform(np.eye(3), ids=[[0, 1, 2]])
+    assert built.n_components == before
+
+
+def test_networks_of_another_dtype_leave_positions_exact():
+    built = GaussianMap(window=1)
+    built.insert(Scan(np.random.default_rng(0).normal(5e5, size=(50, 2)), np.full(2, 5e5)))
+    before = built.means.clone()
+    assert torch.equal(built.half().means, before)
+
+
+@pytest.mark.parametrize(
+    "options", [{"window": 1.5}, {"window": "2"}, {"n_samples": 0}, {"random_state": None}]
+)
+def test_options_that_are_no_whole_numbers_are_refused(options):
+    with pytest.raises(InvalidArgumentError, match=next(iter(options))):
+        GaussianMap(**options)
+
+
+def test_what_is_no_scan_is_refused():
+    with pytest.raises(InvalidArgumentError, match=r"Tensor.*Scan"):
+        GaussianMap().insert(torch.zeros(3, 2))

@@ -916,3 +916,11 @@ def test_float32_points_far_out_warn_and_float64_ones_do_not():
         warnings.simplefilter("error")
         GaussianMixture(2, random_state=0, max_iter=500).fit(far)
         GaussianMixture(2, random_state=0, max_iter=500).fit(points.astype(np.float32))
+
+
+def test_a_state_dict_restores_into_a_fresh_mixture():
+    points = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)))
+    fitted = GaussianMixture(3, random_state=0).fit(points)
+    network = torch.nn.ModuleDict({"map": GaussianMixture(3)})
+    network.load_state_dict(torch.nn.ModuleDict({"map": fitted}).state_dict())
+    assert torch.equal(network["map"].score_samples(points), fitted.score_samples(points))

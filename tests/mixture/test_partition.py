@@ -140,3 +140,17 @@ def test_pooled_statistics_are_sums_by_label(generator):
         own = labels == piece
         expected = (features[own] * weight[own, None]).sum(0)
         torch.testing.assert_close(sums[piece], expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
+def test_a_few_far_returns_do_not_keep_a_cloud_in_one_piece(n_strays, distance):
+    generator = torch.Generator().manual_seed(0)
+    room = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * torch.tensor([6.0, 5.0, 2.5])
+    strays = torch.randn(n_strays, 3, generator=generator, dtype=torch.float64) + distance
+    rule = FlatnessRule(min_weight=20, min_weight_thick=20)
+    alone = partition(room, torch.ones(len(room), dtype=torch.float64), rule)
+    points = torch.cat([room, strays])
+    both = partition(points - points.mean(0), torch.ones(len(points), dtype=torch.float64), rule)
+    assert both.n_pieces >= alone.n_pieces
+    of_strays = both.labels[len(room) :]
+    assert not torch.isin(both.labels[: len(room)], of_strays).any()
