@@ -54,12 +54,14 @@ def run_dir() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def set_up(runtime: DictConfig) -> str:
+def set_up(config: DictConfig) -> str:
     """Apply the runtime options; returns the device. Raises `InvalidArgumentError` on a bad one."""
     import torch
 
-    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.errors import InvalidArgumentError, check_whole
 
+    runtime = config.runtime
+    check_whole("seed", config.seed, 0)
     if runtime.threads is not None:
         if runtime.threads < 1:
             raise InvalidArgumentError(f"runtime.threads={runtime.threads} must be at least 1, or null.")

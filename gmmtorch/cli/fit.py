@@ -35,7 +35,7 @@ def run(config: DictConfig) -> float:
     from gmmtorch.evaluation import fitting
     from gmmtorch.report.progress import ProgressBars
 
-    device = common.set_up(config.runtime)
+    device = common.set_up(config)
     folder = common.run_dir()
     dataset = common.open_dataset(config.dataset)
     with ProgressBars(enabled=config.report.progress) as bars:

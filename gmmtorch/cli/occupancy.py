@@ -34,7 +34,7 @@ def run(config: DictConfig) -> float:
     from gmmtorch.evaluation import occupancy
     from gmmtorch.report.progress import ProgressBars
 
-    device = common.set_up(config.runtime)
+    device = common.set_up(config)
     folder = common.run_dir()
     limits = {"memory_limit": config.runtime.memory_limit, "compiled": config.runtime.compile}
     known = occupancy.methods(_map_factory(config, limits), **limits)
@@ -69,7 +69,12 @@ def _map_factory(config: DictConfig, limits: dict[str, Any]) -> Callable[[], Gau
     options.pop("name")
     own = {key: options.pop(key) for key in ("window", "n_samples", "sampling", "prior")}
     rule = LearningRule(**options, dtype=config.runtime.dtype)
-    return lambda: GaussianMap(learning=rule, random_state=config.seed, **own, **limits)
+
+    def make() -> GaussianMap:
+        return GaussianMap(learning=rule, random_state=config.seed, **own, **limits)
+
+    make()  # a bad option must not wait for the grids to be built
+    return make
 
 
 def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
