@@ -1,7 +1,8 @@
 """The commands end to end: what they write, what they print, and how they fail."""
 
-from __future__ import json
+from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
