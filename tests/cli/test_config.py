@@ -297,3 +297,13 @@ def test_the_commands_are_installed_under_their_names():
     scripts = {point.name: point.value for point in entry_points(group="console_scripts")}
     for command in COMMANDS:
         assert scripts[f"gmmtorch-{command}"] == f"gmmtorch.cli.{command}:main"
+
+
+@pytest.mark.parametrize(("command", "groups"), [("occupancy", ("dataset", "map")), ("fit", ("dataset",))])
+def test_help_names_every_choice_of_every_group(command, groups):
+    conf = Path(common.conf_dir())
+    template = (conf / f"{command}.yaml").read_text()
+    listed = template.split("== Configuration groups ==")[1].split("== Options")[0]
+    for group in groups:
+        for file in (conf / group).glob("*.yaml"):
+            assert file.stem in listed
