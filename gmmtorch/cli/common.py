@@ -69,7 +69,7 @@ def set_up(config: DictConfig) -> str:
     if runtime.memory_limit < 1:
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
     try:
-        torch.zeros(1, device=runtime.device).item()
+        torch.zeros(1, device=runtime.device).item()  # "meta" can be named, but holds no numbers
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidArgumentError(

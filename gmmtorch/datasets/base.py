@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,13 +74,13 @@ class Dataset(Sequence[Scan]):
         self.ranges = ranges
         self.stride = stride
 
+    @abstractmethod
     def _count(self) -> int:
         """How many scans the source holds."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _read(self, index: int) -> Scan:
         """Scan `index` of the source."""
-        raise NotImplementedError
 
     def __len__(self) -> int:
         return -(-self._count() // self.stride)

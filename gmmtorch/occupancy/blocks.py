@@ -149,40 +149,43 @@ class BlockEvidence:
         """
         if ends.shape[0] == 0:
             return
+        earlier = self.n_blocks
         try:
             window = self._open_window(origins, ends)
             self._add_misses(window, origins, ends, weights, chunk_visits)
         except _Full:
+            needed = self._bytes_needed(origins, ends, self.resolution, earlier)
             raise MemoryLimitError(
-                f"resolution={self.resolution} m takes more bytes for the cells that rays touch than the "
-                f"limit of {self.memory_limit:,}; a resolution of "
-                f"{self._fitting_resolution(origins, ends):.3g} m fits."
+                f"resolution={self.resolution} m takes {needed:,} bytes for the cells that rays touch, above "
+                f"the limit of {self.memory_limit:,}; a resolution of "
+                f"{self._fitting_resolution(origins, ends, earlier):.3g} m fits."
             ) from None
         index, stored = self._locate(ends)
         counted = stored if is_hit is None else stored & is_hit
         source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
         self.hits.view(-1).scatter_add_(0, index[counted], source[counted])
 
-    def _fitting_resolution(self, origins: Tensor, ends: Tensor) -> float:
+    def _fitting_resolution(self, origins: Tensor, ends: Tensor, earlier: int) -> float:
         """A coarser resolution, of three digits, at which the blocks that these rays touch fit."""
         resolution = self.resolution
-        while True:
+        while self._bytes_needed(origins, ends, resolution, earlier) > self.memory_limit:
             resolution = float(f"{resolution * 1.3:.3g}")
-            side = resolution * self.block_side
-            starts, stops = origins.double() / side, ends.double() / side
-            both = torch.cat([starts, stops]).floor()
-            low = both.amin(0)
-            shape = tuple((both.amax(0) - low + 1).long().tolist())
-            touched = torch.zeros(math.prod(shape), dtype=torch.bool, device=low.device)
-            for visit in traverse(starts, stops, shape, low=low):
-                touched[visit.voxel] = True
-            # The end blocks come on top, and what is stored of earlier rays, which shrinks at least so.
-            n_ends = torch.unique(stops.floor(), dim=0).shape[0]
-            earlier = self.n_blocks * self.resolution / resolution
-            if (
-                int(touched.sum()) + n_ends + earlier
-            ) * self.cells_per_block * BYTES_PER_CELL <= self.memory_limit:
-                return resolution
+        return resolution
+
+    def _bytes_needed(self, origins: Tensor, ends: Tensor, resolution: float, earlier: int) -> int:
+        """Bytes, at most, of the blocks that these rays touch at a resolution, and of `earlier` ones."""
+        side = resolution * self.block_side
+        starts, stops = origins.double() / side, ends.double() / side
+        both = torch.cat([starts, stops]).floor()
+        low = both.amin(0)
+        shape = tuple((both.amax(0) - low + 1).long().tolist())
+        touched = torch.zeros(math.prod(shape), dtype=torch.bool, device=low.device)
+        for visit in traverse(starts, stops, shape, low=low):
+            touched[visit.voxel] = True
+        # The end blocks come on top; earlier blocks shrink at least in proportion.
+        n_ends = torch.unique(stops.floor(), dim=0).shape[0]
+        n_earlier = math.ceil(earlier * self.resolution / resolution)
+        return (int(touched.sum()) + n_ends + n_earlier) * self.cells_per_block * BYTES_PER_CELL
 
     def _open_window(self, origins: Tensor, ends: Tensor) -> _Window:
         """The box of blocks around the rays, with the blocks that they end in allocated."""
