@@ -44,8 +44,8 @@ class NotFittedError(GmmTorchError, ScikitLearnNotFittedError):
 class GaussianMixture(DensityMixin, BaseEstimator, nn.Module):
     """Weighted full-covariance EM (thesis 2.1.1) on any device.
 
-    Arrays in, arrays out; tensors in, tensors out. Parameters are kept in float64 relative to
-    nothing: clouds are centred while they are worked on, so points 500 km away lose no digits.
+    Arrays in, arrays out; tensors in, tensors out. Parameters are kept in float64, and
+    clouds are centred while they are worked on, so points 500 km away lose no digits.
 
     Args:
         n_components: K, at most the number of points.
