@@ -33,7 +33,7 @@ from gmmtorch.errors import (
 )
 from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.gaussian_mixture import NotFittedError
+from gmmtorch.mixture.estimator import NotFittedError
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
