@@ -15,7 +15,18 @@ if TYPE_CHECKING:
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
     from gmmtorch.mapping.learning import LearningRule as LearningRule
+    from gmmtorch.mixture.deconvolved_mixture import DeconvolvedGaussianMixture as DeconvolvedGaussianMixture
+    from gmmtorch.mixture.depth_image import fit_depth_image as fit_depth_image
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
+    from gmmtorch.mixture.hierarchical import HierarchicalGaussianMixture as HierarchicalGaussianMixture
+    from gmmtorch.mixture.pruning import prune as prune
+    from gmmtorch.mixture.reduction import merge as merge
+    from gmmtorch.mixture.reduction import simplify as simplify
+    from gmmtorch.mixture.riemannian import RiemannianGaussianMixture as RiemannianGaussianMixture
+    from gmmtorch.mixture.sliced_wasserstein import (
+        SlicedWassersteinGaussianMixture as SlicedWassersteinGaussianMixture,
+    )
+    from gmmtorch.mixture.variational import VariationalGaussianMixture as VariationalGaussianMixture
     from gmmtorch.occupancy.evidence import Evidence as Evidence
     from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
     from gmmtorch.scan import Scan as Scan
@@ -26,26 +37,44 @@ except PackageNotFoundError:  # a bare checkout on the path
     __version__ = "0+unknown"
 
 _HOMES = {
+    "DeconvolvedGaussianMixture": "gmmtorch.mixture.deconvolved_mixture",
     "Evidence": "gmmtorch.occupancy.evidence",
     "GaussianMap": "gmmtorch.mapping.gaussian_map",
     "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
     "GmmTorchError": "gmmtorch.errors",
+    "HierarchicalGaussianMixture": "gmmtorch.mixture.hierarchical",
     "LearningRule": "gmmtorch.mapping.learning",
     "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
+    "RiemannianGaussianMixture": "gmmtorch.mixture.riemannian",
     "Scan": "gmmtorch.scan",
+    "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.sliced_wasserstein",
+    "VariationalGaussianMixture": "gmmtorch.mixture.variational",
     "VoxelGrid": "gmmtorch.occupancy.grid",
+    "fit_depth_image": "gmmtorch.mixture.depth_image",
+    "merge": "gmmtorch.mixture.reduction",
+    "prune": "gmmtorch.mixture.pruning",
+    "simplify": "gmmtorch.mixture.reduction",
 }
 
 __all__ = [
+    "DeconvolvedGaussianMixture",
     "Evidence",
     "GaussianMap",
     "GaussianMixture",
     "GmmTorchError",
+    "HierarchicalGaussianMixture",
     "LearningRule",
     "OccupancyGrid",
+    "RiemannianGaussianMixture",
     "Scan",
+    "SlicedWassersteinGaussianMixture",
+    "VariationalGaussianMixture",
     "VoxelGrid",
     "datasets",
+    "fit_depth_image",
+    "merge",
+    "prune",
+    "simplify",
 ]
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-pytest.register_assert_rewrite("occupancy.protocol_contract")
+pytest.register_assert_rewrite("occupancy.protocol_contract", "mixture.estimator_contract")
 
 torch.set_num_threads(1)
 settings.register_profile(

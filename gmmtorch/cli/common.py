@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
+    from gmmtorch.evaluation.estimators import FitOptions
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
@@ -45,6 +46,14 @@ def as_options(node: DictConfig) -> dict[str, Any]:
     """A configuration node as keyword arguments."""
     plain: Any = OmegaConf.to_container(node, resolve=True)
     return {str(key): value for key, value in plain.items()}
+
+
+def fit_options(config: DictConfig) -> FitOptions:
+    """The options `mixture.*`, and those of `runtime.*` that a fit has."""
+    from gmmtorch.evaluation.estimators import FitOptions
+
+    runtime = config.runtime
+    return FitOptions(**as_options(config.mixture), dtype=runtime.dtype, compiled=runtime.compile)
 
 
 def run_dir() -> Path:
@@ -117,6 +126,27 @@ def write_results(command: str, config: DictConfig, rows: list[dict[str, Any]], 
         "rows": rows,
     }
     return write_json(folder / "results.json", results)
+
+
+def headline(rows: Sequence[dict[str, Any]]) -> str:
+    """What a table of fits is about."""
+    return f"{rows[0]['dataset']}: {rows[0]['n_points']:,} points"
+
+
+def log_likelihood(row: dict[str, Any]) -> float:
+    """Of a fit: on the points held out, or on its own if there are none."""
+    held_out = row["held_out_log_likelihood"]
+    return float(row["log_likelihood"] if held_out is None else held_out)
+
+
+def save_figures(config: DictConfig, figures: dict[str, Any], folder: Path) -> None:
+    """Every figure as NAME.png, if `report.figures` wants them."""
+    if not config.report.figures:
+        return
+    from gmmtorch.report.save import save_figure
+
+    for name, figure in figures.items():
+        save_figure(figure, folder / f"{name}.png")
 
 
 def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str], title: str) -> None:

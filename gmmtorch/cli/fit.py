@@ -3,99 +3,110 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, schema
+from gmmtorch.cli import common, fit_stream, material, schema, studies
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from gmmtorch.evaluation.fitting import FitOutcome
+    from gmmtorch.evaluation.events import Event
+    from gmmtorch.evaluation.fitting import FitOutcome, Row
 
 _TABLE = (
-    "method n_points n_components seconds n_iterations log_likelihood held_out_log_likelihood psnr2_db nbytes"
+    "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
+    "psnr2_db held_out_psnr2_db nbytes"
 )
 
 
 def main() -> None:
     """Entry point of the command."""
     schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="fit")(_guarded)()
+    with fit_stream.quiet_follower():
+        hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="fit")(_guarded)()
 
 
 def _guarded(config: DictConfig) -> float | None:
     return common.run_guarded(run, config)
 
 
-def run(config: DictConfig) -> float:
-    """One run; returns the held-out (else the training) log-likelihood of the last method."""
-    from gmmtorch.evaluation import fitting
+def run(config: DictConfig) -> float | None:
+    """One run; returns the held-out (else the training) log-likelihood of the last row."""
     from gmmtorch.report.progress import ProgressBars
 
+    if fit_stream.is_wanted(config):
+        return _run_streamed(config)
     device = common.set_up(config)
     folder = common.run_dir()
-    dataset = common.open_dataset(config.dataset)
     with ProgressBars(enabled=config.report.progress) as bars:
-        points = _points(config, dataset, device, bars)
-        outcome = fitting.compare(
-            dataset.name,
-            points,
-            list(config.method),
-            fitting.FitOptions(**common.as_options(config.mixture), dtype=config.runtime.dtype),
-            config.test_share,
-            config.seed,
-            bars,
-        )
+        work = _compare if config.study is None else studies.run
+        rows = work(config, device, folder, bars)
+    common.print_files(folder, folder / "results.json")
+    return common.log_likelihood(rows[-1])
+
+
+def _run_streamed(config: DictConfig) -> float | None:
+    """The same of a fit that is streamed; None in all processes but the first."""
+    from gmmtorch.evaluation.fitting import FitOutcome
+
+    folder = common.run_dir()
+    streamed = fit_stream.run(config, material.material, folder)
+    if streamed is None:
+        return None
+    row, mixture, sample = streamed
+    _show(config, sample.train, FitOutcome([row], {"em": mixture}, {"em": mixture.lower_bounds_}), folder)
+    common.print_table([row], _TABLE.split(), f"{sample.dataset}: {row['n_points']:,} points")
+    common.print_files(folder, folder / "results.json")
+    return common.log_likelihood(row)
+
+
+def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
+    """A row for each method; every mixture is saved, and shown."""
+    from gmmtorch.evaluation import fitting
+
+    given = material.material(config, device, on_event)
+    outcome = fitting.compare(
+        given,
+        list(config.method),
+        common.fit_options(config),
+        config.seed,
+        on_event,
+        lambda rows: common.write_results("fit", config, rows, folder),
+        common.as_options(config.method_options),
+    )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
-    path = common.write_results("fit", config, outcome.rows, folder)
-    _show(config, points, outcome, folder)
-    common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {points.shape[0]} points")
-    common.print_files(folder, path)
-    last = outcome.rows[-1]
-    held_out = last["held_out_log_likelihood"]
-    return float(last["log_likelihood"] if held_out is None else held_out)
-
-
-def _points(config: DictConfig, dataset: Any, device: str, bars: Any) -> Tensor:
-    """The points (N, D) of the chosen scans, thinned to `max_points`."""
-    import torch
-
-    from gmmtorch.errors import InvalidArgumentError
-
-    indices = list(range(len(dataset))) if config.scans is None else list(config.scans)
-    for index in indices:
-        if not -len(dataset) <= index < len(dataset):
-            raise InvalidArgumentError(f"scans={indices}: {dataset.name} has scans 0 to {len(dataset) - 1}.")
-    if not indices:
-        raise InvalidArgumentError("scans is empty; name at least one, or null for all.")
-    points = torch.cat([scan.points for scan in common.read_scans(dataset, indices, device, bars)])
-    if config.max_points is not None and points.shape[0] > config.max_points:
-        if config.max_points < 1:
-            raise InvalidArgumentError(f"max_points={config.max_points} must be at least 1, or null.")
-        generator = torch.Generator().manual_seed(config.seed)
-        chosen = torch.randperm(points.shape[0], generator=generator)[: config.max_points].sort().values
-        points = points[chosen.to(points.device)]
-    return points
+    _show(config, given.train, outcome, folder)
+    common.print_table(outcome.rows, _TABLE.split(), common.headline(outcome.rows))
+    return outcome.rows
 
 
 def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) -> None:
     """Figures as PNG and, with the numbers, in TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report import Board, convergence_figure, mixture_figure, save_figure
+    from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
+    from gmmtorch.evaluation.fitting import in_use
+    from gmmtorch.report import Board, comparison_figure, convergence_figure, mixture_figure
+    from gmmtorch.report.style import label_of
 
-    figures = {"convergence": convergence_figure(outcome.lower_bounds)}
+    likelihoods = {name: b for name, b in outcome.lower_bounds.items() if name not in NO_LIKELIHOODS}
+    figures = {"convergence": convergence_figure(likelihoods)}
+    if len(outcome.rows) > 1:
+        figures["comparison"] = comparison_figure(outcome.rows)
     for method, mixture in outcome.mixtures.items():
+        used = in_use(mixture, points)  # where the others are says nothing of the cloud
         figures[f"mixture_{method}"] = mixture_figure(
-            points, mixture.means, mixture.covariances, mixture.weights
+            points,
+            mixture.means[used],
+            mixture.covariances[used],
+            mixture.weights[used],
+            title=f"Gaussian mixture by {label_of(method)}",
         )
-    if config.report.figures:
-        for name, figure in figures.items():
-            save_figure(figure, folder / f"{name}.png")
+    common.save_figures(config, figures, folder)
     if not config.report.tensorboard:
         return
     with Board(folder / "tensorboard") as board:
@@ -108,7 +119,8 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
             board.figure(f"figures/{name}", figure)
         board.cloud("points", points)
         for method, mixture in outcome.mixtures.items():
-            board.ellipsoids(f"mixture_{method}", mixture.means, mixture.covariances)
+            used = in_use(mixture, points)
+            board.ellipsoids(f"mixture_{method}", mixture.means[used], mixture.covariances[used])
         metrics = {f"hparam/log_likelihood_{row['method']}": row["log_likelihood"] for row in outcome.rows}
         board.hparams(common.flat(config), metrics)
 

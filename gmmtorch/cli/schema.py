@@ -24,6 +24,13 @@ class DepthFramesDataset(FileDataset):
 
 
 @dataclass
+class MeshDataset(FileDataset):
+    n_points: int = 100_000
+    noise: float = 0.0  # standard deviation (m) along each axis
+    seed: int = 0
+
+
+@dataclass
 class SyntheticDataset:
     name: str = MISSING
     max_range: float | None = None
@@ -70,12 +77,67 @@ class Evaluation:
 
 @dataclass
 class Mixture:
-    n_components: int = 100
-    init_params: str = "kmeans"
+    n_components: int | None = 100  # null: as many as the surfaces ask for
+    noise: float = 0.01  # standard deviation of the range sensor (m), for n_components=null
+    init_params: str = "auto"
+    algorithm: str = "auto"
+    max_cells: int | None = None
     tol: float = 1e-3
     reg_covar: float = 1e-6
     max_iter: int = 100
     n_init: int = 1
+
+
+@dataclass
+class InitializationStudy:
+    name: str = "initialization"
+    n_components: list[int] = field(default_factory=lambda: [4, 8, 32, 64, 128, 256, 512])
+    init_params: list[str] = field(
+        default_factory=lambda: ["random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces"]
+    )
+    n_seeds: int = 3
+
+
+@dataclass
+class ComponentCountStudy:
+    name: str = "component_count"
+    n_components: list[int] = field(default_factory=lambda: [16, 32, 64, 128, 256, 512, 1024])
+    noise: float = 0.01
+    multiples: list[float] = field(default_factory=lambda: [0.5, 1.0, 2.0, 4.0])
+    bandwidths: list[float] = field(default_factory=lambda: [0.4, 0.2, 0.1])
+    window: int = 20
+    window_components: list[int] = field(default_factory=lambda: [25, 50, 100, 200, 400, 800])
+    resolution: float = 0.1
+    test_every: int = 10
+    max_beams: int = 50_000
+    n_samples: int = 1_000_000
+
+
+@dataclass
+class SensorModelStudy:
+    name: str = "sensor_model"
+    sensor: str = "lidar"  # or depth_camera, laser_2d
+    sensor_options: dict[str, Any] = field(default_factory=dict)
+    n_components: list[int] = field(default_factory=lambda: [50, 200])
+    n_points: int = 20_000
+    resolution: float = 0.1
+    test_every: int = 10
+    max_beams: int = 20_000
+    max_iter: int = 50
+    tol: float = 1e-4
+    n_neighbors: int = 16
+    max_origins: int = 8
+    n_samples: int = 1_000_000
+
+
+@dataclass
+class Stream:
+    chunk_points: int = 1 << 17
+    sample_points: int = 100_000
+    max_range: float | None = None
+    checkpoint_every: int = 10  # iterations
+    checkpoint_seconds: float | None = None
+    timeout: float = 600.0  # seconds that processes wait for each other
 
 
 @dataclass
@@ -114,6 +176,12 @@ class Fit:
     max_points: int | None = None
     test_share: float = 0.1
     mixture: Mixture = field(default_factory=Mixture)
+    method_options: dict[str, Any] = field(default_factory=dict)
+    study: Any = None
+    points: str | None = None
+    checkpoint: str | None = None
+    resume: bool = False
+    stream: Stream = field(default_factory=Stream)
     report: Report = field(default_factory=Report)
     runtime: Runtime = field(default_factory=Runtime)
 
@@ -124,7 +192,11 @@ def register() -> None:
     store.store(name="occupancy_schema", node=Occupancy)
     store.store(name="fit_schema", node=Fit)
     store.store(group="schema/map", name="map", node=Map)
+    store.store(group="schema/study", name="component_count", node=ComponentCountStudy)
+    store.store(group="schema/study", name="initialization", node=InitializationStudy)
+    store.store(group="schema/study", name="sensor_model", node=SensorModelStudy)
     store.store(group="schema/dataset", name="file", node=FileDataset)
     store.store(group="schema/dataset", name="depth_frames", node=DepthFramesDataset)
+    store.store(group="schema/dataset", name="mesh", node=MeshDataset)
     store.store(group="schema/dataset", name="synthetic", node=SyntheticDataset)
     store.store(group="schema/dataset", name="synthetic_building", node=SyntheticBuildingDataset)

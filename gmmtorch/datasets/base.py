@@ -20,6 +20,11 @@ _ROUNDING = 1e-6
 """Share of a range that is lost when float32 coordinates are turned and measured again, amply."""
 
 
+def is_beyond(distance: Tensor, max_range: float) -> Tensor:
+    """Which distances (m) are at or beyond `max_range`, to rounding."""
+    return distance >= max_range * (1 - _ROUNDING)
+
+
 @dataclass(frozen=True)
 class Ranges:
     """What a reading means.
@@ -54,7 +59,7 @@ class Ranges:
         valid = torch.isfinite(distance) & (distance > 0)
         empty = torch.zeros_like(valid) if no_return is None else no_return.clone()
         if self.max_range is not None:
-            empty |= distance >= self.max_range * (1 - _ROUNDING)
+            empty |= is_beyond(distance, self.max_range)
         returned, empty = valid & ~empty, valid & empty
         if self.no_return_range == 0:
             return Scan(ends[returned], origin)
@@ -92,10 +97,14 @@ class Dataset(Sequence[Scan]):
     def __getitem__(self, index: int | slice) -> Scan | list[Scan]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
+        return self._read(self._position(index))
+
+    def _position(self, index: int) -> int:
+        """Where scan `index` of the data set, from the end if below zero, is in the source."""
         position = index + len(self) if index < 0 else index
         if not 0 <= position < len(self):
             raise IndexError(f"scan {index} of {self.name}, which has {len(self)}")
-        return self._read(position * self.stride)
+        return position * self.stride
 
     def __iter__(self) -> Iterator[Scan]:
         return (self[i] for i in range(len(self)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,11 +29,8 @@ class _Announced(NamedTuple):
     header_bytes: int
 
 
-def read_cloud(path: Path) -> Tensor:
-    """Points (N, 3), float64, of a PCD or PLY file, NaN rows included.
-
-    Raises `DataError` if the file is unreadable or shorter than its header says.
-    """
+def open3d_for(path: Path) -> Any:
+    """Open3D, to read this file; raises `GmmTorchError` where it does not load."""
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -41,6 +38,15 @@ def read_cloud(path: Path) -> Tensor:
             f"{path} cannot be read, because Open3D does not load: {error}. On Debian or Ubuntu install "
             "libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libgomp1 (scripts/setup.sh does it)."
         ) from error
+    return open3d
+
+
+def read_cloud(path: Path) -> Tensor:
+    """Points (N, 3), float64, of a PCD or PLY file, NaN rows included.
+
+    Raises `DataError` if the file is unreadable or shorter than its header says.
+    """
+    open3d = open3d_for(path)
     expected = _check_whole(path)
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
@@ -59,7 +65,7 @@ def read_cloud(path: Path) -> Tensor:
 def pcd_header(path: Path) -> dict[str, list[str]]:
     """Header fields of a PCD file, such as {"VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"]}."""
     fields: dict[str, list[str]] = {}
-    for line in _head(path).split(b"\n"):
+    for line in file_head(path).split(b"\n"):
         words = line.decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
             fields[words[0]] = words[1:]
@@ -105,12 +111,12 @@ def _pcd_announced(path: Path) -> _Announced:
         width = sum(c * int(s) for c, s in zip(counts, header["SIZE"], strict=True))
     # a compressed file starts with its own length, which Open3D does check
     length = 0 if kind == "binary_compressed" else points * width
-    return _Announced(points, kind == "ascii", length, _header_end(path, b"DATA"))
+    return _Announced(points, kind == "ascii", length, header_end(path, b"DATA"))
 
 
 def _ply_announced(path: Path) -> _Announced:
     """A list is counted with its length alone, since how long it is stands in the data."""
-    lines = [line.decode("ascii", errors="replace").split() for line in _head(path).split(b"\n")]
+    lines = [line.decode("ascii", errors="replace").split() for line in file_head(path).split(b"\n")]
     if lines[0] != ["ply"]:
         raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
     is_text, points, length, count = True, None, 0, 0
@@ -124,15 +130,15 @@ def _ply_announced(path: Path) -> _Announced:
             length += count * (1 if is_text else _PLY_BYTES[words[2] if words[1] == "list" else words[1]])
     if points is None:
         raise DataError(f"{path} does not say how many points it holds (element vertex); it is damaged.")
-    return _Announced(points, is_text, length, _header_end(path, b"end_header"))
+    return _Announced(points, is_text, length, header_end(path, b"end_header"))
 
 
-def _head(path: Path) -> bytes:
+def file_head(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(_HEADER_BYTES)
 
 
-def _header_end(path: Path, last_line: bytes) -> int:
+def header_end(path: Path, last_line: bytes) -> int:
     """Position of the first byte after the line that begins with `last_line`."""
-    head = _head(path)
+    head = file_head(path)
     return head.index(b"\n", head.index(b"\n" + last_line) + 1) + 1

@@ -24,7 +24,8 @@ class DepthFrames(Dataset):
 
     No return: pixels at or beyond `max_range` metres of distance. Invalid, dropped: depth 0 and
     65535, with which the camera says that it could not tell. `pixel_stride` keeps every n-th
-    pixel of every n-th row.
+    pixel of every n-th row. `intrinsics` is the pinhole matrix (3, 3), pixels; `image` gives the depth
+    of a scan as it was read.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, pixel_stride: int = 1) -> None:
@@ -46,17 +47,31 @@ class DepthFrames(Dataset):
             raise DataError(
                 f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; one each is needed."
             )
-        self._intrinsics = _matrix(path / "camera-intrinsics.txt", 3)
+        self.intrinsics = _matrix(path / "camera-intrinsics.txt", 3)
 
     def _count(self) -> int:
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        path = self._files[index]
-        pose_path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
-        pose = rigid(_matrix(pose_path, 4), str(pose_path))
-        points = back_project(_depth(path), self._intrinsics, self.pixel_stride)
+        pose = self._pose(index)
+        points = back_project(_depth(self._files[index]), self.intrinsics, self.pixel_stride)
         return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+    def image(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth (H, W) in metres, invalid pixels 0, and the pose (4, 4), world ← camera, of a scan.
+
+        The rotation, rounded in the file, is made orthonormal.
+        """
+        position = self._position(index)
+        pose = self._pose(position).clone()
+        left, _, right = torch.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = left @ right
+        return _depth(self._files[position]), pose
+
+    def _pose(self, index: int) -> Tensor:
+        path = self._files[index]
+        path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
+        return rigid(_matrix(path, 4), str(path))
 
 
 def back_project(depth: Tensor, intrinsics: Tensor, pixel_stride: int = 1) -> Tensor:

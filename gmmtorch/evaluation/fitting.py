@@ -2,119 +2,51 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.estimators import METHODS, FitOptions
 from gmmtorch.evaluation.events import Event
-from gmmtorch.evaluation.metrics import psnr2
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.evaluation.metrics import psnr2, psnr_terms
+from gmmtorch.mixture.estimator import MixtureEstimator
 
-
-@dataclass(frozen=True)
-class FitOptions:
-    """The options `mixture.*`: scikit-learn's names, see `GaussianMixture`."""
-
-    n_components: int = 100
-    init_params: str = "kmeans"
-    tol: float = 1e-3
-    reg_covar: float = 1e-6
-    max_iter: int = 100
-    n_init: int = 1
-    dtype: str = "float32"
+Row = dict[str, Any]
+OnRows = Callable[[list[Row]], object]
+"""Called with all rows so far whenever there is one more, so that hours of work need not hang on the last."""
 
 
 @dataclass
 class FitOutcome:
     """rows: as in results.json; mixtures and lower bounds by method."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    mixtures: dict[str, GaussianMixture] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+    mixtures: dict[str, MixtureEstimator] = field(default_factory=dict)
     lower_bounds: dict[str, list[float]] = field(default_factory=dict)
 
 
-def fit_em(points: Tensor, options: FitOptions, seed: int, on_event: Event) -> GaussianMixture:
-    """Our own EM."""
-    on_event("em", 0, options.max_iter)
+class Material(NamedTuple):
+    """What is learned from: points train (N, D) of a data set; and points test (M, D) held out, M ≥ 0."""
 
-    def on_iteration(iteration: int, lower_bound: float) -> None:
-        on_event("em", iteration, options.max_iter)
-
-    mixture = GaussianMixture(**vars(options), random_state=seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whether it converged is in the row
-        mixture.fit(points, on_iteration=on_iteration)
-    on_event("em", options.max_iter, options.max_iter)
-    return mixture
+    dataset: str
+    train: Tensor
+    test: Tensor
 
 
-def fit_scikit_learn(points: Tensor, options: FitOptions, seed: int, on_event: Event) -> GaussianMixture:
-    """scikit-learn's EM with the same options, from its own k-means start; its result as our mixture."""
-    from sklearn.mixture import GaussianMixture as ScikitLearnMixture
+def split(dataset: str, points: Tensor, test_share: float, seed: int) -> Material:
+    """Hold out a random share of points (N, D).
 
-    if options.init_params != "kmeans":
-        raise InvalidArgumentError(
-            f"mixture.init_params={options.init_params!r}: method scikit_learn is compared from kmeans only."
-        )
-    GaussianMixture(**vars(options), random_state=seed).check_parameters(points.shape[0])
-    on_event("scikit_learn", 0, 1)
-    peer = ScikitLearnMixture(
-        options.n_components,
-        tol=options.tol,
-        reg_covar=options.reg_covar,
-        max_iter=options.max_iter,
-        n_init=options.n_init,
-        random_state=seed,
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        peer.fit(points.cpu().numpy())
-    on_event("scikit_learn", 1, 1)
-    return GaussianMixture.from_parameters(
-        peer.weights_,
-        peer.means_,
-        peer.covariances_,
-        lower_bounds=[float(x) for x in peer.lower_bounds_],
-        converged=peer.converged_,
-    )
-
-
-METHODS: dict[str, Callable[[Tensor, FitOptions, int, Event], GaussianMixture]] = {
-    "em": fit_em,
-    "scikit_learn": fit_scikit_learn,
-}
-
-
-def compare(
-    name: str,
-    points: Tensor,
-    methods: Sequence[str],
-    options: FitOptions,
-    test_share: float,
-    seed: int,
-    on_event: Event,
-) -> FitOutcome:
-    """Fit points (N, D) by each method, and score the mixtures on the same held-out share.
-
-    Raises `InvalidArgumentError` for an unknown method, which lists the known, and for a share
-    outside [0, 1) or a cloud without points.
+    Raises `InvalidArgumentError` for a share outside [0, 1) or a cloud without points.
     """
-    for method in methods:
-        if method not in METHODS:
-            raise InvalidArgumentError(
-                f"method={method!r} is not known; known are {', '.join(sorted(METHODS))}."
-            )
-    if not methods:
-        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(METHODS))}.")
     if not 0 <= test_share < 1:
         raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
     if points.shape[0] == 0:
@@ -122,35 +54,107 @@ def compare(
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(points.shape[0], generator=generator).to(points.device)
     n_test = int(test_share * points.shape[0])
-    test, train = points[order[:n_test]], points[order[n_test:].sort().values]
+    return Material(dataset, points[order[n_test:].sort().values], points[order[:n_test]])
+
+
+def compare(
+    material: Material,
+    methods: Sequence[str],
+    options: FitOptions,
+    seed: int,
+    on_event: Event,
+    on_rows: OnRows = lambda rows: None,
+    own: Mapping[str, Mapping[str, Any]] | None = None,
+) -> FitOutcome:
+    """Fit the training points by each method, and score the mixtures on the same points held out.
+
+    `own` has, by method, options that only its estimator takes. Raises `InvalidArgumentError` for an
+    unknown method, which lists the known, and for a bad option.
+    """
+    own = own or {}
+    for method in (*methods, *own):
+        if method not in METHODS:
+            raise InvalidArgumentError(
+                f"method={method!r} is not known; known are {', '.join(sorted(METHODS))}."
+            )
+    if not methods:
+        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(METHODS))}.")
+    options.check(material.train.shape[0], seed)
     outcome = FitOutcome()
     for method in methods:
         begin = time.perf_counter()
-        mixture = METHODS[method](train, options, seed, on_event)
+        mixture = METHODS[method](material.train, options, seed, on_event, **own.get(method, {}))
         seconds = time.perf_counter() - begin
-        sampled, _ = mixture.sample(train.shape[0], random_state=seed)
-        quality = psnr2(train, torch.as_tensor(sampled))
         outcome.mixtures[method] = mixture
         outcome.lower_bounds[method] = mixture.lower_bounds_
-        outcome.rows.append(
-            {
-                "dataset": name,
-                "method": method,
-                "n_points": int(train.shape[0]),
-                "n_components": int(mixture.weights.shape[0]),
-                "seconds": seconds,
-                "n_iterations": mixture.n_iter_,
-                "converged": bool(mixture.converged_),
-                "log_likelihood": mixture.score(train),
-                "held_out_log_likelihood": mixture.score(test) if n_test else None,
-                "psnr2_db": quality if np.isfinite(quality) else None,
-                "nbytes": _file_size(mixture),
-            }
-        )
+        outcome.rows.append(row_of(material, method, mixture, seconds, seed))
+        on_rows(outcome.rows)
     return outcome
 
 
-def _file_size(mixture: GaussianMixture) -> int:
+def row_of(material: Material, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:
+    """How good a mixture is for what it was learned from, and for what was held out.
+
+    `n_components_used` counts those that a training point belongs to (weights would not do: a
+    prior may give weight to components that explain nothing). The points of PSNR2 are drawn with
+    the seed, as many as they are compared with.
+    """
+    _, train, test = material
+    forward, backward = psnr_terms(train, _drawn(mixture, len(train), seed))
+    return {
+        "dataset": material.dataset,
+        "method": method,
+        "n_points": len(train),
+        "n_components": len(mixture.weights),
+        "n_components_used": int(in_use(mixture, train).sum()),
+        "seconds": seconds,
+        "n_iterations": mixture.n_iter_,
+        "converged": bool(mixture.converged_),
+        "log_likelihood": mixture.score(train),
+        "held_out_log_likelihood": mixture.score(test) if len(test) else None,
+        "psnr2_db": _finite(forward + backward),
+        "psnr_forward_db": _finite(forward),
+        "psnr_backward_db": _finite(backward),
+        "held_out_psnr2_db": _finite(psnr2(test, _drawn(mixture, len(test), seed))) if len(test) else None,
+        "nbytes": _file_size(mixture),
+    }
+
+
+def means(rows: Sequence[Row], by: Sequence[str]) -> list[Row]:
+    """One row for each combination of the fields `by`: `n_seeds`, and means over the rows that share it.
+
+    Of what is no number the value that all share, else None.
+    """
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in by), []).append(row)
+    return [
+        {"n_seeds": len(group), **{name: _mean([row[name] for row in group]) for name in group[0]}}
+        for group in groups.values()
+    ]
+
+
+def _mean(values: Sequence[Any]) -> Any:
+    if all(value == values[0] for value in values):
+        return values[0]
+    return fmean(values) if all(isinstance(value, int | float) for value in values) else None
+
+
+def in_use(mixture: MixtureEstimator, points: Tensor) -> Tensor:
+    """Which components (K,) are the likeliest of one of the points (N, D) at least."""
+    return torch.bincount(torch.as_tensor(mixture.predict(points)), minlength=len(mixture.weights)) > 0
+
+
+def _drawn(mixture: MixtureEstimator, n: int, seed: int) -> Tensor:
+    points, _ = mixture.sample(n, random_state=seed)
+    return torch.as_tensor(points)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _file_size(mixture: MixtureEstimator) -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mixture.safetensors"
         mixture.save(path)

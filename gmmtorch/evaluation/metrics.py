@@ -86,16 +86,38 @@ def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
     }
 
 
-def psnr2(points: Tensor, sampled: Tensor) -> float:
-    """PSNR2 (2.10) in dB of a cloud (N, D) and as many points (N, D) drawn from its model.
+class Psnr(NamedTuple):
+    """The two terms of PSNR2, dB: from each point to the nearest drawn one, and the other way round.
 
-    20 log₁₀(B/RMSE(X, X̂)) + 20 log₁₀(B/RMSE(X̂, X)), B the diagonal of the cloud's bounding box,
-    RMSE over nearest-neighbour distances. Infinite where both clouds are the same.
+    forward falls when the model misses part of the cloud, backward when it puts points where there are none.
+    """
+
+    forward: float
+    backward: float
+
+
+def psnr_terms(points: Tensor, sampled: Tensor) -> Psnr:
+    """20 log₁₀(B/RMSE(X, X̂)) and 20 log₁₀(B/RMSE(X̂, X)) in dB, of X (N, D) and X̂ (M, D).
+
+    B is the diagonal of the bounding box of X, RMSE is over nearest-neighbour distances. A term is
+    infinite where they are all zero.
     """
     x, y = points.cpu().numpy(), sampled.cpu().numpy()
     diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
-    there, back = cKDTree(y).query(x)[0], cKDTree(x).query(y)[0]
-    errors = [math.sqrt(float((d**2).mean())) for d in (there, back)]
-    if min(errors) == 0:
+    return Psnr(_psnr(cKDTree(y).query(x)[0], diagonal), _psnr(cKDTree(x).query(y)[0], diagonal))
+
+
+def _psnr(distances: np.ndarray, diagonal: float) -> float:
+    error = math.sqrt(float((distances**2).mean()))
+    if error == 0:
         return math.inf
-    return sum(20 * math.log10(diagonal / e) for e in errors) if diagonal > 0 else -math.inf
+    return 20 * math.log10(diagonal / error) if diagonal > 0 else -math.inf
+
+
+def psnr2(points: Tensor, sampled: Tensor) -> float:
+    """PSNR2 (2.10) in dB of a cloud (N, D) and as many points (N, D) drawn from its model.
+
+    The sum of both terms (see `psnr_terms`); infinite where either is.
+    """
+    terms = psnr_terms(points, sampled)
+    return math.inf if math.inf in terms else sum(terms)

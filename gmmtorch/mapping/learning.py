@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture import em
 from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.component_count import surface_rule
 from gmmtorch.mixture.partition import FlatnessRule, partition, pool
 from gmmtorch.scan import Scan
 
@@ -55,13 +56,13 @@ class LearningRule:
     def flatness(self, dim: int) -> FlatnessRule:
         # In 2D a few points that span several surfaces are better told apart, down to single ones
         # (5 % of intel, 0.1 m: AUC 0.948 against 0.940); in 3D that only adds components.
-        least = self.min_points or (6 if dim == 2 else 20)
-        return FlatnessRule(
-            thickness=2 * self.noise,
+        rule = surface_rule(self.noise, dim, self.min_points)
+        return replace(
+            rule,
             length=self.length,
-            min_weight=least,
-            min_weight_thick=1 if dim == 2 else least,
+            min_weight_thick=1 if dim == 2 else rule.min_weight,
             max_components=self.n_components,
+            apart=10 * self.length,
         )
 
 

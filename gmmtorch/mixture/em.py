@@ -12,7 +12,8 @@ below and never falls (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -54,8 +55,20 @@ class EMResult:
 
 def quadratic_features(points: Tensor) -> Tensor:
     """φ(x) = [1, x, x_i x_j (i ≤ j)]: (N, D) → (N, 1 + D + D(D+1)/2)."""
-    rows, cols = triangle_indices(points.shape[1], points.device)
-    return torch.cat([points.new_ones(points.shape[0], 1), points, points[:, rows] * points[:, cols]], 1)
+    return torch.cat([points.new_ones(points.shape[0], 1), points, _products(points, points)], 1)
+
+
+def _products(left: Tensor, right: Tensor) -> Tensor:
+    """x_i y_j, i ≤ j: (…, D) and (…, D) → (…, D(D+1)/2). By slices: far faster than by indices."""
+    return torch.cat([left[..., i : i + 1] * right[..., i:] for i in range(left.shape[-1])], -1)
+
+
+def shift_features(features: Tensor, offset: Tensor) -> Tensor:
+    """Features (…, F) of points moved by offset (…, D): of x + d, from those of x; sums of features alike."""
+    dim = offset.shape[-1]
+    count, first, second = features[..., :1], features[..., 1 : 1 + dim], features[..., 1 + dim :]
+    second = second + _products(first, offset) + _products(offset, first) + count * _products(offset, offset)
+    return torch.cat([count, first + count * offset, second], -1)
 
 
 def natural_parameters(parameters: Parameters) -> Tensor:
@@ -178,6 +191,49 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
     return constant - 0.5 * squared
 
 
+def _responsibilities(
+    points: Tensor, sample_weight: Tensor, parameters: Parameters
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Points (n, D), their weighted responsibilities (n, K) and Σ_n p_n log p(x_n), chunk by chunk."""
+    rows = max(1, CHUNK_ELEMENTS // parameters.weights.shape[0])
+    for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
+        joint = log_joint(part, parameters)
+        norm = torch.logsumexp(joint, 1)
+        yield part, torch.exp(joint - norm[:, None]) * p[:, None], torch.dot(p, norm)
+
+
+def direct_sums(points: Tensor, sample_weight: Tensor, parameters: Parameters) -> tuple[Tensor, Tensor]:
+    """First pass of the direct form: (K, 1 + D), N_k and Σγx, and Σ_n p_n log p(x_n)."""
+    sums = torch.cat([torch.zeros_like(parameters.weights)[:, None], torch.zeros_like(parameters.means)], 1)
+    total = points.new_zeros(())
+    for part, gamma, value in _responsibilities(points, sample_weight, parameters):
+        sums[:, 0] += gamma.sum(0)
+        sums[:, 1:] += gamma.T @ part
+        total += value
+    return sums, total
+
+
+def direct_scatter(points: Tensor, sample_weight: Tensor, parameters: Parameters, means: Tensor) -> Tensor:
+    """Second pass of the direct form: Σγ(x−μ)(x−μ)ᵀ (K, D, D) about the new means (K, D)."""
+    scatter = torch.zeros_like(parameters.covariances)
+    for part, gamma, _ in _responsibilities(points, sample_weight, parameters):
+        offset = part[:, None, :] - means
+        scatter += torch.einsum("nk,nki,nkj->kij", gamma, offset, offset)
+    return scatter
+
+
+def direct_maximization(
+    sums: Tensor, scatter: Callable[[Tensor], Tensor], reg_covar: float, previous: Parameters
+) -> Parameters:
+    """M-step from the sums (K, 1 + D) of the first pass; `scatter` makes the second, about means (K, D)."""
+    eps = 10 * torch.finfo(sums.dtype).eps
+    count = sums[:, 0] + eps
+    means = sums[:, 1:] / count[:, None]
+    covariances = scatter(means) / count[:, None, None]
+    covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
+    return _keep_dead(Parameters(count / count.sum(), means, covariances), sums[:, 0] > eps, previous)
+
+
 def direct_step(
     points: Tensor, sample_weight: Tensor, parameters: Parameters, reg_covar: float
 ) -> tuple[Parameters, Tensor]:
@@ -185,34 +241,11 @@ def direct_step(
 
     Second moments are taken about the new means, in a second pass over the points.
     """
-    n_components = parameters.weights.shape[0]
-    rows = max(1, CHUNK_ELEMENTS // n_components)
-
-    def chunks() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
-            joint = log_joint(part, parameters)
-            norm = torch.logsumexp(joint, 1)
-            yield part, torch.exp(joint - norm[:, None]) * p[:, None], torch.dot(p, norm)
-
-    eps = 10 * torch.finfo(points.dtype).eps
-    count = torch.zeros_like(parameters.weights)
-    first = torch.zeros_like(parameters.means)
-    total = points.new_zeros(())
-    for part, gamma, value in chunks():
-        count += gamma.sum(0)
-        first += gamma.T @ part
-        total += value
-    alive = count > eps
-    count = count + eps
-    means = first / count[:, None]
-    second = torch.zeros_like(parameters.covariances)
-    for part, gamma, _ in chunks():
-        offset = part[:, None, :] - means
-        second += torch.einsum("nk,nki,nkj->kij", gamma, offset, offset)
-    covariances = second / count[:, None, None]
-    covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
-    new = Parameters(count / count.sum(), means, covariances)
-    return _keep_dead(new, alive, parameters), total
+    sums, total = direct_sums(points, sample_weight, parameters)
+    new = direct_maximization(
+        sums, lambda means: direct_scatter(points, sample_weight, parameters, means), reg_covar, parameters
+    )
+    return new, total
 
 
 # -- the loop -------------------------------------------------------------------------------------
@@ -233,18 +266,35 @@ def natural_step(
     With `points` (N, D), the ones the features are of, steps whose natural parameters would
     cancel are taken in the direct form instead.
     """
-    total = sample_weight.sum()
+
+    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
+        return expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
+
+    direct = None
+    if points is not None:
+        direct = functools.partial(direct_step, points, sample_weight, reg_covar=reg_covar)
+    return guarded_step(gather, direct, reg_covar, float(sample_weight.sum()))
+
+
+def guarded_step(
+    gather: Callable[[Parameters], tuple[Tensor, Tensor]],
+    direct: Callable[[Parameters], tuple[Parameters, Tensor]] | None,
+    reg_covar: float,
+    total: float,
+) -> Step:
+    """EM steps by `gather`, the E-step: parameters → S (K, F) and Σ_n p_n log p(x_n); Σ_n p_n is `total`.
+
+    Where natural parameters cancel, or S has, the step is taken by `direct` instead, if there is one.
+    """
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        if points is None or not is_ill_conditioned(parameters):
-            statistics, value = expectation(
-                features, sample_weight, natural_parameters(parameters), softmax_dtype
-            )
+        if direct is None or not is_ill_conditioned(parameters):
+            statistics, value = gather(parameters)
             new = maximization(statistics, reg_covar, parameters)
-            if points is None or not _has_cancelled(statistics, new):
-                return new, float(value / total)
-        new, value = direct_step(points, sample_weight, parameters, reg_covar)
-        return new, float(value / total)
+            if direct is None or not _has_cancelled(statistics, new):
+                return new, float(value) / total
+        new, value = direct(parameters)
+        return new, float(value) / total
 
     return step
 
@@ -256,16 +306,20 @@ def run_em(
     tol: float = 1e-3,
     max_iter: int = 100,
     on_iteration: Callable[[int, float], None] | None = None,
+    lower_bounds: Sequence[float] = (),
 ) -> EMResult:
-    """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations."""
-    bounds: list[float] = []
-    converged = False
-    for iteration in range(max_iter):
+    """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations.
+
+    `lower_bounds` are those of the iterations that led to `parameters`, when EM goes on from there.
+    """
+    bounds = list(lower_bounds)
+    while not (converged := _has_settled(bounds, tol)) and len(bounds) < max_iter:
         parameters, bound = step(parameters)
         bounds.append(bound)
         if on_iteration is not None:
-            on_iteration(iteration + 1, bound)
-        if iteration and abs(bounds[-1] - bounds[-2]) < tol:
-            converged = True
-            break
+            on_iteration(len(bounds), bound)
     return EMResult(parameters, bounds, converged)
+
+
+def _has_settled(bounds: list[float], tol: float) -> bool:
+    return len(bounds) > 1 and abs(bounds[-1] - bounds[-2]) < tol

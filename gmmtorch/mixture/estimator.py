@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -49,7 +49,8 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
 
     A subclass names its parameters in `__init__` (which sets them and calls `nn.Module.__init__`),
     checks them in `check_parameters`, and learns in `fit`: `_prepare` gives the checked, centred
-    cloud, and `_keep` takes the result.
+    cloud, and `_keep` takes the result. What it learns beside the mixture (a posterior, a tree) it
+    names in `_extra_names` and hands to `_keep`; it is then kept by files, states, copies and motions.
 
     Arrays in, arrays out; tensors in, tensors out. Parameters are kept in float64, and clouds are
     centred while they are worked on, so points 500 km away lose no digits.
@@ -66,6 +67,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
     means: Tensor
     covariances: Tensor
     _tensors: bool  # whether fit was given a tensor
+    _extra_names: ClassVar[tuple[str, ...]] = ()  # buffers beside the mixture's own
 
     @classmethod
     def from_parameters(
@@ -112,23 +114,34 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
 
     # -- learning: what every fit begins and ends with --------------------------------------------
 
-    def _prepare(self, X: Array, sample_weight: Array | None) -> Cloud:
-        """The points of non-zero weight, checked, about their weighted mean."""
+    def _prepare(self, X: Array, sample_weight: Array | None, reset: bool = True) -> Cloud:
+        """The points of non-zero weight, checked, about their weighted mean.
+
+        Without `reset` they add to what was learned: of its dimension, and as few as there are.
+        """
         self.check_parameters()
-        points = self._as_points(X, reset=True)
+        points = self._as_points(X, reset=reset).detach()
         warn_if_coarse(X, points)
         weight = checked_weight(sample_weight, points)
         points, weight = points[weight > 0], weight[weight > 0]
-        self.check_parameters(points.shape[0])
+        if reset:
+            self.check_parameters(points.shape[0])
         center = (points * (weight / weight.sum())[:, None]).sum(0)
         return Cloud(points - center, weight, center)
 
     def _keep(
-        self, parameters: Parameters, center: Tensor, lower_bounds: Sequence[float], converged: bool
+        self,
+        parameters: Parameters,
+        center: Tensor,
+        lower_bounds: Sequence[float],
+        converged: bool,
+        extra: Mapping[str, Tensor] | None = None,
     ) -> None:
+        """Take a fit's result: parameters about `center`, and `extra` tensors in the points' own frame."""
         weights, means, covariances = parameters
         self._set_buffers(weights / weights.sum(), means + center, covariances)
         self._set_history(lower_bounds, converged)
+        self._set_extra(extra or {})
 
     def _set_history(self, lower_bounds: Sequence[float], converged: bool) -> None:
         self.lower_bounds_ = [float(x) for x in lower_bounds]
@@ -147,7 +160,11 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         if all(isinstance(value, Tensor) for value in given):
             weights, means, covariances = (cast(Tensor, value).double().clone() for value in given)
             self._set_buffers(weights, means, covariances)
-            self.n_components, self.n_features_in_ = means.shape[0], means.shape[1]
+            self.n_features_in_ = means.shape[1]
+            if self.n_components is not None:  # which says that it is found, whatever was found
+                self.n_components = means.shape[0]
+            extra = ((name, state_dict.get(prefix + name)) for name in self._extra_names)
+            self._set_extra({name: value.clone() for name, value in extra if isinstance(value, Tensor)})
             if not hasattr(self, "lower_bounds_"):
                 self._tensors = True
                 self._set_history((), True)
@@ -156,6 +173,27 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
             self.register_buffer(name, value)
+
+    # -- what a subclass keeps beside the mixture -------------------------------------------------
+
+    def _extra_tensors(self) -> dict[str, Tensor]:
+        """The tensors named in `_extra_names`, those that are there: float64, int64 or bool."""
+        return {name: getattr(self, name) for name in self._extra_names if name in self._buffers}
+
+    def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
+        """Keep these in place of any there are. Comes last: the mixture's own buffers are set.
+
+        They may come from a file or another's state: a subclass checks them first, and raises
+        `InvalidArgumentError`. None at all is no error: a mixture of given parameters has none.
+        """
+        for name in self._extra_names:
+            self._buffers.pop(name, None)
+            if name in tensors:
+                self.register_buffer(name, tensors[name])
+
+    def _moved_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
+        """The extra tensors after a rigid motion x ↦ R x + t; a subclass moves those it moves."""
+        return self._extra_tensors()
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -264,6 +302,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         moved._set_buffers(
             self.weights.clone(), means @ rotation.T + translation, rotation @ self.covariances @ rotation.T
         )
+        moved._set_extra({k: v.clone() for k, v in self._moved_extra(rotation, translation).items()})
         return moved
 
     def save(self, path: str | Path) -> None:
@@ -282,6 +321,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
             self.converged_,
             arrays=not self._tensors,
             parameters=plain,
+            extra=self._extra_tensors(),
         )
         storage.write(path, stored)
 
@@ -289,7 +329,9 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
     def load(cls: type[Self], path: str | Path) -> Self:
         """Read a mixture that `save` wrote. Raises `DataError` when the file is not one."""
         stored = storage.read(path)
-        known = set(cls._get_param_names()) - {"n_components"}
+        known = set(cls._get_param_names())
+        if stored.parameters.get("n_components", 0) is not None:  # None stays: it is found anew
+            known.remove("n_components")
         with storage.naming(path):
             mixture = cls.from_parameters(
                 stored.weights,
@@ -299,6 +341,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
                 converged=stored.converged,
                 **{key: value for key, value in stored.parameters.items() if key in known},
             )
+            mixture._set_extra(stored.extra)
         mixture._tensors = not stored.arrays
         return mixture
 

@@ -1,4 +1,4 @@
-"""Where EM starts (thesis 2.1.3): k-means, random points, or uniform in the bounding box.
+"""Where EM starts (thesis 2.1.3): k-means, random points, uniform in the bounding box, or flat pieces.
 
 Starts are drawn from the distinct points, in sorted order, with their summed weights: so a point of
 weight 2 and the same point given twice start EM from the very same place.
@@ -15,8 +15,18 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from gmmtorch.mixture.em import Parameters, maximization, quadratic_features
-from gmmtorch.mixture.partition import pool
+from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.em import (
+    Parameters,
+    feature_dimension,
+    maximization,
+    quadratic_features,
+    shift_features,
+)
+from gmmtorch.mixture.partition import FlatnessRule, partition, pool
+
+_FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # that flat pieces are cut from
+_FINEST_CELLS = 1 << 14  # along the longest side
 
 Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator], Parameters]
 """(points (N, D), weight (N,), K, reg_covar, generator) → parameters. Points centred, float64."""
@@ -30,22 +40,28 @@ def distinct_points(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def from_kmeans(
-    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+    points: Tensor,
+    weight: Tensor,
+    n_components: int,
+    reg_covar: float,
+    generator: torch.Generator,
+    n_init: int = 1,
 ) -> Parameters:
-    """One covariance for each of scikit-learn's k-means clusters."""
+    """One covariance for each of scikit-learn's k-means clusters, the tightest of `n_init` runs."""
     seed = int(torch.randint(2**31 - 1, (), generator=generator))
-    kmeans = KMeans(n_components, n_init=1, random_state=seed)
+    kmeans = KMeans(n_components, n_init=n_init, random_state=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # fewer clusters than asked for: see start()
         labels = kmeans.fit(points.cpu().numpy(), sample_weight=weight.cpu().numpy()).labels_
     labels = torch.from_numpy(labels.astype(np.int64)).to(points.device)
-    # Second moments about each cluster's own mean: clusters may be thin, and far apart.
-    count = points.new_zeros(n_components).index_add_(0, labels, weight).clamp_min(1e-300)
-    means = points.new_zeros(n_components, points.shape[1])
-    means = means.index_add_(0, labels, points * weight[:, None]) / count[:, None]
-    statistics = pool(quadratic_features(points - means[labels]), weight, labels, n_components)
-    found = maximization(statistics, reg_covar)
-    return Parameters(found.weights, means + found.means, found.covariances)
+    return moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points)
+
+
+def from_kmeans_restarts(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+) -> Parameters:
+    """The tightest of ten k-means clusterings."""
+    return from_kmeans(points, weight, n_components, reg_covar, generator, n_init=10)
 
 
 def from_random_points(
@@ -78,10 +94,85 @@ def _isotropic(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) 
     return Parameters(weights, means, covariances.expand(n_components, dim, dim).clone())
 
 
+def from_flat_pieces(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+) -> Parameters:
+    """One component for each of the cloud's flat pieces: nothing random, and cheap for any K."""
+    found, _ = flat_pieces(points, weight, n_components, reg_covar)
+    return copied(found, n_components)[0]
+
+
+def flat_pieces(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, features: Tensor | None = None
+) -> tuple[Parameters, Tensor]:
+    """At most K components, and the one that each point (N, D) belongs to, (N,).
+
+    The cloud is halved again and again, the longest and thickest pieces first (see `partition`). In
+    2D and 3D, that is done on cells where there are many points to a component. The points may be
+    the means of cells already, and `features` (N, F) their mean features.
+    """
+    rule = FlatnessRule(
+        0.0, 0.0, min_weight=0.0, min_weight_thick=0.0, max_components=n_components, apart=0.0
+    )
+    n_cells = max(_FEWEST_CELLS, _CELLS_OF_A_COMPONENT * n_components)
+    finest = float((points.amax(0) - points.amin(0)).max()) / _FINEST_CELLS
+    return pieces_by(rule, points, weight, reg_covar, n_cells, finest, features)
+
+
+def pieces_by(
+    rule: FlatnessRule,
+    points: Tensor,
+    weight: Tensor,
+    reg_covar: float,
+    n_cells: int,
+    finest: float,
+    features: Tensor | None = None,
+) -> tuple[Parameters, Tensor]:
+    """What `flat_pieces` gives, of the pieces that a rule cuts.
+
+    Where there are more than twice `n_cells` points (2D, 3D), cells of side `finest` or more are cut.
+    """
+    dim = points.shape[1]
+    exact = None
+    if features is not None:
+        mass, member = weight, None
+    elif dim > 3 or points.shape[0] < 2 * n_cells:
+        features, mass, member, exact = quadratic_features(points), weight, None, points
+    else:
+        features, mass, member = pool_into_cells(points, n_cells, finest, weight)
+    pieces = partition(features[:, 1 : 1 + dim].contiguous(), mass, rule, features)
+    labels = pieces.labels if member is None else pieces.labels[member]
+    return moments_of(features, mass, pieces.labels, pieces.n_pieces, reg_covar, exact), labels
+
+
+def moments_of(
+    features: Tensor,
+    weight: Tensor,
+    labels: Tensor,
+    n_components: int,
+    reg_covar: float,
+    points: Tensor | None = None,
+) -> Parameters:
+    """Weight, mean and covariance of the rows of each label: (N, F) features, labels (N,) below K.
+
+    `points` (N, D), if the features are those of points: far out, they have digits that products lack.
+    """
+    dim = feature_dimension(features.shape[1])
+    sums = pool(features[:, : 1 + dim], weight, labels, n_components)
+    means = sums[:, 1:] / sums[:, :1].clamp_min(1e-300)
+    # Second moments about each one's own mean: pieces may be thin, and far apart.
+    center = means.index_select(0, labels)
+    local = shift_features(features, -center) if points is None else quadratic_features(points - center)
+    found = maximization(pool(local, weight, labels, n_components), reg_covar)
+    return Parameters(found.weights, means + found.means, found.covariances)
+
+
 INITIALIZATIONS: dict[str, Initialization] = {
     "kmeans": from_kmeans,
+    "kmeans_restarts": from_kmeans_restarts,
     "random_points": from_random_points,
     "bounding_box": from_bounding_box,
+    "flat_pieces": from_flat_pieces,
 }
 
 
@@ -101,8 +192,13 @@ def start(
     points, weight = distinct_points(points, weight)
     n = min(n_components, points.shape[0])
     found = INITIALIZATIONS[method](points, weight, n, reg_covar, generator)
-    if n == n_components:
-        return found
-    copy = torch.arange(n_components, device=points.device) % n
+    return copied(found, n_components)[0]
+
+
+def copied(found: Parameters, n_components: int) -> tuple[Parameters, Tensor]:
+    """K components from fewer: copies that share the weight; and which (K,) each is a copy of."""
+    n = found.weights.shape[0]
+    copy = torch.arange(n_components, device=found.weights.device) % n
     shares = torch.bincount(copy, minlength=n)[copy]
-    return Parameters(found.weights[copy] / shares, found.means[copy], found.covariances[copy])
+    parameters = Parameters(found.weights[copy] / shares, found.means[copy], found.covariances[copy])
+    return parameters, copy

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gmmtorch.report.board import Board as Board
+    from gmmtorch.report.comparison import comparison_figure as comparison_figure
     from gmmtorch.report.curves import convergence_figure as convergence_figure
     from gmmtorch.report.curves import roc_figure as roc_figure
     from gmmtorch.report.maps import map_figure as map_figure
@@ -27,6 +28,7 @@ _HOMES = {
     "MapPanel": "raster",
     "ProgressBars": "progress",
     "auc_against_kept_figure": "sparsity",
+    "comparison_figure": "comparison",
     "convergence_figure": "curves",
     "ellipsoid_mesh": "meshes",
     "format_table": "table",

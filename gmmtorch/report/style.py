@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gmmtorch.scan import ArrayLike
 
@@ -51,6 +55,18 @@ def dress(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> 
     for side in ("top", "right"):
         if side in axes.spines:
             axes.spines[side].set_visible(False)
+
+
+def log_axis(axes: Axes, name: str, values: Iterable[float]) -> None:
+    """Make the axis "x" or "y" logarithmic for these values, its labels in full: 0.2, 0.5, 1, 2, …"""
+    positive = [value for value in values if value > 0]
+    decades = math.log10(max(positive) / min(positive)) if positive else 1.0
+    subs = (1.0,) if decades > 3 else (1.0, 2.0, 5.0)
+    axes.set(**{f"{name}scale": "log"})
+    axis = getattr(axes, f"{name}axis")
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def colour(index: int) -> str:

@@ -93,7 +93,7 @@ def test_the_run_directory_holds_results_figures_events_and_configuration(whole_
     assert {"results.json", ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml"} <= files
     expected = {
         "occupancy": {"auc_against_kept.png", "map_0.1m.png", "roc_0.1m.png", "mixture.png"},
-        "fit": {"convergence.png", "mixture_em.png", "mixture_scikit_learn.png"},
+        "fit": {"comparison.png", "convergence.png", "mixture_em.png", "mixture_scikit_learn.png"},
     }[command]
     assert {name for name in files if name.endswith(".png")} == expected
     for name in expected:
@@ -239,6 +239,114 @@ def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
     assert not (done.folder / "results.json").exists()
 
 
+# -- experiments ----------------------------------------------------------------------------------
+
+
+def test_an_experiment_with_rows_of_its_own(run):
+    options = [
+        "study.n_components=[2,5]",
+        "study.n_seeds=2",
+        "report.figures=true",
+        "report.tensorboard=true",
+    ]
+    done = succeeded(run("fit", "experiment=fig2_1_initialization", *options))
+    results = done.results()
+    starts = results["config"]["study"]["init_params"]
+    assert len(results["rows"]) == 2 * 2 * len(starts)
+    for row in results["rows"]:
+        assert FIT_FIELDS | {"init_params", "seed", "init_seconds", "em_seconds"} <= row.keys()
+        assert row["n_points"] == 200
+    files = done.files()
+    assert {name for name in files if name.endswith(".png")} == {
+        "initialization.png",
+        "initialization_quality.png",
+    }
+    assert any("tfevents" in name for name in files)
+    table = [line.split()[:3] for line in done.stdout.splitlines() if line.startswith("kmeans ")]
+    assert table == [["kmeans", "2", "2"], ["kmeans", "5", "2"]]
+
+
+def test_a_study_of_scans(run):
+    done = succeeded(
+        run(
+            "fit",
+            "experiment=sensor_model",
+            "dataset=synthetic_building_2d",
+            "dataset.n_scans=6",
+            "study.sensor=laser_2d",
+            "study.n_components=[4]",
+            "study.n_points=300",
+            "study.max_beams=200",
+            "study.test_every=3",
+            "study.resolution=0.5",
+            "study.n_samples=5000",
+            "report.figures=true",
+        )
+    )
+    rows = done.results()["rows"]
+    assert [row["method"] for row in rows] == ["plain", "planar", "noise", "noise_planar"]
+    for row in rows:
+        assert FIT_FIELDS | {"held_out_log_likelihood", "auc", "thickness"} <= row.keys()
+        assert row["n_points"] == 300
+        assert row["psnr2_db"] is None  # not measured
+    assert "sensor_model.png" in done.files()
+
+
+def test_a_study_of_points_and_scans(run):
+    done = succeeded(
+        run(
+            "fit",
+            "experiment=automatic_components",
+            "dataset=synthetic_building_2d",
+            "dataset.n_scans=6",
+            "study.n_components=[2,4]",
+            "study.multiples=[1]",
+            "study.bandwidths=[0.4]",
+            "study.window=3",
+            "study.window_components=[4]",
+            "study.max_beams=200",
+            "study.test_every=3",
+            "study.resolution=0.5",
+            "study.n_samples=5000",
+            "report.figures=true",
+            "report.tensorboard=true",
+        )
+    )
+    rows = done.results()["rows"]
+    fits = ["fixed", "fixed", "flat_pieces", "mean_shift", "hierarchical", "bic"]
+    assert [row["rule"] for row in rows] == [*fits, "map_flat_pieces", "map_fixed"]
+    assert all(FIT_FIELDS | {"setting", "auc", "component_bytes"} <= row.keys() for row in rows)
+    assert "component_count.png" in done.files()
+    assert any("tfevents" in name for name in done.files())
+
+
+def test_the_number_of_components_can_be_left_open(run):
+    counts = [
+        succeeded(run("fit", "mixture.n_components=null", f"mixture.noise={noise}")).results()["rows"][0]
+        for noise in (0.01, 10.0)
+    ]
+    assert [row["n_components"] for row in counts] == [pytest.approx(15, abs=14), 1]
+
+
+def test_every_strategy_has_its_row_and_its_picture(run):
+    done = succeeded(run("fit", "experiment=strategies", "report.figures=true"))
+    results = done.results()
+    methods = results["config"]["method"]
+    assert [row["method"] for row in results["rows"]] == methods
+    assert FIT_FIELDS | {"held_out_psnr2_db", "n_components_used"} <= results["rows"][0].keys()
+    pictures = {name for name in done.files() if name.endswith(".png")}
+    assert pictures == {"comparison.png", "convergence.png", *(f"mixture_{m}.png" for m in methods)}
+
+
+def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
+    mesh = tmp_path / "triangle.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    options = [*QUIET, "dataset=mesh", f"dataset.path={mesh}", "dataset.n_points=300", "dataset.noise=0.01"]
+    done = succeeded(run_here(monkeypatch, "fit", tmp_path / "run", "mixture.n_components=4", *options))
+    assert done.results()["rows"][0]["dataset"] == "triangle"
+    assert done.results()["rows"][0]["n_points"] == 270
+
+
 # -- failing --------------------------------------------------------------------------------------
 
 
@@ -298,9 +406,20 @@ def test_a_bad_value_for_a_map_is_named_in_one_line(options, words, run):
         ("max_points=0", "max_points=0"),
         ("mixture.n_components=9999", "n_components=9999"),
         ("mixture.n_components=9999 method=[scikit_learn]", "n_components=9999"),
+        ("mixture.n_components=null method=[scikit_learn]", "mixture.n_components=null scikit_learn"),
+        ("mixture.n_components=null mixture.noise=0", "noise=0"),
         ("mixture.init_params=sorted", "init_params='sorted' kmeans"),
         ("runtime.dtype=float16", "dtype='float16'"),
         ("seed=-1", "-1"),
+        ("experiment=fig2_1_initialization study.n_seeds=0", "study.n_seeds=0"),
+        ("experiment=fig2_1_initialization study.n_components=[999]", "n_components=999 200"),
+        ("experiment=fig2_1_initialization study.init_params=[sorted]", "init_params='sorted' kmeans"),
+        ("+method_options.em.branching=2", "method_options.em.branching warm_start"),
+        ("+method_options.hierarchical.branching=1 method=[hierarchical]", "branching=1"),
+        ("experiment=sensor_model study.sensor=sonar", "study.sensor='sonar' lidar"),
+        ("experiment=sensor_model +study.sensor_options.axial=1", "study.sensor_options.axial noise"),
+        ("experiment=sensor_model study.sensor_options={noise:0}", "noise=0"),
+        ("experiment=fig2_1_initialization study.name=history", "study.name='history' initialization"),
     ],
 )
 def test_a_bad_value_for_a_fit_is_named_in_one_line(options, words, run):

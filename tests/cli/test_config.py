@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Iterator
 from dataclasses import MISSING as REQUIRED
@@ -19,8 +20,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
 from gmmtorch.cli import common, schema
+from gmmtorch.cli.studies import STUDIES
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
-from gmmtorch.evaluation.fitting import FitOptions
+from gmmtorch.evaluation import component_count, initialization, sensor_noise
+from gmmtorch.evaluation.estimators import METHODS, FitOptions
 from gmmtorch.evaluation.occupancy import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning import LearningRule
@@ -63,11 +66,12 @@ def leaves(node: type, prefix: str = "") -> Iterator[str]:
 
 
 def test_the_groups_hold_what_is_promised():
-    assert {"carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log"} <= set(
+    assert {"carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log", "mesh"} <= set(
         choices("dataset")
     )
     assert {"synthetic_building", "synthetic_building_2d"} <= set(choices("dataset"))
     assert {"per_scan", "windowed"} <= set(choices("map"))
+    assert {"fig2_1_initialization", "sensor_model", "strategies"} <= set(choices("experiment"))
 
 
 @pytest.mark.parametrize("dataset", choices("dataset"))
@@ -84,6 +88,26 @@ def test_every_data_set_composes_and_its_reader_takes_its_options(command, datas
     config.path = str(tmp_path / "nowhere")
     with pytest.raises(MissingDataError, match=r"nowhere does not exist; looked for"):
         common.open_dataset(config)
+
+
+@pytest.mark.parametrize("name", choices("experiment"))
+def test_every_experiment_composes_and_what_it_asks_for_is_there(name):
+    config = composed("fit", f"experiment={name}")
+    assert not OmegaConf.missing_keys(config)
+    assert composed("fit", f"experiment={name}", "max_points=77").max_points == 77
+    if config.study is None:
+        assert set(config.method) <= set(METHODS)
+        return
+    assert callable(importlib.import_module(f"gmmtorch.report.{STUDIES[config.study.name].report}").figures)
+    with pytest.raises(ConfigCompositionException, match="nonsense"):
+        composed("fit", f"experiment={name}", "study.nonsense=1")
+
+
+@pytest.mark.parametrize("dataset", choices("dataset"))
+def test_an_experiment_runs_on_any_data_set(dataset):
+    config = composed("fit", "experiment=strategies", f"dataset={dataset}")
+    assert config.dataset.name == dataset
+    assert len(config.method) > 1
 
 
 @pytest.mark.parametrize("name", choices("map"))
@@ -169,6 +193,21 @@ def test_the_mixture_takes_what_the_options_offer_with_the_same_defaults():
     assert plain(composed("fit").mixture) == ours
 
 
+@pytest.mark.parametrize(
+    ("experiment", "options", "more"),
+    [
+        ("fig2_1_initialization", initialization.Options, ()),
+        ("sensor_model", sensor_noise.NoiseStudy, ("sensor", "sensor_options")),
+        ("automatic_components", component_count.CountStudy, ()),
+    ],
+)
+def test_a_study_takes_what_the_options_offer_with_the_same_defaults(experiment, options, more):
+    ours = plain(composed("fit", f"experiment={experiment}").study)
+    for name in ("name", *more):
+        del ours[name]
+    assert ours == {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options()).items()}
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_files_repeat_the_defaults_of_the_schema(command):
     config = composed(command)
@@ -189,14 +228,25 @@ def test_the_configuration_file_shows_every_option(options):
 
 
 @pytest.mark.parametrize(
-    "options", [schema.Occupancy, schema.Fit, schema.DepthFramesDataset, schema.SyntheticBuildingDataset]
+    "options",
+    [
+        schema.Occupancy,
+        schema.Fit,
+        schema.DepthFramesDataset,
+        schema.MeshDataset,
+        schema.SyntheticBuildingDataset,
+        schema.ComponentCountStudy,
+        schema.InitializationStudy,
+        schema.SensorModelStudy,
+    ],
 )
 def test_every_option_is_documented(options):
     path = CHECKOUT / "docs" / "commands.md"
     assert path.is_file(), "the options are to be described in docs/commands.md"
     lines = path.read_text(encoding="utf-8").splitlines()
     prefix = "dataset." if issubclass(options, schema.FileDataset | schema.SyntheticDataset) else ""
-    silent = {"map.name", "dataset.name"}  # the choice in the group says it
+    prefix = "study." if options.__name__.endswith("Study") else prefix
+    silent = {"map.name", "dataset.name", "study.name"}  # the choice in the group says it
     missing = [name for name in leaves(options, prefix) if not any(map(partial(speaks_of, name), lines))]
     assert not set(missing) - silent
 
@@ -299,7 +349,9 @@ def test_the_commands_are_installed_under_their_names():
         assert scripts[f"gmmtorch-{command}"] == f"gmmtorch.cli.{command}:main"
 
 
-@pytest.mark.parametrize(("command", "groups"), [("occupancy", ("dataset", "map")), ("fit", ("dataset",))])
+@pytest.mark.parametrize(
+    ("command", "groups"), [("occupancy", ("dataset", "map")), ("fit", ("dataset", "experiment"))]
+)
 def test_help_names_every_choice_of_every_group(command, groups):
     conf = Path(common.conf_dir())
     template = (conf / f"{command}.yaml").read_text()

@@ -25,7 +25,9 @@ def test_an_unknown_name_lists_the_known_ones():
         assert name in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log"])
+@pytest.mark.parametrize(
+    "name", ["carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log", "mesh"]
+)
 def test_a_missing_path_says_what_was_looked_for(name, tmp_path):
     with pytest.raises(MissingDataError, match="nowhere") as caught:
         load(name, tmp_path / "nowhere")

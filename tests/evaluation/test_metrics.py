@@ -15,7 +15,7 @@ from sklearn.metrics import brier_score_loss, roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.metrics import auc_interval, brier, psnr2, roc, unknown_scores
+from gmmtorch.evaluation.metrics import auc_interval, brier, psnr2, psnr_terms, roc, unknown_scores
 
 eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)
 """Few values, so that ties are common."""
@@ -179,6 +179,7 @@ def test_psnr2_is_that_of_all_pairs_of_points(generator, dim, dtype):
     sampled = torch.randn(80, dim, generator=generator, dtype=dtype) * 3 + 5
     expected = psnr2_by_all_pairs(points.double().numpy(), sampled.double().numpy())
     assert psnr2(points, sampled) == pytest.approx(expected, rel=1e-6)
+    assert sum(psnr_terms(points, sampled)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_psnr2_does_not_depend_on_place_and_scale(generator):
@@ -190,6 +191,17 @@ def test_psnr2_of_the_same_cloud_is_infinite_in_any_order(generator):
     points = torch.rand(20, 3, generator=generator)
     assert psnr2(points, points) == math.inf
     assert psnr2(points, points.flip(0)) == math.inf
+
+
+def test_the_terms_of_psnr2_tell_what_is_missed_from_what_is_invented(generator):
+    points = torch.rand(200, 2, generator=generator)
+    there, back = psnr_terms(points, points[:20])  # misses most of the cloud, invents nothing
+    assert back == math.inf
+    assert there < 40
+    there, back = psnr_terms(points, torch.cat([points, points[:50] + 3]))
+    assert there == math.inf
+    assert back < 0
+    assert psnr2(points, points[:20]) == math.inf
 
 
 def test_psnr2_of_a_single_point_has_no_scale():

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gmmtorch.mixture import GaussianMixture, em
 from gmmtorch.mixture.cells import pool_into_cells
 from gmmtorch.mixture.em import quadratic_features
 
@@ -111,3 +112,71 @@ def test_the_order_of_the_points_does_not_matter():
     cells, shuffled = pool_into_cells(points, 60, 0.01), pool_into_cells(points[order], 60, 0.01)
     torch.testing.assert_close(cells.features, shuffled.features, rtol=1e-12, atol=1e-12)
     assert torch.equal(cells.member[order], shuffled.member)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("limit", [30, 1000])
+def test_a_whole_weight_is_a_point_repeated(dim, limit):
+    points = cloud(200, dim, 5)
+    weight = torch.randint(1, 4, (200,), generator=torch.Generator().manual_seed(0)).double()
+    weighted = pool_into_cells(points, min(limit, 199), 1e-3, weight)
+    repeated = pool_into_cells(points.repeat_interleave(weight.long(), 0), min(limit, 199), 1e-3)
+    torch.testing.assert_close(weighted.features, repeated.features, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(weighted.weight, repeated.weight)
+    assert torch.equal(weighted.member.repeat_interleave(weight.long()), repeated.member)
+
+
+def test_few_weighted_points_keep_their_weights():
+    weight = torch.tensor([0.5, 2.0, 1e-6], dtype=torch.float64)
+    assert torch.equal(pool_into_cells(cloud(3, 2, 0), 3, 1.0, weight).weight, weight)
+
+
+def test_equal_points_share_one_cell_however_fine():
+    cells = pool_into_cells(torch.zeros(50, 3, dtype=torch.float64), 5, 0.0)
+    assert cells.weight.tolist() == [50.0]
+    assert cells.member.tolist() == [0] * 50
+    assert cells.features.tolist() == [[1.0] + [0.0] * 9]
+
+
+@given(seed=st.integers(0, 10**6), dim=st.integers(1, 3), k=st.integers(1, 5), limit=st.integers(5, 80))
+def test_a_step_on_cells_keeps_the_moments_of_the_cloud_and_the_bound_rises(seed, dim, k, limit):
+    points = cloud(300, dim, seed)
+    points = points - points.mean(0)
+    cells = pool_into_cells(points, limit, 1e-3)
+    generator = torch.Generator().manual_seed(seed)
+    first = em.Parameters(
+        torch.full((k,), 1 / k, dtype=torch.float64),
+        torch.randn(k, dim, generator=generator, dtype=torch.float64),
+        torch.eye(dim, dtype=torch.float64).repeat(k, 1, 1),
+    )
+    step = em.natural_step(cells.features, cells.weight, 0.0, torch.float64)
+    found = em.run_em(step, first, tol=0.0, max_iter=8)
+    assert (np.diff(found.lower_bounds) >= -1e-10).all()
+    weights, means, covariances = found.parameters
+    torch.testing.assert_close(weights @ means, points.mean(0), rtol=0, atol=1e-9)
+    second = covariances + means[:, :, None] * means[:, None, :]
+    expected = points.T @ points / 300
+    torch.testing.assert_close(torch.einsum("k,kij->ij", weights, second), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("algorithm", ["exact", "truncated"])
+@pytest.mark.parametrize("init", ["kmeans", "flat_pieces"])
+def test_with_a_cell_for_every_point_the_fit_is_that_of_the_points(algorithm, init):
+    points = cloud(300, 3, 1).numpy()
+    options = {"algorithm": algorithm, "init_params": init, "random_state": 0, "dtype": "float64"}
+    plain = GaussianMixture(20, **options).fit(points)
+    for limit in (300, 5000):
+        pooled = GaussianMixture(20, max_cells=limit, **options).fit(points)
+        np.testing.assert_allclose(pooled.lower_bounds_, plain.lower_bounds_, rtol=1e-9)
+        np.testing.assert_allclose(pooled.means_, plain.means_, atol=1e-6)
+        np.testing.assert_allclose(pooled.covariances_, plain.covariances_, atol=1e-6)
+
+
+def test_a_fit_of_cells_is_nearly_as_likely_as_one_of_points():
+    centers = 6 * cloud(12, 3, 7)
+    points = (centers.repeat(400, 1) + 0.5 * cloud(4800, 3, 8)).numpy()
+    plain = GaussianMixture(12, init_params="flat_pieces", tol=1e-5).fit(points)
+    pooled = GaussianMixture(12, init_params="flat_pieces", tol=1e-5, max_cells=1000).fit(points)
+    assert pooled.lower_bound_ < pooled.score(points)
+    assert pooled.score(points) > plain.score(points) - 0.1
+    assert pooled.n_samples_seen_ == 4800

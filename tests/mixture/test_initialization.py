@@ -7,9 +7,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.mixture.initialization import INITIALIZATIONS, distinct_points, start
+from gmmtorch.mixture import initialization
+from gmmtorch.mixture.cells import pool_into_cells
+from gmmtorch.mixture.em import Parameters, quadratic_features
+from gmmtorch.mixture.initialization import (
+    INITIALIZATIONS,
+    copied,
+    distinct_points,
+    flat_pieces,
+    moments_of,
+    start,
+)
 
 METHODS = sorted(INITIALIZATIONS)
+SEEDED = [method for method in METHODS if method != "flat_pieces"]
 
 
 def cloud(n: int, dim: int, seed: int = 0) -> Tensor:
@@ -42,7 +53,7 @@ def test_a_start_is_a_mixture_within_the_cloud(method, dim):
     assert bool(((means >= points.amin(0)) & (means <= points.amax(0))).all())
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SEEDED)
 def test_the_seed_decides(method):
     points = cloud(200, 2)
     first, again, other = begin(method, points, 5), begin(method, points, 5), begin(method, points, 5, seed=1)
@@ -108,6 +119,20 @@ def test_kmeans_gives_each_cluster_its_moments():
         np.testing.assert_allclose(covariances[i].numpy(), expected, rtol=1e-8, atol=1e-11)
 
 
+def test_of_kmeans_restarts_the_tightest_clustering_is_taken():
+    points = cloud(400, 2)
+
+    def scatter(method: str, seed: int) -> float:
+        weights, _, covariances = begin(method, points, 25, seed=seed)
+        return float((weights * covariances.diagonal(dim1=-2, dim2=-1).sum(1)).sum())
+
+    once, restarted = (
+        [scatter(method, seed) for seed in range(6)] for method in ("kmeans", "kmeans_restarts")
+    )
+    assert all(many <= one + 1e-12 for one, many in zip(once, restarted, strict=True))
+    assert min(restarted) < min(once)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_with_few_distinct_points_copies_share_the_weight(method):
     points = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64).repeat(10, 1)
@@ -116,3 +141,72 @@ def test_with_few_distinct_points_copies_share_the_weight(method):
     assert float(weights.sum()) == pytest.approx(1)
     assert len({tuple(row) for row in means.tolist()}) == 2
     assert float(torch.linalg.eigvalsh(covariances).min()) > 0
+
+
+# -- flat pieces -------------------------------------------------------------------------------------
+
+
+def check_moments(found: Parameters, labels: Tensor, points: np.ndarray, weight: np.ndarray) -> None:
+    """That each component has the weight, mean and covariance of the points of its label."""
+    dim = points.shape[1]
+    for k, (share, mean, covariance) in enumerate(zip(*found, strict=True)):
+        own, p = points[labels.numpy() == k], weight[labels.numpy() == k]
+        assert float(share) == pytest.approx(p.sum() / weight.sum(), rel=1e-9)
+        center = np.average(own, axis=0, weights=p)
+        np.testing.assert_allclose(mean, center, rtol=1e-12, atol=1e-9)
+        offset = own - center
+        expected = np.einsum("n,ni,nj->ij", p / p.sum(), offset, offset) + 1e-6 * np.eye(dim)
+        np.testing.assert_allclose(covariance, expected, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("pooled", [False, True])
+def test_flat_pieces_are_as_many_as_asked_for_and_have_their_points_moments(dim, pooled, monkeypatch):
+    if pooled:
+        monkeypatch.setattr(initialization, "_FEWEST_CELLS", 100)
+    points = cloud(600, dim)
+    weight = torch.rand(600, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 0.1
+    found, labels = flat_pieces(points, weight, 12, 1e-6)
+    assert found.weights.shape == (12,)
+    assert labels.shape == (600,)
+    assert sorted(set(labels.tolist())) == list(range(12))
+    check_moments(found, labels, points.numpy(), weight.numpy())
+
+
+def test_flat_pieces_of_cells_have_the_moments_of_the_points_in_them():
+    points, weight = cloud(600, 3), torch.ones(600, dtype=torch.float64)
+    cells = pool_into_cells(points, 150, 1e-3)
+    means = cells.features[:, 1:4].contiguous()
+    found, labels = flat_pieces(means, cells.weight, 10, 1e-6, cells.features)
+    assert labels.shape == (len(means),)
+    check_moments(found, labels[cells.member], points.numpy(), weight.numpy())
+
+
+@pytest.mark.parametrize("n", [10, 20_000])
+def test_flat_pieces_of_equal_points_are_one(n):
+    found, labels = flat_pieces(torch.zeros(n, 3, dtype=torch.float64), torch.ones(n).double(), 5, 1e-6)
+    assert found.weights.tolist() == [pytest.approx(1)]
+    assert set(labels.tolist()) == {0}
+
+
+def test_moments_of_thin_pieces_far_apart_keep_their_digits():
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    wall = (rng.normal(size=(500, 3)) * [1, 1, 1e-3]) @ turn.T
+    points = torch.from_numpy(np.concatenate([wall - 250_000.0, wall + 250_000.0]))
+    labels = torch.arange(2).repeat_interleave(500)
+    weight = torch.ones(1000, dtype=torch.float64)
+    found = moments_of(quadratic_features(points), weight, labels, 2, 0.0, points)
+    for covariance in found.covariances:
+        np.testing.assert_allclose(covariance, np.cov(wall.T, ddof=0), atol=1e-10)
+
+
+@pytest.mark.parametrize("k", [3, 4, 7])
+def test_copies_share_the_weight_of_what_they_are_copies_of(k):
+    weights = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
+    found = Parameters(weights, cloud(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1))
+    many, copy = copied(found, k)
+    assert many.weights.shape == (k,)
+    assert torch.equal(many.means, found.means[copy])
+    sums = torch.zeros(3, dtype=torch.float64).index_add_(0, copy, many.weights)
+    torch.testing.assert_close(sums, weights)

@@ -154,3 +154,81 @@ def test_a_few_far_returns_do_not_keep_a_cloud_in_one_piece(n_strays, distance):
     assert both.n_pieces >= alone.n_pieces
     of_strays = both.labels[len(room) :]
     assert not torch.isin(both.labels[: len(room)], of_strays).any()
+
+
+# -- a given number of pieces ------------------------------------------------------------------------
+
+ALL = {"thickness": 0.0, "length": 0.0, "min_weight": 0.0, "min_weight_thick": 0.0, "apart": 0.0}
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 150),
+    dim=st.integers(1, 3),
+    limit=st.integers(1, 170),
+    grain=st.sampled_from([0.0, 0.5]),
+    within=st.sampled_from([0.0, 1.0]),
+)
+def test_there_are_as_many_pieces_as_asked_for_or_as_distinct_points(seed, n, dim, limit, grain, within):
+    points = cloud(n, dim, seed)
+    points = (points / grain).round() * grain if grain else points
+    generator = torch.Generator().manual_seed(seed)
+    weight = torch.rand(n, generator=generator, dtype=torch.float64) ** 8 + 1e-6  # a few cells weigh most
+    features = quadratic_features(points)
+    # Cells have an extent of their own, which no cut takes away.
+    spread = within * torch.rand(n, generator=generator, dtype=torch.float64)
+    for i in range(dim):
+        features[:, 1 + dim + i * dim - i * (i - 1) // 2] += spread
+    labels, n_pieces = partition(points, weight, FlatnessRule(**ALL, max_components=limit), features)
+    assert n_pieces == min(limit, len(points.unique(dim=0)))
+    assert labels.unique().tolist() == list(range(n_pieces))
+
+
+def sheets(gap: float, n: int = 400) -> Tensor:
+    """Points of a strip 1 m × 0.2 m, on two sheets `gap` apart."""
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 0.2, 0.0])
+    points[::2, 2] = gap
+    return points
+
+
+@pytest.mark.parametrize("thick_first", [False, True])
+def test_of_two_pieces_as_long_and_heavy_the_thick_one_is_cut_first(thick_first):
+    pair = [sheets(0.1), sheets(0.0) + torch.tensor([0.0, 20.0, 0.0])]
+    points = torch.cat(pair if thick_first else pair[::-1])
+    labels, n_pieces = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=3))
+    assert n_pieces == 3
+    thick, thin = (labels[:400], labels[400:]) if thick_first else (labels[400:], labels[:400])
+    assert len(set(thick.tolist())) == 2
+    assert len(set(thin.tolist())) == 1
+
+
+def test_of_two_pieces_of_one_shape_the_heavier_is_cut_first():
+    piece = sheets(0.02)
+    points = torch.cat([piece, piece + torch.tensor([0.0, 20.0, 0.0])])
+    weight = torch.cat([torch.full((400,), value, dtype=torch.float64) for value in (1.0, 1.5)])
+    center = weight @ points / weight.sum()
+    labels, n_pieces = cut(points - center, FlatnessRule(**ALL, max_components=3), weight)
+    assert n_pieces == 3
+    assert len(set(labels[:400].tolist())) == 1
+
+
+def test_with_room_for_more_pieces_thin_sheets_are_told_apart():
+    points = sheets(0.3)
+    labels, _ = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=16))
+    upper, lower = set(labels[::2].tolist()), set(labels[1::2].tolist())
+    assert not upper & lower
+
+
+def test_pieces_that_cannot_be_cut_do_not_use_up_the_levels():
+    # Heavy cells, wide in themselves, are worth most, but only the light ones can be parted.
+    heavy = torch.stack([torch.arange(90.0, dtype=torch.float64) * 50, torch.zeros(90)], 1)
+    light = torch.stack([torch.arange(40.0, dtype=torch.float64) * 0.01 - 300, torch.zeros(40)], 1)
+    points = torch.cat([heavy, light])
+    weight = torch.cat([torch.full((90,), 1e6), torch.ones(40)]).double()
+    center = weight @ points / weight.sum()
+    features = quadratic_features(points - center)
+    features[:90, 3] += 100.0
+    features[:90, 5] += 100.0
+    found = partition(points - center, weight, FlatnessRule(**ALL, max_components=125), features)
+    assert found.n_pieces == 125

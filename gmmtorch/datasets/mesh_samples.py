@@ -1,0 +1,105 @@
+"""Points sampled from the surface of a triangle mesh: a cloud that no sensor's view shaped."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.clouds import open3d_for
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.scan import Scan
+
+
+class MeshSamples(Dataset):
+    """One scan: `n_points` points uniform on the surface, each moved by isotropic Gaussian noise.
+
+    No sensor saw them; the middle of the bounding box stands for its position. No return: points at
+    or beyond `max_range` of that. None are invalid.
+
+    Args:
+        path: PLY, OBJ, STL or whatever else Open3D reads triangles from; metres.
+        n_points: how many.
+        noise: standard deviation (m) along each axis.
+        seed: of the draw.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        n_points: int = 100_000,
+        noise: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self._path = existing(
+            path,
+            "file",
+            "a triangle mesh (PLY, OBJ, STL)",
+            "The Stanford 3D scanning repository has well-known ones.",
+        )
+        super().__init__(self._path.stem, ranges, stride)
+        self.n_points = check_whole("n_points", n_points, 1)
+        self.seed = check_whole("seed", seed, 0)
+        if not 0 <= noise < math.inf:
+            raise InvalidArgumentError(f"noise={noise} must be a standard deviation of at least 0 m.")
+        self.noise = noise
+
+    def _count(self) -> int:
+        return 1
+
+    def _read(self, index: int) -> Scan:
+        triangles = read_triangles(self._path)
+        generator = torch.Generator().manual_seed(self.seed)
+        points = sample_surface(triangles, self.n_points, generator)
+        points += self.noise * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+        corners = triangles.reshape(-1, 3)
+        return self.ranges.scan(points, (corners.amin(0) + corners.amax(0)) / 2)
+
+
+def read_triangles(path: Path) -> Tensor:
+    """Corners (T, 3, 3), float64, of the triangles of a mesh file.
+
+    Raises `DataError` if it is unreadable, truncated, has no triangle, or a corner that is not finite.
+    """
+    open3d = open3d_for(path)
+    try:
+        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+            mesh = open3d.t.io.read_triangle_mesh(path)
+    except RuntimeError as error:
+        raise DataError(f"{path} cannot be read as a mesh: {error}") from error
+    if "positions" not in mesh.vertex or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+        raise DataError(
+            f"{path} holds no triangles that can be read; it is truncated, a cloud, or no mesh at all. "
+            "Give a PLY, OBJ or STL file with faces."
+        )
+    corners = torch.from_numpy(mesh.vertex.positions.numpy()).double()
+    indices = torch.from_numpy(mesh.triangle.indices.numpy()).long()
+    if int(indices.min()) < 0 or int(indices.max()) >= len(corners):
+        raise DataError(f"{path}: a face names a corner that is not there; the file is damaged.")
+    triangles = corners[indices]
+    if not bool(torch.isfinite(triangles).all()):
+        raise DataError(f"{path}: a corner is NaN or infinite; the file is damaged.")
+    return triangles
+
+
+def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator) -> Tensor:
+    """Points (n_points, 3), uniform by area on triangles (T, 3, 3).
+
+    With u, v uniform, a + (1 − v) √u (b − a) + v √u (c − a) is uniform on a triangle. Raises
+    `DataError` if no triangle has an area.
+    """
+    a, b, c = triangles.unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1)
+    if not bool(area.sum() > 0):
+        raise DataError("The mesh has no area: every triangle is a line or a point.")
+    share = torch.cumsum(area, 0)
+    drawn = torch.rand(n_points, generator=generator, dtype=torch.float64) * share[-1]
+    chosen = torch.searchsorted(share, drawn, right=True).clamp_max(len(area) - 1)
+    u, v = torch.rand(2, n_points, 1, generator=generator, dtype=torch.float64)
+    a, b, c = triangles[chosen].unbind(1)
+    return a + u.sqrt() * ((1 - v) * (b - a) + v * (c - a))

@@ -1,0 +1,222 @@
+"""A depth image to a mixture in milliseconds: its moments are summed where the pixels lie.
+
+A pixel (u, v) of depth z sees the point (u z/f, v z/f, z), u and v from the optical axis. All moments of a
+block of pixels are therefore sums of z and z² times 1, u, v and their products, which strided
+convolutions yield, without a single point being computed. Blocks that are flat together are merged, up
+to 32 × 32 pixels, so that walls become few cells and edges stay sharp; EM then runs on the cells (see
+`cells`). A block is flat if its inverse depth is linear in u and v: of points alone it cannot be
+told, as what a few pixels see lies near the plane through them and the camera, steps and all.
+
+Camera frame: x right, y down, z forward, metres.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.mixture import em
+from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.grouping import Rows
+from gmmtorch.mixture.initialization import copied, flat_pieces
+
+_BLOCK = 8  # pixels along the side of the smallest cell
+_LEVELS = 2  # doublings of it
+_FARTHEST = 1e15  # metres: what is beyond is no depth, and its square may be no number
+_LEAST_VARIANCE = 1e-3  # of the pixels of a cell, along u and v (pixels²)
+
+
+def pool_depth_image(
+    depth: Tensor, intrinsics: Tensor, *, max_range: float = float("inf"), noise: float = 0.01
+) -> Rows:
+    """Cells of a depth image (H, W), metres along the optical axis: mean features and pixel counts.
+
+    Pixels that are not finite, not above zero, or not below `max_range` are left out. Four cells
+    become one where depth deviates from a plane by at most half of `noise` (root mean square), in
+    metres, and times z² beyond one metre, as the error of depth cameras grows. Sums of features are
+    those of the back-projected points, to float32 of what depth spans within a block.
+
+    Raises `InvalidArgumentError` for another shape, or where no pixel is left.
+    """
+    _check(depth, intrinsics, max_range, noise)
+    sums, inverse = _block_features(depth.detach(), intrinsics, max_range)
+    whole, found = torch.ones_like(sums[0], dtype=torch.bool), []
+    for _ in range(_LEVELS):
+        parent, inverse = _sum_of_four(sums), _sum_of_four(inverse)
+        flat = _is_flat(inverse, noise / 2) & _all_of_four(whole)
+        found.append(sums[:, whole & ~_four_of_each(flat) & (sums[0] > 0)])
+        sums, whole = parent, flat
+    found.append(sums[:, whole & (sums[0] > 0)])
+    cells = torch.cat(found, 1).T
+    if cells.shape[0] == 0:
+        raise InvalidArgumentError(
+            "depth holds no pixel above zero and below max_range; there is nothing to fit."
+        )
+    return Rows(cells / cells[:, :1], cells[:, 0].contiguous(), are_points=False)
+
+
+def fit_depth_image(
+    depth: Tensor,
+    intrinsics: Tensor,
+    n_components: int = 50,
+    *,
+    max_range: float = float("inf"),
+    noise: float = 0.01,
+    max_iter: int = 4,
+) -> GaussianMixture:
+    """A mixture of a depth image (H, W) in the camera frame; move it by `transform(T_world_camera)`.
+
+    Flat pieces of the cells (see `pool_depth_image`), then `max_iter` iterations of EM on the cells.
+    `noise` squared is the least variance of a component (m²).
+
+    Raises `InvalidArgumentError` for bad arguments, and if there are fewer cells than components.
+    """
+    check_whole("n_components", n_components, 1)
+    check_whole("max_iter", max_iter, 1)
+    with torch.inference_mode():  # a tenth of the time is book-keeping for gradients
+        cells = pool_depth_image(depth, intrinsics, max_range=max_range, noise=noise)
+        n_cells = cells.weight.shape[0]
+        if n_cells < n_components:
+            raise InvalidArgumentError(
+                f"n_components={n_components} is more than the {n_cells} cells of the image; ask for fewer."
+            )
+        share = (cells.weight / cells.weight.sum())[:, None]
+        center = (cells.points * share).sum(0)
+        features = em.shift_features(cells.values, -center)
+        centered = Rows(features, cells.weight, are_points=False)
+        first, _ = flat_pieces(centered.points, cells.weight, n_components, noise**2, features)
+        step = em.natural_step(features, cells.weight, noise**2)
+        found = em.run_em(step, copied(first, n_components)[0], tol=0.0, max_iter=max_iter)
+        weights, means, covariances = found.parameters
+        means = means + center
+    return GaussianMixture.from_parameters(
+        (weights / weights.sum()).clone(),
+        means.clone(),
+        covariances.clone(),
+        lower_bounds=found.lower_bounds,
+        reg_covar=noise**2,
+    )
+
+
+def _check(depth: Tensor, intrinsics: Tensor, max_range: float, noise: float) -> None:
+    if depth.ndim != 2 or not depth.is_floating_point() or 0 in depth.shape:
+        raise InvalidArgumentError(
+            f"depth has shape {tuple(depth.shape)} and dtype {depth.dtype}; expected (H, W), floating, "
+            "metres."
+        )
+    is_pinhole = tuple(intrinsics.shape) == (3, 3) and bool(torch.isfinite(intrinsics).all())
+    if not is_pinhole or not bool((intrinsics.diagonal()[:2] > 0).all()):
+        raise InvalidArgumentError(
+            f"intrinsics={intrinsics.tolist()} must be a 3×3 pinhole matrix in pixels, finite, focal lengths "
+            "above zero."
+        )
+    if not max_range > 0:
+        raise InvalidArgumentError(f"max_range={max_range} must be above zero metres.")
+    if not 0 < noise < float("inf"):
+        raise InvalidArgumentError(f"noise={noise} must be above zero metres.")
+
+
+def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tuple[Tensor, Tensor]:
+    """Sums of features over blocks of pixels: of the points, and of (u, v, 1/z), (10, h, w) each.
+
+    u and v are pixels: from the optical axis for the points, else from the middle of the largest
+    cell. h and w are rounded up to whole largest cells.
+    """
+    side = _BLOCK << _LEVELS
+    padded = torch.nn.functional.pad(depth, (0, -depth.shape[1] % side, 0, -depth.shape[0] % side))
+    valid = (padded > 0) & (padded < min(max_range, _FARTHEST))  # false for NaN, too
+    of_one, (of_z, of_zz), (of_w, of_ww) = _block_sums(valid, padded)
+    u, v = (
+        (_BLOCK - 1) / 2 + _BLOCK * torch.arange(n, dtype=torch.float64, device=depth.device)
+        for n in (of_one.shape[2], of_one.shape[1])
+    )
+    fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    middle = (side - 1) / 2
+    local = u % side - middle, (v % side - middle)[:, None]
+    count, su, sv, suu, suv, svv = _about(of_one, *local)
+    sw, suw, svw, *_ = _about(of_w, *local)
+    axis = u - cx, (v - cy)[:, None]
+    sz, sx, sy, *_ = _about(of_z, *axis)
+    szz, sxz, syz, sxx, sxy, syy = _about(of_zz, *axis)
+    points = [count, sx / fx, sy / fy, sz, sxx / fx**2, sxy / (fx * fy), sxz / fx, syy / fy**2, syz / fy, szz]
+    return torch.stack(points), torch.stack([count, su, sv, sw, suu, suv, suw, svv, svw, of_ww[0]])
+
+
+def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Σ1, (Σz, Σz²) and (Σw, Σw²), w = 1/z, over the valid pixels of blocks of an image (H, W).
+
+    Each of them times 1, d, e, d², de, e², d and e being the pixels from the middle of the block:
+    (6, h, w), float64. The sums over pixels run in float32, about a value within the block (0 if none is
+    at hand), so that thin cells far off keep their digits.
+    """
+    images = torch.empty(5, *z.shape, dtype=torch.float32, device=z.device)
+    images[0] = valid
+    middles, missing = [], ~valid
+    for place, image in ((1, z), (3, z.reciprocal())):
+        middle = _some_value(valid, image)
+        blocks = image.unflatten(1, (-1, _BLOCK)).unflatten(0, (-1, _BLOCK))
+        local = images[place].unflatten(1, (-1, _BLOCK)).unflatten(0, (-1, _BLOCK))
+        if image.dtype == torch.float32:
+            torch.sub(blocks, middle[:, None, :, None], out=local)
+        else:
+            local.copy_(blocks - middle[:, None, :, None])
+        images[place].masked_fill_(missing, 0.0)  # also of NaN
+        torch.square(images[place], out=images[place + 1])
+        middles.append(middle.double())
+    d = torch.arange(_BLOCK, dtype=torch.float32, device=z.device) - (_BLOCK - 1) / 2
+    d, e = d.expand(_BLOCK, _BLOCK), d[:, None].expand(_BLOCK, _BLOCK)
+    monomials = torch.stack([torch.ones_like(d), d, e, d * d, d * e, e * e])
+    found = torch.nn.functional.conv2d(images[:, None], monomials[:, None], stride=_BLOCK).double()
+    one = found[0]
+    of_z, of_w = (
+        (first + middle * one, second + middle * (2 * first + middle * one))
+        for middle, first, second in zip(middles, found[1::2], found[2::2], strict=True)
+    )
+    return one, of_z, of_w
+
+
+def _some_value(valid: Tensor, image: Tensor) -> Tensor:
+    """The largest valid one of four values (h, w) of each block, or 0: far cheaper than that of all."""
+    near, far = _BLOCK // 4, _BLOCK - 1 - _BLOCK // 4
+    four = [
+        torch.where(valid[i::_BLOCK, j::_BLOCK], image[i::_BLOCK, j::_BLOCK], 0.0)
+        for i in (near, far)
+        for j in (near, far)
+    ]
+    return torch.stack(four).amax(0)
+
+
+def _about(sums: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
+    """Σg, Σgu, Σgv, Σgu², Σguv, Σgv² from the sums (6, h, w) of d and e: u = a + d, v = b + e."""
+    s, sd, se, sdd, sde, see = sums
+    su, sv = a * s + sd, b * s + se
+    return s, su, sv, a * (su + sd) + sdd, a * sv + b * sd + sde, b * (sv + se) + see
+
+
+def _is_flat(sums: Tensor, deviation: float) -> Tensor:
+    """Whether depth is a plane's to within a deviation (m, times z² beyond one metre), (h, w).
+
+    By the variance of inverse depth w given u and v, which it is linear in on a plane; it deviates by
+    that of depth over z².
+    """
+    u, v, w, uu, uv, uw, vv, vw, ww = sums[1:] / sums[0].clamp_min(1)
+    # A little wider than they are: pixels in one line have a slope, too.
+    suu, suv, svv = uu - u * u + _LEAST_VARIANCE, uv - u * v, vv - v * v + _LEAST_VARIANCE
+    suw, svw, sww = uw - u * w, vw - v * w, ww - w * w
+    explained = (svv * suw * suw - 2 * suv * suw * svw + suu * svw * svw) / (suu * svv - suv * suv)
+    return sww - explained <= (deviation * w.square().clamp_min(1)).square()
+
+
+def _sum_of_four(sums: Tensor) -> Tensor:
+    rows = sums[:, ::2] + sums[:, 1::2]
+    return rows[..., ::2] + rows[..., 1::2]
+
+
+def _all_of_four(flags: Tensor) -> Tensor:
+    rows = flags[::2] & flags[1::2]
+    return rows[:, ::2] & rows[:, 1::2]
+
+
+def _four_of_each(flags: Tensor) -> Tensor:
+    return flags.repeat_interleave(2, 0).repeat_interleave(2, 1)

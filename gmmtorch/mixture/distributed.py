@@ -1,0 +1,138 @@
+"""Several processes that share one fit: each reads its own points, and all hold the same parameters.
+
+What they exchange is little: one sum of K × F sufficient statistics an iteration, whatever the number
+of points. Started by torchrun, they find each other; started alone, a process is the whole group.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+
+_LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+TIMEOUT = 600.0
+"""Seconds that a process waits for the others, unless the caller says otherwise."""
+
+
+class LostProcessError(GmmTorchError, RuntimeError):
+    """Another process of the group has ended, or did not answer in time."""
+
+
+class Processes:
+    """Those that share a fit. This is one process alone, whose points are all the points."""
+
+    rank = 0
+    size = 1
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        """The sum of everyone's tensor, of the same shape and dtype in all."""
+        return tensor
+
+    def gather(self, rows: Tensor) -> list[Tensor]:
+        """Everyone's rows (n, C), by rank; n may differ."""
+        return [rows]
+
+    def broadcast(self, vector: Tensor | None) -> Tensor:
+        """Rank 0's vector (n,), which the others need not have, nor know the length of; float64."""
+        assert vector is not None
+        return vector
+
+
+ALONE = Processes()
+
+
+class ProcessGroup(Processes):
+    """The processes of torch.distributed, which `joined` initialises."""
+
+    def __init__(self, timeout: float, device: torch.device) -> None:
+        from torch import distributed
+
+        self._distributed: Any = distributed
+        self._timeout, self._device = timeout, device
+        self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        total = tensor.to(self._device).contiguous()
+        with self._answering():
+            self._distributed.all_reduce(total)
+        return total.to(tensor.device)
+
+    def gather(self, rows: Tensor) -> list[Tensor]:
+        lengths = torch.zeros(self.size, dtype=torch.float64)
+        lengths[self.rank] = rows.shape[0]
+        counts = [int(n) for n in self.sum(lengths)]
+        padded = rows.new_zeros(max(counts), rows.shape[1]).to(self._device)
+        padded[: rows.shape[0]] = rows
+        everyone = [torch.empty_like(padded) for _ in counts]
+        with self._answering():
+            self._distributed.all_gather(everyone, padded)
+        return [part[:n].to(rows.device) for part, n in zip(everyone, counts, strict=True)]
+
+    def broadcast(self, vector: Tensor | None) -> Tensor:
+        length = 0 if vector is None or self.rank else vector.numel()
+        length = int(self.sum(torch.tensor([length], dtype=torch.float64)))
+        if vector is None or self.rank:
+            vector = torch.empty(length, dtype=torch.float64)
+        sent = vector.to(self._device).contiguous()
+        with self._answering():
+            self._distributed.broadcast(sent, 0)
+        return sent.to(vector.device)
+
+    @contextmanager
+    def _answering(self) -> Iterator[None]:
+        """What torch raises when a process is gone becomes a `LostProcessError`."""
+        try:
+            yield
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise LostProcessError(
+                f"rank {self.rank} of {self.size} lost another process, or had no answer within "
+                f"{self._timeout:g} s ({reason})."
+            ) from error
+
+
+def is_launched() -> bool:
+    """Whether torchrun, or something like it, started this process as one of several."""
+    return all(name in os.environ for name in _LAUNCHED) and int(os.environ["WORLD_SIZE"]) > 1
+
+
+@contextmanager
+def joined(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Iterator[Processes]:
+    """The processes that torchrun started together (gloo on CPU, nccl on CUDA), or this one alone.
+
+    `timeout` (s) bounds how long one waits for another. Raises `LostProcessError` if they do not find
+    each other, `InvalidArgumentError` for a timeout that is none.
+    """
+    if not (math.isfinite(timeout) and timeout > 0):
+        raise InvalidArgumentError(f"timeout={timeout} must be above zero seconds, and finite.")
+    if not is_launched():
+        yield ALONE
+        return
+    from torch import distributed
+
+    device = torch.device(device)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+        os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")  # else nccl ends the process by itself
+    try:
+        distributed.init_process_group(
+            "nccl" if device.type == "cuda" else "gloo", timeout=datetime.timedelta(seconds=timeout)
+        )
+    except RuntimeError as error:
+        raise LostProcessError(
+            f"rank {os.environ['RANK']} did not find the other {int(os.environ['WORLD_SIZE']) - 1} at "
+            f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']} within {timeout:g} s ({error})."
+        ) from error
+    try:
+        yield ProcessGroup(timeout, device)
+    finally:
+        distributed.destroy_process_group()

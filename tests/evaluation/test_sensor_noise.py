@@ -1,0 +1,172 @@
+"""The sensor-noise study in a room that is known in closed form."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from evaluation.pillar_room import room_scan
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import queries, sensor_noise
+from gmmtorch.evaluation.sensor_noise import SENSORS, VARIANTS, NoiseStudy, run
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mixture.sensor_model import LaserModel, LidarModel
+from gmmtorch.scan import Scan
+
+NOISE = 0.04
+SENSOR = LaserModel(noise=NOISE, divergence=1e-4)
+STUDY = NoiseStudy((6, 20), 1500, 0.1, 5, 800, 40, 1e-6, n_samples=20_000)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Scan]:
+    return [room_scan(number, 100, noise=NOISE) for number in range(30)]
+
+
+@pytest.fixture(scope="module")
+def rows(scans: list[Scan]) -> dict[tuple[int, str], dict]:
+    found = run("room", scans, SENSOR, STUDY)
+    order = [(k, variant) for k in STUDY.n_components for variant in VARIANTS]
+    assert [row["variant"] for row in found] == [variant for _, variant in order]
+    return dict(zip(order, found, strict=True))
+
+
+def test_every_row_is_plain_and_says_what_it_is_about(rows):
+    for (k, variant), row in rows.items():
+        assert json.loads(json.dumps(row)) == row
+        assert (row["dataset"], row["variant"], row["n_train_points"]) == ("room", variant, 1500)
+        assert 1 <= row["n_components"] <= k
+        assert row["n_test_beams"] == 6 * 90
+        assert row["seconds"] > 0
+        assert 10 * row["n_components"] < row["nbytes"] < 1000 * row["n_components"] + 10_000
+        assert row["auc_low"] <= row["auc"] <= row["auc_high"]
+        assert row["sensor_deviation"] == pytest.approx(NOISE, rel=0.01)
+
+
+def test_each_variant_is_scored_by_its_own_density(rows):
+    for (_, variant), row in rows.items():
+        own = "log_likelihood_noise_added" if variant.startswith("noise") else "log_likelihood_as_fitted"
+        assert row["held_out_log_likelihood"] == row[own]
+
+
+def test_the_scores_are_those_of_the_densities_and_the_map(scans, monkeypatch):
+    """One variant again, its likelihood by SciPy and its AUC by counting pairs."""
+    kept: list[GaussianMap] = []
+    make = GaussianMap.from_components
+    monkeypatch.setattr(
+        GaussianMap,
+        "from_components",
+        lambda *args, **options: kept.append(make(*args, **options)) or kept[-1],
+    )
+    study = NoiseStudy((6,), 800, 0.2, 5, 100, 10, n_neighbors=0, n_samples=5000)
+    row = run("room", scans, SENSOR, study)[2]
+    built = kept[2]
+    origins, ends = queries.test_beams(scans[::5], 100, 0)
+    noise = SENSOR.noise_covariances(ends, origins).numpy()
+    weight = (built.support / built.support.sum()).numpy()
+    logs = np.array(
+        [
+            [
+                np.log(w) + multivariate_normal(m, c + r).logpdf(x)
+                for w, m, c in zip(weight, built.means.numpy(), built.covariances.numpy(), strict=True)
+            ]
+            for x, r in zip(ends.numpy(), noise, strict=True)
+        ]
+    )
+    # The map is rounded as it is stored.
+    assert row["held_out_log_likelihood"] == pytest.approx(logsumexp(logs, axis=1).mean(), abs=1e-3)
+    asked = queries.hit_and_free(origins, ends, "uniform", 0.2, 0)
+    theta = built.occupancy(asked.points, 0.2)
+    hit, free = theta[asked.labels == 1], theta[asked.labels == 0]
+    pairs = (hit[:, None] > free).double() + 0.5 * (hit[:, None] == free).double()
+    assert row["auc"] == pytest.approx(float(pairs.mean()), abs=1e-9)
+    assert row["nbytes"] == built.nbytes
+
+
+def test_the_noise_model_thins_the_walls_and_explains_the_measurements_better(rows):
+    plain, noise = rows[20, "plain"], rows[20, "noise"]
+    assert noise["thickness"] < 0.7 * plain["thickness"]
+    assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
+    # Counting the noise twice, or not at all, costs.
+    assert plain["log_likelihood_noise_added"] < plain["held_out_log_likelihood"]
+    assert noise["log_likelihood_as_fitted"] < noise["held_out_log_likelihood"]
+
+
+def test_planar_components_are_no_thicker_than_the_noise(rows):
+    for (_, variant), row in rows.items():
+        if variant.endswith("planar"):
+            assert row["thickness"] <= row["sensor_deviation"] * (1 + 1e-6)
+
+
+def test_a_sensor_without_noise_changes_nothing(scans):
+    exact = LaserModel(noise=1e-9, divergence=1e-9)
+    study = NoiseStudy((10,), 600, 0.1, 5, 100, 10, n_samples=5000)
+    plain, _, noise, _ = run("room", scans, exact, study)
+    for name in ("held_out_log_likelihood", "auc", "thickness"):
+        assert noise[name] == pytest.approx(plain[name], rel=1e-5)
+
+
+def test_the_same_seed_gives_the_same_rows(scans):
+    study = NoiseStudy((5,), 300, 0.2, 5, 100, 5, n_samples=5000)
+    first, again, other = (run("room", scans, SENSOR, study, seed) for seed in (3, 3, 4))
+    for row in (*first, *again):
+        row.pop("seconds")
+    assert first == again
+    assert first[0]["held_out_log_likelihood"] != other[0]["held_out_log_likelihood"]
+
+
+def test_progress_is_told(scans):
+    told: list[tuple[str, int, int | None]] = []
+    study = NoiseStudy((2, 3), 100, 0.5, 5, 50, 2, n_samples=5000)
+    run("room", scans, SENSOR, study, on_event=lambda *event: told.append(event))
+    assert told == [("sensor model", done, 8) for done in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"n_components": ()}, "n_components"),
+        ({"n_components": (5, 0)}, "n_components"),
+        ({"n_points": 0}, "n_points"),
+        ({"resolution": 0.0}, "resolution"),
+        ({"test_every": 1}, "test_every"),
+        ({"max_beams": 0}, "max_beams"),
+        ({"n_neighbors": -1}, "n_neighbors"),
+        ({"max_iter": 1.5}, "max_iter"),
+        ({"n_samples": 0}, "n_samples"),
+    ],
+)
+def test_what_cannot_be_is_named(options, name):
+    with pytest.raises(InvalidArgumentError, match=name):
+        NoiseStudy(**options)
+
+
+def test_scans_without_points_are_refused(scans):
+    empty = [Scan(np.empty((0, 2)), scan.origin) if i % 5 else scan for i, scan in enumerate(scans)]
+    with pytest.raises(InvalidArgumentError, match="no points"):
+        run("room", empty, SENSOR, STUDY)
+
+
+def test_the_sensors_have_names():
+    for name, model in SENSORS.items():
+        assert model().noise_covariances(torch.ones(1, 2), torch.zeros(2)).shape == (1, 2, 2), name
+    assert sensor_noise.SENSORS["lidar"] is LidarModel
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_on_real_scans_the_noise_model_explains_held_out_measurements_better(real_data: Path):
+    path = real_data / "laser2d" / "intel.log.gz"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    study = NoiseStudy((200,), 8000, 0.1, max_beams=5000, max_iter=30)
+    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=2)), LaserModel(), study)
+    assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
+    assert noise["thickness"] < plain["thickness"]

@@ -1,0 +1,455 @@
+"""Extreme deconvolution against loops, plain EM, autograd and the truth behind the noise."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mixture.estimator_contract import MixtureContract, blobs
+from scipy.optimize import minimize
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture, deconvolution, noisy_pairs
+from gmmtorch.mixture.deconvolution import Block, blocks, constrained, expectation, maximization
+from gmmtorch.mixture.em import Parameters
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+class TestDeconvolvedGaussianMixture(MixtureContract):
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *({"max_iter": value} for value in (0, 2.5, "long")),
+        *({"tol": value} for value in (-1e-3, math.nan, "small")),
+        *({"reg_covar": value} for value in (-1.0, math.inf, None)),
+        *({"thickness": value} for value in (-1.0, 0.0, 1e-4, math.nan, math.inf, "thin")),
+        *({"init_params": value} for value in ("unheard_of", None)),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> DeconvolvedGaussianMixture:
+        return DeconvolvedGaussianMixture(n_components, **{"random_state": 0, **options})
+
+
+class TestThinGaussianMixture(TestDeconvolvedGaussianMixture):
+    """The contract again with every component tied to one thickness."""
+
+    score_tolerance = 1.5  # the clusters are no planes
+
+    def make(self, n_components: int = 3, **options: Any) -> DeconvolvedGaussianMixture:
+        tied = {"thickness": 0.1, "reg_covar": 0.1**2}
+        if options.keys() & {"thickness", "reg_covar"}:
+            tied = {}
+        return DeconvolvedGaussianMixture(n_components, **{"random_state": 0, **tied, **options})
+
+    @pytest.mark.parametrize("dim", [1, 2, 3])
+    def test_every_component_is_exactly_so_thin(self, dim):
+        smallest = torch.linalg.eigvalsh(self.make().fit(blobs(dim)).covariances)[:, 0]
+        torch.testing.assert_close(smallest, torch.full_like(smallest, 0.01))
+
+
+def random_spd(rng: np.random.Generator, n: int, dim: int, scale: float = 1.0) -> np.ndarray:
+    root = rng.normal(size=(n, dim, dim)) * scale
+    return root @ root.transpose(0, 2, 1) + 1e-3 * scale**2 * np.eye(dim)
+
+
+def random_mixture(rng: np.random.Generator, k: int, dim: int) -> Parameters:
+    weights = rng.random(k) + 0.2
+    return Parameters(
+        *map(torch.from_numpy, (weights / weights.sum(), rng.normal(size=(k, dim)), random_spd(rng, k, dim)))
+    )
+
+
+def noisy_cloud(rng: np.random.Generator, n: int, dim: int) -> Block:
+    cloud = (rng.normal(size=(n, dim)) * 1.5, rng.random(n) + 0.1, random_spd(rng, n, dim, 0.5))
+    return Block(*map(torch.from_numpy, cloud))
+
+
+def looped_em(block: Block, parameters: Parameters) -> tuple[Parameters, float]:
+    """One iteration as Bovy, Hogg & Roweis write it, (14) to (16): a point and a component at a time."""
+    points, weight, noise = (t.numpy() for t in block)
+    pi, mu, sigma = (t.numpy() for t in parameters)
+    n, (k, dim) = len(points), mu.shape
+    count, mean = np.zeros(k), np.zeros((k, dim))
+    total, gamma = 0.0, np.zeros((n, k))
+    b, remaining = np.zeros((n, k, dim)), np.zeros((n, k, dim, dim))
+    for i in range(n):
+        logs = np.array(
+            [
+                np.log(pi[j]) + multivariate_normal(mu[j], sigma[j] + noise[i]).logpdf(points[i])
+                for j in range(k)
+            ]
+        )
+        total += weight[i] * logsumexp(logs)
+        gamma[i] = weight[i] * np.exp(logs - logsumexp(logs))
+        for j in range(k):
+            inverse = np.linalg.inv(sigma[j] + noise[i])
+            b[i, j] = mu[j] + sigma[j] @ inverse @ (points[i] - mu[j])
+            remaining[i, j] = sigma[j] - sigma[j] @ inverse @ sigma[j]
+            count[j] += gamma[i, j]
+            mean[j] += gamma[i, j] * b[i, j]
+    mean /= count[:, None]
+    covariance = np.zeros((k, dim, dim))
+    for j in range(k):
+        for i in range(n):
+            covariance[j] += gamma[i, j] * (np.outer(mean[j] - b[i, j], mean[j] - b[i, j]) + remaining[i, j])
+        covariance[j] /= count[j]
+    return Parameters(*map(torch.from_numpy, (count / count.sum(), mean, covariance))), total
+
+
+def step(block: Block, parameters: Parameters) -> tuple[Parameters, float]:
+    moments, value = expectation(block, parameters)
+    return maximization(moments, parameters), float(value)
+
+
+# -- one iteration ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_an_iteration_is_that_of_the_loops(dim):
+    rng = np.random.default_rng(dim)
+    block, parameters = noisy_cloud(rng, 12, dim), random_mixture(rng, 3, dim)
+    (found, value), (expected, likelihood) = step(block, parameters), looped_em(block, parameters)
+    assert value == pytest.approx(likelihood, rel=1e-12)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_one_covariance_for_all_is_the_same_one_for_each(dim):
+    rng = np.random.default_rng(dim)
+    block, parameters = noisy_cloud(rng, 200, dim), random_mixture(rng, 4, dim)
+    shared = block._replace(noise=block.noise[0])
+    each = block._replace(noise=block.noise[:1].expand(200, -1, -1))
+    (found, value), (expected, likelihood) = step(shared, parameters), step(each, parameters)
+    assert value == pytest.approx(likelihood, rel=1e-10)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_chunks_add_up(monkeypatch):
+    rng = np.random.default_rng(0)
+    block, parameters = noisy_cloud(rng, 50, 3), random_mixture(rng, 4, 3)
+    whole = step(block, parameters)
+    monkeypatch.setattr(noisy_pairs, "_CHUNK_ELEMENTS", 12)
+    chunked = step(block, parameters)
+    assert whole[1] == pytest.approx(chunked[1], rel=1e-12)
+    torch.testing.assert_close(whole[0].covariances, chunked[0].covariances)
+
+
+def test_pairs_left_out_would_have_had_no_share(monkeypatch):
+    """A room's walls: thin components, many metres apart, noise from none to 3 cm."""
+    rng = np.random.default_rng(0)
+    spread = np.array([0.3, 0.2, 2e-3])
+    parameters = random_mixture(rng, 30, 3)
+    turns = np.linalg.qr(rng.normal(size=(30, 3, 3)))[0]
+    parameters = parameters._replace(
+        means=parameters.means * 4,
+        covariances=torch.from_numpy((turns * spread**2) @ turns.transpose(0, 2, 1)),
+    )
+    label = rng.integers(30, size=400)
+    points = parameters.means[label] + torch.from_numpy(
+        np.einsum("nij,nj->ni", turns[label] * spread, rng.normal(size=(400, 3)))
+    )
+    noise = torch.from_numpy(random_spd(rng, 400, 3) * rng.choice([0.0, 1e-5, 1e-3], size=(400, 1, 1)))
+    points[:5] += 20  # strays far from everything
+    block = Block(points, torch.ones(400, dtype=torch.float64), noise)
+    few, value = expectation(block, parameters)
+    n_few = sum(len(pairs.row) for _, pairs in noisy_pairs.chunks(points, noise, parameters))
+    monkeypatch.setattr(noisy_pairs, "_NEGLIGIBLE", 1e300)
+    every, expected = expectation(block, parameters)
+    assert n_few < 0.5 * 400 * 30
+    assert float(value) == pytest.approx(float(expected), rel=1e-13)
+    for mine, theirs in zip(few, every, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_a_stray_beyond_all_digits_still_has_a_component():
+    points = np.concatenate([blobs(2), [[1e9, -3e9]]])
+    noise = np.tile(np.eye(2) * 1e-4, (241, 1, 1))
+    mixture = DeconvolvedGaussianMixture(3, random_state=0).fit(blobs(2))
+    scores = mixture.score_samples(points, noise)
+    assert np.isfinite(scores).all()
+    assert scores[-1] < -1e18
+
+
+def test_points_that_share_a_covariance_are_taken_together():
+    rng = np.random.default_rng(0)
+    block, parameters = noisy_cloud(rng, 3000, 2), random_mixture(rng, 3, 2)
+    kinds = torch.from_numpy(rng.integers(3, size=3000))
+    noise = block.noise[:3][kinds]
+    parts = blocks(block.points, block.weight, noise)
+    assert [part.noise.ndim for part in parts] == [2, 2, 2]
+    assert sum(len(part.points) for part in parts) == 3000
+    together = deconvolution.deconvolution_step(parts)(parameters)
+    apart = deconvolution.deconvolution_step([block._replace(noise=noise)])(parameters)
+    assert together[1] == pytest.approx(apart[1], rel=1e-10)
+    torch.testing.assert_close(together[0].covariances, apart[0].covariances, rtol=1e-9, atol=1e-9)
+    assert len(blocks(*block)) == 1  # all different: no use
+
+
+def test_thin_components_far_from_the_centre_lose_no_digits():
+    """Natural parameters would cancel here; the other form is taken, and agrees with R = 0 exactly."""
+    rng = np.random.default_rng(0)
+    sheet = np.array([1.0, 1.0, 1e-4])
+    points = np.concatenate([c + rng.normal(size=(300, 3)) * sheet for c in ((-3e4, 0, 0), (3e4, 0, 0))])
+    mixture = DeconvolvedGaussianMixture(2, reg_covar=0.0, random_state=0).fit(points)
+    smallest = np.linalg.eigvalsh(mixture.covariances_)[:, 0]
+    parts = (points[:300], points[300:])
+    expected = [np.linalg.eigvalsh(np.cov(part.T, bias=True))[0] for part in parts]
+    np.testing.assert_allclose(np.sort(smallest), np.sort(expected), rtol=1e-4)
+
+
+# -- whole fits -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("noise", [None, "shared", "each"])
+def test_without_noise_it_is_plain_em(dim, noise):
+    points = blobs(dim)
+    zero = {None: None, "shared": np.zeros((dim, dim)), "each": np.zeros((len(points), dim, dim))}[noise]
+    options = {"reg_covar": 0.0, "tol": 0.0, "max_iter": 40, "random_state": 0}
+    weight = np.random.default_rng(0).random(len(points))
+    mine = DeconvolvedGaussianMixture(3, **options).fit(points, None, weight, zero)
+    plain = GaussianMixture(3, dtype="float64", **options).fit(points, sample_weight=weight)
+    np.testing.assert_allclose(mine.lower_bounds_, plain.lower_bounds_, atol=1e-8)
+    np.testing.assert_allclose(mine.weights_, plain.weights_, atol=1e-8)
+    np.testing.assert_allclose(mine.means_, plain.means_, atol=1e-8)
+    np.testing.assert_allclose(mine.covariances_, plain.covariances_, atol=1e-8)
+
+
+def test_zero_noise_for_each_point_takes_the_path_of_its_own(monkeypatch):
+    points, zero = blobs(3), np.zeros((240, 3, 3))
+    usual = DeconvolvedGaussianMixture(3, random_state=0).fit(points, noise_covariances=zero)
+    monkeypatch.setattr(deconvolution, "_WORTH_SHARING", 1)
+    shared = DeconvolvedGaussianMixture(3, random_state=0).fit(points, noise_covariances=zero)
+    np.testing.assert_allclose(usual.covariances_, shared.covariances_, rtol=1e-9)
+
+
+@st.composite
+def noisy_fits(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    dim, seed = draw(st.integers(1, 3)), draw(st.integers(0, 10_000))
+    rng = np.random.default_rng(seed)
+    n = draw(st.integers(4, 40))
+    scale = 10.0 ** rng.uniform(-2, 1, size=n)
+    points = np.round(rng.normal(size=(n, dim)) * 2, draw(st.integers(0, 3)))  # duplicates, with few digits
+    noise = random_spd(rng, n, dim) * scale[:, None, None]
+    noise[rng.random(n) < 0.3] = 0
+    reg = draw(st.sampled_from([1e-6, 1e-3, 0.01]))
+    thickness = draw(st.sampled_from([None, reg**0.5, 0.1, 1.0]))
+    options = {"n_components": draw(st.integers(1, 4)), "reg_covar": reg, "thickness": thickness}
+    return points, rng.random(n) + 1e-3, noise, options
+
+
+@given(case=noisy_fits())
+def test_the_likelihood_never_falls(case):
+    points, weight, noise, options = case
+    mixture = DeconvolvedGaussianMixture(tol=0.0, max_iter=25, random_state=0, **options)
+    mixture.fit(points, None, weight, noise)
+    bounds = np.array(mixture.lower_bounds_)
+    assert np.isfinite(bounds).all()
+    assert (np.diff(bounds) >= -1e-9 * (1 + np.abs(bounds[1:]))).all()
+    assert len(bounds) == 25
+    variances = np.linalg.eigvalsh(mixture.covariances_)
+    reg, thickness = options["reg_covar"], options["thickness"]
+    assert (variances >= reg * (1 - 1e-9)).all()
+    if thickness is not None:
+        assert (variances[:, 0] <= thickness**2 * (1 + 1e-6)).all()
+
+
+def log_likelihood(parameters: list[Tensor], points: Tensor, noise: Tensor) -> Tensor:
+    """Mean log-likelihood, by torch's own normal density; of free parameters, for autograd."""
+    logits, means, roots = parameters
+    total = roots @ roots.mT + noise[:, None]
+    joint = torch.log_softmax(logits, 0) + MultivariateNormal(means, total).log_prob(points[:, None])
+    return torch.logsumexp(joint, 1).mean()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_where_em_ends_the_gradient_is_zero(dim):
+    rng = np.random.default_rng(0)
+    points = torch.from_numpy(blobs(dim, 300))
+    noise = torch.from_numpy(random_spd(rng, 300, dim, 0.05))
+    mixture = DeconvolvedGaussianMixture(3, tol=0.0, max_iter=300, random_state=0)
+    mixture.fit(points, noise_covariances=noise)
+    free = [mixture.weights.log(), mixture.means, torch.linalg.cholesky(mixture.covariances)]
+    free = [value.clone().requires_grad_() for value in free]
+    value = log_likelihood(free, points, noise)
+    value.backward()
+    assert float(value.detach()) == pytest.approx(mixture.lower_bound_, abs=1e-9)
+    assert max(float(f.grad.abs().max()) for f in free) < 1e-6
+    with torch.no_grad():  # and elsewhere it is not
+        free[1] += 0.05
+    free[1].grad = None
+    log_likelihood(free, points, noise).backward()
+    assert float(free[1].grad.abs().max()) > 1e-2
+
+
+def test_what_lies_behind_the_noise_is_found():
+    """Two sheets, 1 mm thick, measured with noise of 1 to 6 cm that differs by point and direction."""
+    rng = np.random.default_rng(0)
+    n = 8000
+    true = np.diag([0.5, 0.3, 1e-3]) ** 2
+    centers = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.5]])
+    label = rng.integers(2, size=n)
+    noise = random_spd(rng, n, 3, 0.02)
+    error = np.einsum("nij,nj->ni", np.linalg.cholesky(noise), rng.normal(size=(n, 3)))
+    points = centers[label] + rng.multivariate_normal(np.zeros(3), true, n) + error
+    options = {"tol": 1e-7, "max_iter": 300, "random_state": 0}
+    mixture = DeconvolvedGaussianMixture(2, **options).fit(points, noise_covariances=noise)
+    order = mixture.means_[:, 2].argsort()
+    np.testing.assert_allclose(mixture.means_[order], centers, atol=0.03)
+    for found in mixture.covariances_:
+        np.testing.assert_allclose(np.diag(found)[:2], np.diag(true)[:2], rtol=0.06)
+        assert found[2, 2] ** 0.5 < 0.006
+    plain = GaussianMixture(2, **options).fit(points)
+    assert (plain.covariances_[:, 2, 2] ** 0.5 > 0.03).all()
+    fresh_noise = noise[:100]
+    mine = mixture.score_samples(points[:100], fresh_noise)
+    assert mine.mean() > plain.score_samples(points[:100]).mean()
+
+
+def test_a_surface_thicker_than_its_noise_keeps_its_thickness():
+    rng = np.random.default_rng(1)
+    true, noise = np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[0.2, -0.1], [-0.1, 0.4]])
+    points = rng.multivariate_normal([1, 2], true + noise, 40_000)
+    mixture = DeconvolvedGaussianMixture(1, tol=1e-9, max_iter=200, random_state=0)
+    mixture.fit(points, noise_covariances=noise)
+    np.testing.assert_allclose(mixture.covariances_[0], np.cov(points.T, bias=True) - noise, atol=1e-3)
+    np.testing.assert_allclose(mixture.covariances_[0], true, atol=0.02)
+
+
+# -- scores -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_score_of_measurements_adds_their_noise(dim, shared):
+    rng = np.random.default_rng(0)
+    points = blobs(dim) + 1e5
+    mixture = DeconvolvedGaussianMixture(3, random_state=0).fit(points)
+    noise = random_spd(rng, len(points), dim, 0.3)
+    given = noise[0] if shared else noise
+    expected = [
+        logsumexp(
+            [
+                np.log(w) + multivariate_normal(m, c + noise[0 if shared else i]).logpdf(x)
+                for w, m, c in zip(mixture.weights_, mixture.means_, mixture.covariances_, strict=True)
+            ]
+        )
+        for i, x in enumerate(points)
+    ]
+    np.testing.assert_allclose(mixture.score_samples(points, given), expected, atol=1e-8)
+    np.testing.assert_allclose(
+        mixture.score_samples(points, np.zeros((dim, dim))), mixture.score_samples(points), atol=1e-7
+    )
+
+
+def test_the_score_of_measurements_has_a_gradient():
+    points = torch.from_numpy(blobs(3, 20))
+    noise = torch.eye(3, dtype=torch.float64).expand(20, 3, 3) * 0.1
+    mixture = DeconvolvedGaussianMixture(2, random_state=0).fit(points)
+    points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: mixture.score_samples(x, noise), (points,))
+
+
+# -- bounded variances --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("bounds", [(0.0, 0.3), (0.2, 0.3), (0.25, 0.25), (0.5, None), (0.0, None)])
+def test_the_bounded_m_step_is_the_maximiser(dim, bounds):
+    """Nelder–Mead over every covariance that keeps the bounds finds none likelier."""
+    low, high = bounds
+    rng = np.random.default_rng(dim)
+    scatter = random_spd(rng, 1, dim)[0]
+    found = constrained(torch.from_numpy(scatter)[None], low**2, high)[0].numpy()
+
+    def cost(covariance: np.ndarray) -> float:
+        return np.linalg.slogdet(covariance)[1] + np.trace(np.linalg.inv(covariance) @ scatter)
+
+    def inside(x: np.ndarray) -> np.ndarray:
+        """Any parameters as a covariance within the bounds."""
+        root = np.zeros((dim, dim))
+        root[np.tril_indices(dim)] = x
+        variances, directions = np.linalg.eigh(root @ root.T)
+        variances = np.maximum(variances, max(low**2, 1e-9))
+        if high is not None:
+            variances[0] = min(variances[0], high**2)
+        return (directions * variances) @ directions.T
+
+    best = min(
+        minimize(
+            lambda x: cost(inside(x)),
+            rng.normal(size=dim * (dim + 1) // 2),
+            method="Nelder-Mead",
+            options={"maxiter": 3000, "xatol": 1e-6, "fatol": 1e-9},
+        ).fun
+        for _ in range(4)
+    )
+    assert cost(found) <= best + 1e-7
+    assert cost(found) == pytest.approx(best, abs=1e-3)  # so the search did come near
+
+
+def test_a_cap_thins_a_thick_component_only():
+    covariances = torch.diag_embed(torch.tensor([[0.04, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
+    found = constrained(covariances, 0.0, 0.1)
+    expected = torch.diag_embed(torch.tensor([[0.01, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
+    torch.testing.assert_close(found, expected)
+
+
+# -- arguments ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [
+        (np.zeros((239, 2, 2)), r"shape \(239, 2, 2\)"),
+        (np.zeros((3, 3)), r"shape \(3, 3\)"),
+        (np.zeros(240), r"shape \(240,\)"),
+        (np.full((2, 2), np.nan), r"\[0\] holds NaN"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "negative eigenvalue"),
+        (-np.eye(2), "negative eigenvalue"),
+    ],
+)
+def test_noise_that_cannot_be_is_named(noise, said):
+    mixture = DeconvolvedGaussianMixture(2, random_state=0)
+    for kind in (np.asarray, torch.from_numpy):
+        with pytest.raises(InvalidArgumentError, match=f"^noise_covariances.*{said}"):
+            mixture.fit(kind(blobs(2)), noise_covariances=kind(noise))
+    mixture.fit(blobs(2))
+    with pytest.raises(InvalidArgumentError, match=f"^noise_covariances.*{said}"):
+        mixture.score_samples(blobs(2), noise)
+
+
+def test_the_noise_of_points_without_weight_is_left_out():
+    rng = np.random.default_rng(0)
+    points, noise = blobs(2), random_spd(rng, 240, 2, 0.2)
+    present = rng.random(240) > 0.4
+    weighted = DeconvolvedGaussianMixture(2, random_state=0).fit(points, None, present.astype(float), noise)
+    without = DeconvolvedGaussianMixture(2, random_state=0).fit(points[present], None, None, noise[present])
+    assert torch.equal(weighted.means, without.means)
+
+
+def test_a_collapse_without_a_bound_is_an_error():
+    with pytest.raises(NumericalError, match="reg_covar"):
+        DeconvolvedGaussianMixture(1, reg_covar=0.0).fit(np.ones((5, 2)))
+    with pytest.raises(NumericalError, match="reg_covar"):
+        DeconvolvedGaussianMixture(1, reg_covar=0.0).fit(
+            np.ones((5, 2)), noise_covariances=np.zeros((5, 2, 2))
+        )
+
+
+def test_iterations_are_reported():
+    told: list[tuple[int, float]] = []
+    mixture = DeconvolvedGaussianMixture(2, random_state=0)
+    mixture.fit(blobs(2), on_iteration=lambda i, value: told.append((i, value)))
+    assert told == list(enumerate(mixture.lower_bounds_, 1))

@@ -1,0 +1,54 @@
+"""Every mixture estimator keeps the contract of `mixture.estimator_contract`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+from mixture.estimator_contract import MixtureContract
+
+from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+
+BAD_LOOP_PARAMETERS: list[dict[str, Any]] = [
+    *({"max_iter": value} for value in (0, 2.5, "long")),
+    *({"n_init": value} for value in (0, -1)),
+    *({"tol": value} for value in (-1e-3, math.nan, "small")),
+    *({"reg_covar": value} for value in (-1.0, math.inf, None)),
+    *({"init_params": value} for value in ("unheard_of", None)),
+    *({"dtype": value} for value in ("float16", None)),
+]
+"""Of the estimators that have an iteration, starts and a regularised covariance, as EM has."""
+
+
+class TestGaussianMixture(MixtureContract):
+    bad_parameters: ClassVar[list[dict[str, Any]]] = BAD_LOOP_PARAMETERS
+
+    def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
+        return GaussianMixture(n_components, **{"random_state": 0, **options})
+
+
+class TestVariationalGaussianMixture(MixtureContract):
+    score_tolerance = 1.2  # the default prior is as wide as the cloud
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *BAD_LOOP_PARAMETERS,
+        *({"weight_concentration_prior_type": value} for value in ("dirichlet", None)),
+        *({"weight_concentration_prior": value} for value in (0, -1.0, math.inf, "small")),
+        *({"mean_precision_prior": value} for value in (0, math.nan)),
+        *({"degrees_of_freedom_prior": value} for value in (0, 1.0, "many")),
+        *({"mean_prior": value} for value in ([0.0], [0.0, math.nan], [[0.0, 0.0]])),
+        *(
+            {"covariance_prior": value}
+            for value in ([[1.0]], [[1.0, 0.5], [0.2, 1.0]], [[math.inf, 0.0], [0.0, 1.0]])
+        ),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> VariationalGaussianMixture:
+        return VariationalGaussianMixture(n_components, **{"random_state": 0, **options})
+
+
+class TestVariationalGaussianMixtureOfDirichletWeights(MixtureContract):
+    score_tolerance = 1.2
+
+    def make(self, n_components: int = 3, **options: Any) -> VariationalGaussianMixture:
+        kind = {"weight_concentration_prior_type": "dirichlet_distribution"}
+        return VariationalGaussianMixture(n_components, **{"random_state": 0, **kind, **options})

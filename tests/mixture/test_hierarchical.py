@@ -1,0 +1,760 @@
+"""HierarchicalGaussianMixture: a naive tree in loops, flat EM, what is conserved, and what is kept."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import warnings
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mixture.estimator_contract import FAR, MixtureContract, blobs, check_mixture, rigid_motion
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+from gmmtorch import datasets
+from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
+from gmmtorch.mixture.growth import GrowthRule, grow
+from gmmtorch.mixture.nested import (
+    Children,
+    Members,
+    pack,
+    partition,
+    principal_axes_start,
+    run_em,
+    without_weak,
+)
+from gmmtorch.mixture.tree import Tree, check_tree
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+class TestContract(MixtureContract):
+    exact_components = False
+    score_tolerance = 0.4
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *({"branching": value} for value in (1, 2.5, None)),
+        *({"max_levels": value} for value in (0, 1.5)),
+        *({"max_iter": value} for value in (0, 2.5, "long")),
+        *({"soft_threshold": value} for value in (-0.1, 1.1, math.nan, None)),
+        *(
+            {name: value}
+            for name in ("tol", "reg_covar", "planarity_threshold", "thickness", "min_support", "min_gain")
+            for value in (-1e-3, math.nan, math.inf, "small", None)
+        ),
+        *({"dtype": value} for value in ("float16", None)),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> HierarchicalGaussianMixture:
+        return HierarchicalGaussianMixture(n_components, **{"random_state": 0, "dtype": "float64", **options})
+
+
+class TestContractInSinglePrecision(MixtureContract):
+    exact_components = False
+    score_tolerance = 0.4
+    order_tolerance = repetition_tolerance = motion_tolerance = far_tolerance = (
+        0.05  # EM may stop a step apart
+    )
+
+    def make(self, n_components: int = 3, **options: Any) -> HierarchicalGaussianMixture:
+        return HierarchicalGaussianMixture(n_components, **{"random_state": 0, **options})
+
+
+def room(n: int, seed: int = 0, noise: float = 0.01) -> np.ndarray:
+    """Two walls and a floor, and a ball in the room."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * [4.0, 3.0, 2.0]
+    side = np.arange(n) % 4
+    for axis in range(3):
+        points[side == axis, axis] = 0
+    ball = rng.normal(size=(n, 3))
+    points[side == 3] = [2.5, 2.0, 1.0] + 0.4 * (ball / np.linalg.norm(ball, axis=1, keepdims=True))[
+        side == 3
+    ]
+    return points + noise * rng.normal(size=(n, 3))
+
+
+def exact(n_components: int | None = None, **options: Any) -> HierarchicalGaussianMixture:
+    return HierarchicalGaussianMixture(n_components, **{"random_state": 0, "dtype": "float64", **options})
+
+
+# -- the algorithm, in loops ----------------------------------------------------------------------
+
+
+class NaiveTree:
+    """Hierarchical EM one node, one point and one component at a time. Node: (parent, w, μ, Σ)."""
+
+    def __init__(self, points: np.ndarray, weight: np.ndarray, **rule: Any) -> None:
+        self.points, self.rule = points, rule
+        mean, covariance = self.moments(points, weight)
+        self.nodes: list[tuple[int, float, np.ndarray, np.ndarray]] = []
+        self.members: list[np.ndarray] = []
+        level = [(-1, 1.0, mean, covariance, weight)]
+        for _ in range(rule["max_levels"]):
+            below: list[Any] = []
+            for index, w, mean, covariance, p in level:
+                below += self.split(index, w, mean, covariance, p)
+            first = len(self.nodes)
+            self.nodes += [child[:4] for child in below]
+            self.members += [child[4] for child in below]
+            level = [(first + i, *child[1:]) for i, child in enumerate(below)]
+
+    def bound(self, weight: np.ndarray) -> float:
+        """Σ q log(π N(x) / q) over the leaves, q the shares of the points in each."""
+        value = 0.0
+        for i, (_, w, mean, covariance) in enumerate(self.nodes):
+            if i not in [node[0] for node in self.nodes]:
+                q = self.members[i] / weight
+                log_joint = math.log(w) + multivariate_normal(mean, covariance).logpdf(self.points)
+                value += weight @ np.where(q > 0, q * (log_joint - np.log(np.where(q > 0, q, 1))), 0)
+        return float(value / weight.sum())
+
+    def moments(self, points: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        mean = np.average(points, axis=0, weights=p)
+        offset = points - mean
+        covariance = sum(q * np.outer(x, x) for q, x in zip(p, offset, strict=True)) / p.sum()
+        return mean, covariance + self.rule["reg_covar"] * np.eye(points.shape[1])
+
+    def start(self, p: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """Pieces halved across their longest direction, the widest first."""
+        pieces = [np.flatnonzero(p > 0)]
+        while len(pieces) < self.rule["branching"]:
+            widest = []
+            for piece in pieces:
+                variance = np.linalg.eigvalsh(self.moments(self.points[piece], p[piece])[1])
+                longest = variance[-1] - self.rule["reg_covar"]
+                widest.append(p[piece].sum() * longest if longest > self.rule["reg_covar"] else 0)
+            order = [i for i in np.argsort(widest)[::-1] if widest[i] > 0]
+            if not order:
+                break
+            halves = list(pieces)
+            for i in order[: min(len(pieces), self.rule["branching"] - len(pieces))]:
+                mean, covariance = self.moments(self.points[pieces[i]], p[pieces[i]])
+                axis = np.linalg.eigh(covariance)[1][:, -1]
+                side = (self.points[pieces[i]] - mean) @ axis > 0
+                halves[i] = pieces[i][~side]
+                halves.append(pieces[i][side])
+            pieces = halves
+        return [(p[i].sum() / p.sum(), *self.moments(self.points[i], p[i])) for i in pieces]
+
+    def joint(self, mixture: list[tuple[float, np.ndarray, np.ndarray]]) -> np.ndarray:
+        return np.stack(
+            [math.log(w) + multivariate_normal(m, c).logpdf(self.points) for w, m, c in mixture], 1
+        )
+
+    def split(
+        self, index: int, weight: float, mean: np.ndarray, covariance: np.ndarray, p: np.ndarray
+    ) -> list[Any]:
+        variance = np.linalg.eigvalsh(covariance)
+        if variance[0] < self.rule["planarity_threshold"] * variance.sum():
+            return []
+        if p.sum() < 2 * self.rule["min_support"] or variance[-1] <= 2 * self.rule["reg_covar"]:
+            return []
+        mixture, last = self.start(p), -math.inf
+        for _ in range(self.rule["max_iter"]):
+            joint = self.joint(mixture)
+            value = p @ logsumexp(joint, axis=1) / p.sum()
+            gamma = np.exp(joint - logsumexp(joint, axis=1, keepdims=True)) * p[:, None]
+            mixture = [(g.sum() / p.sum(), *self.moments(self.points, g)) for g in gamma.T if g.sum() > 1e-14]
+            if value - last < self.rule["tol"]:
+                break
+            last = value
+        mixture = [child for child in mixture if child[0] * p.sum() >= self.rule["min_support"]]
+        if len(mixture) < 2:
+            return []
+        total = sum(child[0] for child in mixture)
+        mixture = [(w / total, m, c) for w, m, c in mixture]
+        joint = self.joint(mixture)
+        gain = p @ (logsumexp(joint, axis=1) - multivariate_normal(mean, covariance).logpdf(self.points))
+        dim = len(mean)
+        price = self.rule["min_gain"] * (len(mixture) - 1) * (1 + dim + dim * (dim + 1) / 2)
+        if gain < max(price, self.rule["tol"] * p.sum()):
+            return []
+        gamma = np.exp(joint - joint.max(1, keepdims=True))
+        gamma[gamma <= self.rule["soft_threshold"]] = 0  # the largest is 1
+        shares = gamma / gamma.sum(1, keepdims=True) * p[:, None]
+        return [(index, weight * w, m, c, q) for (w, m, c), q in zip(mixture, shares.T, strict=True)]
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("branching", [2, 5, 8])
+def test_the_tree_is_that_of_a_naive_implementation(dim, branching):
+    rng = np.random.default_rng(dim)
+    points = np.concatenate([room(300, noise=0.002)[:, :dim], blobs(dim, 100)])
+    weight = rng.uniform(0.2, 3.0, len(points))
+    rule: dict[str, Any] = {
+        "branching": branching,
+        "max_levels": 3,
+        "max_iter": 12,
+        "tol": 1e-3,
+        "reg_covar": 1e-4,
+        "min_support": 6.0,
+        "min_gain": 0.2,
+        "soft_threshold": 0.1,
+        "planarity_threshold": 0.002,
+    }
+    tree = exact(**rule).fit(points, sample_weight=weight)
+    naive = NaiveTree(points, weight, **rule)
+    assert tree.n_levels_ > 1
+    assert len(tree.node_parents_) == len(naive.nodes)
+    assert tree.lower_bound_ == pytest.approx(naive.bound(weight), abs=1e-6)
+    mine = zip(tree.node_parents_, tree.node_weights_, tree.node_means_, tree.node_covariances_, strict=True)
+    for found, expected in zip(rows_of(list(mine)), rows_of(naive.nodes), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def rows_of(nodes: list[tuple[int, float, np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """What each node is and what its parent, in an order that the order of siblings does not matter to."""
+    rows = []
+    for parent, weight, mean, covariance in nodes:
+        _, above_weight, above_mean, above = (
+            nodes[parent] if parent >= 0 else (0, 1.0, 0 * mean, 0 * covariance)
+        )
+        values = (above_weight, above_mean, above, weight, mean, covariance)
+        rows.append(np.concatenate([np.ravel(value) for value in values]))
+    return sorted(rows, key=lambda row: tuple(np.round(row, 4)))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("k", [5, 8])
+def test_one_level_is_flat_em_from_the_same_start(dim, k):
+    points = torch.from_numpy(room(500)[:, :dim])
+    center = points.mean(0)
+    members = Members(torch.arange(500), torch.zeros(500, dtype=torch.int64), torch.ones(500).double())
+    packed = pack(points, members, center[None], torch.float64)
+    start = principal_axes_start(packed, 1, k, 1e-6)
+    flat = GaussianMixture(
+        k,
+        weights_init=start.weights[0],
+        means_init=start.means[0] + center,
+        precisions_init=torch.linalg.inv(start.covariances[0]),
+        dtype="float64",
+    ).fit(points)
+    tree = exact(branching=k, max_levels=1, min_support=0.0).fit(points)
+    assert tree.n_levels_ == 1
+    # One Gaussian comes first, and what is kept last.
+    np.testing.assert_allclose(tree.lower_bounds_[1:-1], flat.lower_bounds_, atol=1e-9)
+    for name in ("weights", "means", "covariances"):
+        torch.testing.assert_close(getattr(tree, name), getattr(flat, name), rtol=1e-6, atol=1e-9)
+
+
+def present(children: Children, node: int) -> Children:
+    """The children of a node that are there, from left to right."""
+    order = children.means[node, :, 0].argsort()
+    return Children(*(value[node][order][children.weights[node][order] > 0] for value in children))
+
+
+def test_nodes_are_learned_as_if_each_were_alone():
+    """Of very different numbers of points, some with fewer places than children."""
+    points = torch.from_numpy(room(400))
+    points[:30] = points[0]
+    points[30:60] = points[[30, 31] * 15]
+    node = torch.repeat_interleave(torch.arange(5), torch.tensor([30, 30, 40, 250, 50]))
+    shuffle = torch.randperm(400, generator=torch.Generator().manual_seed(0))
+    members = Members(shuffle, node[shuffle], 0.5 + torch.arange(400).double() % 7)
+    options: dict[str, Any] = {"reg_covar": 1e-4, "tol": 1e-4, "max_iter": 40, "worst_error": math.inf}
+
+    def learn(members: Members, centers: Tensor) -> tuple[Children, list[Tensor]]:
+        packed = pack(points, members, centers, torch.float64)
+        start, values = principal_axes_start(packed, len(centers), 6, 1e-4), []
+        mass = members.mass(len(centers))
+        found = run_em(packed, start, mass, on_values=lambda v: values.append(v.clone()), **options)
+        return found.children, values
+
+    centers = torch.stack([points[node == i].mean(0) for i in range(5)])
+    together, values = learn(members, centers)
+    assert (together.weights > 0).sum(1).tolist() == [1, 2, 6, 6, 6]
+    for i in range(5):
+        alone, _ = learn(members.of(torch.tensor([i]), 5), centers[i : i + 1])
+        for found, expected in zip(present(together, i), present(alone, 0), strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+    rises = torch.stack(values).diff(dim=0)
+    assert bool((rises > -1e-3).all())
+    assert int((rises[-1] == 0).sum()) >= 3  # they end each by itself
+
+
+# -- points handed down ---------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 99), threshold=st.sampled_from([0.0, 0.01, 0.3, 0.9, 1.0]), dim=st.integers(1, 3))
+def test_points_go_to_the_children_of_enough_responsibility_and_keep_their_weight(seed, threshold, dim):
+    rng = np.random.default_rng(seed)
+    points, weight = rng.normal(size=(40, dim)), rng.uniform(0.1, 2.0, 40)
+    node = rng.integers(0, 3, 40)
+    centers = rng.normal(size=(3, dim))
+    roots = rng.normal(size=(3, 4, dim, dim)) + np.eye(dim)
+    weights = rng.dirichlet(np.ones(4), size=3)
+    weights[1] = [0.5, 0.0, 0.5, 0.0]  # two that are not there
+    means = rng.normal(size=(3, 4, dim))
+    covariances = roots @ roots.swapaxes(2, 3) + 0.1 * np.eye(dim)
+    members = Members(torch.arange(40), torch.from_numpy(node), torch.from_numpy(weight))
+    packed = pack(torch.from_numpy(points), members, torch.from_numpy(centers), torch.float64)
+    children = Children(*(torch.from_numpy(value) for value in (weights, means, covariances)))
+    found = partition(packed, children, members, threshold)
+    shares = np.zeros((40, 12))
+    shares[found.members.point, found.members.node] = found.members.weight
+    values = np.zeros(3)
+    for i, (x, p, g) in enumerate(zip(points, weight, node, strict=True)):
+        density = [
+            w * multivariate_normal(centers[g] + m, c).pdf(x)
+            for w, m, c in zip(weights[g], means[g], covariances[g], strict=True)
+        ]
+        gamma = np.array(density) / sum(density)
+        gamma[gamma <= max(threshold, 1e-30) * gamma.max()] *= (
+            gamma.argmax() == np.arange(4)[gamma <= max(threshold, 1e-30) * gamma.max()]
+        )
+        expected = np.zeros(12)
+        expected[4 * g : 4 * g + 4] = p * gamma / gamma.sum()
+        np.testing.assert_allclose(shares[i], expected, rtol=1e-7, atol=1e-12)
+        values[g] += p * math.log(sum(density))
+    np.testing.assert_allclose(found.value, values, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(shares.sum(1), weight, rtol=1e-14)
+    at = [
+        multivariate_normal(
+            (centers[:, None] + means).reshape(12, dim)[c], covariances.reshape(12, dim, dim)[c]
+        ).logpdf(points[i])
+        for i, c in zip(found.members.point, found.members.node, strict=True)
+    ]
+    np.testing.assert_allclose(found.log_density, at, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("soft_threshold", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_every_level_holds_the_weight_of_every_point(soft_threshold, dtype):
+    points = torch.from_numpy(room(600))
+    weight = torch.rand(600, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
+    rule = GrowthRule(60, 4, 3, soft_threshold=soft_threshold, dtype=dtype)
+    held: list[tuple[Tensor, Members]] = []
+    tree = grow(
+        points, weight, rule, on_level=lambda nodes, members: held.append((nodes.place, members))
+    ).tree
+    assert int(tree.levels().max()) == 3
+    shares = torch.zeros(600, len(tree.parents), dtype=torch.float64)
+    for places, members in held[1:]:
+        shares[members.point, places[members.node]] += members.weight
+    for level in range(1, 4):
+        torch.testing.assert_close(shares[:, tree.at_level(level)].sum(1), weight, rtol=1e-13, atol=0)
+    inner = torch.unique(tree.parents[tree.parents >= 0])
+    for node in inner:
+        torch.testing.assert_close(
+            shares[:, tree.parents == node].sum(1), shares[:, node], rtol=1e-13, atol=0
+        )
+    assert float((shares[:, tree.leaves()] > 0).sum(1).double().mean()) > (
+        1.0 if soft_threshold < 1 else 0.99
+    )
+
+
+# -- likelihood -----------------------------------------------------------------------------------
+
+
+def test_without_a_threshold_every_level_raises_the_likelihood():
+    points = room(500)
+    scores = []
+    for levels in (1, 2, 3, 4):
+        tree = exact(branching=3, max_levels=levels, soft_threshold=0.0, min_gain=0.0).fit(points)
+        scores.append(tree.score(points))
+        assert tree.lower_bound_ <= scores[-1] + 1e-9
+        if levels == 1:
+            assert tree.lower_bound_ == pytest.approx(scores[-1], abs=1e-9)
+    assert all(after > before + 1e-3 for before, after in itertools.pairwise(scores))
+
+
+@pytest.mark.parametrize("soft_threshold", [0.01, 0.1, 1.0])
+def test_what_a_level_keeps_is_a_lower_bound_that_the_next_one_passes(soft_threshold):
+    """With points given to some children only, the likelihood itself may fall; not below the bound."""
+    points = room(2000)
+    weight = np.random.default_rng(0).uniform(0.5, 2.0, len(points))
+    kept, scores = [], []
+    for levels in (1, 2, 3):
+        tree = exact(branching=4, max_levels=levels, soft_threshold=soft_threshold)
+        tree.fit(points, sample_weight=weight)
+        kept.append(tree.lower_bound_)
+        scores.append(np.average(tree.score_samples(points), weights=weight))
+        np.testing.assert_allclose(tree.level(levels).score_samples(points), tree.score_samples(points))
+    assert all(bound <= score + 1e-9 for bound, score in zip(kept, scores, strict=True))
+    assert all(after >= bound for bound, after in zip(kept, scores[1:], strict=False))
+    assert scores[2] > scores[0]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_bound_never_falls_while_em_runs_on_a_level(dtype):
+    found: list[float] = []
+    tree = HierarchicalGaussianMixture(branching=6, max_levels=1, reg_covar=1e-9, dtype=dtype)
+    tree.fit(room(3000), on_iteration=lambda iteration, bound: found.append(bound))
+    assert found == tree.lower_bounds_
+    assert len(found) > 10
+    assert np.diff(found[1:-1]).min() > (-1e-3 if dtype == "float32" else -1e-10)
+    assert found[1] > found[0]
+
+
+def test_a_tree_explains_fresh_points_nearly_as_well_as_flat_em():
+    points, fresh = room(6000), room(2000, seed=1)
+    tree = HierarchicalGaussianMixture(64, random_state=0).fit(points)
+    k = len(tree.weights_)
+    assert 56 <= k <= 64
+    flat = GaussianMixture(k, random_state=0).fit(points)
+    single = GaussianMixture(1).fit(points)
+    assert tree.score(fresh) > flat.score(fresh) - 0.15
+    assert tree.score(fresh) > single.score(fresh) + 1.5
+
+
+def test_single_precision_is_raised_where_it_would_err():
+    """Sheets half a millimetre thin, two hundred metres apart."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, size=(900, 3)) * [100.0, 100.0, 0.0]
+    points[:, 2] = (np.arange(900) % 3) * 100.0 + 5e-4 * rng.normal(size=900)
+    options: dict[str, Any] = {"branching": 3, "max_levels": 2, "reg_covar": 1e-12}
+    single = HierarchicalGaussianMixture(dtype="float32", **options).fit(points)
+    double = HierarchicalGaussianMixture(dtype="float64", **options).fit(points)
+    assert abs(single.score(points) - double.score(points)) < 0.05
+    assert np.sqrt(np.linalg.eigvalsh(single.covariances_)[:, 0]).max() < 1e-3
+
+
+# -- what stops it --------------------------------------------------------------------------------
+
+
+def split_nodes(tree: HierarchicalGaussianMixture) -> np.ndarray:
+    return np.unique(tree.node_parents_[tree.node_parents_ >= 0])
+
+
+def test_flat_nodes_are_not_split():
+    points = room(4000)
+    free = exact(min_gain=0.0).fit(points)
+    tree = exact(min_gain=0.0, planarity_threshold=3e-3).fit(points)
+    variance = np.linalg.eigvalsh(tree.node_covariances_)
+    flat = variance[:, 0] < 3e-3 * variance.sum(1)
+    assert flat.any()
+    assert not flat[split_nodes(tree)].any()
+    assert len(tree.weights_) < len(free.weights_) / 2
+    assert len(exact(planarity_threshold=1.0).fit(points).weights_) == 1
+
+
+def test_thin_nodes_are_not_split():
+    points = room(4000)
+    tree = exact(min_gain=0.0, thickness=0.02).fit(points)
+    deviation = np.sqrt(np.linalg.eigvalsh(tree.node_covariances_)[:, 0])
+    assert (deviation < 0.02).any()
+    assert not (deviation < 0.02)[split_nodes(tree)].any()
+    assert len(tree.weights_) < len(exact(min_gain=0.0).fit(points).weights_) / 2
+
+
+def test_weak_children_are_dropped_and_their_siblings_take_over():
+    weights = torch.tensor([[0.7, 0.25, 0.05], [0.04, 0.03, 0.93], [0.5, 0.5, 0.0]]).double()
+    children = Children(weights, torch.zeros(3, 3, 2), torch.zeros(3, 3, 2, 2))
+    found = without_weak(children, torch.tensor([100.0, 100.0, 3.0]).double(), 6.0).weights
+    expected = [[0.7 / 0.95, 0.25 / 0.95, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0]]
+    torch.testing.assert_close(found, torch.tensor(expected).double())
+
+
+@pytest.mark.parametrize("min_support", [5.0, 40.0])
+def test_no_leaf_is_without_support(min_support):
+    points = room(1000)
+    tree = exact(min_support=min_support, min_gain=0.0).fit(points)
+    support = tree.weights_ * 1000
+    assert len(support) > 5
+    assert support.min() > 0.5 * min_support  # of a node's own points, whose paths weigh not quite the same
+    assert tree.weights_.sum() == pytest.approx(1, abs=1e-12)
+
+
+def test_a_split_must_gain_more_than_its_parameters_cost():
+    points = np.random.default_rng(0).normal(size=(3000, 3))  # one Gaussian
+    assert len(exact().fit(points).weights_) == 1
+    assert len(exact(min_gain=0.0).fit(points).weights_) > 20
+    few, many = exact(min_gain=math.log(3000) / 2).fit(room(3000)), exact().fit(room(3000))
+    assert 4 <= len(few.weights_) < len(many.weights_) < 300
+
+
+def test_a_split_must_gain_more_than_tol_a_point():
+    points = np.random.default_rng(0).uniform(size=(2000, 1))
+    assert len(exact(min_gain=0.0, branching=2, max_levels=1, tol=1e-3).fit(points).weights_) == 2
+    assert len(exact(min_gain=0.0, branching=2, max_levels=1, tol=0.2).fit(points).weights_) == 1
+
+
+@pytest.mark.parametrize("places", [1, 2, 5])
+def test_as_many_leaves_as_there_are_places_at_most(places):
+    at = np.random.default_rng(0).normal(size=(places, 3))
+    points = np.repeat(at, 20, axis=0)
+    tree = exact().fit(points)
+    assert len(tree.weights_) == places
+    order = np.lexsort(tree.means_.T), np.lexsort(at.T)
+    np.testing.assert_allclose(tree.means_[order[0]], at[order[1]], atol=1e-9)
+    np.testing.assert_allclose(tree.weights_, 1 / places)
+
+
+# -- a budget -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("branching", [2, 3, 8])
+@pytest.mark.parametrize("n_components", [1, 2, 3, 7, 9, 20, 100])
+def test_there_are_n_components_leaves_at_most_and_hardly_fewer(n_components, branching):
+    tree = exact(n_components, branching=branching, max_levels=9, min_support=1.0, min_gain=0.0)
+    k = len(tree.fit(room(1500)).weights_)
+    assert 0.9 * n_components <= k <= n_components
+
+
+def test_a_budget_goes_where_it_gains_most():
+    """Two clusters as heavy and as wide, one of them evenly filled, the other dots on a grid."""
+    rng = np.random.default_rng(0)
+    even = rng.uniform(-2, 2, size=(1000, 2)) + np.array([20.0, 0.0])
+    dots = rng.integers(-2, 3, size=(1000, 2)) * 0.8 + 0.02 * rng.normal(size=(1000, 2))
+    points = np.concatenate([even, dots])
+    few, all_of_it = (exact(n, branching=2, max_levels=8, min_gain=0.0).fit(points) for n in (24, None))
+    assert (all_of_it.means_[:, 0] > 10).sum() > 50
+    assert (few.means_[:, 0] > 10).sum() == 8  # of sixteen nodes on the fourth level
+    assert (few.means_[:, 0] < 10).sum() == 16
+
+
+# -- levels ---------------------------------------------------------------------------------------
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> list[int]:
+    """Parents, level by level."""
+    levels = [[-1] * draw(st.integers(1, 3))]
+    for _ in range(draw(st.integers(0, 4))):
+        first = sum(map(len, levels[:-1]))
+        counts = [draw(st.integers(0, 3)) for _ in levels[-1]]
+        below = [first + i for i, n in enumerate(counts) for _ in range(n)]
+        if not below:
+            break
+        levels.append(below)
+    return [parent for level in levels for parent in level]
+
+
+@given(parents=trees())
+def test_levels_and_leaves_of_any_tree(parents):
+    def depth(node: int) -> int:
+        return 1 if parents[node] < 0 else 1 + depth(parents[node])
+
+    n = len(parents)
+    tree = Tree(torch.tensor(parents), *(torch.zeros(n, *shape) for shape in ((), (2,), (2, 2))))
+    assert tree.levels().tolist() == [depth(node) for node in range(n)]
+    leaves = [node for node in range(n) if node not in parents]
+    assert tree.leaves().tolist() == leaves
+    for level in range(1, 6):
+        expected = [i for i in range(n) if depth(i) == level or (i in leaves and depth(i) < level)]
+        assert tree.at_level(level).tolist() == expected
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_every_level_is_a_mixture_of_the_whole_cloud(kind):
+    points, fresh = kind(room(4000)), kind(room(1000, seed=1))
+    tree = HierarchicalGaussianMixture(branching=5, max_levels=3, random_state=0).fit(points)
+    assert tree.n_levels_ == 3
+    sizes, scores = [], []
+    for level in range(1, 4):
+        mixture = tree.level(level)
+        assert type(mixture) is GaussianMixture
+        assert type(mixture.means_) is type(points)
+        check_mixture(mixture, np.asarray(points), at_most=5**level)
+        sizes.append(mixture.n_components)
+        scores.append(mixture.score(fresh))
+        np.testing.assert_allclose(mixture.weights @ mixture.means, np.asarray(points).mean(0), atol=0.02)
+    assert sizes == sorted(set(sizes))
+    assert scores == sorted(scores)
+    assert sizes[0] == 5
+    assert torch.equal(tree.level(3).means, tree.means)
+    weights, parents = np.asarray(tree.node_weights_), np.asarray(tree.node_parents_)
+    for node in split_nodes(HierarchicalGaussianMixture().fit(np.asarray(points))):
+        if (parents == node).any():
+            assert weights[parents == node].sum() == pytest.approx(weights[node], rel=1e-9)
+    assert len(weights) == len(tree.node_means_) == len(tree.node_covariances_) == len(tree.node_levels_)
+    for level, message in ((0, "at least 1"), (4, "n_levels_=3"), (1.5, "whole number")):
+        with pytest.raises(InvalidArgumentError, match=f"^level={level}.*{message}"):
+            tree.level(level)
+
+
+def test_a_tree_of_one_node_is_one_gaussian():
+    tree = exact(1).fit(blobs(2))
+    assert tree.n_levels_ == 1
+    assert tree.node_parents_.tolist() == [-1]
+    np.testing.assert_allclose(tree.means_[0], blobs(2).mean(0))
+    np.testing.assert_allclose(tree.covariances_[0], np.cov(blobs(2).T, bias=True) + 1e-6 * np.eye(2))
+    assert tree.lower_bound_ == pytest.approx(tree.score(blobs(2)))
+
+
+def test_a_mixture_of_given_parameters_is_one_level():
+    whole = exact(branching=3, max_levels=2).fit(blobs(2))
+    tree = HierarchicalGaussianMixture.from_parameters(whole.weights_, whole.means_, whole.covariances_)
+    assert tree.n_levels_ == 1
+    assert torch.equal(tree.level(1).means, whole.means)
+    assert (tree.node_parents_ == -1).all()
+    pruned, kept = prune(whole, 240, min_support=20.0)
+    assert pruned.n_levels_ == 1
+    assert len(pruned.weights_) == int(kept.sum())
+
+
+# -- moving and keeping ---------------------------------------------------------------------------
+
+
+def deep() -> HierarchicalGaussianMixture:
+    return HierarchicalGaussianMixture(branching=3, max_levels=3, random_state=0).fit(room(600) + FAR[:3])
+
+
+def assert_same_tree(one: HierarchicalGaussianMixture, other: HierarchicalGaussianMixture) -> None:
+    assert one.n_levels_ == other.n_levels_ > 1
+    assert (one.node_parents_ == other.node_parents_).all()
+    for level in range(1, one.n_levels_ + 1):
+        assert torch.equal(one.level(level).covariances, other.level(level).covariances)
+
+
+def test_the_tree_goes_with_files_states_and_copies(tmp_path):
+    tree = deep()
+    tree.save(tmp_path / "tree.safetensors")
+    loaded = HierarchicalGaussianMixture.load(tmp_path / "tree.safetensors")
+    assert loaded.get_params() == tree.get_params()
+    assert loaded.n_components is None
+    limited = exact(100).fit(room(600))
+    assert len(limited.weights_) < 100
+    limited.save(tmp_path / "limited.safetensors")
+    assert HierarchicalGaussianMixture.load(tmp_path / "limited.safetensors").n_components == 100
+    restored = HierarchicalGaussianMixture(2).fit(blobs(2))
+    restored.load_state_dict(tree.state_dict())
+    for other in (loaded, restored, copy.deepcopy(tree)):
+        assert_same_tree(other, tree)
+    flat = GaussianMixture.load(tmp_path / "tree.safetensors")
+    assert torch.equal(flat.means, tree.means)
+
+
+def test_the_tree_moves_with_the_mixture():
+    tree, motion = deep(), rigid_motion(3)
+    moved = tree.transform(motion)
+    points = room(50, seed=2) + FAR[:3]
+    at = points @ motion[:3, :3].T + motion[:3, 3]
+    for level in range(1, tree.n_levels_ + 1):
+        expected = tree.level(level).score_samples(points)
+        np.testing.assert_allclose(moved.level(level).score_samples(at), expected, atol=1e-6)
+    assert_same_tree(tree, deep())
+
+
+def test_a_second_fit_forgets_the_tree():
+    tree = exact(branching=3).fit(room(600))
+    tree.fit(blobs(2))
+    assert_same_tree(tree, exact(branching=3).fit(blobs(2)))
+
+
+def broken(change: str, tree: Tree) -> Tree:
+    parents, weights, means, covariances = (value.clone() for value in tree)
+    if change == "cycle":
+        parents[0] = len(parents) - 1
+    elif change == "self":
+        parents[3] = 3
+    elif change == "negative":
+        parents[0] = -2
+    elif change == "beyond":
+        parents[-1] = len(parents)
+    elif change == "leaves":
+        parents[-1] = -1
+        weights[-1] = 0.5
+    elif change == "type":
+        parents = parents.double()
+    elif change == "short":
+        means = means[:-1]
+    elif change == "single":
+        covariances = covariances.float()
+    elif change == "shape":
+        parents = parents[None]
+    return Tree(parents, weights, means, covariances)
+
+
+@pytest.mark.parametrize(
+    "change", ["cycle", "self", "negative", "beyond", "leaves", "type", "short", "single", "shape"]
+)
+def test_a_file_whose_tree_is_none_is_refused(tmp_path, change):
+    tree, path = deep(), tmp_path / "tree.safetensors"
+    tree.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
+    check_tree(tree._tree(), tree.weights)
+    names = HierarchicalGaussianMixture._extra_names
+    tensors |= {f"extra.{n}": v for n, v in zip(names, broken(change, tree._tree()), strict=True)}
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **facts))
+    with pytest.raises(DataError, match=r"tree\.safetensors"):
+        HierarchicalGaussianMixture.load(path)
+
+
+def test_a_file_that_holds_half_a_tree_is_refused(tmp_path):
+    tree, path = deep(), tmp_path / "tree.safetensors"
+    tree.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.mixture", 1)
+    del tensors["extra.node_means"]
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **facts))
+    with pytest.raises(DataError, match="node_means"):
+        HierarchicalGaussianMixture.load(path)
+
+
+# -- clouds that cannot be, or hardly -------------------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(data=st.data(), dim=st.integers(1, 3), n=st.integers(1, 60))
+def test_any_cloud_of_few_places_is_learned(data, dim, n):
+    """Deep trees of lattices, with points many times over, of any scale and far away."""
+    scale, offset = data.draw(
+        st.sampled_from([(1.0, 0.0), (1e-6, 0.0), (1e3, 5e5), (1e-3, -1e6), (1e6, 0.0)])
+    )
+    rng = np.random.default_rng(data.draw(st.integers(0, 999)))
+    points = offset + scale * rng.integers(0, data.draw(st.sampled_from([1, 2, 4, 20])), size=(n, dim))
+    weight = rng.choice([1e-3, 1.0, 50.0], size=n)
+    options = {
+        "branching": data.draw(st.sampled_from([2, 3, 8])),
+        "min_support": data.draw(st.sampled_from([0.0, 1.0, 4.0])),
+        "min_gain": data.draw(st.sampled_from([0.0, 1.0])),
+        "soft_threshold": data.draw(st.sampled_from([0.0, 0.1, 1.0])),
+        "dtype": data.draw(st.sampled_from(["float32", "float64"])),
+    }
+    tree = HierarchicalGaussianMixture(max_levels=3, max_iter=20, **options).fit(points, sample_weight=weight)
+    check_mixture(tree, points, at_most=n)
+    for level in range(1, tree.n_levels_ + 1):
+        check_mixture(tree.level(level), points, at_most=n)
+    assert (tree.weights > 0).all()
+
+
+def test_without_regularisation_it_is_learned_or_refused():
+    tree = exact(reg_covar=0.0, max_levels=2).fit(room(1000))
+    check_mixture(tree, room(1000), at_most=64)
+    with pytest.raises(NumericalError, match="reg_covar"):
+        exact(reg_covar=0.0).fit(np.ones((20, 3)))
+
+
+def test_em_cut_short_warns():
+    with pytest.warns(ConvergenceWarning, match="max_iter=2"):
+        tree = exact(max_iter=2).fit(room(1000))
+    assert not tree.converged_
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert exact(max_iter=500).fit(room(1000)).converged_
+
+
+# -- real scans -----------------------------------------------------------------------------------
+
+
+def held_out(points: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    return points[order[:n]], points[order[n : n + n // 4]]
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("name", ["hall", "bunny"])
+def test_real_surfaces_are_explained_nearly_as_well_as_by_flat_em(real_data: Path, name: str):
+    if name == "hall":
+        cloud = datasets.load("scan_folder", path=real_data / "hall")[0].points
+    else:
+        cloud = datasets.load("mesh", path=real_data / "meshes" / "bunny.ply")[0].points
+    points, fresh = held_out(cloud.double(), 15_000)
+    tree = HierarchicalGaussianMixture(64, random_state=0).fit(points)
+    assert len(tree.weights) > 56
+    flat = GaussianMixture(len(tree.weights), random_state=0).fit(points)
+    scores = [tree.level(level).score(fresh) for level in range(1, tree.n_levels_ + 1)]
+    assert scores == sorted(scores)
+    assert tree.score(fresh) > flat.score(fresh) - 0.3
+    assert tree.score(fresh) > GaussianMixture(8, random_state=0).fit(points).score(fresh) + 0.3

@@ -1,0 +1,455 @@
+"""Riemannian ascent: against autograd, scipy's matrix functions, dense BFGS, EM and scikit-learn."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mixture.estimator_contract import MixtureContract, blobs
+from mixture.test_estimators import BAD_LOOP_PARAMETERS
+from scipy.linalg import expm, sqrtm
+from scipy.optimize import rosen, rosen_der
+from scipy.stats import multivariate_normal
+from sklearn import mixture as sklearn_mixture
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+from gmmtorch.errors import NumericalError
+from gmmtorch.mixture import GaussianMixture, em
+from gmmtorch.mixture.ascent import SOLVERS, LimitedMemory, ascend, search
+from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture.initialization import start
+from gmmtorch.mixture.riemannian import (
+    Frames,
+    Iterate,
+    Likelihood,
+    RiemannianGaussianMixture,
+    pack_tangent,
+    unpack_tangent,
+)
+
+solvers = pytest.mark.parametrize("solver", list(SOLVERS))
+
+
+class TestRiemannianGaussianMixture(MixtureContract):
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *BAD_LOOP_PARAMETERS,
+        *({"solver": value} for value in ("newton", None)),
+        *({"memory": value} for value in (0, 2.5)),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> RiemannianGaussianMixture:
+        return RiemannianGaussianMixture(n_components, **{"random_state": 0, **options})
+
+
+class TestByConjugateGradients(TestRiemannianGaussianMixture):
+    def make(self, n_components: int = 3, **options: Any) -> RiemannianGaussianMixture:
+        return super().make(n_components, **{"solver": "cg", **options})
+
+
+def random_iterate(
+    k: int, dim: int, generator: torch.Generator, n: int = 40, blur: float = 0.3, dtype=torch.float64
+) -> Iterate:
+    """A place on the manifold that is no mixture: s ≠ 1."""
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    weight = torch.rand(n, generator=generator, dtype=torch.float64) + 0.1
+    likelihood = Likelihood(2 * normal(n, dim), weight, blur, dtype)
+    first = Parameters(
+        torch.full((k,), 1 / k).double(), normal(k, dim), torch.eye(dim).double().expand(k, dim, dim)
+    )
+    there = likelihood.at(first)
+    return there.move(0.4 * normal(*there.gradient.shape))
+
+
+def augmented(place: Iterate) -> Tensor:
+    """H (K, D+1, D+1) as one matrix: H [x; 1] = A (x − μ) + b."""
+    linear, means, offset = place.frames
+    return torch.cat([linear, offset[:, :, None] - linear @ means[:, :, None]], 2)
+
+
+def covariance(place: Iterate) -> Tensor:
+    """S = (HᵀH)⁻¹."""
+    frame = augmented(place)
+    return torch.linalg.inv(frame.mT @ frame)
+
+
+def reference(likelihood: Likelihood, S: Tensor, log_weights: Tensor) -> Tensor:
+    """f as the module's text says it, of S and η."""
+    dim = S.shape[1] - 1
+    y = torch.cat([likelihood.points, likelihood.points.new_ones(len(likelihood.points), 1)], 1)
+    inverse = torch.linalg.inv(S)
+    squared = torch.einsum("ni,kij,nj->nk", y, inverse, y)
+    blur = likelihood.blur * torch.stack([p[:dim, :dim].trace() for p in inverse])
+    log_q = 0.5 - dim / 2 * math.log(2 * math.pi) - 0.5 * (torch.logdet(S) + squared + blur)
+    value = torch.logsumexp(torch.log_softmax(log_weights, 0) + log_q, 1)
+    return (likelihood.weight * value).sum() / likelihood.weight.sum()
+
+
+# -- the function and its gradient -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_value_and_gradient_are_autograds(dim, generator):
+    place = random_iterate(3, dim, generator)
+    S = covariance(place).requires_grad_()
+    log_weights = place.log_weights.clone().requires_grad_()
+    value = reference(place.likelihood, S, log_weights)
+    assert place.value == pytest.approx(float(value.detach()), rel=1e-12)
+    by_S, by_weights = torch.autograd.grad(value, [S, log_weights])
+    root = torch.linalg.inv(augmented(place))  # S = G Gᵀ, so that df = tr(∂f/∂S G dΞ Gᵀ)
+    expected = pack_tangent(root.mT @ by_S @ root, by_weights)
+    torch.testing.assert_close(place.gradient, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_the_gradient_is_the_slope_along_geodesics(dim, generator):
+    place = random_iterate(2, dim, generator)
+    for _ in range(3):
+        tangent = torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64)
+        rise = place.move(1e-5 * tangent).value - place.move(-1e-5 * tangent).value
+        assert rise / 2e-5 == pytest.approx(float((place.gradient * tangent).sum()), rel=1e-6)
+
+
+def test_in_float32_value_and_gradient_are_close(generator):
+    state = generator.get_state()
+    exact = random_iterate(3, 3, generator)
+    generator.set_state(state)
+    coarse = random_iterate(3, 3, generator, dtype=torch.float32)
+    assert coarse.value != exact.value
+    assert coarse.value == pytest.approx(exact.value, abs=1e-5)
+    torch.testing.assert_close(coarse.gradient, exact.gradient, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_with_one_component_it_is_the_expected_log_density_of_blurred_points(dim, generator):
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(dim, dim))
+    mean, cov, points = rng.normal(size=dim), root @ root.T + np.eye(dim), rng.normal(size=(20, dim))
+    parameters = Parameters(torch.ones(1).double(), *(torch.from_numpy(v[None]) for v in (mean, cov)))
+    place = Likelihood(torch.from_numpy(points), torch.ones(20).double(), 0.3).at(parameters)
+    nodes = np.array(list(itertools.product([-1, 1], repeat=dim)))  # exact for quadratic functions
+    blurred = points[:, None] + math.sqrt(0.3) * nodes
+    assert place.value == pytest.approx(multivariate_normal(mean, cov).logpdf(blurred).mean())
+
+
+def test_the_likelihood_is_bounded_by_the_function(generator):
+    for _ in range(20):
+        place = random_iterate(3, 2, generator)
+        mixture = GaussianMixture.from_parameters(*place.parameters())
+        scores = mixture.score_samples(place.likelihood.points)
+        weight = place.likelihood.weight
+        assert place.value < float((weight * scores).sum() / weight.sum())
+
+
+def test_thin_and_far_out_is_as_near_the_center(generator):
+    """1 mm thick and 10 km out: the products with natural parameters would keep two digits."""
+    flat = torch.randn(60, 3, generator=generator, dtype=torch.float64) * torch.tensor([2.0, 1.0, 1e-3])
+    flat = torch.round(flat * 2**30) / 2**30
+    offset = torch.tensor([8192.0, -4096.0, 2048.0]).double()
+    weight, share = torch.ones(60).double(), torch.ones(1).double()
+    cov = torch.diag(torch.tensor([3.0, 2.0, 2e-6]).double())[None]
+    tangent = 0.3 * torch.randn(1, 11, generator=generator, dtype=torch.float64)
+    places = []
+    for shift in (0 * offset, offset):
+        mean = shift[None] + 1e-3
+        first = Likelihood(flat + shift, weight, 1e-9).at(Parameters(share, mean, cov))
+        places.append((first, first.move(tangent)))
+    assert em.is_ill_conditioned(places[1][0].parameters())
+    for near, far in zip(*places, strict=True):
+        assert far.value == pytest.approx(near.value, rel=1e-6)
+        torch.testing.assert_close(far.gradient, near.gradient, rtol=1e-5, atol=1e-6)
+
+
+# -- the manifold ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_packed_tangents_keep_the_inner_product(size, generator):
+    matrices = torch.randn(2, 5, size, size, generator=generator, dtype=torch.float64)
+    matrices = matrices + matrices.mT
+    change = torch.randn(2, 5, generator=generator, dtype=torch.float64)
+    a, b = (pack_tangent(m, c) for m, c in zip(matrices, change, strict=True))
+    traces = torch.stack([(x @ y).trace() for x, y in zip(*matrices, strict=True)]).sum()
+    assert float((a * b).sum()) == pytest.approx(float(traces + (change[0] * change[1]).sum()))
+    back, back_change = unpack_tangent(a, size)
+    torch.testing.assert_close(back, matrices[0])
+    assert torch.equal(back_change, change[0])
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_a_move_is_the_exponential_map_and_carries_vectors_along(dim, generator):
+    """S½ exp(S^−½ V S^−½) S½, and transport E Z Eᵀ with E = (S' S⁻¹)½, by scipy's expm and sqrtm."""
+    place = random_iterate(2, dim, generator)
+    step, other = (
+        0.5 * torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64) for _ in range(2)
+    )
+    moved = place.move(step)
+    torch.testing.assert_close(
+        moved.log_weights, torch.log_softmax(place.log_weights + step[:, -1], 0), rtol=1e-12, atol=0
+    )
+    for k in range(2):
+        S, S_new = (covariance(p)[k].numpy() for p in (place, moved))
+        root, root_new = (np.linalg.inv(augmented(p)[k].numpy()) for p in (place, moved))
+        V, Z, Z_new = (
+            g @ unpack_tangent(t, dim + 1)[0][k].numpy() @ g.T
+            for g, t in ((root, step), (root, other), (root_new, other))
+        )
+        half = np.real(sqrtm(S))
+        inverse = np.linalg.inv(half)
+        np.testing.assert_allclose(S_new, half @ expm(inverse @ V @ inverse) @ half, rtol=1e-8, atol=1e-10)
+        E = np.real(sqrtm(S_new @ np.linalg.inv(S)))
+        np.testing.assert_allclose(Z_new, E @ Z @ E.T, rtol=1e-8, atol=1e-10)
+
+
+def test_frames_stay_in_parts(generator):
+    place = random_iterate(3, 3, generator)
+    linear, means, offset = place.frames
+    assert float((linear.mT @ offset[:, :, None]).abs().max()) < 1e-12
+    S = covariance(place)
+    last = S[:, 3, 3]
+    torch.testing.assert_close(1 / last, offset.square().sum(1))
+    torch.testing.assert_close(S[:, :3, 3] / last[:, None], means)
+    central = S[:, :3, :3] - last[:, None, None] * means[:, :, None] * means[:, None, :]
+    torch.testing.assert_close(place.covariances, central)
+
+
+# -- the ascent, on functions of its own ------------------------------------------------------------
+
+
+@dataclass
+class Flat:
+    """A point of Rⁿ as the ascent sees it."""
+
+    at: np.ndarray
+    function: Any
+    slope: Any
+    tried: list[np.ndarray]
+
+    @property
+    def value(self) -> float:
+        return float(self.function(self.at))
+
+    @property
+    def gradient(self) -> Tensor:
+        return torch.from_numpy(self.slope(self.at))
+
+    @property
+    def inverse_hessian(self) -> Tensor:
+        return torch.full((len(self.at),), 0.5).double()
+
+    def bounded(self, direction: Tensor) -> Tensor:
+        return direction
+
+    def move(self, tangent: Tensor) -> Flat:
+        self.tried.append(self.at + tangent.numpy())
+        return Flat(self.tried[-1], self.function, self.slope, self.tried)
+
+
+def hill(start: list[float]) -> Flat:
+    return Flat(np.array(start), lambda x: -rosen(x), lambda x: -rosen_der(x), [])
+
+
+@solvers
+def test_rosenbrocks_valley_is_followed_to_its_end(solver):
+    top, values, converged = ascend(hill([-1.2, 1.0, 0.5]), SOLVERS[solver](5), tol=1e-14, max_iter=500)
+    assert converged
+    np.testing.assert_allclose(top.at, 1, atol=1e-5)
+    assert (np.diff(values) >= 0).all()
+
+
+def test_the_two_loops_are_the_dense_bfgs_formula():
+    rng = np.random.default_rng(0)
+    solver, dense = LimitedMemory(9), 0.5 * np.eye(4)
+    for _ in range(4):
+        step, root = rng.normal(size=4), rng.normal(size=(4, 4))
+        fall = (root @ root.T + np.eye(4)) @ step
+        before, after = (Flat(np.zeros(4), None, lambda x, g=g: g, []) for g in (fall, np.zeros(4)))
+        solver.learn(before, torch.from_numpy(step / 2), 2.0, after)
+        rho = 1 / (fall @ step)
+        left = np.eye(4) - rho * np.outer(step, fall)
+        dense = left @ dense @ left.T + rho * np.outer(step, step)  # Nocedal & Wright, 6.17
+    gradient = rng.normal(size=4)
+    found = solver.direction(Flat(np.zeros(4), None, lambda x: gradient, []))
+    np.testing.assert_allclose(found.numpy(), dense @ gradient, rtol=1e-10)
+
+
+@pytest.mark.parametrize("slope_left", [0.9, 0.1])
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e3])
+def test_a_step_meets_the_wolfe_conditions(size, slope_left):
+    place = hill([-1.2, 1.0])
+    direction = size * place.gradient / place.gradient.norm()
+    length, found = search(place, direction, slope_left)
+    slope = float((place.gradient * direction).sum())
+    assert found.value >= place.value + 1e-4 * length * slope
+    assert float((found.gradient * direction).sum()) <= slope_left * slope
+
+
+def test_where_nothing_leads_up_nothing_moves():
+    place = Flat(np.zeros(2), lambda x: -np.abs(x).sum(), lambda x: np.ones(2), [])  # a gradient that lies
+    for solver in SOLVERS.values():
+        top, values, converged = ascend(place, solver(3), tol=0, max_iter=50)
+        assert (top.at.tolist(), values, converged) == ([0, 0], [0], True)
+    assert len(place.tried) < 100
+
+
+def test_what_cannot_be_computed_is_no_rise():
+    def function(x: np.ndarray) -> float:
+        if x[0] > 1:
+            raise NumericalError("out of bounds")
+        return math.nan if x[0] > 0.5 else x[0]
+
+    place = Flat(np.zeros(1), function, lambda x: np.ones(1), [])
+    place.move = lambda t: (function(t.numpy()), Flat(t.numpy(), function, place.slope, []))[1]
+    length, found = search(place, torch.tensor([8.0]).double(), 0.9)
+    assert 0.4 < found.value <= 0.5
+    assert length == pytest.approx(found.value / 8)
+
+
+# -- the estimator ---------------------------------------------------------------------------------
+
+
+def overlapping(seed: int = 0, n: int = 1500) -> np.ndarray:
+    """Four components of one place and size, that only their shapes tell apart."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(4, 2, 2)) * 0.3 + np.eye(2)
+    label = rng.integers(4, size=n)
+    return rng.normal(size=(4, 2))[label] * 0.5 + np.einsum(
+        "nij,nj->ni", roots[label], rng.normal(size=(n, 2))
+    )
+
+
+def blurred_em_step(points: np.ndarray, reg_covar: float) -> em.Step:
+    """EM on what the ascent climbs: points as cells of covariance ε I."""
+    x = torch.from_numpy(points)
+    features = em.quadratic_features(x)
+    dim = x.shape[1]
+    rows, cols = torch.triu_indices(dim, dim)
+    features[:, 1 + dim :] += reg_covar * (rows == cols)
+    return em.natural_step(features, torch.ones(len(x)).double(), 0.0, torch.float64)
+
+
+@solvers
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_one_component_has_the_mean_and_the_covariance_plus_epsilon(solver, dim):
+    points = overlapping()[:, [0]] if dim == 1 else blobs(dim)
+    fit = RiemannianGaussianMixture(
+        1, reg_covar=0.25, init_params="bounding_box", random_state=0, tol=1e-12, solver=solver
+    ).fit(points)
+    expected = np.cov(points.T, ddof=0).reshape(dim, dim) + 0.25 * np.eye(dim)
+    np.testing.assert_allclose(fit.means_[0], points.mean(0), atol=1e-5)
+    np.testing.assert_allclose(fit.covariances_[0], expected, atol=1e-5)
+
+
+@solvers
+@pytest.mark.parametrize("init_params", ["kmeans", "random_points"])
+@pytest.mark.parametrize("reg_covar", [1e-6, 0.1])
+def test_where_it_ends_em_finds_nothing_to_improve(solver, init_params, reg_covar):
+    points = overlapping(n=500)
+    fit = RiemannianGaussianMixture(
+        4,
+        reg_covar=reg_covar,
+        tol=1e-9,
+        max_iter=2000,
+        init_params=init_params,
+        random_state=0,
+        solver=solver,
+    ).fit(points)
+    assert fit.converged_
+    parameters = Parameters(fit.weights, fit.means, fit.covariances)
+    again = em.run_em(blurred_em_step(points, reg_covar), parameters, tol=0, max_iter=30)
+    assert again.lower_bounds[0] == pytest.approx(fit.lower_bound_, abs=1e-8)
+    assert 0 <= again.lower_bounds[-1] - again.lower_bounds[0] < 1e-7
+    place = Likelihood(torch.from_numpy(points), torch.ones(len(points)).double(), reg_covar).at(parameters)
+    assert float(place.gradient.norm()) < 1e-4
+    torch.testing.assert_close(place.frames.offset.norm(dim=1), torch.ones(4).double(), rtol=0, atol=1e-3)
+
+
+@solvers
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10**6), dim=st.integers(1, 3), k=st.integers(1, 6))
+def test_the_likelihood_never_falls(solver, seed, dim, k):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(80, dim)) * rng.choice([1e-3, 1, 30], size=dim)
+    told: list[float] = []
+    fit = RiemannianGaussianMixture(
+        k, solver=solver, init_params="random_points", random_state=seed, tol=0, max_iter=25
+    )
+    fit.fit(points, sample_weight=rng.random(80) + 0.1, on_iteration=lambda i, value: told.append(value))
+    assert told == fit.lower_bounds_
+    assert (np.diff(told) >= 0).all()
+
+
+def test_clusters_well_apart_are_those_of_em_and_scikit_learn():
+    points = blobs(3, 600)
+    ours = RiemannianGaussianMixture(3, tol=1e-9, random_state=0).fit(points)
+    theirs = sklearn_mixture.GaussianMixture(3, tol=1e-9, max_iter=500, random_state=0).fit(points)
+    order, their_order = ours.weights_.argsort(), theirs.weights_.argsort()
+    for name in ("weights_", "means_", "covariances_"):
+        mine, other = getattr(ours, name)[order], getattr(theirs, name)[their_order]
+        np.testing.assert_allclose(mine, other, atol=1e-4)
+    em_fit = GaussianMixture(3, tol=1e-9, max_iter=500, random_state=0).fit(points)
+    assert ours.score(points) == pytest.approx(em_fit.score(points), abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_clusters_overlap_it_needs_a_fifth_of_ems_steps(seed):
+    points = overlapping(seed)
+    calls = 0
+    evaluate = Likelihood.evaluate
+
+    def counted(self: Likelihood, frames: Frames, log_weights: Tensor) -> Iterate:
+        nonlocal calls
+        calls += 1
+        return evaluate(self, frames, log_weights)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Likelihood, "evaluate", counted)
+        ours = RiemannianGaussianMixture(4, tol=1e-8, max_iter=3000, random_state=0).fit(points)
+    weight = torch.ones(len(points)).double()
+    x = torch.from_numpy(points)
+    first = start("kmeans", x, weight, 4, 1e-6, torch.Generator().manual_seed(0))
+    run = em.run_em(
+        em.natural_step(em.quadratic_features(x), weight, 1e-6, torch.float64),
+        first,
+        tol=0,
+        max_iter=5 * calls,
+    )
+    assert ours.lower_bound_ > run.lower_bounds[-1] - 1e-4
+    assert ours.lower_bound_ > run.lower_bounds[calls]
+
+
+def test_the_best_of_several_starts_is_kept():
+    points = blobs(2)
+    options = {"init_params": "random_points", "tol": 1e-6, "max_iter": 300}
+    seeds = torch.Generator().manual_seed(3)
+    single = [
+        RiemannianGaussianMixture(4, random_state=seeds, **options).fit(points).lower_bound_ for _ in range(4)
+    ]
+    several = RiemannianGaussianMixture(4, random_state=3, n_init=4, **options).fit(points)
+    assert several.lower_bound_ == max(single)
+    assert max(single) > min(single) + 1e-6
+
+
+def test_too_few_iterations_are_warned_of():
+    with pytest.warns(ConvergenceWarning, match="max_iter=2"):
+        fit = RiemannianGaussianMixture(4, tol=1e-9, max_iter=2, random_state=0).fit(overlapping())
+    assert (fit.n_iter_, fit.converged_) == (2, False)
+
+
+@solvers
+def test_without_regularisation_a_collapse_is_an_error(solver):
+    points = np.concatenate([blobs(2), np.array([[40.0, 40.0], [40.0, 41.0]])])
+    with pytest.raises(NumericalError, match="reg_covar"):
+        RiemannianGaussianMixture(
+            5, reg_covar=0, tol=0, max_iter=400, init_params="random_points", random_state=1, solver=solver
+        ).fit(points)

@@ -1,0 +1,263 @@
+"""Sensor models against hand computation, simulated sensors, and what must hold of any."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mixture.sensor_model import (
+    DepthCameraModel,
+    LaserModel,
+    LidarModel,
+    SensorModel,
+    cos_incidence,
+    estimate_normals,
+)
+from gmmtorch.simulation import depth_camera, laser_2d, simulate_scan, spinning_lidar
+
+MODELS: list[tuple[SensorModel, int]] = [(DepthCameraModel(), 3), (LidarModel(), 3), (LaserModel(), 2)]
+models = pytest.mark.parametrize(("model", "dim"), MODELS, ids=["camera", "lidar", "laser"])
+
+
+def vector(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def rotation(dim: int, seed: int = 0) -> Tensor:
+    matrix = np.linalg.qr(np.random.default_rng(seed).normal(size=(dim, dim)))[0]
+    matrix[:, 0] *= np.sign(np.linalg.det(matrix))
+    return torch.from_numpy(matrix)
+
+
+# -- noise ------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_by_hand():
+    camera = DepthCameraModel(axial=(0.001, 0.002, 0.003), lateral=0.5, pixel_angle=0.01)
+    (found,) = camera.noise_covariances(vector(5, 1, 1)[None], vector(3, 1, 1))
+    # z = 2 m: σ = 1 + 4 + 12 mm along x, half a pixel of 2 cm across.
+    torch.testing.assert_close(found, torch.diag(vector(0.017, 0.01, 0.01) ** 2))
+
+
+def test_the_kinect_is_as_published():
+    """Nguyen et al.: σ_z = 1.2 mm + 1.9 mm (z − 0.4)², and within a factor of two Khoshelham's 1.4 mm z²."""
+    z = torch.linspace(0.4, 5, 20, dtype=torch.float64)
+    along = DepthCameraModel().deviations(z).along
+    torch.testing.assert_close(along, 0.0012 + 0.0019 * (z - 0.4) ** 2)
+    far = z > 1
+    assert (along[far] / (1.425e-3 * z[far] ** 2) < 2).all()
+    assert (along[far] / (1.425e-3 * z[far] ** 2) > 0.5).all()
+
+
+def test_a_lidar_by_hand():
+    lidar = LidarModel(noise=0.01, proportional_noise=0.001, divergence=0.004)
+    normal = vector(0, math.sin(1.0), math.cos(1.0))[None]
+    (found,) = lidar.noise_covariances(vector(0, 0, 10)[None], vector(0, 0, 0), normal)
+    along = math.hypot(0.02, 0.01 * math.tan(1.0))
+    torch.testing.assert_close(found, torch.diag(vector(0.01, 0.01, along) ** 2))
+
+
+def test_a_laser_by_hand():
+    laser = LaserModel(noise=0.02, divergence=0.008)
+    origin, points = vector(1, 1), torch.stack([vector(1, 6), vector(4, 5)])
+    found = laser.noise_covariances(points, origin)
+    along, across = 0.02**2, 0.01**2  # both at 5 m
+    torch.testing.assert_close(found[0], torch.diag(vector(across, along)))
+    beam = vector(0.6, 0.8)
+    expected = across * torch.eye(2).double() + (along - across) * torch.outer(beam, beam)
+    torch.testing.assert_close(found[1], expected)
+
+
+def test_readings_of_the_simulated_laser_err_as_its_model_says():
+    class Wall:
+        def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+            return (4 - origin[0]) / directions[:, 0]
+
+    sensor = laser_2d(400, field_of_view=0.5, range_noise=0.03)
+    generator = torch.Generator().manual_seed(0)
+    model = LaserModel(noise=0.03, divergence=1e-6)
+    scans = [simulate_scan(sensor, torch.eye(3).double(), Wall(), generator) for _ in range(50)]
+    points = torch.stack([scan.points for scan in scans])
+    error = points - points.mean(0)
+    empirical = torch.einsum("sni,snj->ij", error, error) / (50 * 400) * 50 / 49
+    expected = model.noise_covariances(points.mean(0), vector(0, 0)).mean(0)
+    torch.testing.assert_close(empirical, expected, rtol=0.03, atol=3e-6)
+
+
+@models
+def test_incidence_grows_the_noise_along_the_beam_and_is_capped(model, dim):
+    angles = torch.linspace(0, math.pi / 2, 40, dtype=torch.float64)
+    normals = torch.zeros(40, dim, dtype=torch.float64)
+    normals[:, 0], normals[:, 1] = -angles.cos(), angles.sin()
+    points = torch.zeros(40, dim, dtype=torch.float64)
+    points[:, 0] = 6
+    origin = torch.zeros(dim, dtype=torch.float64)
+    found = model.noise_covariances(points, origin, normals)
+    along = found[:, 0, 0]
+    assert (along.diff() >= 0).all()
+    assert along[0] < along[20] < along[-1]
+    capped = angles > math.radians(80)
+    assert along[capped].max() == along[capped].min()
+    _, across, footprint = model.deviations(vector(6))
+    head_on = model.noise_covariances(points[:1], origin)[0]
+    torch.testing.assert_close(found[0], head_on)
+    expected = head_on[0, 0] + footprint[0] ** 2 * math.tan(math.radians(80)) ** 2
+    torch.testing.assert_close(along[-1], expected)
+    torch.testing.assert_close(found[:, 1, 1], (across**2).expand(40))
+    flipped = model.noise_covariances(points, origin, -normals)
+    assert torch.equal(flipped, found)
+
+
+@models
+@given(seed=st.integers(0, 1000), scale=st.sampled_from([0.0, 1e-4, 1.0, 1e3]))
+def test_covariances_are_positive_definite_and_turn_with_the_world(model, dim, seed, scale):
+    rng = np.random.default_rng(seed)
+    points = torch.from_numpy(rng.normal(size=(12, dim)) * scale)
+    origin = torch.from_numpy(rng.normal(size=dim) * 0.1)
+    points[0] = origin
+    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(12, dim))), dim=1)
+    found = model.noise_covariances(points, origin, normals)
+    assert found.shape == (12, dim, dim)
+    torch.testing.assert_close(found, found.mT)
+    assert (torch.linalg.cholesky_ex(found)[1] == 0).all()
+    turn, shift = rotation(dim, seed), torch.from_numpy(rng.normal(size=dim) * 10)
+    moved = model.noise_covariances(points @ turn.T + shift, turn @ origin + shift, normals @ turn.T)
+    torch.testing.assert_close(moved[1:], turn @ found[1:] @ turn.T, rtol=1e-6, atol=1e-12)
+
+
+@models
+def test_points_may_have_origins_of_their_own(model, dim):
+    rng = np.random.default_rng(0)
+    points, origins = torch.from_numpy(rng.normal(size=(2, 9, dim)))
+    each = torch.cat([model.noise_covariances(points[i : i + 1], origins[i]) for i in range(9)])
+    torch.testing.assert_close(model.noise_covariances(points, origins), each)
+    far = vector(5e5, 4e6, 100)[:dim]
+    torch.testing.assert_close(
+        model.noise_covariances(points + far, origins + far), each, rtol=1e-6, atol=1e-10
+    )
+
+
+# -- density ----------------------------------------------------------------------------------------------
+
+
+def test_densities_by_hand():
+    camera = DepthCameraModel(pixel_angle=0.002)
+    assert float(camera.point_density(vector(2.5), 0.5)) == pytest.approx(0.5 / 0.005**2)
+    lidar = LidarModel(azimuth_step=0.004, elevation_step=0.02)
+    assert float(lidar.point_density(vector(5.0))) == pytest.approx(1 / (25 * 8e-5))
+    laser = LaserModel(angular_step=0.01)
+    assert float(laser.point_density(vector(4.0), -0.25)) == pytest.approx(0.25 / 0.04)
+    edge_on = float(laser.point_density(vector(4.0), 0.0))
+    assert edge_on == pytest.approx(math.cos(math.radians(80)) / 0.04)
+
+
+class Plane:
+    """The plane through (4, 0, 0) whose normal is turned by `angle` towards y."""
+
+    def __init__(self, angle: float, dim: int) -> None:
+        self.normal = torch.zeros(dim, dtype=torch.float64)
+        self.normal[0], self.normal[1] = math.cos(angle), math.sin(angle)
+
+    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+        distance = 4 * self.normal[0] / (directions @ self.normal)
+        return torch.where(distance > 0, distance, torch.inf)
+
+
+SENSORS = {
+    "camera": (
+        depth_camera(320, 240, range_noise=0.0),
+        DepthCameraModel(pixel_angle=math.tan(math.radians(37.5)) / 160),
+    ),
+    "lidar": (
+        spinning_lidar(200, 2000, (-0.5, 0.5), range_noise=0.0),
+        LidarModel(azimuth_step=2 * math.pi / 2000, elevation_step=1 / 199),
+    ),
+    "laser": (laser_2d(2000, range_noise=0.0), LaserModel(angular_step=math.pi / 2000)),
+}
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+@pytest.mark.parametrize("angle", [0.0, 0.8, -1.2])
+def test_a_simulated_sensor_samples_a_surface_as_densely_as_expected(kind, angle):
+    sensor, model = SENSORS[kind]
+    dim = sensor.directions.shape[1]
+    plane = Plane(angle, dim)
+    points = simulate_scan(sensor, torch.eye(dim + 1).double(), plane, torch.Generator()).points
+    center = torch.zeros(dim, dtype=torch.float64)
+    center[0] = 4
+    radius = 0.15
+    n = int(((points - center).norm(dim=1) < radius).sum())
+    size = math.pi * radius**2 if dim == 3 else 2 * radius
+    origin = torch.zeros(dim, dtype=torch.float64)
+    cos = cos_incidence(center[None], origin, plane.normal[None])
+    assert n / size == pytest.approx(float(model.point_density(vector(4.0), cos)), rel=0.06)
+
+
+# -- normals ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_normals_of_a_noisy_plane_are_its_own(dim):
+    rng = np.random.default_rng(0)
+    turn = rotation(dim)
+    flat = torch.from_numpy(rng.uniform(-1, 1, size=(3000, dim)))
+    flat[:, 0] = torch.from_numpy(rng.normal(size=3000) * 3e-4)
+    points = flat @ turn.T + torch.tensor([5e5, 4e6, 0.0])[:dim].double()
+    normals = estimate_normals(points, 20)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(3000).double())
+    assert ((normals @ turn[:, 0]).abs() > 0.99).double().mean() > 0.95
+
+
+def test_normals_of_a_sphere_are_its_radii():
+    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)))
+    aligned = (estimate_normals(points, 12) * points.double()).sum(1).abs()
+    assert float(aligned.min()) > 0.97
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_normals_exist_whatever_the_cloud(dim):
+    line = torch.arange(5.0)[:, None] * torch.ones(dim)
+    for points in (torch.zeros(1, dim), torch.ones(7, dim), line, torch.zeros(2, dim)):
+        normals = estimate_normals(points)
+        torch.testing.assert_close(normals.norm(dim=1), torch.ones(len(points)).double())
+    across = estimate_normals(line) @ torch.ones(dim).double()
+    torch.testing.assert_close(across, torch.zeros(5).double())
+
+
+# -- arguments --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: DepthCameraModel(axial=(0.0, 0.0, 0.0)), "axial"),
+        (lambda: DepthCameraModel(axial=(0.001, -0.01, 0.001)), "axial"),
+        (lambda: DepthCameraModel(axial=(0.001, 0.0, -0.001)), "axial"),
+        (lambda: DepthCameraModel(axial=(math.nan, 0.0, 0.0)), "axial"),
+        (lambda: DepthCameraModel(lateral=0.0), "lateral"),
+        (lambda: DepthCameraModel(pixel_angle=-1.0), "pixel_angle"),
+        (lambda: LidarModel(noise=0.0), "noise"),
+        (lambda: LidarModel(proportional_noise=-0.1), "proportional_noise"),
+        (lambda: LidarModel(elevation_step=math.inf), "elevation_step"),
+        (lambda: LaserModel(divergence=math.nan), "divergence"),
+        (lambda: LaserModel(angular_step=0.0), "angular_step"),
+        (lambda: LaserModel(max_incidence=math.pi / 2), "max_incidence"),
+        (lambda: estimate_normals(torch.zeros(3, 2), 0), "n_neighbors"),
+    ],
+)
+def test_what_cannot_be_is_named(make, name):
+    with pytest.raises(InvalidArgumentError, match=f"^{name}="):
+        make()
+
+
+def test_the_depth_noise_may_dip_but_not_below_zero():
+    DepthCameraModel(axial=(0.001, -0.0019, 0.001))
+    with pytest.raises(InvalidArgumentError, match="axial"):
+        DepthCameraModel(axial=(0.001, -0.0021, 0.001))

@@ -1,0 +1,402 @@
+"""Sliced Wasserstein mixtures: against quadrature, closed forms, finite differences and EM."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mixture.estimator_contract import MixtureContract, blobs
+from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.stats import norm, wasserstein_distance
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+from gmmtorch.errors import NumericalError
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture import transport as lines
+from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture.initialization import start
+from gmmtorch.mixture.sliced_wasserstein import Shape, SlicedWassersteinGaussianMixture, differentiate
+from gmmtorch.mixture.transport import (
+    LEVELS,
+    Slices,
+    mixture_quantiles,
+    random_directions,
+    slice_cloud,
+    transport,
+)
+
+UP = torch.ones(1, 1).double()
+"""The one direction there is on the line."""
+
+
+class TestSlicedWassersteinGaussianMixture(MixtureContract):
+    motion_tolerance = None  # the directions do not move with the cloud, and Adam has axes
+    score_tolerance = 0.6  # it is not the likelihood that it seeks
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *({"max_iter": value} for value in (0, 2.5, "long")),
+        *({"n_projections": value} for value in (0, 2.5, None)),
+        *({"learning_rate": value} for value in (0, -0.1, math.nan, "slow")),
+        *({"tol": value} for value in (-1e-3, math.nan, "small")),
+        *({"reg_covar": value} for value in (-1.0, math.inf, None)),
+        *({"init_params": value} for value in ("unheard_of", None)),
+        *({"dtype": value} for value in ("float16", None)),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> SlicedWassersteinGaussianMixture:
+        # Short, and careful enough to stay near a good start; what a whole descent reaches is below.
+        short = {"n_projections": 16, "max_iter": 4, "learning_rate": 0.02}
+        return SlicedWassersteinGaussianMixture(n_components, **{"random_state": 0, **short, **options})
+
+
+def random_line(k: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (K,), means and deviations (1, K) of a mixture on the line, some of it narrow."""
+    rng = np.random.default_rng(seed)
+    weights = torch.from_numpy(rng.dirichlet(np.ones(k)))
+    return weights, *(torch.from_numpy(v[None]) for v in (rng.normal(size=k) * 2, 0.02 + rng.random(k) ** 3))
+
+
+def level_masses() -> np.ndarray:
+    """What lies between two levels: a cloud of so many points of these weights is gathered exactly."""
+    return np.diff(0.5 * (1 - np.cos(np.pi * np.arange(LEVELS + 1) / LEVELS)))
+
+
+def random_cloud(seed: int) -> np.ndarray:
+    """Values (J,), one for each level."""
+    rng = np.random.default_rng(seed)
+    return np.sort(rng.normal(size=LEVELS) * rng.choice([0.3, 3]) + rng.normal())
+
+
+def sliced(values: np.ndarray, weight: np.ndarray | None = None) -> Slices:
+    weight = np.ones(len(values)) if weight is None else weight
+    return slice_cloud(torch.from_numpy(values[:, None]), torch.from_numpy(weight), UP)
+
+
+def exact_cost(values: np.ndarray, weights: Tensor, means: Tensor, deviations: Tensor) -> float:
+    """W₂² of a mixture and a cloud of `level_masses` by adaptive quadrature over x, cell by cell."""
+    w, m, s = weights.numpy(), means[0].numpy(), deviations[0].numpy()
+    low, high = (m - 12 * s).min(), (m + 12 * s).max()
+    levels = level_masses().cumsum()
+    cuts = [brentq(lambda x, t=t: w @ norm.cdf((x - m) / s) - t, low, high, xtol=1e-14) for t in levels[:-1]]
+    cells = zip([low, *cuts], [*cuts, high], values, strict=True)
+    knots = np.sort((m[:, None] + s[:, None] * np.array([-3, 0, 3])).ravel())
+    total = 0.0
+    for a, b, u in cells:
+        total += quad(
+            lambda x, u=u: (x - u) ** 2 * (w @ (norm.pdf((x - m) / s) / s)),
+            a, b, points=knots[(knots > a) & (knots < b)], limit=200,
+        )[0]  # fmt: skip
+    return total
+
+
+@pytest.fixture
+def many_steps(monkeypatch):
+    """Quantiles to rounding."""
+    monkeypatch.setattr(lines, "_NEWTON_STEPS", 40)
+
+
+# -- clouds along lines ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_directions_are_unit_vectors_from_everywhere(dim, generator):
+    directions = random_directions(4000, dim, generator)
+    assert directions.shape == (1 if dim == 1 else 4000, dim)
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)).double())
+    second = directions.T @ directions / len(directions)
+    torch.testing.assert_close(second, torch.eye(dim).double() / dim, rtol=0, atol=0.02)
+
+
+def test_a_cloud_is_gathered_as_its_quantile_function_averages(generator):
+    points = torch.randn(37, 3, generator=generator, dtype=torch.float64)
+    weight = torch.rand(37, generator=generator, dtype=torch.float64)
+    found = slice_cloud(points, weight, random_directions(5, 3, generator))
+    edges = np.concatenate([[0], level_masses().cumsum()])
+    for direction, values, power in zip(found.directions, found.values, found.power, strict=True):
+        coordinates = (points @ direction).numpy()
+        order = coordinates.argsort()
+        reached = (weight.numpy()[order] / float(weight.sum())).cumsum()
+        fine = np.linspace(0, 1, 400_001)[:-1] + 1 / 800_000
+        quantile = coordinates[order][np.minimum(np.searchsorted(reached, fine), 36)]
+        cell = np.searchsorted(edges, fine) - 1
+        expected = np.bincount(cell, quantile, LEVELS) / np.bincount(cell, minlength=LEVELS)
+        np.testing.assert_allclose(values[5:-5], expected[5:-5], atol=0.02)
+        mass = level_masses()
+        assert float(values @ torch.from_numpy(mass)) == pytest.approx(
+            float((weight @ (points @ direction)) / weight.sum())
+        )
+        assert float(power) == pytest.approx(float(values.square() @ torch.from_numpy(mass)))
+
+
+def test_a_cloud_of_the_levels_own_masses_is_gathered_exactly():
+    values = random_cloud(0)
+    np.testing.assert_allclose(sliced(values, level_masses()).values[0], values, rtol=1e-9, atol=1e-9)
+
+
+# -- transport along a line --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 2, 6])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_cost_is_that_of_quadrature(k, seed, many_steps):
+    values, mixture = random_cloud(seed), random_line(k, seed)
+    found = float(transport(sliced(values, level_masses()), *mixture).cost)
+    assert found == pytest.approx(exact_cost(values, *mixture), rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize(("mean", "deviation"), [(0.0, 1.0), (0.5, 2.0), (-3.0, 0.1), (0.0, 0.9)])
+def test_between_gaussians_the_cost_has_its_closed_form(mean, deviation):
+    """(m − m')² + (s − s')², the cloud being the quantiles of a standard normal."""
+    cloud = sliced(norm.ppf((np.arange(100_000) + 0.5) / 100_000))
+    found = transport(cloud, *(torch.tensor(v).double() for v in ([1.0], [[mean]], [[deviation]])))
+    assert float(found.cost) == pytest.approx(mean**2 + (deviation - 1) ** 2, abs=2e-4)
+    assert float(found.by_mean) == pytest.approx(2 * mean, abs=1e-6)
+    assert float(found.by_deviation) == pytest.approx(2 * (deviation - 1), abs=2e-4)
+
+
+@settings(max_examples=12)
+@given(seed=st.integers(0, 10**6), k=st.integers(1, 8))
+def test_no_cost_is_below_w1_squared_and_two_newton_steps_are_enough(seed, k):
+    """W₁ ≤ W₂; scipy's W₁ of the cloud and 20 000 quantiles of the mixture."""
+    values, mixture = random_cloud(seed), random_line(k, seed)
+    cloud = sliced(values, level_masses())
+    found = transport(cloud, *mixture)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lines, "_NEWTON_STEPS", 40)
+        best = transport(cloud, *mixture)
+        fine = mixture_quantiles((torch.arange(20_000).double() + 0.5) / 20_000, *mixture)[0].numpy()
+    w1 = wasserstein_distance(values, fine, u_weights=level_masses())
+    assert float(best.cost) >= 0.999 * w1**2
+    assert float(found.cost) <= float(best.cost) + 1e-9  # the potential of other cuts is a lower bound
+    assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-2, abs=1e-4)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_the_derivatives_are_finite_differences_of_the_cost(k, many_steps):
+    values, (weights, means, deviations) = random_cloud(1), random_line(k, 1)
+    cloud = sliced(values, level_masses())
+    found = transport(cloud, weights, means, deviations)
+
+    def slope(change: list[Tensor]) -> float:
+        there, back = (
+            float(transport(cloud, *(v + h * c for v, c in zip(point, change, strict=True))).cost)
+            for h in (1e-5, -1e-5)
+        )
+        return (there - back) / 2e-5
+
+    point = [weights, means, deviations]
+    nothing = [torch.zeros_like(v) for v in point]
+    for part, derivative in ((1, found.by_mean), (2, found.by_deviation)):
+        for i in range(k):
+            change = [v.clone() for v in nothing]
+            change[part][0, i] = 1
+            assert slope(change) == pytest.approx(float(derivative[0, i]), rel=1e-5, abs=1e-7)
+    for i in range(1, k):  # weights move on the simplex
+        change = [v.clone() for v in nothing]
+        change[0][i], change[0][0] = 1, -1
+        expected = float(found.by_weight[0, i] - found.by_weight[0, 0])
+        assert slope(change) == pytest.approx(expected, rel=1e-5, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_quantiles_have_their_levels(seed, many_steps):
+    """Components of 1 mm beside ones of 1 m, with gaps between them."""
+    rng = np.random.default_rng(seed)
+    weights = torch.from_numpy(rng.dirichlet(np.full(20, 0.3)))
+    means = torch.from_numpy(rng.normal(size=(3, 20)) * 10)
+    deviations = torch.from_numpy(rng.random((3, 20)) ** 4 + 1e-3)
+    levels = torch.from_numpy(level_masses().cumsum()[:-1])
+    cuts = mixture_quantiles(levels, weights, means, deviations)
+    reached = norm.cdf((cuts[:, :, None] - means[:, None]) / deviations[:, None]) @ weights.numpy()
+    np.testing.assert_allclose(reached, levels.expand(3, -1), atol=1e-9)
+    assert (cuts.diff(dim=1) >= 0).all()
+
+
+def test_blocks_do_not_change_the_result(monkeypatch, generator):
+    points, weight = torch.randn(50, 3, generator=generator).double(), torch.ones(50).double()
+    directions = random_directions(7, 3, generator)
+    weights = torch.full((4,), 0.25).double()
+    means = torch.randn(7, 4, generator=generator).double()
+    whole = slice_cloud(points, weight, directions)
+    cost = transport(whole, weights, means, means.abs() + 0.1)
+    monkeypatch.setattr(lines, "_BLOCK_ELEMENTS", 1)
+    parts = slice_cloud(points, weight, directions)
+    torch.testing.assert_close(parts, whole)
+    torch.testing.assert_close(transport(parts, weights, means, means.abs() + 0.1), cost)
+
+
+# -- the descent -------------------------------------------------------------------------------------
+
+
+def random_shape(generator: torch.Generator, k: int = 3, dim: int = 3) -> tuple[Shape, Parameters]:
+    root = torch.randn(k, dim, dim, generator=generator, dtype=torch.float64)
+    first = Parameters(
+        torch.softmax(torch.randn(k, generator=generator, dtype=torch.float64), 0),
+        torch.randn(k, dim, generator=generator, dtype=torch.float64),
+        root @ root.mT + 0.1 * torch.eye(dim).double(),
+    )
+    return Shape(first), first
+
+
+def test_a_shape_begins_at_its_start(generator):
+    shape, first = random_shape(generator)
+    with torch.no_grad():
+        torch.testing.assert_close(shape(), first)
+
+
+def test_the_derivatives_by_a_shape_are_finite_differences(generator, many_steps):
+    shape, _ = random_shape(generator)
+    points = torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    slices = slice_cloud(points, torch.ones(60).double(), random_directions(4, 3, generator))
+    with torch.no_grad():
+        for parameter in shape.parameters():
+            parameter += 0.3 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+    differentiate(shape, slices)
+    gradients = [parameter.grad.clone() for parameter in shape.parameters()]
+    for parameter, gradient in zip(shape.parameters(), gradients, strict=True):
+        change = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        costs = []
+        for h in (1e-5, -1e-5):
+            with torch.no_grad():
+                parameter += h * change
+            costs.append(differentiate(shape, slices))
+            with torch.no_grad():
+                parameter -= h * change
+        assert (costs[0] - costs[1]) / 2e-5 == pytest.approx(float((gradient * change).sum()), rel=1e-5)
+
+
+def distance(points: np.ndarray, parameters: Parameters, n: int = 300) -> float:
+    """SW² (m²) along directions that no fit has seen."""
+    center = torch.from_numpy(points.mean(0))
+    directions = random_directions(n, points.shape[1], torch.Generator().manual_seed(12345))
+    cloud = slice_cloud(torch.from_numpy(points) - center, torch.ones(len(points)).double(), directions)
+    weights, means, covariances = parameters
+    return differentiate(Shape(Parameters(weights, means - center, covariances)), cloud)
+
+
+def parameters_of(mixture: Any) -> Parameters:
+    return Parameters(mixture.weights, mixture.means, mixture.covariances)
+
+
+# -- the estimator -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_one_gaussian_is_found(dim):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3000, dim)) @ (rng.normal(size=(dim, dim)) + np.eye(dim)) + 5
+    fit = SlicedWassersteinGaussianMixture(1, init_params="bounding_box", random_state=0).fit(points)
+    covariance = np.cov(points.T).reshape(dim, dim)
+    spread = math.sqrt(covariance.trace() / dim)
+    np.testing.assert_allclose(fit.means_[0], points.mean(0), atol=0.02 * spread)
+    np.testing.assert_allclose(fit.covariances_[0], covariance, atol=0.05 * spread**2)
+
+
+def rings(n: int = 600) -> np.ndarray:
+    """Two rings: more than four components can follow."""
+    rng = np.random.default_rng(0)
+    angle, radius = rng.random(n) * 2 * np.pi, rng.choice([1.0, 2.0], n) + 0.05 * rng.normal(size=n)
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("init_params", ["kmeans", "random_points", "bounding_box"])
+def test_it_ends_nearer_than_its_start_and_than_em(init_params):
+    points = rings()
+    fit = SlicedWassersteinGaussianMixture(
+        8, n_projections=32, init_params=init_params, random_state=0, max_iter=40
+    ).fit(points)
+    center = torch.from_numpy(points.mean(0))
+    first = start(
+        init_params, torch.from_numpy(points) - center, torch.ones(len(points)).double(), 8, 1e-6,
+        torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    em_fit = GaussianMixture(8, init_params=init_params, random_state=0, tol=1e-6, max_iter=500).fit(points)
+    reached = distance(points, parameters_of(fit))
+    assert reached < 0.95 * distance(points, first._replace(means=first.means + center))
+    assert reached < distance(points, parameters_of(em_fit))
+    assert -fit.lower_bound_ == pytest.approx(reached, rel=0.5)
+
+
+def test_the_history_is_the_distance_and_is_told():
+    told: list[tuple[int, float]] = []
+    points = blobs(2)
+    fit = SlicedWassersteinGaussianMixture(3, n_projections=32, random_state=0)
+    fit.fit(points, on_iteration=lambda i, value: told.append((i, value)))
+    assert told == list(enumerate(fit.lower_bounds_, 1))
+    assert fit.converged_
+    assert max(fit.lower_bounds_) < 0
+    assert fit.lower_bounds_[-1] > fit.lower_bounds_[0]
+
+
+def test_too_few_passes_are_warned_of():
+    with pytest.warns(ConvergenceWarning, match="max_iter=2"):
+        fit = SlicedWassersteinGaussianMixture(3, max_iter=2, random_state=0).fit(blobs(2))
+    assert (fit.n_iter_, fit.converged_) == (2, False)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_another_unit_of_length_is_the_same_fit(scale):
+    points = blobs(2)
+    options = {"n_projections": 32, "random_state": 0}
+    fit = SlicedWassersteinGaussianMixture(3, reg_covar=1e-6, **options).fit(points)
+    other = SlicedWassersteinGaussianMixture(3, reg_covar=1e-6 * scale**2, **options).fit(scale * points)
+    np.testing.assert_allclose(other.means_, scale * fit.means_, rtol=1e-5, atol=1e-6 * scale)
+    np.testing.assert_allclose(
+        other.covariances_, scale**2 * fit.covariances_, rtol=1e-4, atol=1e-7 * scale**2
+    )
+    assert other.lower_bound_ == pytest.approx(scale**2 * fit.lower_bound_, rel=1e-4)
+
+
+def test_in_float32_the_fit_is_as_near():
+    points = rings()
+    fits = [
+        SlicedWassersteinGaussianMixture(8, n_projections=32, random_state=0, dtype=dtype).fit(points)
+        for dtype in ("float64", "float32")
+    ]
+    double, single = (distance(points, parameters_of(fit)) for fit in fits)
+    assert not torch.equal(fits[0].means, fits[1].means)
+    assert single == pytest.approx(double, rel=0.2)
+
+
+def test_without_regularisation_a_point_is_an_error():
+    with pytest.raises(NumericalError, match="reg_covar"):
+        SlicedWassersteinGaussianMixture(1, reg_covar=0, random_state=0).fit(np.ones((5, 3)))
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_clusters_well_apart_are_found(dim):
+    points, fresh = blobs(dim), blobs(dim, 400, seed=1)
+    fit = SlicedWassersteinGaussianMixture(3, n_projections=64, random_state=0).fit(points)
+    assert fit.converged_
+    em_fit = GaussianMixture(3, random_state=0).fit(points)
+    order, em_order = fit.means_[:, 0].argsort(), em_fit.means_[:, 0].argsort()
+    np.testing.assert_allclose(fit.weights_[order], em_fit.weights_[em_order], atol=0.02)
+    np.testing.assert_allclose(fit.means_[order], em_fit.means_[em_order], atol=0.06)
+    assert fit.score(fresh) > em_fit.score(fresh) - 0.6
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_gradients_may_be_off():
+    with torch.no_grad():
+        fit = SlicedWassersteinGaussianMixture(3, n_projections=16, max_iter=3, random_state=0).fit(blobs(2))
+    assert fit.n_iter_ == 3
+
+
+@pytest.mark.real_data
+def test_a_real_scan_is_nearer_than_ems(real_data):
+    from gmmtorch.datasets import load
+    from gmmtorch.evaluation.metrics import psnr2
+
+    points = load("scan_folder", real_data / "hall")[0].points.double().numpy()[::3]
+    fit = SlicedWassersteinGaussianMixture(32, n_projections=128, random_state=0).fit(points)
+    em_fit = GaussianMixture(32, random_state=0).fit(points)
+    assert distance(points, parameters_of(fit)) < distance(points, parameters_of(em_fit))
+    sampled = fit.sample(len(points), random_state=1)[0]
+    assert psnr2(torch.from_numpy(points), torch.from_numpy(sampled)) > 88

@@ -1,0 +1,475 @@
+"""partial_fit: against batch EM, the recursion of its statistics, and what the points were drawn from."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from sklearn.base import clone
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import pack_tensors
+from gmmtorch.mixture import GaussianMixture, stepwise
+from gmmtorch.mixture.em import Parameters
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
+CENTERS = np.array([[-3.0, 0.0, 1.0, 0.0, 2.0], [3.0, 1.0, -1.0, 1.0, 0.0], [0.0, 4.0, 0.0, -2.0, 0.0]])
+SHARES = np.array([0.5, 0.3, 0.2])
+
+
+def blobs(n: int = 300, dim: int = 2, seed: int = 0, scale: float = 1.0) -> np.ndarray:
+    """Three clusters in no order; their overlap grows with `scale`. Multiples of 2⁻²⁰."""
+    rng = np.random.default_rng(seed)
+    label = rng.choice(3, size=n, p=SHARES)
+    points = CENTERS[label, :dim] + scale * rng.normal(size=(n, dim)) * np.linspace(0.5, 1.0, dim)
+    return np.round(points * 2**20) / 2**20
+
+
+def exact(**options) -> GaussianMixture:
+    return GaussianMixture(**{"n_components": 3, "random_state": 0, "dtype": "float64", **options})
+
+
+def assert_same(one: GaussianMixture, other: GaussianMixture, tolerance: float = 1e-9) -> None:
+    for name in ("weights_", "means_", "covariances_"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=tolerance, atol=tolerance)
+
+
+def is_sound(gmm: GaussianMixture) -> bool:
+    eigenvalues = np.linalg.eigvalsh(gmm.covariances_)
+    rounding = 1e-14 * np.abs(gmm.covariances_).max((1, 2), keepdims=True)[:, :, 0]
+    return bool(
+        np.isfinite(gmm.means_).all()
+        and abs(gmm.weights_.sum() - 1) < 1e-9
+        and (gmm.weights_ >= 0).all()
+        and (eigenvalues >= 0.99 * gmm.reg_covar - rounding).all()
+        and math.isfinite(gmm.lower_bound_)
+    )
+
+
+# -- against batch EM ---------------------------------------------------------------------------------
+
+
+@dims
+@pytest.mark.parametrize("init", ["kmeans", "random_points", "bounding_box"])
+def test_the_first_batch_is_one_step_of_batch_em(dim, init):
+    x = blobs(dim=dim)
+    stepped = exact(init_params=init).partial_fit(x, kappa=1.0)
+    fitted = exact(init_params=init, max_iter=1).fit(x)
+    assert_same(stepped, fitted, 1e-12)
+    assert stepped.lower_bounds_ == fitted.lower_bounds_
+    assert stepped.n_samples_seen_ == fitted.n_samples_seen_ == 300
+
+
+@dims
+def test_without_memory_every_call_is_a_step_of_batch_em(dim):
+    x, weight = blobs(dim=dim, scale=2.0), np.random.default_rng(0).random(300)
+    gmm = exact()
+    bounds = []
+    for steps in range(1, 8):
+        gmm.partial_fit(x, sample_weight=weight, memory=0)
+        bounds.append(gmm.lower_bound_)
+        assert_same(gmm, exact(max_iter=steps, tol=0).fit(x, sample_weight=weight))
+    fitted = exact(max_iter=7, tol=0).fit(x, sample_weight=weight)
+    np.testing.assert_allclose(bounds, fitted.lower_bounds_, rtol=1e-12)
+
+
+def statistics_of(x: np.ndarray, weight: np.ndarray, theta: tuple) -> tuple[np.ndarray, ...]:
+    """N_k, Σ γ x and Σ γ x xᵀ of a batch, by SciPy's densities."""
+    logs = (multivariate_normal(m, c).logpdf(x).reshape(len(x)) for m, c in zip(*theta[1:], strict=True))
+    joint = np.log(theta[0])[:, None] + np.stack(list(logs))
+    gamma = np.exp(joint - logsumexp(joint, axis=0)) * weight
+    return gamma.sum(1), gamma @ x, np.einsum("kn,ni,nj->kij", gamma, x, x)
+
+
+def maximized(statistics: tuple[np.ndarray, ...], reg_covar: float) -> tuple[np.ndarray, ...]:
+    count, first, second = statistics
+    means = first / count[:, None]
+    covariances = second / count[:, None, None] - np.einsum("ki,kj->kij", means, means)
+    return count / count.sum(), means, covariances + reg_covar * np.eye(means.shape[1])
+
+
+@pytest.mark.parametrize("kappa", [0.6, 0.8, 1.0])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_statistics_follow_their_recursion(dim, kappa):
+    """S ← (1 − η) S + η s, kept as such, in plain numpy; batches of many sizes and weights."""
+    rng = np.random.default_rng(2)
+    x, weight = blobs(900, dim, scale=2.0), rng.random(900) * 3
+    start = {
+        "weights_init": SHARES,
+        "means_init": CENTERS[:, :dim] + 0.5,
+        "precisions_init": np.stack([np.eye(dim) * 0.5] * 3),
+    }
+    gmm = exact(**start, reg_covar=1e-2)
+    theta = (SHARES, start["means_init"], np.linalg.inv(start["precisions_init"]))
+    running, seen = tuple(np.zeros_like(part) for part in theta), 0.0
+    for part in np.split(np.arange(900), [200, 210, 211, 500, 503]):
+        gmm.partial_fit(x[part], sample_weight=weight[part], kappa=kappa)
+        n = weight[part].sum()
+        eta = (n / (seen + n)) ** kappa
+        new = statistics_of(x[part], weight[part], theta)
+        running = tuple((1 - eta) * old + eta * s / n for old, s in zip(running, new, strict=True))
+        theta, seen = maximized(running, 1e-2), seen + n
+        for mine, expected in zip((gmm.weights_, gmm.means_, gmm.covariances_), theta, strict=True):
+            np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-10)
+    assert gmm.n_samples_seen_ == pytest.approx(weight.sum())
+
+
+@pytest.mark.parametrize("kappa", [0.55, 0.7, 1.0])
+def test_steps_of_equal_batches_are_those_of_liang_and_klein(kappa):
+    steps = [stepwise.step_size(50.0, 50.0 * t, kappa) for t in range(6)]
+    np.testing.assert_allclose(steps, [1.0, *((t + 2) ** -kappa for t in range(5))], rtol=1e-14)
+
+
+@settings(max_examples=50)
+@given(
+    seed=st.integers(0, 10**6), dim=st.integers(1, 5), step=st.floats(0, 1), offset=st.sampled_from([0, 5e5])
+)
+def test_a_blend_has_the_blended_moments(seed, dim, step, offset):
+    rng = np.random.default_rng(seed)
+
+    def random() -> Parameters:
+        root = rng.normal(size=(4, dim, dim))
+        weights, means = rng.dirichlet(np.ones(4)), rng.normal(size=(4, dim))
+        return Parameters(*map(torch.from_numpy, (weights, means, root @ root.transpose(0, 2, 1))))
+
+    old, new = random(), random()
+    found = stepwise.blend(
+        old._replace(means=old.means + offset), new._replace(means=new.means + offset), step
+    )
+
+    def raw(p: Parameters) -> torch.Tensor:
+        second = p.covariances + p.means[:, :, None] * p.means[:, None, :]
+        return torch.cat([torch.ones(4, 1), p.means, second.flatten(1)], 1).double() * p.weights[:, None]
+
+    expected = (1 - step) * raw(old) + step * raw(new)
+    torch.testing.assert_close(
+        raw(found._replace(means=found.means - offset)), expected, rtol=1e-7, atol=1e-8
+    )
+
+
+# -- where it leads -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [20, 100])
+def test_many_passes_in_small_batches_come_to_what_em_finds(size):
+    x = blobs(1000, 2, scale=1.5)
+    converged = exact(tol=1e-9, max_iter=2000).fit(x)
+    rng, gmm = np.random.default_rng(0), exact()
+    for _ in range(20):
+        for part in np.array_split(rng.permutation(1000), 1000 // size):
+            gmm.partial_fit(x[part])
+    first = exact().partial_fit(x[:size])
+    assert gmm.score(x) > converged.score(x) - 0.002
+    assert gmm.score(x) > first.score(x) + 0.02
+
+
+@pytest.mark.parametrize("kappa", [0.7, 1.0])
+def test_a_stream_comes_to_what_it_is_drawn_from(kappa):
+    gmm, errors = exact(init_params="kmeans"), []
+    for batch in range(200):
+        gmm.partial_fit(blobs(200, 2, seed=batch), kappa=kappa)
+        if batch in (9, 199):
+            order = [int(np.abs(gmm.means_ - center).sum(1).argmin()) for center in CENTERS[:, :2]]
+            errors.append(
+                max(
+                    np.abs(gmm.means_[order] - CENTERS[:, :2]).max(),
+                    np.abs(gmm.weights_[order] - SHARES).max(),
+                    np.abs(gmm.covariances_[order] - np.diag([0.25, 1.0])).max(),
+                )
+            )
+    assert errors[1] < 0.03
+    assert errors[1] < errors[0]
+
+
+def test_the_order_and_size_of_batches_hardly_matter_when_each_point_counts_the_same():
+    x = blobs(3000, 2, scale=0.5)
+    rng = np.random.default_rng(0)
+    cuts = [np.arange(0, 2700, 300), np.arange(0, 2700, 45), np.sort(rng.choice(2700, 20, replace=False))]
+    whole = exact(max_iter=1).fit(x)
+    for cut in cuts:
+        gmm = exact().partial_fit(x[:300], kappa=1.0)
+        order = 300 + rng.permutation(2700)
+        for part in np.split(order, cut[1:]):
+            gmm.partial_fit(x[part], kappa=1.0)
+        assert gmm.n_samples_seen_ == 3000
+        assert gmm.score(x) == pytest.approx(whole.score(x), abs=2e-3)
+
+
+def test_a_scene_that_changes_is_followed_with_a_short_memory():
+    def at(time: int) -> np.ndarray:
+        return blobs(200, 2, seed=time) + 0.02 * time
+
+    followers = {memory: exact() for memory in (200.0, None)}
+    for time in range(150):
+        for memory, gmm in followers.items():
+            gmm.partial_fit(at(time), kappa=1.0, memory=memory)
+    scores = {memory: gmm.score(at(149)) for memory, gmm in followers.items()}
+    anew = exact(max_iter=200).fit(at(149)).score(at(149))
+    assert scores[200.0] > anew - 0.05
+    assert scores[None] < anew - 0.3
+    assert followers[200.0].n_samples_seen_ == 400
+
+
+# -- going on from something else -----------------------------------------------------------------------
+
+
+def test_a_fit_counts_for_its_points():
+    x, more = blobs(300), blobs(100, seed=1) + 0.5
+    gmm = exact().fit(x)
+    before = gmm.means_.copy()
+    gmm.partial_fit(more, kappa=1.0)
+    assert gmm.n_samples_seen_ == 400
+    moved = (gmm.weights_ @ gmm.means_) - (exact().fit(x).weights_ @ before)
+    np.testing.assert_allclose(moved, (more.mean(0) - x.mean(0)) / 4, atol=1e-9)
+    capped = exact().fit(x).partial_fit(more, kappa=1.0, memory=100)
+    np.testing.assert_allclose(capped.weights_ @ capped.means_, (more.mean(0) + x.mean(0)) / 2, atol=1e-9)
+    assert capped.n_samples_seen_ == 200
+    roomy = exact().fit(x).partial_fit(more, kappa=1.0, memory=10_000)
+    assert_same(roomy, gmm, 0)
+
+
+def test_fitting_anew_forgets_what_was_seen():
+    gmm = exact().partial_fit(blobs(500)).fit(blobs(300))
+    assert gmm.n_samples_seen_ == 300
+    assert_same(gmm, exact().fit(blobs(300)), 0)
+
+
+def test_a_warm_start_goes_on_after_a_partial_fit():
+    x = blobs()
+    gmm = exact(warm_start=True, max_iter=5, tol=0).partial_fit(x).fit(x)
+    assert_same(gmm, exact(max_iter=6, tol=0).fit(x))
+
+
+def test_given_parameters_need_to_be_told_what_they_count_for():
+    fitted = exact().fit(blobs())
+    given = GaussianMixture.from_parameters(fitted.weights_, fitted.means_, fitted.covariances_)
+    with pytest.raises(InvalidArgumentError, match="memory=None"):
+        given.partial_fit(blobs(50, seed=1))
+    np.testing.assert_array_equal(given.means_, fitted.means_)
+    given.set_params(dtype="float64").partial_fit(blobs(50, seed=1), memory=300)
+    assert_same(given, exact().fit(blobs()).partial_fit(blobs(50, seed=1)))
+    given.partial_fit(blobs(50, seed=2))
+    assert given.n_samples_seen_ == 400
+
+
+@pytest.mark.parametrize(
+    "keeper",
+    [
+        copy.deepcopy,
+        lambda g: pickle.loads(pickle.dumps(g)),
+        lambda g: g.transform(np.eye(3)),
+        lambda g: (g.save("m.safetensors"), GaussianMixture.load("m.safetensors"))[1],
+    ],
+    ids=["deepcopy", "pickle", "transform", "file"],
+)
+def test_learning_goes_on_in_a_copy(keeper, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    gmm = exact().partial_fit(blobs(100)).partial_fit(blobs(30, seed=1))
+    kept = keeper(gmm)
+    assert kept.n_samples_seen_ == 130
+    before = gmm.means_.copy()
+    kept.partial_fit(blobs(50, seed=2))
+    np.testing.assert_array_equal(gmm.means_, before)
+    assert_same(kept, gmm.partial_fit(blobs(50, seed=2)), 1e-13)
+
+
+def test_the_state_is_still_the_parameters_alone():
+    gmm = exact().partial_fit(blobs())
+    assert set(gmm.state_dict()) == {"weights", "means", "covariances"}
+    other = exact().fit(blobs(500, seed=3))
+    other.load_state_dict(gmm.state_dict())
+    assert other.n_samples_seen_ is None
+    assert_same(other.partial_fit(blobs(50), memory=300), gmm.partial_fit(blobs(50)))
+
+
+def test_a_clone_begins_anew():
+    gmm = exact().partial_fit(blobs())
+    assert not hasattr(clone(gmm), "n_samples_seen_")
+    assert_same(clone(gmm).partial_fit(blobs()), exact().partial_fit(blobs()), 0)
+
+
+@pytest.mark.parametrize("seen", [torch.tensor(-1.0), torch.tensor([1.0, 2.0]), torch.zeros(0)])
+def test_a_file_whose_count_cannot_be_is_refused(tmp_path, seen):
+    gmm = exact().fit(blobs())
+    tensors = {name: getattr(gmm, name) for name in ("weights", "means", "covariances")}
+    facts = {"lower_bounds": [-1.0], "converged": True, "arrays": True, "parameters": {"n_components": 3}}
+    for value, refused in ((torch.tensor(7.0), False), (seen, True)):
+        packed = pack_tensors(
+            {**tensors, "extra.n_samples_seen": value.double()}, "gmmtorch.mixture", 1, **facts
+        )
+        (tmp_path / "m.safetensors").write_bytes(packed)
+        if refused:
+            with pytest.raises(DataError, match="n_samples_seen"):
+                GaussianMixture.load(tmp_path / "m.safetensors")
+        else:
+            assert GaussianMixture.load(tmp_path / "m.safetensors").n_samples_seen_ == 7
+
+
+# -- frames, weights and kinds ----------------------------------------------------------------------------
+
+
+@dims
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_500_km_away_is_the_same_mixture_moved(dim, dtype):
+    offset = np.array([500_000.0, -4_000_000.0, 250.0, 1000.0, -500_000.0])[:dim]
+    near, far = exact(dtype=dtype), exact(dtype=dtype)
+    for batch in range(30):
+        x = blobs(40, dim, seed=batch)
+        near.partial_fit(x)
+        far.partial_fit(x + offset)
+    np.testing.assert_allclose(far.means_ - offset, near.means_, atol=1e-6)
+    np.testing.assert_allclose(far.covariances_, near.covariances_, rtol=1e-5, atol=1e-7)
+
+
+def test_batches_hundreds_of_kilometres_apart_keep_thin_components():
+    rng = np.random.default_rng(0)
+    pieces = [np.array([x, 4096.0]) for x in (-250_000.0, 250_000.0)]
+
+    def batch(piece: np.ndarray) -> np.ndarray:
+        flat = np.stack([rng.normal(size=100) * 1e-3, rng.uniform(-1, 1, 100)], 1)
+        return piece + np.round(flat * 2**24) / 2**24
+
+    gmm = exact(n_components=2, reg_covar=1e-8).partial_fit(np.concatenate([batch(p) for p in pieces]))
+    for turn in range(20):
+        gmm.partial_fit(batch(pieces[turn % 2]), kappa=1.0)
+    for piece in pieces:
+        k = np.abs(gmm.means_ - piece).sum(1).argmin()
+        assert gmm.weights_[k] == pytest.approx(0.5, abs=1e-6)
+        np.testing.assert_allclose(gmm.means_[k] - piece, 0, atol=0.06)
+        np.testing.assert_allclose(gmm.covariances_[k], np.diag([1e-6, 1 / 3]), rtol=0.15, atol=3e-5)
+        assert gmm.covariances_[k][0, 0] == pytest.approx(1.01e-6, rel=0.1)
+
+
+def test_a_motion_commutes_with_learning():
+    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    rotation[:, 0] *= np.sign(np.linalg.det(rotation))
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, [1.0, -2.0, 5.0]
+    one = exact().partial_fit(blobs(100, 3)).partial_fit(blobs(50, 3, seed=1)).transform(motion)
+    other = exact().partial_fit(blobs(100, 3)).transform(motion)
+    other.partial_fit(blobs(50, 3, seed=1) @ rotation.T + motion[:3, 3])
+    assert_same(one, other)
+
+
+def test_a_whole_weight_is_a_point_repeated_and_zero_is_absence():
+    rng = np.random.default_rng(0)
+    weighted, repeated = exact(), exact()
+    for batch in range(4):
+        x, weight = blobs(60, seed=batch), rng.integers(0, 4, 60)
+        polluted = np.where(weight[:, None] > 0, x, 1e3)
+        weighted.partial_fit(polluted, sample_weight=weight)
+        repeated.partial_fit(np.repeat(x, weight, axis=0))
+    assert_same(weighted, repeated)
+    assert weighted.n_samples_seen_ == repeated.n_samples_seen_
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_tensors_and_arrays_learn_alike(dtype):
+    x = [blobs(60, seed=k).astype(dtype) for k in range(3)]
+    arrays, tensors, mixed = exact(), exact(), exact()
+    for k, batch in enumerate(x):
+        arrays.partial_fit(batch)
+        tensors.partial_fit(torch.from_numpy(batch).requires_grad_())
+        mixed.partial_fit(torch.from_numpy(batch) if k else batch)
+    assert torch.equal(arrays.means, tensors.means)
+    assert torch.equal(arrays.means, mixed.means)
+    assert not tensors.means.requires_grad
+    assert (type(arrays.means_), type(tensors.means_)) == (np.ndarray, torch.Tensor)
+    assert isinstance(mixed.means_, np.ndarray)
+
+
+# -- awkward batches --------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(
+    data=st.data(),
+    dim=st.integers(1, 3),
+    k=st.integers(1, 5),
+    kappa=st.sampled_from([0.51, 0.7, 1.0]),
+    memory=st.sampled_from([None, 0.0, 3.0]),
+    reg_covar=st.sampled_from([1e-6, 1e-2]),
+)
+def test_small_batches_never_break_a_mixture(data, dim, k, kappa, memory, reg_covar):
+    gmm = GaussianMixture(k, random_state=0, reg_covar=reg_covar)
+    numbers = st.sampled_from([0.0, 1.0, 2.0, 1e-3, -50.0])
+    for turn in range(4):
+        n = data.draw(st.integers(1 if turn else k, 6 if turn else k + 4))
+        x = np.array(data.draw(st.lists(numbers, min_size=n * dim, max_size=n * dim))).reshape(n, dim)
+        gmm.partial_fit(x + 5e5 * (turn == 3), kappa=kappa, memory=memory)
+        assert is_sound(gmm)
+        assert np.isfinite(gmm.score_samples(x)).all()
+
+
+def test_the_first_batch_must_have_a_point_for_each_component_and_later_ones_need_not():
+    gmm = exact()
+    with pytest.raises(InvalidArgumentError, match=r"n_components=3.*n_samples=2"):
+        gmm.partial_fit(blobs(2))
+    assert not hasattr(gmm, "means")
+    gmm.partial_fit(blobs(50))
+    for seed in range(30):
+        gmm.partial_fit(blobs(1, seed=seed))
+    assert is_sound(gmm)
+    assert gmm.n_samples_seen_ == 80
+
+
+def test_a_component_without_points_waits_where_it_was():
+    far = exact().partial_fit(np.concatenate([blobs(90), blobs(90) + 1e4]))
+    k = int(far.means_[:, 0].argmax())
+    mean, covariance, weight = far.means_[k].copy(), far.covariances_[k].copy(), far.weights_[k]
+    far.partial_fit(blobs(180, seed=1), kappa=1.0)
+    np.testing.assert_allclose(far.means_[k], mean, rtol=1e-12)
+    np.testing.assert_allclose(far.covariances_[k], covariance, rtol=1e-9)
+    assert far.weights_[k] == pytest.approx(weight / 2)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+@pytest.mark.parametrize("started", [False, True])
+def test_what_is_no_batch_is_refused_and_changes_nothing(kind, started):
+    gmm = exact()
+    if started:
+        gmm.partial_fit(kind(blobs()))
+        before = gmm.means.clone()
+    bad = blobs(20)
+    bad[7, 1] = np.nan
+    for x in (bad, np.empty((0, 2)), np.zeros(4), *([np.zeros((5, 3))] if started else [])):
+        with pytest.raises(ValueError, match=r"X|array|feature"):
+            gmm.partial_fit(kind(x))
+    for weight in (np.zeros(20), -np.ones(20), np.ones(19), np.full(20, np.nan)):
+        with pytest.raises(InvalidArgumentError, match="sample_weight"):
+            gmm.partial_fit(kind(blobs(20)), sample_weight=kind(weight))
+    if started:
+        assert torch.equal(gmm.means, before)
+        assert gmm.n_samples_seen_ == 300
+    else:
+        assert not hasattr(gmm, "means")
+
+
+@pytest.mark.parametrize("started", [False, True])
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        *(({"kappa": value}, "kappa=") for value in (0.5, 1.01, 0, math.nan, "slow", None)),
+        *(({"memory": value}, "memory=") for value in (-1, math.inf, math.nan, "long")),
+    ],
+)
+def test_bad_options_are_named(started, options, match):
+    gmm = exact().partial_fit(blobs()) if started else exact()
+    with pytest.raises(InvalidArgumentError, match=match):
+        gmm.partial_fit(blobs(), **options)
+
+
+def test_another_number_of_components_is_refused():
+    gmm = exact().partial_fit(blobs()).set_params(n_components=4)
+    with pytest.raises(InvalidArgumentError, match="n_components=4"):
+        gmm.partial_fit(blobs())

@@ -1,0 +1,409 @@
+"""EM in chunks against EM on the whole cloud; checkpoints against runs that were never stopped."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.datasets.point_chunks import PointChunks, in_memory, open_points
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mixture import em
+from gmmtorch.mixture.checkpoints import Checkpoint, State, read_state, write_state
+from gmmtorch.mixture.distributed import Processes
+from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.streaming import Accumulate, ExactEStep, fit_stream, score_stream
+
+pytestmark = pytest.mark.filterwarnings("ignore:EM did not converge")
+
+
+def blobs(n: int, dim: int, seed: int = 0, n_blobs: int = 4) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    centers = 4 * torch.randn(n_blobs, dim, generator=generator, dtype=torch.float64)
+    label = torch.randint(n_blobs, (n,), generator=generator)
+    return centers[label] + torch.randn(n, dim, generator=generator, dtype=torch.float64)
+
+
+def exact(k: int, **options: Any) -> GaussianMixture:
+    """Ten iterations in float64, whatever happens."""
+    return GaussianMixture(k, **{"dtype": "float64", "tol": 0, "max_iter": 10, "random_state": 0, **options})
+
+
+def assert_same(found: GaussianMixture, expected: GaussianMixture, tolerance: float) -> None:
+    np.testing.assert_allclose(found.lower_bounds_, expected.lower_bounds_, rtol=tolerance, atol=tolerance)
+    for name in ("weights", "means", "covariances"):
+        torch.testing.assert_close(
+            getattr(found, name), getattr(expected, name), rtol=tolerance, atol=tolerance
+        )
+    assert found.converged_ == expected.converged_
+    assert found.n_features_in_ == expected.n_features_in_
+    assert found.n_samples_seen_ == expected.n_samples_seen_
+
+
+# -- the same as on the whole cloud ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("chunk_points", [7, 100, 10_000])
+def test_chunks_give_what_the_whole_cloud_gives(dim, chunk_points):
+    points = blobs(500, dim)
+    found = fit_stream(exact(4), in_memory(points, chunk_points=chunk_points))
+    assert_same(found, exact(4).fit(points), 1e-10)
+
+
+@pytest.mark.parametrize("init_params", ["kmeans", "random_points", "bounding_box"])
+@pytest.mark.parametrize("random_state", [3, "generator"])
+def test_every_start_is_the_same(init_params, random_state):
+    def state() -> Any:
+        return torch.Generator().manual_seed(5) if random_state == "generator" else random_state
+
+    points = blobs(300, 3)
+    found = fit_stream(
+        exact(4, init_params=init_params, random_state=state()), in_memory(points, chunk_points=64)
+    )
+    assert_same(found, exact(4, init_params=init_params, random_state=state()).fit(points), 1e-10)
+
+
+def test_order_and_chunks_do_not_matter_to_a_given_start():
+    points = blobs(2000, 3)
+    start = {"means_init": points[:4].numpy(), "weights_init": np.full(4, 0.25)}
+    start["precisions_init"] = np.tile(np.eye(3), (4, 1, 1))
+    shuffled = points[torch.randperm(2000, generator=torch.Generator().manual_seed(1))]
+    one = fit_stream(exact(4, **start), in_memory(points, chunk_points=333))
+    other = fit_stream(exact(4, **start), in_memory(shuffled, chunk_points=50))
+    assert_same(other, one, 1e-9)
+
+
+def test_in_float32_it_is_the_same_to_float32(generator):
+    points = blobs(2000, 3)
+    found = fit_stream(exact(4, dtype="float32"), in_memory(points, chunk_points=100))
+    assert_same(found, exact(4).fit(points), 1e-5)
+
+
+def test_far_from_the_origin_nothing_is_lost():
+    points = blobs(400, 3) + torch.tensor([5e5, 5.4e6, 100.0])
+    found = fit_stream(exact(4), in_memory(points, chunk_points=64))
+    near = exact(4).fit(points - torch.tensor([5e5, 5.4e6, 100.0]))
+    torch.testing.assert_close(found.covariances, near.covariances, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(found.means - torch.tensor([5e5, 5.4e6, 100.0]), near.means, rtol=0, atol=1e-6)
+
+
+def test_where_natural_parameters_cancel_the_direct_form_is_taken():
+    """Two thin blobs 200 km apart: about their common centre, 1 cm is lost among the squares."""
+    points = 0.01 * blobs(200, 3, n_blobs=1)
+    points[100:, 0] += 2e5
+    start = {"weights_init": np.array([0.5, 0.5]), "means_init": points[[0, 100]].numpy()}
+    start["precisions_init"] = np.tile(np.eye(3) * 1e4, (2, 1, 1))
+    options = {"max_iter": 3, "reg_covar": 1e-9, **start}
+    found = fit_stream(exact(2, **options), in_memory(points, chunk_points=30))
+    assert_same(found, exact(2, **options).fit(points), 1e-10)
+    local = points[:100] - points[:100].mean(0)
+    expected = local.T @ local / 100 + 1e-9 * torch.eye(3)
+    torch.testing.assert_close(found.covariances[0], expected, rtol=1e-4, atol=1e-10)
+
+
+def test_a_float32_file_with_invalid_rows_is_its_valid_points(tmp_path):
+    points = blobs(300, 3).float()
+    points[::10] = math.nan
+    np.save(tmp_path / "cloud.npy", points.numpy())
+    found = fit_stream(exact(4), open_points(tmp_path / "cloud.npy", chunk_points=77))
+    assert_same(found, exact(4).fit(points[torch.isfinite(points).all(1)].double()), 1e-10)
+
+
+def test_a_small_draw_starts_em_and_chunks_do_not_change_it():
+    points = blobs(3000, 3)
+    one, other = (
+        fit_stream(exact(4), in_memory(points, chunk_points=size), sample_points=100) for size in (50, 999)
+    )
+    assert_same(one, other, 1e-10)
+    # It is only the start: converged, it is as good as the whole cloud's.
+    long = {"tol": 1e-9, "max_iter": 500}
+    found = fit_stream(exact(4, **long), in_memory(points), sample_points=100)
+    assert found.lower_bound_ == pytest.approx(exact(4, **long).fit(points).lower_bound_, abs=1e-4)
+
+
+def test_a_warm_start_goes_on():
+    points = blobs(300, 2)
+    mixture = exact(3, max_iter=4, warm_start=True)
+    fit_stream(mixture, in_memory(points))
+    fit_stream(mixture, in_memory(points))
+    whole = exact(3, max_iter=8).fit(points)
+    torch.testing.assert_close(mixture.means, whole.means, rtol=1e-10, atol=1e-10)
+
+
+def test_scores_are_the_mean_over_the_points():
+    points = blobs(500, 3)
+    mixture = exact(4).fit(points)
+    value, count = score_stream(mixture, in_memory(points, chunk_points=33))
+    assert count == 500
+    assert value == pytest.approx(float(mixture.score_samples(points).mean()), rel=1e-12)
+
+
+def test_iterations_are_told():
+    seen: list[tuple[int, float]] = []
+    mixture = fit_stream(
+        exact(3), in_memory(blobs(100, 2)), on_iteration=lambda i, bound: seen.append((i, bound))
+    )
+    assert [i for i, _ in seen] == list(range(1, 11))
+    assert [bound for _, bound in seen] == mixture.lower_bounds_
+
+
+# -- what passes between --------------------------------------------------------------------------
+
+
+def test_no_more_than_a_chunk_is_worked_on_and_the_e_step_can_be_another():
+    sizes: list[int] = []
+
+    class Watched(ExactEStep):
+        def __call__(self, parameters: Parameters) -> Accumulate:
+            accumulate = super().__call__(parameters)
+
+            def watched(points: Tensor) -> tuple[Tensor, Tensor]:
+                sizes.append(points.shape[0])
+                return accumulate(points)
+
+            return watched
+
+    points = blobs(250, 3)
+    found = fit_stream(
+        exact(4), in_memory(points, chunk_points=40), sample_points=30, e_step=Watched("float64")
+    )
+    assert max(sizes) == 40
+    assert sum(sizes) == 250 * 10
+    assert_same(found, fit_stream(exact(4), in_memory(points), sample_points=30), 1e-10)
+
+
+def test_processes_exchange_k_by_f_numbers_once_an_iteration():
+    class Counting(Processes):
+        def __init__(self) -> None:
+            self.sent: list[int] = []
+
+        def sum(self, tensor: Tensor) -> Tensor:
+            self.sent.append(tensor.numel())
+            return tensor
+
+    processes = Counting()
+    fit_stream(exact(4), in_memory(blobs(200, 3), chunk_points=30), processes=processes)
+    assert processes.sent == [4 * 10 + 1] * 10
+
+
+# -- degenerate clouds ----------------------------------------------------------------------------
+
+
+@given(
+    n=st.integers(1, 12),
+    k=st.integers(1, 5),
+    kind=st.sampled_from(["one place", "line", "plane", "few places"]),
+    chunk_points=st.integers(1, 13),
+)
+def test_degenerate_clouds_are_what_fit_makes_of_them(n, k, kind, chunk_points):
+    points = torch.from_numpy(np.random.default_rng(n).normal(size=(n, 3)))
+    if kind == "one place":
+        points[:] = points[0]
+    elif kind == "few places":
+        points = points[torch.arange(n) % 2]
+    else:
+        points[:, 1 if kind == "line" else 2 :] = 1.0
+    source = in_memory(points, chunk_points=chunk_points)
+    if k > n:
+        with pytest.raises(InvalidArgumentError, match="n_components"):
+            fit_stream(exact(k), source)
+        return
+    found = fit_stream(exact(k), source)
+    assert all(bool(torch.isfinite(value).all()) for value in found.state_dict().values())
+    expected = exact(k).fit(points)
+    assert found.score(points) == pytest.approx(expected.score(points), rel=1e-6)
+
+
+@pytest.mark.parametrize("points", [np.empty((0, 3)), np.full((5, 3), np.nan)])
+def test_a_source_without_points_is_an_error(points):
+    with pytest.raises(DataError, match="no points"):
+        fit_stream(exact(1), in_memory(points))
+
+
+def test_bad_arguments_are_refused():
+    source = in_memory(blobs(20, 2))
+    with pytest.raises(InvalidArgumentError, match="n_init=2"):
+        fit_stream(exact(2, n_init=2), source)
+    with pytest.raises(InvalidArgumentError, match="reg_covar"):
+        fit_stream(exact(2, reg_covar=-1), source)
+    with pytest.raises(InvalidArgumentError, match="sample_points"):
+        fit_stream(exact(2), source, sample_points=2.5)
+
+
+# -- checkpoints ----------------------------------------------------------------------------------
+
+
+def source_of(seed: int = 0) -> PointChunks:
+    return in_memory(blobs(400, 3, seed), chunk_points=90)
+
+
+def test_going_on_is_as_if_it_had_never_stopped(tmp_path):
+    """Through a file written every third iteration, from the sixth of eight.
+
+    All but to the bit: k-means rounds by where its arrays lie in memory.
+    """
+    path = tmp_path / "run" / "state.safetensors"
+
+    def stop(iteration: int, bound: float) -> None:
+        if iteration == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_stream(exact(4), source_of(), checkpoint=Checkpoint(path, every=3), on_iteration=stop)
+    state, _ = read_state(path)
+    assert len(state.lower_bounds) == 6
+    told: list[int] = []
+    found = fit_stream(
+        exact(4),
+        source_of(),
+        checkpoint=Checkpoint(path, every=3, resume=True),
+        on_iteration=lambda i, bound: told.append(i),
+    )
+    assert told == [7, 8, 9, 10]
+    assert_same(found, fit_stream(exact(4), source_of()), 1e-12)
+
+
+def test_a_finished_run_is_not_run_again_but_may_be_made_longer(tmp_path):
+    path = tmp_path / "state.safetensors"
+    mixture = exact(3, tol=1e-2, max_iter=100)
+    first = fit_stream(mixture, source_of(), checkpoint=Checkpoint(path))
+    assert first.converged_
+    told: list[int] = []
+    again = fit_stream(
+        exact(3, tol=1e-2, max_iter=100),
+        source_of(),
+        checkpoint=Checkpoint(path, resume=True),
+        on_iteration=lambda i, bound: told.append(i),
+    )
+    assert_same(again, first, 0)
+    assert told == []
+    longer = {"tol": 0, "max_iter": first.n_iter_ + 3}
+    found = fit_stream(exact(3, **longer), source_of(), checkpoint=Checkpoint(path, resume=True))
+    assert_same(found, fit_stream(exact(3, **longer), source_of()), 1e-12)
+
+
+def test_seconds_are_enough_to_write(tmp_path):
+    path = tmp_path / "state.safetensors"
+    seen: list[int] = []
+
+    def look(iteration: int, bound: float) -> None:
+        seen.append(len(read_state(path)[0].lower_bounds))
+
+    fit_stream(
+        exact(2), source_of(), checkpoint=Checkpoint(path, every=1000, seconds=1e-9), on_iteration=look
+    )
+    assert seen == list(range(1, 11))
+
+
+@pytest.mark.parametrize(
+    ("other", "seed", "named"),
+    [
+        ({"n_components": 3}, 0, "n_components"),
+        ({"reg_covar": 1e-3}, 0, "reg_covar"),
+        ({"random_state": 1}, 0, "random_state"),
+        ({"dtype": "float32"}, 0, "e_step"),
+        ({"means_init": np.zeros((4, 3))}, 0, "given_start"),
+        ({}, 1, "checksum"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused(tmp_path, other, seed, named):
+    path = tmp_path / "state.safetensors"
+    fit_stream(exact(4, max_iter=1), source_of(), checkpoint=Checkpoint(path))
+    before = path.read_bytes()
+    with pytest.raises(InvalidArgumentError, match=rf"state\.safetensors is of another run.*{named}="):
+        fit_stream(
+            exact(**{"k": other.pop("n_components", 4), **other}),
+            source_of(seed),
+            checkpoint=Checkpoint(path, resume=True),
+        )
+    assert path.read_bytes() == before
+
+
+def test_a_checkpoint_is_not_overwritten_unasked(tmp_path):
+    path = tmp_path / "state.safetensors"
+    fit_stream(exact(2, max_iter=1), source_of(), checkpoint=Checkpoint(path))
+    with pytest.raises(InvalidArgumentError, match="resume=true"):
+        fit_stream(exact(2), source_of(), checkpoint=Checkpoint(path))
+
+
+def test_a_damaged_checkpoint_is_an_error_that_names_it(tmp_path):
+    path = tmp_path / "state.safetensors"
+    fit_stream(exact(2, max_iter=1), source_of(), checkpoint=Checkpoint(path))
+    data = path.read_bytes()
+    for damaged in (data[:-9], data[:20], b"", b"{}" + data):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=str(path)):
+            fit_stream(exact(2), source_of(), checkpoint=Checkpoint(path, resume=True))
+    path.write_bytes(data)
+    state, run = read_state(path)
+    fewer = Parameters(*(value[:1] for value in state.parameters))
+    write_state(path, State(fewer, state.center, state.lower_bounds), run)
+    with pytest.raises(DataError, match="other parameters"):
+        fit_stream(exact(2), source_of(), checkpoint=Checkpoint(path, resume=True))
+
+
+@pytest.mark.parametrize("options", [{"every": 0}, {"seconds": 0.0}, {"seconds": math.inf}])
+def test_checkpoints_that_cannot_be_are_refused(tmp_path, options):
+    with pytest.raises(InvalidArgumentError, match=next(iter(options))):
+        Checkpoint(tmp_path / "state.safetensors", **options)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+from gmmtorch.datasets.point_chunks import open_points
+from gmmtorch.mixture.checkpoints import Checkpoint
+from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.streaming import fit_stream
+
+def kill(iteration, bound):
+    if iteration == 6:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+fit_stream(
+    GaussianMixture(4, dtype="float64", tol=0, max_iter=10, random_state=0),
+    open_points(sys.argv[1], chunk_points=90),
+    checkpoint=Checkpoint(Path(sys.argv[2]), every=2),
+    on_iteration=kill,
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_to_the_same_result(tmp_path):
+    cloud, path = tmp_path / "cloud.npy", tmp_path / "state.safetensors"
+    np.save(cloud, blobs(400, 3).numpy())
+    done = subprocess.run([sys.executable, "-c", KILLED, str(cloud), str(path)], timeout=120, check=False)
+    assert done.returncode == -signal.SIGKILL
+    source = open_points(cloud, chunk_points=90)
+    found = fit_stream(exact(4), source, checkpoint=Checkpoint(path, every=2, resume=True))
+    assert_same(found, fit_stream(exact(4), source), 1e-12)
+
+
+def test_em_goes_on_from_lower_bounds():
+    points = blobs(100, 2)
+    step = em.natural_step(em.quadratic_features(points), points.new_ones(100), 1e-6, torch.float64)
+    eye = torch.eye(2, dtype=torch.float64).expand(3, 2, 2)
+    start = Parameters(torch.full((3,), 1 / 3, dtype=torch.float64), points[:3], eye)
+    whole = em.run_em(step, start, tol=1e-3)
+    assert whole.converged
+    half = em.run_em(step, start, tol=1e-3, max_iter=whole.n_iter // 2)
+    rest = em.run_em(step, half.parameters, tol=1e-3, lower_bounds=half.lower_bounds)
+    assert rest.lower_bounds == whole.lower_bounds
+    assert torch.equal(rest.parameters.means, whole.parameters.means)
+    settled = em.run_em(step, rest.parameters, tol=1e-3, lower_bounds=rest.lower_bounds)
+    assert settled.converged
+    assert settled.n_iter == whole.n_iter

@@ -1,0 +1,854 @@
+"""EM over the components that matter, against brute force and against EM over all of them."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mixture.estimator_contract import MixtureContract, check_mixture
+from mixture.test_gaussian_mixture import DtypeRecorder
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mixture import GaussianMixture, em, gaussian_mixture, grouping, truncated
+from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture.grouping import Rows, choose_candidates, group_rows, nearest
+from gmmtorch.mixture.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.momentum import Momentum
+from gmmtorch.mixture.truncated import (
+    Settings,
+    learn_truncated,
+    local_parameters,
+    rounding,
+    run_truncated,
+    truncated_expectation,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
+kinds = pytest.mark.parametrize("are_points", [True, False])
+
+
+def cloud(n: int, dim: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(n, dim, generator=generator, dtype=torch.float64)
+
+
+def rows_of(points: Tensor, weight: Tensor | None = None, are_points: bool = True) -> Rows:
+    values = points if are_points else em.quadratic_features(points)
+    return Rows(values, points.new_ones(len(points)) if weight is None else weight, are_points)
+
+
+def random_weight(n: int, seed: int = 0) -> Tensor:
+    return torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) + 0.1
+
+
+def random_parameters(k: int, dim: int, seed: int = 0, spread: float = 1.5) -> Parameters:
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(k, dim, dim, generator=generator, dtype=torch.float64) * 0.3
+    covariances = root @ root.transpose(1, 2) + 0.2 * torch.eye(dim, dtype=torch.float64)
+    weights = torch.rand(k, generator=generator, dtype=torch.float64) + 0.1
+    means = spread * torch.randn(k, dim, generator=generator, dtype=torch.float64)
+    return Parameters(weights / weights.sum(), means, covariances)
+
+
+def scipy_joint(points: Tensor, parameters: Parameters) -> np.ndarray:
+    """log π_k + log N(x_n | k), (N, K)."""
+    parts = [
+        np.log(float(w)) + multivariate_normal(m.numpy(), c.numpy()).logpdf(points.numpy()).reshape(-1)
+        for w, m, c in zip(*parameters, strict=True)
+    ]
+    return np.stack(parts, 1)
+
+
+def room(n: int, seed: int = 0, noise: float = 0.005) -> np.ndarray:
+    """Points on the walls, floor and ceiling of a room of 6 × 5 × 2.5 m."""
+    rng = np.random.default_rng(seed)
+    size = np.array([6.0, 5.0, 2.5])
+    points = rng.random((n, 3)) * size
+    face = rng.integers(6, size=n)
+    points[np.arange(n), face % 3] = np.where(face < 3, 0, size[face % 3])
+    return points + noise * rng.normal(size=points.shape)
+
+
+def beads(n: int, k: int, dim: int = 2, gap: float = 4.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points of k unit clusters `gap` apart in a square pattern, and the clusters' centers."""
+    rng = np.random.default_rng(seed)
+    side = int(np.ceil(np.sqrt(k)))
+    centers = np.zeros((k, dim))
+    centers[:, 0], centers[:, 1] = gap * (np.arange(k) % side), gap * (np.arange(k) // side)
+    return centers[rng.integers(k, size=n)] + rng.normal(size=(n, dim)), centers
+
+
+# -- rows in blocks --------------------------------------------------------------------------------
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 300),
+    k=st.integers(1, 9),
+    dim=st.integers(1, 3),
+    one_group=st.booleans(),
+    are_points=st.booleans(),
+    build_rows=st.sampled_from([1 << 18, 7]),
+)
+def test_every_row_is_in_one_slot_of_its_owner_and_the_rest_weighs_nothing(
+    seed, n, k, dim, one_group, are_points, build_rows
+):
+    points, weight, centers = cloud(n, dim, seed), random_weight(n, seed), cloud(k, dim, seed + 1)
+    owner = torch.randint(0, k, (n,), generator=torch.Generator().manual_seed(seed))
+    owner = owner // 2 * 2 if not one_group else torch.full_like(owner, k - 1)  # some groups are empty
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(grouping, "_BUILD_ROWS", build_rows)
+        groups = group_rows(rows_of(points, weight, are_points), owner, centers, torch.float64)
+    block = groups.weight.shape[1]
+    assert sorted(groups.row.tolist()) == list(range(n))
+    assert len(set(groups.slot.tolist())) == n
+    assert (groups.owner[groups.slot // block] == owner[groups.row]).all()
+    assert (groups.owner[1:] >= groups.owner[:-1]).all()
+    assert groups.n_rows.tolist() == np.bincount(owner.numpy(), minlength=k).tolist()
+    features, found = groups.features.flatten(0, 1), groups.weight.flatten()
+    expected = em.quadratic_features((points - centers[owner])[groups.row])
+    torch.testing.assert_close(features[groups.slot], expected, rtol=1e-12, atol=1e-12)
+    assert torch.equal(found[groups.slot], weight[groups.row])
+    empty = torch.ones(len(found), dtype=torch.bool)
+    empty[groups.slot] = False
+    assert (found[empty] == 0).all()
+    assert (features[empty] == 0).all()
+    assert int(empty.sum()) < block * len(set(owner.tolist()))  # no block is there for nothing
+
+
+# -- the E-step ------------------------------------------------------------------------------------
+
+
+@dims
+@kinds
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
+def test_with_every_component_a_candidate_it_is_the_e_step(dim, are_points, dtype, tolerance, monkeypatch):
+    monkeypatch.setattr(truncated, "CHUNK_ELEMENTS", 500)  # several chunks
+    points, weight, parameters = cloud(400, dim), random_weight(400), random_parameters(7, dim)
+    owner = torch.randint(0, 7, (400,), generator=torch.Generator().manual_seed(3))
+    groups = group_rows(rows_of(points, weight, are_points), owner, parameters.means, dtype)
+    candidates = choose_candidates(groups, parameters, 16)
+    assert [sorted(row) for row in candidates.tolist()] == [list(range(7))] * 7
+    found = truncated_expectation(groups, candidates, parameters)
+    statistics, value = em.expectation(
+        em.quadratic_features(points), weight, em.natural_parameters(parameters), torch.float64
+    )
+    about_means = em.shift_features(statistics, -parameters.means)
+    assert found.value == pytest.approx(float(value), rel=tolerance)
+    assert found.statistics.dtype == torch.float64
+    scale = float(about_means.abs().max())
+    torch.testing.assert_close(found.statistics, about_means, rtol=0, atol=tolerance * scale)
+    assert found.owner is None
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("m", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_with_fewer_candidates_it_is_the_sum_over_exactly_those(dim, m, dtype):
+    k, n = 8, 300
+    tolerance = {torch.float64: 1e-10, torch.float32: 1e-4}[dtype]
+    points, weight, parameters = cloud(n, dim), random_weight(n), random_parameters(k, dim, seed=2)
+    generator = torch.Generator().manual_seed(1)
+    owner = torch.randint(0, k, (n,), generator=generator)
+    candidates = torch.stack([torch.randperm(k, generator=generator)[:m] for _ in range(k)])
+    groups = group_rows(rows_of(points, weight), owner, parameters.means, dtype)
+    found = truncated_expectation(groups, candidates, parameters, want_owner=True)
+
+    joint = scipy_joint(points, parameters)
+    offered = np.zeros((n, k), dtype=bool)
+    np.put_along_axis(offered, candidates[owner].numpy(), True, axis=1)
+    allowed = np.where(offered, joint, -np.inf)
+    norm = logsumexp(allowed, axis=1)
+    value = (weight.numpy() * norm).sum()
+    assert found.value == pytest.approx(value, rel=tolerance)
+    assert found.value < (weight.numpy() * logsumexp(joint, axis=1)).sum()
+    assert found.owner is not None
+    assert (found.owner.numpy() == allowed.argmax(1)).all()
+    gamma = np.exp(allowed - norm[:, None]) * weight.numpy()[:, None]
+    for component in range(k):
+        local = em.quadratic_features(points - parameters.means[component]).numpy()
+        expected = (gamma[:, component, None] * local).sum(0)
+        np.testing.assert_allclose(found.statistics[component], expected, atol=tolerance * n)
+
+
+@dims
+def test_local_parameters_give_the_weighted_log_densities(dim):
+    k = 6
+    points, parameters, centers = cloud(20, dim), random_parameters(k, dim), cloud(k, dim, seed=9)
+    candidates = torch.arange(k).expand(k, k)
+    natural = local_parameters(parameters, centers, candidates)
+    for group in range(k):
+        joint = em.quadratic_features(points - centers[group]) @ natural[group].T
+        np.testing.assert_allclose(joint.numpy(), scipy_joint(points, parameters), rtol=1e-10, atol=1e-9)
+
+
+# -- candidates ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_candidates_are_the_owner_and_the_likeliest_for_its_rows(dtype):
+    k, m, n = 40, 5, 250  # few rows in each group: all of them are asked
+    points, parameters = 2 * cloud(n, 2), random_parameters(k, 2)
+    joint = scipy_joint(points, parameters)
+    owner = torch.from_numpy(joint.argmax(1))
+    groups = group_rows(rows_of(points), owner, parameters.means, dtype)
+    assert int(groups.n_rows.max()) <= 64
+    candidates = choose_candidates(groups, parameters, m)
+    assert candidates.shape == (k, m)
+    relative = joint - joint.max(1, keepdims=True)
+    for group in range(k):
+        assert group in candidates[group]
+        assert len(set(candidates[group].tolist())) == m
+        own = relative[(owner == group).numpy()]
+        if len(own) == 0:
+            continue
+        score = own.max(0)
+        score[group] = np.inf
+        assert set(candidates[group].tolist()) == set(np.argsort(score)[-m:].tolist())
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_rows_at_both_ends_of_a_group_are_asked_whatever_their_order(reverse):
+    along = torch.linspace(-10, 10, 5000, dtype=torch.float64)
+    points = torch.stack([along.flip(0) if reverse else along, 0 * along], 1)
+    means = torch.zeros(20, 2, dtype=torch.float64)
+    means[1, 0], means[2, 0] = -11.0, 11.0
+    means[3:, 0], means[3:, 1] = torch.tensor([-11.0, 11.0]).repeat(9)[:17], 5.0 + torch.arange(17)
+    covariances = torch.eye(2, dtype=torch.float64).repeat(20, 1, 1)
+    covariances[0, 0, 0] = 16.0
+    parameters = Parameters(torch.full((20,), 0.05, dtype=torch.float64), means, covariances)
+    groups = group_rows(rows_of(points), torch.zeros(5000, dtype=torch.int64), means, torch.float32)
+    assert sorted(choose_candidates(groups, parameters, 3)[0].tolist()) == [0, 1, 2]
+
+
+def test_the_nearest_mean_is_that_of_all_distances():
+    points, means = cloud(200, 3), cloud(11, 3, seed=1)
+    assert torch.equal(nearest(points, means), torch.cdist(points, means).argmin(1))
+
+
+# -- the loop --------------------------------------------------------------------------------------
+
+
+def check_run(found: em.EMResult, max_iter: int, slack: float = 0.0) -> None:
+    assert 1 <= found.n_iter <= max_iter
+    assert np.isfinite(found.lower_bounds).all()
+    assert (np.diff(found.lower_bounds) >= -slack).all()
+    assert all(bool(torch.isfinite(value).all()) for value in found.parameters)
+    assert float(found.parameters.weights.min()) >= 0
+    assert float(found.parameters.weights.sum()) == pytest.approx(1, abs=1e-9)
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 300),
+    dim=st.sampled_from([1, 2, 3, 5]),
+    k=st.integers(1, 9),
+    n_candidates=st.integers(2, 5),
+    tol=st.sampled_from([0.0, 1e-6, 1e-3, 0.1]),
+    max_iter=st.integers(1, 40),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    grain=st.sampled_from([0.0, 0.5]),
+    are_points=st.booleans(),
+)
+def test_bounds_never_fall_and_every_run_ends(
+    seed, n, dim, k, n_candidates, tol, max_iter, dtype, grain, are_points
+):
+    points = cloud(n, dim, seed)
+    points = (points / grain).round() * grain if grain else points  # many equal points
+    weight = random_weight(n, seed)
+    rows = rows_of(points, weight, are_points)
+    calls: list[tuple[int, float]] = []
+    wishes = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    parameters = random_parameters(k, dim, seed)
+    found, owner, _ = run_truncated(rows, nearest(points, parameters.means), parameters, wishes)
+    check_run(found, max_iter)
+    assert calls == list(enumerate(found.lower_bounds, 1))
+    assert owner.shape == (n,)
+    assert set(owner.tolist()) <= set(range(k))
+    if found.n_iter < max_iter:
+        assert found.converged
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    dim=st.integers(1, 3),
+    k=st.integers(1, 6),
+    n_candidates=st.integers(2, 5),
+    max_iter=st.integers(1, 20),
+)
+def test_what_is_returned_is_a_step_beyond_the_last_bound(seed, dim, k, n_candidates, max_iter):
+    points, weight, parameters = (
+        cloud(400, dim, seed),
+        random_weight(400, seed),
+        random_parameters(k, dim, seed),
+    )
+    wishes = Settings(1e-9, 1e-4, max_iter, torch.float64, n_candidates)
+    found, owner, candidates = run_truncated(
+        rows_of(points, weight), nearest(points, parameters.means), parameters, wishes
+    )
+    joint = em.log_joint(points, found.parameters)
+    allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
+    bound, score = (torch.logsumexp(j, 1) @ weight / weight.sum() for j in (joint + allowed, joint))
+    assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
+
+
+def test_one_iteration_is_one_step_of_em():
+    points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
+    wishes = Settings(1e-6, 0.0, 1, torch.float64)
+    found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, wishes)
+    step = em.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
+    expected, bound = step(parameters)
+    assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
+    torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
+
+
+def test_cells_of_one_point_each_are_the_points():
+    points, weight, parameters = cloud(600, 2), random_weight(600), random_parameters(20, 2)
+    owner, wishes = nearest(points, parameters.means), Settings(tol=1e-5, dtype=torch.float64, max_iter=15)
+    found = [
+        run_truncated(rows_of(points, weight, kind), owner, parameters, wishes)[0] for kind in (True, False)
+    ]
+    np.testing.assert_allclose(found[0].lower_bounds, found[1].lower_bounds, rtol=1e-9)
+    torch.testing.assert_close(tuple(found[0].parameters), tuple(found[1].parameters), rtol=1e-6, atol=1e-7)
+
+
+def test_it_converges_where_em_does():
+    points, _ = beads(2000, 4, gap=3.0)
+    rows = rows_of(torch.from_numpy(points - points.mean(0)))
+    parameters = random_parameters(4, 2, seed=3)
+    owner = nearest(rows.points, parameters.means)
+    found, *_ = run_truncated(
+        rows, owner, parameters, Settings(tol=1e-10, max_iter=2000, dtype=torch.float64)
+    )
+    step = em.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
+    plain = em.run_em(step, parameters, tol=1e-10, max_iter=5000)
+    assert found.converged
+    assert found.lower_bounds[-1] == pytest.approx(plain.lower_bounds[-1], abs=1e-5)
+    torch.testing.assert_close(tuple(found.parameters), tuple(plain.parameters), rtol=0, atol=2e-2)
+
+
+# -- momentum --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n_iter", "share"), [(10, 1.0), (30, 0.8), (100, 0.5)])
+def test_momentum_is_no_worse_than_as_many_steps_of_em(n_iter, share):
+    generator = torch.Generator().manual_seed(0)
+    label = torch.rand(3000, 1, generator=generator, dtype=torch.float64) < 0.5
+    points = torch.randn(3000, 1, generator=generator, dtype=torch.float64) + torch.where(label, 1.0, -1.0)
+    parameters = Parameters(
+        torch.tensor([0.8, 0.2], dtype=torch.float64),
+        torch.tensor([[-0.2], [0.3]], dtype=torch.float64),
+        torch.full((2, 1, 1), 2.0, dtype=torch.float64),
+    )
+    rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
+    step = em.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
+    plain = em.run_em(step, parameters, tol=0.0, max_iter=n_iter)
+    found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
+    assert found.n_iter == n_iter
+    best = em.run_em(step, parameters, tol=0.0, max_iter=3000).lower_bounds[-1]
+    assert best - plain.lower_bounds[-1] > 1e-5  # it converges slowly
+    assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
+
+
+def test_undoing_gives_ems_own_step_and_starts_anew():
+    parameters, momentum = random_parameters(3, 2), Momentum(1e-6)
+    rows = rows_of(cloud(300, 2))
+
+    def expect(at: Parameters) -> Tensor:
+        groups = group_rows(rows, nearest(rows.points, at.means), at.means, torch.float64)
+        return truncated_expectation(groups, choose_candidates(groups, at, 16), at).statistics
+
+    step = em.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
+    for moves in (False, False, True, True):
+        plain = step(parameters)[0]
+        following = momentum.step(expect(parameters), parameters)
+        assert momentum.is_moving is moves
+        close = torch.allclose(following.means, plain.means, rtol=0, atol=1e-9)
+        assert close is not moves
+        if moves:
+            torch.testing.assert_close(tuple(momentum._plain), tuple(plain), rtol=1e-9, atol=1e-10)
+        parameters = following
+    undone = momentum.undo()
+    torch.testing.assert_close(tuple(undone), tuple(plain), rtol=1e-9, atol=1e-10)
+    assert not momentum.is_moving
+    momentum.step(expect(undone), undone)
+    assert not momentum.is_moving
+
+
+class Spy:
+    """The E-step, with what it was given and found noted; made to fail at some calls."""
+
+    def __init__(self, failing: tuple[int, ...] = ()) -> None:
+        self.failing, self.given, self.dtypes, self.sets, self.found = failing, [], [], [], []
+
+    def __call__(self, groups, candidates, parameters, want_owner=False, *rest):
+        found = truncated_expectation(groups, candidates, parameters, want_owner, *rest)
+        if len(self.given) in self.failing:
+            found = found._replace(value=found.value - 1e6)
+        self.given.append(parameters)
+        self.dtypes.append(groups.features.dtype)
+        self.sets.append(candidates)
+        self.found.append(found)
+        return found
+
+
+def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: int = 12) -> em.EMResult:
+    points, _ = beads(1500, k)
+    rows = rows_of(torch.from_numpy(points - points.mean(0)))
+    first, owner = flat_pieces(rows.points, rows.weight, k, 1e-6)
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 0.0, max_iter, torch.float64))
+    check_run(found, max_iter)
+    return found
+
+
+def test_a_momentum_that_lowers_the_bound_is_undone(monkeypatch):
+    spy = Spy(failing=(4,))
+    found = run_spied(monkeypatch, spy)
+    assert found.n_iter == 12
+    assert len(spy.given) == 13
+    at, statistics = spy.given[3], spy.found[3].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+    assert not torch.allclose(spy.given[4].means, spy.given[5].means, rtol=0, atol=1e-9)
+    # What is returned is EM's own step, too, though the momentum has a step of its own by then.
+    at, statistics = spy.given[-1], spy.found[-1].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(found.parameters.means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.parameters.covariances[0], (plain.covariances[0]), rtol=1e-9, atol=0)
+
+
+def test_a_momentum_that_gains_little_is_not_yet_the_end(monkeypatch):
+    points, _ = beads(1500, 20, gap=2.0)
+    rows = rows_of(torch.from_numpy(points - points.mean(0)))
+    first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
+    spy = Spy()
+
+    def weak(*arguments):
+        found = spy(*arguments)
+        if len(spy.found) == 5:  # a step of the momentum, that gains a thousandth of tol
+            found = found._replace(value=spy.found[3].value + 1500 * 1e-7)
+        return found
+
+    monkeypatch.setattr(truncated, "truncated_expectation", weak)
+    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 1e-4, 300, torch.float64))
+    check_run(found, 300)
+    assert found.n_iter > 10
+    at, statistics = spy.given[4], spy.found[4].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum
+def test_new_candidates_that_lower_the_bound_are_dropped_for_the_old(monkeypatch, failing):
+    spy = Spy(failing)
+    found = run_spied(monkeypatch, spy, max_iter=20)
+    assert found.n_iter == 20
+    old, new = spy.sets[failing[0] - 1], spy.sets[failing[0]]
+    assert all(given is new for given in spy.sets[failing[0] : failing[-1] + 1])
+    assert all(given is old for given in spy.sets[failing[-1] + 1 :])  # for good
+
+
+def test_where_ems_own_step_lowers_the_bound_it_ends(monkeypatch):
+    spy = Spy(failing=(3, 4))
+    found = run_spied(monkeypatch, spy)
+    assert found.converged
+    assert found.n_iter == 3
+
+
+def test_bounds_do_not_fall_where_candidates_are_too_few(monkeypatch):
+    points = torch.from_numpy(room(3000) - room(3000).mean(0))
+    first, owner = flat_pieces(points, points.new_ones(3000), 40, 1e-6)
+    found, *_ = run_truncated(
+        rows_of(points), owner, first, Settings(tol=0.0, max_iter=40, n_candidates=2, dtype=torch.float64)
+    )
+    check_run(found, 40)
+    assert found.lower_bounds[-1] > found.lower_bounds[0] + 0.1
+
+
+# -- rounding --------------------------------------------------------------------------------------
+
+
+def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
+    """Points of an oblique wall `size` across, 0.1 mm thick."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + 1e-4 * rng.normal(size=(n, 3))
+    points = points @ turn.T
+    return torch.from_numpy(points - points.mean(0))
+
+
+def two_halves(points: Tensor) -> Parameters:
+    """Components of two halves of a cloud, cut along x."""
+    beyond = (points[:, 0] > 0).long()
+    weight = points.new_ones(len(points))
+    return moments_of(em.quadratic_features(points), weight, beyond, 2, 1e-6)
+
+
+@pytest.mark.parametrize(("size", "dtype"), [(0.2, torch.float32), (30.0, torch.float64)])
+def test_a_large_thin_cloud_is_worked_on_in_float64_and_agrees_with_em(size, dtype):
+    points = thin_wall(4000, size)
+    rows, parameters = rows_of(points), two_halves(points)
+    wishes = Settings(1e-6, 0.0, 1)
+    owner = nearest(points, parameters.means)
+    groups, _ = truncated._sets(rows, owner, parameters, wishes)
+    assert groups.features.dtype == dtype
+    found, *_ = run_truncated(rows, owner, parameters, wishes)
+    expected, total = em.direct_step(points, rows.weight, parameters, 1e-6)
+    tolerance = 1e-8 if dtype == torch.float64 else 1e-3
+    assert found.lower_bounds[0] == pytest.approx(float(total) / 4000, abs=tolerance)
+    least, truth = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (found.parameters, expected))
+    torch.testing.assert_close(least, truth, rtol=100 * tolerance, atol=0)
+
+
+def test_components_that_become_thin_are_worked_on_in_float64_from_then_on(monkeypatch):
+    points = thin_wall(4000, 30.0)
+    rows, parameters = rows_of(points), two_halves(points)
+    parameters = parameters._replace(covariances=parameters.covariances + torch.eye(3, dtype=torch.float64))
+    owner = nearest(points, parameters.means)
+    assert truncated._sets(rows, owner, parameters, Settings())[0].features.dtype == torch.float32
+    spy = Spy()
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
+    assert spy.dtypes == [torch.float32, torch.float64]
+    for at, bound in zip(spy.given, found.lower_bounds, strict=True):
+        score = torch.logsumexp(em.log_joint(points, at), 1).mean()
+        assert bound == pytest.approx(float(score), abs=1e-4)
+    thinnest = torch.linalg.eigvalsh(found.parameters.covariances)[:, 0]
+    torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)
+
+
+def test_a_large_thin_piece_keeps_its_digits_though_it_weighs_little():
+    rng = np.random.default_rng(0)
+    blobs = 0.05 * rng.normal(size=(40_000, 3)) + 5 * rng.random((40, 3))[rng.integers(40, size=40_000)]
+    points = torch.cat([torch.from_numpy(blobs), thin_wall(20, 20.0)])
+    owner = torch.cat([torch.zeros(40_000, dtype=torch.int64), torch.ones(20, dtype=torch.int64)])
+    of_wall = points[40_000:]
+    covariances = torch.stack([torch.cov(points[:40_000].T), torch.cov(of_wall.T, correction=0)])
+    covariances[1] += 1e-6 * torch.eye(3, dtype=torch.float64)
+    parameters = Parameters(
+        torch.tensor([0.9995, 0.0005], dtype=torch.float64),
+        torch.stack([points[:40_000].mean(0), of_wall.mean(0)]),
+        covariances,
+    )
+    groups = group_rows(rows_of(points), owner, parameters.means, torch.float32)
+    average, worst = rounding(groups, parameters)
+    assert average < 0.02 < worst
+    # Brute force of ε/2 E‖x‖² tr Σ⁻¹, group by group.
+    half_eps = torch.finfo(torch.float32).eps / 2
+    errors, counts = [], []
+    for k, own in enumerate((points[:40_000], of_wall)):
+        spread = float((own - parameters.means[k]).square().sum(1).mean())
+        errors.append(half_eps * spread * float(torch.linalg.inv(covariances[k]).trace()))
+        counts.append(len(own))
+    assert worst == pytest.approx(max(errors), rel=1e-4)
+    assert average == pytest.approx(np.average(errors, weights=counts), rel=1e-4)
+    assert truncated._sets(rows_of(points), owner, parameters, Settings())[0].features.dtype == torch.float64
+
+
+@pytest.mark.parametrize("k", [4, 24])  # all components are candidates, or not
+def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(k):
+    wall = thin_wall(1200, 3.0)
+    offset = torch.tensor([5e5, -2e5, 1e3], dtype=torch.float64)
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-5}
+    alone = GaussianMixture(k // 2, **options).fit(wall)
+    both = GaussianMixture(k, **options).fit(torch.cat([wall + offset, wall - offset]))
+    check_mixture(both, torch.cat([wall + offset, wall - offset]).numpy(), at_most=k)
+    score = float(both.score_samples(wall + offset).mean())
+    assert score + np.log(2) == pytest.approx(float(alone.score_samples(wall).mean()), abs=0.05)
+
+
+# -- from cells to points --------------------------------------------------------------------------
+
+
+@settings(max_examples=30)
+@example(  # other candidates on the points would be worse
+    seed=9, k=6, dim=2, grain=0.0, max_iter=4, tol=0.0, n_candidates=2, dtype=torch.float64
+)
+@given(
+    seed=st.integers(0, 10**6),
+    k=st.integers(1, 7),
+    dim=st.integers(1, 3),
+    grain=st.sampled_from([0.0, 0.05, 0.25]),
+    max_iter=st.integers(2, 30),
+    tol=st.sampled_from([0.0, 1e-4, 1e-2]),
+    n_candidates=st.integers(2, 7),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, tol, n_candidates, dtype):
+    points = cloud(1200, dim, seed) + 3 * (torch.arange(1200) % 4)[:, None]
+    points = (points / grain).round() * grain if grain else points
+    points = points - points.mean(0)
+    weight = random_weight(1200, seed)
+    first, owner = flat_pieces(points, weight, k, 1e-6)
+    k = first.weights.shape[0]
+    calls: list[tuple[int, float]] = []
+    wishes = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(truncated, "_MANY_POINTS", 1000)
+        runs: list[Rows] = []
+        run = truncated.run_truncated
+        patch.setattr(
+            truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
+        )
+        found = learn_truncated(Rows(points, weight), owner, first, wishes)
+    assert [rows.are_points for rows in runs] == [False, True]
+    assert float(runs[0].weight.sum()) == pytest.approx(float(weight.sum()))
+    check_run(found, max_iter, slack=1e-6 if dtype == torch.float32 else 1e-10)
+    assert calls == list(enumerate(found.lower_bounds, 1))
+
+
+def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
+    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
+    monkeypatch.setattr(truncated, "pool_into_cells", None)  # would fail
+    for points, k, max_iter in ((cloud(900, 2), 2, 9), (cloud(1200, 4), 2, 9), (cloud(1200, 2), 20, 9)):
+        learn_truncated(
+            rows_of(points),
+            torch.zeros(len(points), dtype=torch.int64),
+            random_parameters(k, points.shape[1]),
+            Settings(max_iter=max_iter),
+        )
+    cells = Rows(em.quadratic_features(cloud(1200, 2)), torch.ones(1200, dtype=torch.float64), False)
+    learn_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
+
+
+def test_by_way_of_cells_the_fit_is_as_good(monkeypatch):
+    x = room(6000)
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
+    direct = GaussianMixture(30, **options).fit(x)
+    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
+    pooled = GaussianMixture(30, **options).fit(x)
+    assert pooled.lower_bounds_ != direct.lower_bounds_
+    assert pooled.score(x) == pytest.approx(direct.score(x), abs=0.05)
+
+
+# -- the estimator ---------------------------------------------------------------------------------
+
+
+def same_start(centers: np.ndarray, variance: float = 1.0) -> dict[str, Any]:
+    k, dim = centers.shape
+    return {
+        "weights_init": np.full(k, 1 / k),
+        "means_init": centers + 0.3,
+        "precisions_init": np.tile(np.eye(dim) / variance, (k, 1, 1)),
+    }
+
+
+@pytest.mark.parametrize("dim", [2, 3, 5])
+@pytest.mark.parametrize(("gap", "tolerance"), [(8.0, 1e-4), (2.5, 0.01)])
+def test_from_the_same_start_it_is_as_likely_as_exact_em(dim, gap, tolerance):
+    x, centers = beads(3000, 30, dim, gap)
+    options = {**same_start(centers), "tol": 1e-5, "max_iter": 500}
+    exact = GaussianMixture(30, algorithm="exact", **options).fit(x)
+    found = GaussianMixture(30, algorithm="truncated", **options).fit(x)
+    assert found.lower_bound_ <= found.score(x) + 1e-4
+    assert found.score(x) > exact.score(x) - tolerance  # where they overlap, it may find a better optimum
+    if gap == 8.0:
+        np.testing.assert_allclose(found.means_, exact.means_, atol=0.01)
+        np.testing.assert_allclose(found.covariances_, exact.covariances_, atol=0.02)
+
+
+def test_the_bound_is_little_below_the_likelihood():
+    x = room(8000)
+    found = GaussianMixture(60, algorithm="truncated", init_params="flat_pieces", tol=1e-5).fit(x)
+    assert 0 <= found.score(x) - found.lower_bound_ < 0.02
+
+
+def test_auto_is_truncated_for_many_pairs_and_exact_for_few(monkeypatch):
+    called: list[int] = []
+
+    def learn(rows, owner, parameters, wishes):
+        called.append(len(owner))
+        return learn_truncated(rows, owner, parameters, wishes)
+
+    monkeypatch.setattr(gaussian_mixture, "learn_truncated", learn)
+    monkeypatch.setattr(gaussian_mixture, "_MANY_PAIRS", 48 * 500)
+    x = room(500)
+    for k, n in ((47, 500), (48, 499)):
+        GaussianMixture(k, max_iter=2, init_params="flat_pieces").fit(x[:n])
+    assert called == []
+    GaussianMixture(48, max_iter=2, init_params="flat_pieces").fit(x)
+    assert called == [500]
+    GaussianMixture(48, max_iter=2, init_params="flat_pieces", algorithm="exact").fit(x)
+    assert called == [500]
+
+
+def test_far_from_the_origin_and_turned_it_is_the_same_fit():
+    x = room(3000)
+    rng = np.random.default_rng(1)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "dtype": "float64"}
+    fit = GaussianMixture(30, **options).fit(x)
+    offset = np.array([5e5, -4e6, 250.0])
+    far = GaussianMixture(30, **options).fit(x + offset)
+    np.testing.assert_allclose(far.score_samples(x + offset), fit.score_samples(x), atol=1e-3)
+    turned = GaussianMixture(30, **options).fit(x @ turn.T)
+    np.testing.assert_allclose(turned.score_samples(x @ turn.T), fit.score_samples(x), atol=1e-3)
+
+
+@pytest.mark.parametrize("order", ["shuffled", "by height and row"])
+def test_the_order_of_the_points_hardly_matters(order):
+    x = room(6000)
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
+    fit = GaussianMixture(60, **options).fit(x)
+    by = np.random.default_rng(0).permutation(6000)
+    if order != "shuffled":
+        by = np.lexsort((np.round(x[:, 1], 1), np.round(x[:, 2], 1)))
+    other = GaussianMixture(60, **options).fit(x[by])
+    assert other.score(x) == pytest.approx(fit.score(x), abs=0.02)
+
+
+def test_a_whole_weight_is_a_point_repeated():
+    x, centers = beads(900, 20)
+    weight = np.random.default_rng(0).integers(1, 4, len(x))
+    options: dict[str, Any] = {
+        **same_start(centers), "algorithm": "truncated", "dtype": "float64", "max_iter": 8
+    }  # fmt: skip
+    weighted = GaussianMixture(20, **options).fit(x, sample_weight=weight)
+    repeated = GaussianMixture(20, **options).fit(np.repeat(x, weight, axis=0))
+    assert weighted.score(x) == pytest.approx(repeated.score(x), abs=1e-3)
+    unweighted = GaussianMixture(20, **options).fit(x)
+    assert weighted.score(x) < unweighted.score(x) - 1e-3  # the weights do count
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e6])
+def test_only_the_ratios_of_the_weights_matter(scale):
+    x, centers = beads(900, 20)
+    weight = np.random.default_rng(0).random(len(x)) + 0.1
+    options: dict[str, Any] = {**same_start(centers), "algorithm": "truncated", "max_iter": 8}
+    one = GaussianMixture(20, **options).fit(x, sample_weight=weight)
+    other = GaussianMixture(20, **options).fit(x, sample_weight=scale * weight)
+    np.testing.assert_allclose(one.means_, other.means_, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("k", [4, 20])
+def test_a_component_of_weight_zero_stays_as_it_is(dtype, k):
+    x, centers = beads(900, k)
+    start = same_start(centers)
+    start["weights_init"] = np.where(np.arange(k) == 1, 0.0, 1 / (k - 1))
+    fit = GaussianMixture(k, **start, algorithm="truncated", dtype=dtype, max_iter=30, tol=0).fit(x)
+    assert fit.weights_[1] == 0
+    np.testing.assert_allclose(fit.means_[1], start["means_init"][1])
+    np.testing.assert_allclose(fit.covariances_[1], np.eye(2))
+    check_mixture(fit, x, at_most=k)
+
+
+def test_a_component_without_points_does_no_harm():
+    x, centers = beads(900, 20)
+    centers[3] += 1e4
+    fit = GaussianMixture(20, **same_start(centers), algorithm="truncated", max_iter=20).fit(x)
+    check_mixture(fit, x, at_most=20)
+    assert fit.weights_[3] < 1e-12
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("n_distinct", [1, 2, 7])
+def test_more_components_than_distinct_points_share_the_weight(dim, n_distinct):
+    places = cloud(n_distinct, dim).numpy()
+    x = np.repeat(places, 30, axis=0)
+    fit = GaussianMixture(20, algorithm="truncated", init_params="flat_pieces").fit(x)
+    check_mixture(fit, x, at_most=20)
+    assert len(np.unique(fit.means_.round(6), axis=0)) == n_distinct
+    np.testing.assert_allclose(np.linalg.eigvalsh(fit.covariances_), 1e-6, rtol=1e-2)
+
+
+@pytest.mark.parametrize("init", ["kmeans", "random_points", "bounding_box", "flat_pieces"])
+@pytest.mark.parametrize("max_cells", [None, 300])
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_with_float64_no_float32_tensor_arises_anywhere(init, max_cells, kind):
+    x = kind(room(500))
+    with DtypeRecorder() as recorder:
+        gmm = GaussianMixture(
+            20,
+            random_state=0,
+            dtype="float64",
+            init_params=init,
+            algorithm="truncated",
+            max_cells=max_cells,
+            max_iter=8,
+        )
+        gmm.fit(x, sample_weight=kind(np.linspace(0.5, 2, 500)))
+    assert recorder.seen.keys() == {torch.float64}, recorder.seen
+
+
+@pytest.mark.parametrize("value", ["fast", "Exact", None, 1])
+def test_an_algorithm_that_is_not_known_is_named(value):
+    with pytest.raises(InvalidArgumentError, match=r"^algorithm="):
+        GaussianMixture(2, algorithm=value).fit(room(30))
+
+
+@pytest.mark.parametrize("value", [0, -3, 2.5, "many"])
+def test_a_number_of_cells_that_cannot_be_is_named(value):
+    with pytest.raises(InvalidArgumentError, match=r"^max_cells="):
+        GaussianMixture(2, max_cells=value).fit(room(30))
+
+
+@pytest.mark.parametrize("algorithm", ["exact", "truncated"])
+def test_cells_in_more_than_three_dimensions_are_refused(algorithm):
+    with pytest.raises(InvalidArgumentError, match=r"^max_cells=20 .* 4\b"):
+        GaussianMixture(2, max_cells=20, algorithm=algorithm).fit(cloud(50, 4))
+
+
+@pytest.mark.parametrize("algorithm", ["exact", "truncated"])
+@pytest.mark.parametrize("init", ["kmeans", "flat_pieces"])
+def test_fewer_cells_than_components_are_copies_that_share_the_weight(algorithm, init):
+    x = room(400)
+    fit = GaussianMixture(8, max_cells=3, algorithm=algorithm, init_params=init, random_state=0).fit(x)
+    check_mixture(fit, x, at_most=8)
+    assert len(np.unique(fit.means_.round(6), axis=0)) <= 3
+
+
+# -- the contract ----------------------------------------------------------------------------------
+
+
+class TestTruncatedGaussianMixture(MixtureContract):
+    # The E-step is one of float32.
+    order_tolerance = motion_tolerance = repetition_tolerance = far_tolerance = 2e-3
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        {"algorithm": "fast"},
+        *({"max_cells": value} for value in (0, 2.5, "many")),
+    ]
+
+    def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
+        return GaussianMixture(n_components, **{"random_state": 0, "algorithm": "truncated", **options})
+
+
+class TestTruncatedGaussianMixtureInFloat64(TestTruncatedGaussianMixture):
+    order_tolerance = motion_tolerance = repetition_tolerance = far_tolerance = 1e-6
+
+    def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
+        return super().make(n_components, **{"init_params": "flat_pieces", "dtype": "float64", **options})
+
+
+class TestGaussianMixtureOfCells(MixtureContract):
+    motion_tolerance = None  # cells lie along the axes
+
+    @pytest.fixture(autouse=True)
+    def _up_to_three_dimensions(self, request):
+        callspec = getattr(request.node, "callspec", None)
+        if callspec is not None and callspec.params.get("dim", 0) > 3:
+            pytest.skip("cells are for up to three dimensions")
+
+    def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
+        usual = {"random_state": 0, "max_cells": 50, "init_params": "flat_pieces"}
+        return GaussianMixture(n_components, **{**usual, **options})
+
+
+@pytest.mark.slow
+def test_compiled_it_finds_the_same():
+    points = torch.from_numpy(beads(3000, 60)[0])
+    options = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
+    plain, compiled = (GaussianMixture(60, compiled=value, **options).fit(points) for value in (False, True))
+    torch.testing.assert_close(compiled.means, plain.means, rtol=1e-3, atol=1e-3)
+    assert compiled.lower_bound_ == pytest.approx(plain.lower_bound_, abs=1e-4)
