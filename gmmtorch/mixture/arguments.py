@@ -10,6 +10,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 
+_LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
+
 Array = Tensor | np.ndarray
 RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
@@ -87,6 +89,16 @@ def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
         )
     if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()):
         raise InvalidArgumentError("sample_weight holds NaN, infinite or negative weights; make them ≥ 0.")
-    if float(weight.sum()) == 0:
+    if float(weight.max()) == 0:
         raise InvalidArgumentError("sample_weight is all zero; at least one point must count.")
     return weight
+
+
+def check_weight_scale(weight: Tensor) -> None:
+    """Raise `InvalidArgumentError` for weights (N,) whose sums lose digits beside 1, or beyond all range."""
+    mean = float((weight / weight.shape[0]).sum())
+    if not _LEAST_MEAN_WEIGHT <= mean <= _LARGEST_MEAN_WEIGHT:
+        raise InvalidArgumentError(
+            f"sample_weight is {mean:.3g} on the average, where sums of it lose digits; scale it to about 1 "
+            "(a weight says how many points a row stands for)."
+        )

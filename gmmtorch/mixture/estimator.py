@@ -22,6 +22,7 @@ from gmmtorch.mixture.arguments import (
     Array,
     RandomState,
     as_generator,
+    check_weight_scale,
     checked_parameter,
     checked_tensor,
     checked_weight,
@@ -68,6 +69,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
     covariances: Tensor
     _tensors: bool  # whether fit was given a tensor
     _extra_names: ClassVar[tuple[str, ...]] = ()  # buffers beside the mixture's own
+    _takes_any_total_weight: ClassVar[bool] = False  # as it does where a prior counts in points
 
     @classmethod
     def from_parameters(
@@ -106,6 +108,7 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         mixture.n_features_in_ = dim
         mixture._set_history(lower_bounds, converged)
         mixture._set_buffers(weight, mean, covariance)
+        mixture._set_extra({})
         return mixture
 
     def check_parameters(self, n_points: int | None = None) -> None:
@@ -124,6 +127,8 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         warn_if_coarse(X, points)
         weight = checked_weight(sample_weight, points)
         points, weight = points[weight > 0], weight[weight > 0]
+        if not self._takes_any_total_weight:
+            check_weight_scale(weight)
         if reset:
             self.check_parameters(points.shape[0])
         center = (points * (weight / weight.sum())[:, None]).sum(0)

@@ -151,12 +151,11 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
 
 
 def _divisible(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
-    """The nodes with points enough for two children, longer than reg_covar can tell, not flat (2.9)."""
+    """The nodes that have points enough for two children, and are not flat (2.9)."""
     variance = torch.linalg.eigvalsh(nodes.parameters.covariances)
     is_flat = variance[:, 0] < rule.planarity_threshold * variance.sum(1)
     is_flat |= variance[:, 0] < rule.thickness**2
-    divisible = ~is_flat & (mass >= 2 * rule.min_support) & (variance[:, -1] > 2 * rule.reg_covar)
-    return divisible.nonzero().squeeze(1)
+    return (~is_flat & (mass >= 2 * rule.min_support)).nonzero().squeeze(1)
 
 
 def _shortlist(

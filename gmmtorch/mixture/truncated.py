@@ -37,6 +37,7 @@ from gmmtorch.mixture.momentum import Momentum
 _FIRST_SETS = (2, 3, 3, 4, 4)  # iterations with the same candidates; more later on
 _LATER_SETS = 8
 _AVERAGE_ROUNDING, _WORST_ROUNDING = 0.02, 0.2  # nats, in float32; above them, float64 is used
+_SAMPLED_OF_A_COMPONENT = 400  # points, of which EM begins on a sample
 _MANY_POINTS = 1 << 19  # from which on EM begins on cells
 _POINTS_OF_A_CELL, _CELLS_OF_A_COMPONENT = 16, 32
 
@@ -245,16 +246,22 @@ def _sharp(rows: Rows, groups: Groups, parameters: Parameters) -> Groups:
 
 
 def learn_truncated(rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings) -> EMResult:
-    """`run_truncated`, on cells first where there are very many points.
+    """`run_truncated`, on a sample first where there are many points, on cells where there are very many.
 
     The bound on cells is below the one on their points with the same owners and candidates, so the
-    bounds still never fall.
+    bounds still never fall. Those on a sample are no bounds on the whole: they are left out.
     """
     n, n_components = rows.weight.shape[0], parameters.weights.shape[0]
     n_all = int(settings.processes.sum(rows.weight.new_tensor([n])))  # all decide alike
     n_cells = max(n_all // _POINTS_OF_A_CELL, _CELLS_OF_A_COMPONENT * n_components)
     many = rows.are_points and n_all >= max(_MANY_POINTS, 4 * n_cells)
     if not many or rows.values.shape[1] > 3 or settings.max_iter < 2:
+        n_sampled = _SAMPLED_OF_A_COMPONENT * n_components
+        if n_all >= 2 * n_sampled and settings.max_iter > 1:
+            drawn = _sample(rows, n * n_sampled // n_all)
+            part = Rows(rows.values[drawn], rows.weight[drawn], rows.are_points)
+            silent = replace(settings, on_iteration=None)
+            parameters = run_truncated(part, owner[drawn], parameters, silent)[0].parameters
         return run_truncated(rows, owner, parameters, settings)[0]
     share = max(1, n_cells // settings.processes.size)
     cells = pool_into_cells(rows.values, share, max(settings.reg_covar, 1e-12) ** 0.5, rows.weight)
@@ -274,6 +281,13 @@ def learn_truncated(rows: Rows, owner: Tensor, parameters: Parameters, settings:
     left = replace(settings, max_iter=settings.max_iter - coarse.n_iter, on_iteration=go_on)
     fine, *_ = run_truncated(rows, owner[cells.member], coarse.parameters, left, candidates)
     return EMResult(fine.parameters, coarse.lower_bounds + fine.lower_bounds, fine.converged)
+
+
+def _sample(rows: Rows, n: int) -> Tensor:
+    """n of the rows at random, in their order: the same ones whenever there are as many."""
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.randperm(rows.weight.shape[0], generator=generator)[:n]
+    return chosen.sort().values.to(rows.weight.device)
 
 
 def _set_lengths() -> Iterator[int]:

@@ -88,6 +88,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         "degrees_of_freedom",
         *(f"prior_{name}" for name in Prior._fields),
     )
+    _takes_any_total_weight = True
     concentration: Tensor
     mean_precision: Tensor
     degrees_of_freedom: Tensor

@@ -925,3 +925,26 @@ def test_a_state_dict_restores_into_a_fresh_mixture():
     network = torch.nn.ModuleDict({"map": GaussianMixture(3)})
     network.load_state_dict(torch.nn.ModuleDict({"map": fitted}).state_dict())
     assert torch.equal(network["map"].score_samples(points), fitted.score_samples(points))
+
+
+def test_how_many_points_a_given_mixture_stands_for_is_not_known():
+    gmm = fitted()
+    given_one = GaussianMixture.from_parameters(gmm.weights_, gmm.means_, gmm.covariances_)
+    assert given_one.n_samples_seen_ is None
+    assert gmm.n_samples_seen_ == 400
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-9, 1e15, 1e39, 1e300])
+def test_weights_that_would_lose_digits_are_refused(scale):
+    x = blobs()
+    with pytest.raises(InvalidArgumentError, match=r"sample_weight is .* scale it"):
+        GaussianMixture(3).fit(x, sample_weight=np.full(len(x), scale))
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1e11])
+def test_large_and_small_weights_that_do_not_are_as_good_as_ones(scale):
+    x = blobs()
+    start = given_start(2)
+    plain = GaussianMixture(3, **start).fit(x)
+    scaled = GaussianMixture(3, **start).fit(x, sample_weight=np.full(len(x), scale))
+    np.testing.assert_allclose(scaled.means_, plain.means_, rtol=1e-6)

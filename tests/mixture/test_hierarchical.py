@@ -158,7 +158,7 @@ class NaiveTree:
         variance = np.linalg.eigvalsh(covariance)
         if variance[0] < self.rule["planarity_threshold"] * variance.sum():
             return []
-        if p.sum() < 2 * self.rule["min_support"] or variance[-1] <= 2 * self.rule["reg_covar"]:
+        if p.sum() < 2 * self.rule["min_support"]:
             return []
         mixture, last = self.start(p), -math.inf
         for _ in range(self.rule["max_iter"]):

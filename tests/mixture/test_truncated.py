@@ -852,3 +852,25 @@ def test_compiled_it_finds_the_same():
     plain, compiled = (GaussianMixture(60, compiled=value, **options).fit(points) for value in (False, True))
     torch.testing.assert_close(compiled.means, plain.means, rtol=1e-3, atol=1e-3)
     assert compiled.lower_bound_ == pytest.approx(plain.lower_bound_, abs=1e-4)
+
+
+def test_of_many_points_it_begins_on_a_sample_whose_bounds_are_left_out(monkeypatch):
+    points = torch.from_numpy(beads(6000, 5)[0])
+    first, owner = flat_pieces(points, torch.ones(6000).double(), 5, 1e-6)
+    runs, told = [], []
+    run = truncated.run_truncated
+    monkeypatch.setattr(
+        truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
+    )
+    found = learn_truncated(
+        Rows(points, torch.ones(6000).double()),
+        owner,
+        first,
+        Settings(on_iteration=lambda *at: told.append(at)),
+    )
+    sample, whole = runs
+    assert sample.weight.shape[0] == 2000
+    assert len(torch.unique(sample.values, dim=0)) == 2000
+    assert whole.weight.shape[0] == 6000
+    assert told == list(enumerate(found.lower_bounds, 1))
+    assert found.lower_bounds == sorted(found.lower_bounds)
