@@ -189,7 +189,8 @@ def test_the_learning_rule_takes_what_the_options_offer_with_the_same_defaults()
 
 def test_the_mixture_takes_what_the_options_offer_with_the_same_defaults():
     ours, theirs = asdict(schema.Mixture()), asdict(FitOptions())
-    assert theirs == {**ours, "dtype": schema.Runtime().dtype}
+    runtime = schema.Runtime()
+    assert theirs == {**ours, "dtype": runtime.dtype, "compiled": runtime.compile}
     assert plain(composed("fit").mixture) == ours
 
 

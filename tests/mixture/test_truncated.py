@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,12 +19,16 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
+from gmmtorch.datasets.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture, em, gaussian_mixture, grouping, truncated
+from gmmtorch.mixture.checkpoints import Checkpoint
+from gmmtorch.mixture.distributed import Processes
 from gmmtorch.mixture.em import Parameters
 from gmmtorch.mixture.grouping import Rows, choose_candidates, group_rows, nearest
 from gmmtorch.mixture.initialization import flat_pieces, moments_of
 from gmmtorch.mixture.momentum import Momentum
+from gmmtorch.mixture.streaming import fit_stream
 from gmmtorch.mixture.truncated import (
     Settings,
     learn_truncated,
@@ -874,3 +882,56 @@ def test_of_many_points_it_begins_on_a_sample_whose_bounds_are_left_out(monkeypa
     assert whole.weight.shape[0] == 6000
     assert told == list(enumerate(found.lower_bounds, 1))
     assert found.lower_bounds == sorted(found.lower_bounds)
+
+
+class Halves(Processes):
+    """Two threads as the two processes of a group, each with half of the rows."""
+
+    size = 2
+
+    def __init__(self, rank: int, barrier: threading.Barrier, board: list[Tensor | None]) -> None:
+        self.rank, self._barrier, self._board = rank, barrier, board
+
+    def sum(self, tensor: Tensor) -> Tensor:
+        self._board[self.rank] = tensor
+        self._barrier.wait(timeout=60)
+        first, second = self._board
+        total = first + second
+        self._barrier.wait(timeout=60)
+        return total
+
+
+@pytest.mark.parametrize("n", [700, 3000])  # on all points at once, and on a sample first
+def test_processes_that_share_the_rows_find_what_one_finds(n):
+    points = torch.from_numpy(beads(n, 5)[0])
+    points = points[torch.randperm(n, generator=torch.Generator().manual_seed(1))]
+    weight = torch.ones(n, dtype=torch.float64)
+    first, owner = flat_pieces(points, weight, 5, 1e-6)
+    wishes = Settings(1e-6, 1e-6, 60, torch.float64)  # all components are candidates
+    alone = learn_truncated(Rows(points, weight), owner, first, wishes)
+    barrier, board = threading.Barrier(2), [None, None]
+
+    def work(rank: int) -> em.EMResult:
+        mine = slice(rank, None, 2)
+        shared = replace(wishes, processes=Halves(rank, barrier, board))
+        return learn_truncated(Rows(points[mine], weight[mine]), owner[mine], first, shared)
+
+    with ThreadPoolExecutor(2) as pool:
+        one, other = pool.map(work, range(2))
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters, other.parameters, strict=True))
+    tolerance = 1e-9 if n == 700 else 1e-3  # another sample begins elsewhere
+    assert one.lower_bounds[-1] == pytest.approx(alone.lower_bounds[-1], abs=tolerance)
+    if n == 700:
+        torch.testing.assert_close(one.parameters.means, alone.parameters.means, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore:EM did not converge")
+def test_streamed_truncated_em_is_as_good_as_exact_em():
+    points = beads(3000, 60)[0]
+    source = in_memory(torch.from_numpy(points), "beads", chunk_points=500)
+    options = {"random_state": 0, "init_params": "flat_pieces", "reg_covar": 1e-6}
+    streamed = fit_stream(GaussianMixture(60, algorithm="truncated", **options), source)
+    exact = GaussianMixture(60, algorithm="exact", **options).fit(points)
+    assert streamed.score(torch.from_numpy(points)) == pytest.approx(exact.score(points), abs=0.02)
+    with pytest.raises(InvalidArgumentError, match="checkpoint"):
+        fit_stream(GaussianMixture(60, algorithm="truncated"), source, checkpoint=Checkpoint(Path("never")))
