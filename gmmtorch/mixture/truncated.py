@@ -149,7 +149,7 @@ class Settings:
     point. max_iter: iterations at most. dtype: of the E-step; float32 is raised to float64 where it
     would err too much. n_candidates: components offered to each row. on_iteration: called with the
     iteration, from 1, and the bound. processes: who shares the fit, each with rows of its own.
-    compiled: the E-step by torch.compile: the same to rounding, about 1.4 times as fast, after some ten
+    compiled: the E-step by torch.compile: the same to rounding, half as fast again, after about five
     seconds for its first use in a process. Needs a C++ compiler.
     """
 
