@@ -46,10 +46,12 @@ class Rows:
         """Features (N, F)."""
         return quadratic_features(self.values) if self.are_points else self.values
 
-    def local_features(self, index: Tensor, center: Tensor) -> Tensor:
+    def local_features(self, index: Tensor, center: Tensor, dtype: torch.dtype) -> Tensor:
         """Features (n, F) of the rows `index` (n,), each about its own center (n, D)."""
         values = self.values.index_select(0, index)
-        return quadratic_features(values - center) if self.are_points else shift_features(values, -center)
+        if self.are_points:
+            return quadratic_features((values - center).to(dtype))
+        return shift_features(values, -center).to(dtype)
 
 
 class Groups(NamedTuple):
@@ -89,7 +91,7 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
         part = slice(begin, min(begin + _BUILD_ROWS, n))
         group = owner.index_select(0, row[part])
         slot[part] = torch.arange(part.start, part.stop, device=owner.device) + gap.index_select(0, group)
-        local = rows.local_features(row[part], centers.index_select(0, group)).to(dtype)
+        local = rows.local_features(row[part], centers.index_select(0, group), dtype)
         features.index_copy_(0, slot[part], local)
         weight.index_copy_(0, slot[part], rows.weight.index_select(0, row[part]).to(dtype))
     trace = pack_symmetric(torch.eye(centers.shape[1], dtype=dtype, device=owner.device))
