@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 import warnings
+from collections.abc import Collection
 
 import numpy as np
 import torch
@@ -33,6 +36,29 @@ def as_generator(random_state: RandomState) -> torch.Generator:
             "a numpy RandomState or a torch Generator."
         )
     return generator
+
+
+def check_number(name: str, value: object, most: float = math.inf, above: bool = False) -> None:
+    """Raise `InvalidArgumentError` unless `value` is a finite number from 0, or `above` it, to `most`."""
+    number = float(value) if isinstance(value, numbers.Real) else math.nan
+    if not (0 <= number <= most and number < math.inf) or (above and number == 0):
+        limit = "above 0" if above else "of at least 0" if most == math.inf else f"from 0 to {most:g}"
+        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
+
+
+def check_choice(name: str, value: object, known: Collection[str]) -> None:
+    """Raise `InvalidArgumentError` unless `value` is one of the `known`, which the error lists."""
+    if not isinstance(value, str) or value not in known:
+        raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
+
+
+def check_enough(n_components: int, n_points: int | None) -> None:
+    """Raise `InvalidArgumentError` for more components than points, if their number is known."""
+    if n_points is not None and n_points < n_components:
+        raise InvalidArgumentError(
+            f"n_components={n_components} is more than the n_samples={n_points} points of "
+            "non-zero weight; ask for fewer components, or give more points."
+        )
 
 
 def warn_if_coarse(X: Array, points: Tensor) -> None:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 import numbers
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture import deconvolution, em
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+)
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.initialization import INITIALIZATIONS, start
 
@@ -102,12 +107,7 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         found = em.run_em(step, first, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
         safe_cholesky(found.parameters.covariances)  # a collapse in the last step shows here
         self._keep(found.parameters, center, found.lower_bounds, found.converged)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"EM did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("EM")
         return self
 
     def score_samples(self, X: Array, noise_covariances: Array | None = None) -> Array:
@@ -128,9 +128,7 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         check_whole("n_components", self.n_components, 1)
         check_whole("max_iter", self.max_iter, 1)
         for name in ("tol", "reg_covar"):
-            value = getattr(self, name)
-            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
+            check_number(name, getattr(self, name))
         thickness: object = self.thickness
         least = float(self.reg_covar) ** 0.5
         if thickness is not None and not (
@@ -142,16 +140,9 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
                 f"thickness={thickness!r} must be None, or a finite length above zero and at least "
                 f"√reg_covar = {least:g} m."
             )
-        if not isinstance(self.init_params, str) or self.init_params not in INITIALIZATIONS:
-            raise InvalidArgumentError(
-                f"init_params={self.init_params!r} is not one of {', '.join(INITIALIZATIONS)}."
-            )
+        check_choice("init_params", self.init_params, INITIALIZATIONS)
         as_generator(self.random_state)
-        if n_points is not None and n_points < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        check_enough(self.n_components, n_points)
 
 
 def checked_noise(noise: Array | None, n: int, points: Tensor) -> Tensor:

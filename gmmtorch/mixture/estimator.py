@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar, cast
@@ -10,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar, cast
 import numpy as np
 import torch
 from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.exceptions import NotFittedError as ScikitLearnNotFittedError
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import validate_data
@@ -45,7 +48,7 @@ class Cloud(NamedTuple):
     center: Tensor
 
 
-class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
+class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module, ABC):
     """A Gaussian mixture with scikit-learn's interface and a torch module's: all but the learning.
 
     A subclass names its parameters in `__init__` (which sets them and calls `nn.Module.__init__`),
@@ -63,12 +66,15 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
     """
 
     n_components: Any  # a whole number, or None where a subclass finds it by itself
+    tol: float
+    max_iter: int
     random_state: RandomState
     weights: Tensor
     means: Tensor
     covariances: Tensor
     _tensors: bool  # whether fit was given a tensor
     _extra_names: ClassVar[tuple[str, ...]] = ()  # buffers beside the mixture's own
+    _finds_n_components: ClassVar[bool] = False  # whether n_components is but the most there may be
     _takes_any_total_weight: ClassVar[bool] = False  # as it does where a prior counts in points
 
     @classmethod
@@ -111,9 +117,17 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         mixture._set_extra({})
         return mixture
 
+    @abstractmethod
     def check_parameters(self, n_points: int | None = None) -> None:
         """Raise `InvalidArgumentError` for a parameter that cannot be, or not with this many points."""
-        raise NotImplementedError
+
+    @abstractmethod
+    def fit(self: Self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Self:
+        """Learn the mixture of points X (N, D), each standing for `sample_weight` (N,) points."""
+
+    def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
+        """Fit, and the most likely component (N,) of each point."""
+        return self.fit(X, y, sample_weight).predict(X)
 
     # -- learning: what every fit begins and ends with --------------------------------------------
 
@@ -147,6 +161,15 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         self._set_buffers(weights / weights.sum(), means + center, covariances)
         self._set_history(lower_bounds, converged)
         self._set_extra(extra or {})
+
+    def _warn_unless_converged(self, what: str, where: str = "") -> None:
+        """Warn the caller of `fit` that it ended by `max_iter`, unless `tol` is zero: then that was meant."""
+        if not self.converged_ and self.tol > 0:
+            warnings.warn(
+                f"{what} did not converge within max_iter={self.max_iter}{where}; raise it, or raise tol.",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
 
     def _set_history(self, lower_bounds: Sequence[float], converged: bool) -> None:
         self.lower_bounds_ = [float(x) for x in lower_bounds]
@@ -335,8 +358,9 @@ class MixtureEstimator(DensityMixin, BaseEstimator, nn.Module):
         """Read a mixture that `save` wrote. Raises `DataError` when the file is not one."""
         stored = storage.read(path)
         known = set(cls._get_param_names())
-        if stored.parameters.get("n_components", 0) is not None:  # None stays: it is found anew
-            known.remove("n_components")
+        asked = stored.parameters.get("n_components", 0)
+        if asked is not None and not (cls._finds_n_components and isinstance(asked, int)):
+            known.remove("n_components")  # it is the number there are
         with storage.naming(path):
             mixture = cls.from_parameters(
                 stored.weights,

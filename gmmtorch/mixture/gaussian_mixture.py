@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import math
-import numbers
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture import em, stepwise
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator, checked_parameter
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+    checked_parameter,
+)
 from gmmtorch.mixture.cells import pool_into_cells
 from gmmtorch.mixture.component_count import surface_pieces
 from gmmtorch.mixture.em import EMResult, Parameters
@@ -143,12 +147,7 @@ class GaussianMixture(MixtureEstimator):
         assert best is not None
         seen = {"n_samples_seen": weight.sum()}
         self._keep(best.parameters, center, best.lower_bounds, best.converged, seen)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"EM did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("EM")
         return self
 
     def partial_fit(
@@ -193,10 +192,6 @@ class GaussianMixture(MixtureEstimator):
         blended = stepwise.blend(previous, update, eta)
         self._keep(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
         return self
-
-    def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
-        """Fit, and the most likely component (N,) of each point."""
-        return self.fit(X, y, sample_weight).predict(X)
 
     # How many points the mixture stands for goes with files and motions, but not with the state,
     # which is the parameters alone.
@@ -332,34 +327,23 @@ class GaussianMixture(MixtureEstimator):
             value = getattr(self, name)
             if name == "n_components" and value is None:
                 self._check_found()
-            elif not isinstance(value, numbers.Integral) or int(value) < 1:
-                raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least 1.")
-        noise: Any = self.noise
-        if not isinstance(noise, numbers.Real) or not 0 < float(noise) < math.inf:
-            raise InvalidArgumentError(
-                f"noise={noise!r} must be a finite number above 0, in the points' unit."
-            )
+            else:
+                check_whole(name, value, 1)
+        check_number("noise", self.noise, above=True)
         for name in ("tol", "reg_covar"):
-            value = getattr(self, name)
-            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
+            check_number(name, getattr(self, name))
         choices = {
             "init_params": ("auto", *INITIALIZATIONS),
             "algorithm": ("auto", "exact", "truncated"),
             "dtype": tuple(em.SOFTMAX_DTYPES),
         }
         for name, known in choices.items():
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in known:
-                raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
+            check_choice(name, getattr(self, name), known)
         if self.max_cells is not None:
             check_whole("max_cells", self.max_cells, 1)
         as_generator(self.random_state)
-        if n_points is not None and self.n_components is not None and n_points < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        if self.n_components is not None:
+            check_enough(self.n_components, n_points)
 
     def _check_found(self) -> None:
         """Raise `InvalidArgumentError` for a start that is given where it is to be found."""

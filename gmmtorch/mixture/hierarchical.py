@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import numbers
-import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.mixture import em, storage
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator
+from gmmtorch.mixture import em
+from gmmtorch.mixture.arguments import Array, RandomState, as_generator, check_choice, check_number
 from gmmtorch.mixture.em import Parameters
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
@@ -69,6 +64,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         "node_means",
         "node_covariances",
     )
+    _finds_n_components = True
     node_parents: Tensor
     node_weights: Tensor
     node_means: Tensor
@@ -134,17 +130,8 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         mixture = Parameters(*(value[leaves] for value in found.tree[1:]))
         extra = dict(zip(self._extra_names, tree, strict=True))
         self._keep(mixture, center, found.lower_bounds, found.converged, extra)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"EM did not converge within max_iter={self.max_iter} in every node; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("EM", " in every node")
         return self
-
-    def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
-        """Fit, and the most likely leaf (N,) of each point."""
-        return self.fit(X, y, sample_weight).predict(X)
 
     def _rule(self) -> GrowthRule:
         given = {name: getattr(self, name) for name in GrowthRule.__dataclass_fields__}
@@ -214,14 +201,6 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         """Covariances (M, D, D) of the nodes."""
         return self._as_fitted(self._tree().covariances)
 
-    @classmethod
-    def load(cls, path: str | Path) -> HierarchicalGaussianMixture:
-        """Read a mixture that `save` wrote. Raises `DataError` when the file is not one."""
-        tree = super().load(path)
-        given = storage.read(path).parameters.get("n_components")
-        tree.n_components = given if isinstance(given, int) else None  # at most, not the leaves there are
-        return tree
-
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         if tensors:
             missing = [name for name in self._extra_names if name not in tensors]
@@ -246,15 +225,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         for name, least in (("branching", 2), ("max_levels", 1), ("max_iter", 1)):
             check_whole(name, getattr(self, name), least)
         for name in ("tol", "reg_covar", "planarity_threshold", "thickness", "min_support", "min_gain"):
-            self._check_number(name, math.inf)
-        self._check_number("soft_threshold", 1.0)
-        if not isinstance(self.dtype, str) or self.dtype not in em.SOFTMAX_DTYPES:
-            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
+            check_number(name, getattr(self, name))
+        check_number("soft_threshold", self.soft_threshold, most=1.0)
+        check_choice("dtype", self.dtype, em.SOFTMAX_DTYPES)
         as_generator(self.random_state)
-
-    def _check_number(self, name: str, most: float) -> None:
-        value = getattr(self, name)
-        number = float(value) if isinstance(value, numbers.Real) else math.nan
-        if not (0 <= number <= most and math.isfinite(number)):
-            limit = "at least 0" if most == math.inf else f"0 to {most:g}"
-            raise InvalidArgumentError(f"{name}={value!r} must be a finite number of {limit}.")

@@ -23,20 +23,24 @@ from __future__ import annotations
 
 import functools
 import math
-import numbers
-import warnings
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor, nn
 
-from gmmtorch.errors import InvalidArgumentError, NumericalError, check_whole
+from gmmtorch.errors import NumericalError, check_whole
 from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, triangle_indices, unpack_symmetric
 from gmmtorch.mixture import em
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+)
 from gmmtorch.mixture.ascent import SOLVERS, ascend
 from gmmtorch.mixture.em import Parameters
 from gmmtorch.mixture.estimator import MixtureEstimator
@@ -141,12 +145,7 @@ class RiemannianGaussianMixture(MixtureEstimator):
         if blur == 0:
             check_thickness(mixture, points)
         self._keep(mixture, center, values, converged)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"The ascent did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("The ascent")
         return self
 
     def check_parameters(self, n_points: int | None = None) -> None:
@@ -154,24 +153,16 @@ class RiemannianGaussianMixture(MixtureEstimator):
         for name in ("n_components", "max_iter", "n_init", "memory"):
             check_whole(name, getattr(self, name), 1)
         for name in ("tol", "reg_covar"):
-            value = getattr(self, name)
-            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
+            check_number(name, getattr(self, name))
         choices: dict[str, Collection[str]] = {
             "init_params": INITIALIZATIONS,
             "solver": SOLVERS,
             "dtype": em.SOFTMAX_DTYPES,
         }
         for name, known in choices.items():
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in known:
-                raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
+            check_choice(name, getattr(self, name), known)
         as_generator(self.random_state)
-        if n_points is not None and n_points < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        check_enough(self.n_components, n_points)
 
 
 # -- the function, and the manifold it lives on ---------------------------------------------------

@@ -16,6 +16,7 @@ more at 30° off the axis), and a lidar's beams to be as dense at every elevatio
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -53,7 +54,7 @@ class SensorModel(Protocol):
 
 
 @dataclass(frozen=True)
-class _BeamModel:
+class _BeamModel(ABC):
     """What the kinds of sensor share.
 
     max_incidence: radians; surfaces more slanted are taken to be met at this angle. It bounds
@@ -68,13 +69,13 @@ class _BeamModel:
                 f"max_incidence={self.max_incidence} must be an angle from 0 to below π/2 radians."
             )
 
+    @abstractmethod
     def deviations(self, distance: Tensor) -> Deviations:
         """Standard deviations at ranges (m) of any shape, at no incidence."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _density(self, distance: Tensor) -> Tensor:
         """Points per m² (or m) of a surface that faces the sensor."""
-        raise NotImplementedError
 
     def noise_covariances(self, points: Tensor, origin: Tensor, normals: Tensor | None = None) -> Tensor:
         """Covariances (N, D, D), m², positive definite, of the points' errors, world frame.

@@ -8,18 +8,22 @@ descends on a few of the directions at a time, and a pass over all of them is an
 from __future__ import annotations
 
 import math
-import numbers
-import warnings
 from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import nn
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import check_whole
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+)
 from gmmtorch.mixture.em import SOFTMAX_DTYPES, Parameters
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.initialization import INITIALIZATIONS, start
@@ -133,35 +137,21 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         safe_cholesky(covariances)
         found = Parameters(weights, means * unit, covariances)
         self._keep(found, center, [-cost * unit**2 for cost in costs], converged)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"The descent did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("The descent")
         return self
 
     def check_parameters(self, n_points: int | None = None) -> None:
         """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
         for name in ("n_components", "n_projections", "max_iter"):
             check_whole(name, getattr(self, name), 1)
-        for name in ("tol", "reg_covar", "learning_rate"):
-            value = getattr(self, name)
-            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
-        if float(self.learning_rate) == 0:
-            raise InvalidArgumentError(f"learning_rate={self.learning_rate!r} must be above 0.")
+        for name in ("tol", "reg_covar"):
+            check_number(name, getattr(self, name))
+        check_number("learning_rate", self.learning_rate, above=True)
         choices: dict[str, Collection[str]] = {"init_params": INITIALIZATIONS, "dtype": SOFTMAX_DTYPES}
         for name, known in choices.items():
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in known:
-                raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
+            check_choice(name, getattr(self, name), known)
         as_generator(self.random_state)
-        if n_points is not None and n_points < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        check_enough(self.n_components, n_points)
 
 
 # -- the descent -----------------------------------------------------------------------------------

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import math
-import numbers
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture import em
-from gmmtorch.mixture.arguments import Array, RandomState, as_generator, checked_parameter
+from gmmtorch.mixture.arguments import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+    checked_parameter,
+)
 from gmmtorch.mixture.em import EMResult, Parameters
 from gmmtorch.mixture.estimator import Cloud, MixtureEstimator, NotFittedError
 from gmmtorch.mixture.gaussian_wishart import (
@@ -178,17 +182,8 @@ class VariationalGaussianMixture(MixtureEstimator):
         extra |= {f"prior_{name}": value for name, value in prior._asdict().items()}
         extra["prior_mean"] = prior.mean + cloud.center
         self._keep(mixture, cloud.center, best.lower_bounds, best.converged, extra)
-        if not self.converged_ and self.tol > 0:
-            warnings.warn(
-                f"The fit did not converge within max_iter={self.max_iter}; raise it, or raise tol.",
-                ConvergenceWarning,
-                stacklevel=2,
-            )
+        self._warn_unless_converged("The fit")
         return self
-
-    def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
-        """Fit, and the most likely component (N,) of each point."""
-        return self.fit(X, y, sample_weight).predict(X)
 
     def _prior(self, cloud: Cloud) -> Prior:
         """The prior about the cloud's centre: as given, and where it is not, the cloud's own."""
@@ -298,24 +293,15 @@ class VariationalGaussianMixture(MixtureEstimator):
         for name in ("n_components", "max_iter", "n_init"):
             check_whole(name, getattr(self, name), 1)
         for name in ("tol", "reg_covar"):
-            value = getattr(self, name)
-            if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-                raise InvalidArgumentError(f"{name}={value!r} must be a finite number of at least 0.")
+            check_number(name, getattr(self, name))
         for name in ("weight_concentration_prior", "mean_precision_prior", "degrees_of_freedom_prior"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, numbers.Real) and 0 < float(value) < math.inf):
-                raise InvalidArgumentError(f"{name}={value!r} must be None, or finite and above 0.")
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), above=True)
         for name, choices in (
             ("init_params", INITIALIZATIONS),
             ("weight_concentration_prior_type", WEIGHT_PRIORS),
             ("dtype", em.SOFTMAX_DTYPES),
         ):
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in choices:
-                raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(choices)}.")
+            check_choice(name, getattr(self, name), choices)
         as_generator(self.random_state)
-        if n_points is not None and n_points < self.n_components:
-            raise InvalidArgumentError(
-                f"n_components={self.n_components} is more than the n_samples={n_points} points of "
-                "non-zero weight; ask for fewer components, or give more points."
-            )
+        check_enough(self.n_components, n_points)
