@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
-from gmmtorch.occupancy.monte_carlo import Cones
+from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import ArrayLike
 
 

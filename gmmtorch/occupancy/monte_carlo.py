@@ -9,23 +9,10 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import safe_cholesky
+from gmmtorch.occupancy.cones import Cones
 
 Sampling = Literal["sobol", "stratified", "plain"]
 SAMPLINGS: tuple[str, ...] = get_args(Sampling)
-
-
-class Cones(NamedTuple):
-    """Components as seen from places: C rows, a component seen from two places takes two rows.
-
-    means (C, D), covariances (C, D, D): the component; origins (C, D): the sensor position;
-    counts (C,): its points measured from there; max_range (C,) bool: points that met no surface.
-    """
-
-    means: Tensor
-    covariances: Tensor
-    origins: Tensor
-    counts: Tensor
-    max_range: Tensor
 
 
 class RayBundle(NamedTuple):
