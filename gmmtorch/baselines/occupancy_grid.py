@@ -51,6 +51,8 @@ class OccupancyGrid:
         compiled: cast rays with torch.compile, see `traverse`.
     """
 
+    any_resolution = False
+
     def __init__(
         self,
         resolution: float,

@@ -111,9 +111,7 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
     figures: dict[str, Any] = {"auc_against_kept": auc_against_kept_figure(outcome.rows)}
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
-        panels = [
-            MapPanel(_label(built), _answers(built, resolution), resolution, low, high) for built in shown
-        ]
+        panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
         # Cells that grazing beams cross are free more often than hit: half is too strict from above.
         figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory, occupied_above=0.4)
         curves = {_label(built): built.roc for built in shown}
@@ -134,10 +132,6 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
 
 def _label(built: Built) -> str:
     return str(built.row["method"])
-
-
-def _answers(built: Built, resolution: float) -> Callable[[Any], Any]:
-    return lambda points: built.map.occupancy(points, resolution)
 
 
 def _write_board(

@@ -31,6 +31,13 @@ class MeshDataset(FileDataset):
 
 
 @dataclass
+class MeshScansDataset(FileDataset):
+    n_scans: int = 100
+    sensor: str = "lidar"
+    seed: int = 0
+
+
+@dataclass
 class SyntheticDataset:
     name: str = MISSING
     max_range: float | None = None
@@ -198,5 +205,6 @@ def register() -> None:
     store.store(group="schema/dataset", name="file", node=FileDataset)
     store.store(group="schema/dataset", name="depth_frames", node=DepthFramesDataset)
     store.store(group="schema/dataset", name="mesh", node=MeshDataset)
+    store.store(group="schema/dataset", name="mesh_scans", node=MeshScansDataset)
     store.store(group="schema/dataset", name="synthetic", node=SyntheticDataset)
     store.store(group="schema/dataset", name="synthetic_building", node=SyntheticBuildingDataset)

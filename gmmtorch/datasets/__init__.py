@@ -33,6 +33,7 @@ _SOURCES = {
     "depth_frames": _Source("depth_frames", "DepthFrames"),
     "octomap_log": _Source("octomap_log", "OctomapLog"),
     "mesh": _Source("mesh_samples", "MeshSamples"),
+    "mesh_scans": _Source("mesh_scans", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
     "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
 }
@@ -50,17 +51,18 @@ def load(
     """The data set `name`: a sequence of `Scan`s, read when asked for.
 
     Args:
-        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, mesh (these need a
-            `path`), synthetic_building or synthetic_building_2d (these need none).
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, mesh, mesh_scans
+            (these need a `path`), synthetic_building or synthetic_building_2d (these need none).
         path: the file or folder.
         max_range: readings at or beyond it (m) are beams without return. None: 50 for CARMEN logs,
-            the sensor's own maximum for the synthetic buildings, no limit (`math.inf`) for the others.
+            the sensor's own maximum for mesh_scans and the synthetic buildings, no limit (`math.inf`)
+            for the others.
         no_return_range: how far (m) such a beam speaks of free space; 0 drops them. None: 8 for CARMEN
-            logs and the synthetic buildings, 0 for the others.
+            logs, mesh_scans and the synthetic buildings, 0 for the others.
         stride: every n-th scan is read.
         options: what only this data set takes: `pixel_stride` for depth_frames; `n_points`, `noise` and
-            `seed` for mesh; `seed`, `n_scans` and `sensor` ("lidar" or "depth_camera", in 3D) for the
-            synthetic buildings.
+            `seed` for mesh; `seed`, `n_scans` and `sensor` ("lidar" or "depth_camera", in 3D) for
+            mesh_scans and the synthetic buildings.
 
     Raises `InvalidArgumentError` for a name, option or value that is not known, `MissingDataError` for a
     path that does not exist, and `DataError`, now or when a scan is read, for what cannot be read.

@@ -17,6 +17,7 @@ from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
 from gmmtorch.files import check_writable
+from gmmtorch.mapping.answers import METHODS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import OccupancyMap
@@ -63,11 +64,35 @@ class Protocol:
             raise InvalidArgumentError(f"max_beams={self.max_beams} must be at least 1.")
 
 
+MapFactory = Callable[[float], OccupancyMap]
+"""Makes an empty map for a resolution (m)."""
+
+Answer = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Form:
+    """A factory of mixture maps that are asked for one form of evidence.
+
+    Forms with the same `new_map` answer from the same map: it is built once.
+    """
+
+    new_map: Callable[[], GaussianMap]
+    form: str
+
+    def __call__(self, resolution: float) -> GaussianMap:
+        return self.new_map()
+
+
 @dataclass(frozen=True)
 class Built:
-    """One map, and what it answered: `theta` (M,) for `asked`, a row of results, the ROC curve."""
+    """One map, and what it answered: `theta` (M,) for `asked`, a row of results, the ROC curve.
+
+    answer: the method's occupancy (M,) of any points (M, D), at the row's resolution.
+    """
 
     map: OccupancyMap
+    answer: Answer
     row: dict[str, Any]
     asked: Queries
     theta: Tensor
@@ -82,17 +107,13 @@ class Outcome:
     shown: list[Built] = field(default_factory=list)
 
 
-MapFactory = Callable[[float], OccupancyMap]
-"""Makes an empty map for a resolution (m)."""
-
-
 def methods(new_map: Callable[[], GaussianMap], **grid_options: Any) -> dict[str, MapFactory]:
     """Every method by name; `new_map` makes the mixture map that ours answer from.
 
     `grid_options` are those of `OccupancyGrid`, other than its kind.
     """
     return {
-        "monte_carlo": lambda resolution: new_map(),
+        **{form: Form(new_map, form) for form in METHODS},
         "occupancy_grid": lambda resolution: OccupancyGrid(resolution, **grid_options),
         "occupancy_log_odds": lambda resolution: OccupancyGrid(
             resolution, log_odds=LogOdds(), **grid_options
@@ -148,17 +169,22 @@ def evaluate(
     largest = max(protocol.kept)
     for kept in protocol.kept:
         shown = split.keep_share(train, kept, protocol.removal, seed)
+        # A map that answers at any resolution, and by any form, is built once and asked again.
+        at_hand: dict[Any, tuple[OccupancyMap, float]] = {}
         for method, factory in factories.items():
-            label = f"{method}, {kept:.0%} of the {protocol.removal}"
-            previous: tuple[OccupancyMap, float] | None = None
+            label = (
+                f"{'mixture' if isinstance(factory, Form) else method}, {kept:.0%} of the {protocol.removal}"
+            )
+            shared = factory.new_map if isinstance(factory, Form) else method
             for resolution in protocol.resolution:
-                # A mixture does not depend on the resolution: it is built once and asked again.
-                if previous is not None and isinstance(previous[0], GaussianMap):
-                    built, seconds = previous
-                else:
-                    built, seconds = _build(factory(resolution), shown, label, on_event)
-                previous = (built, seconds)
-                made = _score(built, asked[resolution], resolution, seed, protocol.unknown)
+                if shared not in at_hand:
+                    at_hand[shared] = _build(factory(resolution), shown, label, on_event)
+                built, seconds = at_hand[shared]
+                if not built.any_resolution:
+                    del at_hand[shared]
+                _aim(built, factory, resolution)
+                answer = _answerer(built, factory, resolution)
+                made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
                 made.row.update(
                     dataset=name,
                     method=method,
@@ -169,7 +195,7 @@ def evaluate(
                 )
                 if protocol.save_map:
                     file = Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}.safetensors"
-                    _save_for(built, file, resolution)
+                    built.save(file)
                 outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
                 on_row(outcome.rows)
                 if kept == largest:
@@ -177,11 +203,18 @@ def evaluate(
     return outcome
 
 
-def _save_for(built: OccupancyMap, file: Path, resolution: float) -> None:
-    """Save a map so that, loaded, it answers at this resolution unless asked for another."""
+def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:
+    """The method's occupancy at a resolution."""
+    if isinstance(factory, Form) and isinstance(built, GaussianMap):
+        return lambda points: torch.as_tensor(built.occupancy(points, resolution, factory.form))
+    return lambda points: torch.as_tensor(built.occupancy(points, resolution))
+
+
+def _aim(built: OccupancyMap, factory: MapFactory, resolution: float) -> None:
+    """Let the map, and its file, answer by this method and at this resolution unless told otherwise."""
     if isinstance(built, GaussianMap):
         built.resolution = resolution
-    built.save(file)
+        built.method = factory.form if isinstance(factory, Form) else built.method
 
 
 def _questions(
@@ -208,9 +241,11 @@ def _build(
     return empty, time.perf_counter() - begin
 
 
-def _score(built: OccupancyMap, asked: Queries, resolution: float, seed: int, unknown: bool) -> Built:
+def _score(
+    built: OccupancyMap, answer: Answer, asked: Queries, resolution: float, seed: int, unknown: bool
+) -> Built:
     begin = time.perf_counter()
-    theta = torch.as_tensor(built.occupancy(asked.points, resolution)).cpu()
+    theta = answer(asked.points).cpu()
     seconds = time.perf_counter() - begin
     occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
     curve = metrics.roc(occupied, free)
@@ -228,7 +263,7 @@ def _score(built: OccupancyMap, asked: Queries, resolution: float, seed: int, un
     }
     if unknown:
         row |= metrics.unknown_scores(theta[asked.of(UNKNOWN)], free)
-    return Built(built, row, asked, theta, curve)
+    return Built(built, answer, row, asked, theta, curve)
 
 
 _COLUMNS = [

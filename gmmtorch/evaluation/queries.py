@@ -19,7 +19,7 @@ from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.scan import Scan
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
-FreePoints = Literal["uniform", "near_surface"]
+FreePoints = Literal["uniform", "near_surface", "clear"]
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,9 @@ def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor
 def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: float, seed: int) -> Queries:
     """One hit and one free point a beam.
 
-    The free point is uniform along the beam, or half to two cells before the hit ("near_surface",
-    which shows how thick a map's surfaces are), never before the sensor.
+    The free point is uniform along the beam; or half to two cells before the hit ("near_surface",
+    which shows how thick a map's surfaces are), never before the sensor; or uniform, but left out
+    within one cell of the hit ("clear": a share of uniform points is too near to be told apart).
     """
     check_free(free)
     generator = torch.Generator().manual_seed(seed)
@@ -75,7 +76,9 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
         length = (ends - origins).norm(dim=1)
         uniform = (1 - (0.5 + 1.5 * uniform) * resolution / length).clamp_min(0)
     points = origins + (ends - origins) * uniform[:, None]
-    labels = torch.cat([torch.full((len(ends),), OCCUPIED), torch.full((len(ends),), FREE)])
+    if free == "clear":
+        points = points[(ends - points).norm(dim=1) > resolution]
+    labels = torch.cat([torch.full((len(ends),), OCCUPIED), torch.full((len(points),), FREE)])
     return Queries(torch.cat([ends, points]), labels)
 
 

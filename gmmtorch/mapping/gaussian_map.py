@@ -15,18 +15,16 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
+from gmmtorch.mapping.answers import Answering, Answers, check_method
 from gmmtorch.mapping.components import Components, sightings_of
 from gmmtorch.mapping.learning import LearningRule, learn_window
-from gmmtorch.occupancy.blocks import BlockEvidence
-from gmmtorch.occupancy.evidence import Evidence, check_prior
-from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
-from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
-METHODS = ("monte_carlo",)
+_OF_THE_MACHINE = ("memory_limit", "compiled")  # options of answering that a file does not carry
 _BUFFERS = tuple(f.name for f in fields(Components))
-_RAYS_AT_ONCE = 1 << 20
 
 
 class GaussianMap(nn.Module):
@@ -39,17 +37,16 @@ class GaussianMap(nn.Module):
         window: scans fitted together; 1 with `max_origins=1` is the thesis's map.
         learning: how a window becomes components.
         resolution: side (m) of the cells that queries without a resolution ask about.
-        n_samples: Monte Carlo rays drawn from the whole map to answer queries.
-        sampling: "sobol", "stratified" or "plain".
-        prior: N_p of (3.9), counts given to either outcome before any evidence.
+        method: form of evidence that queries without a method ask for: "point", in closed form at
+            the point itself; "flux" (exact), "cone" (the thesis's) or "monte_carlo" of the cell that
+            holds it.
         random_state: seed; the same scans in the same order then give the same map and answers.
         robot: first half of the components' ids.
-        memory_limit: bytes that evidence may take.
-        compiled: cast rays with torch.compile, see `traverse`.
+        answering: further options of `Answering`: prior, cutoff, n_samples, …
 
     Asking a map does not change it: scans of a window that is not full yet are fitted for the
-    answer, and again when the window is. The first question after an insertion casts `n_samples`
-    rays of the whole map (about a second for a million): ask seldom, or lower `n_samples`.
+    answer, and again when the window is. The first question by `monte_carlo` after an insertion
+    casts rays of the whole map (about a second for a million).
     To keep a map in a file use `save`; `state_dict` restores into a map that has its components.
     """
 
@@ -63,41 +60,33 @@ class GaussianMap(nn.Module):
     seen_from: Tensor
     seen_count: Tensor
 
+    any_resolution = True
+
     def __init__(
         self,
         window: int = 20,
         learning: LearningRule | None = None,
         *,
         resolution: float = 0.1,
-        n_samples: int = 1_000_000,
-        sampling: Sampling = "sobol",
-        prior: float = 1.0,
+        method: str = "point",
         random_state: int = 0,
         robot: int = 0,
-        memory_limit: int = MEMORY_LIMIT,
-        compiled: bool = False,
+        **answering: Any,
     ) -> None:
         super().__init__()
         check_whole("window", window, 1)
-        check_whole("n_samples", n_samples, 1)
-        check_whole("memory_limit", memory_limit, 1)
-        check_whole("random_state", random_state, 0)
-        if sampling not in SAMPLINGS:
-            raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+        check_method(method)
         self.window = window
         self.learning = learning or LearningRule()
         self.resolution = check_resolution(resolution)
-        self.n_samples = n_samples
-        self.sampling: Sampling = sampling
-        self.prior = check_prior(prior)
+        self.method = method
+        self.answering = Answering(random_state=random_state, **answering)
         self.random_state = int(random_state)
         self.robot = robot
-        self.memory_limit = memory_limit
-        self.compiled = compiled
         self.frame: Tensor | None = None  # (D,) whole metres, near the first scan
         self._pending: list[Scan] = []
         self._n_windows = 0
-        self._answers: dict[float, BlockEvidence] = {}
+        self._answers: Answers | None = None
         self._provisional: Components | None = None
 
     @classmethod
@@ -194,7 +183,7 @@ class GaussianMap(nn.Module):
         self._set(storage.storable(components, self.frame))
 
     def _forget_answers(self) -> None:
-        self._answers, self._provisional = {}, None
+        self._answers, self._provisional = None, None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
         """Moves between devices, waiting scans too; positions stay float64 whatever dtype a network
@@ -249,54 +238,40 @@ class GaussianMap(nn.Module):
     # -- answering --------------------------------------------------------------------------------
 
     def occupancy(
-        self, points: ArrayLike, resolution: float | None = None, method: str = "monte_carlo"
+        self, points: ArrayLike, resolution: float | None = None, method: str | None = None
     ) -> Tensor | np.ndarray:
-        """Probability (M,) that the cell of side `resolution` (m) that holds each point (M, D) is occupied.
+        """Probability (M,) that a cube of side `resolution` (m) at each point (M, D) is occupied.
 
-        Exactly ½ where no evidence is, and everywhere while the map is empty. Arrays in, arrays
-        out. The evidence is computed once for each resolution, and kept until the map changes.
+        Of the cube centred at the point by method "point"; of the cell of the lattice that holds the
+        point by the others. Exactly ½ where no evidence is, and everywhere while the map is empty.
+        Arrays in, arrays out; gradients flow to points that ask for them, by "point".
         """
         query = check_queries(points, self.dim)
+        method = self.method if method is None else method
+        check_method(method)
+        resolution = self.resolution if resolution is None else check_resolution(resolution)
         if self.dim is None:
             theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64, device=query.device)
         else:
-            theta = self._block_evidence(resolution, method).lookup(query.to(self.means.device), self.prior)
+            theta = self._answering().occupancy(query.to(self.means.device), resolution, method)
         return theta.to(query.device) if isinstance(points, Tensor) else theta.cpu().numpy()
 
-    def evidence(self, grid: VoxelGrid, method: str = "monte_carlo") -> Evidence:
+    def evidence(self, grid: VoxelGrid, method: str | None = None) -> Evidence:
         """Hits and misses of every cell of a grid."""
-        _check_method(method)
-        if self.dim is not None and grid.dim != self.dim:
+        method = self.method if method is None else method
+        check_method(method)
+        if self.dim is None:
+            return Evidence.empty(grid)
+        if grid.dim != self.dim:
             raise InvalidArgumentError(
                 f"grid is {grid.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
-        evidence = Evidence.empty(grid, None if self.dim is None else self.means.device)
-        self._cast(evidence)
-        return evidence
+        return self._answering().evidence(grid, method)
 
-    def _block_evidence(self, resolution: float | None, method: str) -> BlockEvidence:
-        _check_method(method)
-        resolution = self.resolution if resolution is None else check_resolution(resolution)
-        if resolution not in self._answers:
-            evidence = BlockEvidence(
-                resolution, cast(int, self.dim), self.means.device, self.memory_limit, self.compiled
-            )
-            self._cast(evidence)
-            self._answers[resolution] = evidence
-        return self._answers[resolution]
-
-    def _cast(self, evidence: Evidence | BlockEvidence) -> None:
-        """Monte Carlo rays of the whole map, added to `evidence`."""
-        if self.dim is None or len(self.components()) == 0:
-            return
-        generator = torch.Generator().manual_seed(self.random_state)
-        rays = sample_rays(self.components().cones(), self.n_samples, generator, self.sampling)
-        parts = zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True)
-        for origins, ends, weights, is_hit in parts:
-            if isinstance(evidence, Evidence):
-                evidence.add_rays(origins, ends, weights, is_hit, compiled=self.compiled)
-            else:
-                evidence.add_rays(origins, ends, weights, is_hit)
+    def _answering(self) -> Answers:
+        if self._answers is None:
+            self._answers = Answers(self.components().cones(), self.answering)
+        return self._answers
 
     # -- keeping ----------------------------------------------------------------------------------
 
@@ -305,11 +280,9 @@ class GaussianMap(nn.Module):
             "window": self.window,
             "learning": asdict(self.learning),
             "resolution": self.resolution,
-            "n_samples": self.n_samples,
-            "sampling": self.sampling,
-            "prior": self.prior,
-            "random_state": self.random_state,
+            "method": self.method,
             "robot": self.robot,
+            **{name: value for name, value in asdict(self.answering).items() if name not in _OF_THE_MACHINE},
         }
         return storage.to_bytes(self.components(), cast(Tensor, self.frame), facts)
 
@@ -333,11 +306,6 @@ class GaussianMap(nn.Module):
         made._set(components)
         made.frame = frame
         return made
-
-
-def _check_method(method: str) -> None:
-    if method not in METHODS:
-        raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
 
 
 def _tensor(value: ArrayLike) -> Tensor:

@@ -33,7 +33,12 @@ def check_queries(points: ArrayLike, dim: int | None) -> Tensor:
 
 @runtime_checkable
 class OccupancyMap(Protocol):
-    """A map that learns from scans and answers whether a place is occupied."""
+    """A map that learns from scans and answers whether a place is occupied.
+
+    any_resolution: whether one map answers at every resolution; else it is made for one.
+    """
+
+    any_resolution: bool
 
     def insert(self, scan: Scan) -> None:
         """Learn from one scan, in the world frame."""

@@ -181,8 +181,9 @@ def test_the_learning_rule_takes_what_the_options_offer_with_the_same_defaults()
     for name, value in asdict(LearningRule()).items():
         assert options.pop(name, value) == value, name
     made = GaussianMap()
-    for name in ("window", "n_samples", "sampling", "prior"):
-        assert options.pop(name) == getattr(made, name), name
+    assert options.pop("window") == made.window
+    for name in ("n_samples", "sampling", "prior"):
+        assert options.pop(name) == getattr(made.answering, name), name
     assert set(options) == {"name"}
     assert plain(composed("occupancy").map) == {**asdict(schema.Map()), "name": "windowed"}
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
-from gmmtorch.evaluation.occupancy import Protocol, evaluate, methods
+from gmmtorch.evaluation.occupancy import Protocol, choose, evaluate, methods
 from gmmtorch.evaluation.queries import (
     FREE,
     OCCUPIED,
@@ -226,7 +226,8 @@ def test_saved_maps_alone_answer_the_saved_queries_as_the_rows_say(tmp_path, fre
         save_queries=str(tmp_path / "q.npz"),
         save_map=str(tmp_path / "maps"),
     )
-    known = methods(lambda: GaussianMap(window=5, n_samples=20_000))
+    ours, grids = ("point", "monte_carlo"), ("occupancy_grid", "occupancy_log_odds")
+    known = choose([*ours, *grids], methods(lambda: GaussianMap(window=5, n_samples=20_000)))
     rows = evaluate("room", room_scans(16), known, protocol, seed=5).rows
     assert len(rows) == len(known) * 4 == len(list((tmp_path / "maps").iterdir()))
     with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
@@ -237,7 +238,7 @@ def test_saved_maps_alone_answer_the_saved_queries_as_the_rows_say(tmp_path, fre
     for row in rows:
         path = tmp_path / "maps" / f"{row['method']}_{row['kept']:g}_{row['resolution']:g}.safetensors"
         assert path.stat().st_size == row["nbytes"]
-        kind = GaussianMap if row["method"] == "monte_carlo" else OccupancyGrid
+        kind = GaussianMap if row["method"] in ours else OccupancyGrid
         asked = np.isin(saved["resolution"], [0, row["resolution"]])
         theta = kind.load(path).occupancy(saved["points"][asked], row["resolution"])
         labels = saved["labels"][asked]

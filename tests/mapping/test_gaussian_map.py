@@ -277,7 +277,7 @@ def test_given_components_hit_where_their_density_is():
     low = grid.centers().numpy() - 0.125
     normal = multivariate_normal(mean, covariance)
     expected = [100 * normal.cdf(a + 0.25, lower_limit=a) for a in low]
-    np.testing.assert_allclose(made.evidence(grid).hits.flatten().numpy(), expected, atol=0.05)
+    np.testing.assert_allclose(made.evidence(grid, "monte_carlo").hits.flatten().numpy(), expected, atol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -528,7 +528,7 @@ def test_an_empty_map_has_no_evidence_nor_components():
 
 def test_evidence_beyond_the_memory_limit_is_refused():
     with pytest.raises(MemoryLimitError, match="resolution"):
-        built([wall_scan(2)], memory_limit=1 << 16).occupancy(lattice(2), 0.005)
+        built([wall_scan(2)], memory_limit=1 << 16).occupancy(lattice(2), 0.005, "monte_carlo")
 
 
 def test_a_map_is_a_module_whose_buffers_are_its_components():
@@ -548,7 +548,7 @@ def test_settings_and_components_come_back(tmp_path):
     made.save(tmp_path / "m.safetensors")
     loaded = GaussianMap.load(tmp_path / "m.safetensors")
     assert loaded.learning == rule
-    for name in ("window", "resolution", "n_samples", "sampling", "prior", "random_state", "robot"):
+    for name in ("window", "resolution", "method", "answering", "random_state", "robot"):
         assert getattr(loaded, name) == getattr(made, name)
     for name in ("means", "covariances", "support", "max_range", "ids"):
         assert torch.equal(getattr(loaded, name), getattr(made.components(), name))

@@ -1,0 +1,81 @@
+"""Scans that a simulated sensor takes on a walk through a triangle mesh: a mine, a warehouse."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.mesh_samples import read_triangles
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.scan import Scan
+from gmmtorch.simulation import depth_camera, sense, spinning_lidar
+from gmmtorch.simulation.mesh_world import MeshWorld
+
+SENSOR_RANGE = 30.0
+_SEEDS_APART = 1_000_003
+
+
+class MeshScans(Dataset):
+    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64), 30 m, noise 1 cm.
+
+    The sensor is carried through the largest part of the mesh that can be walked, 1.2 m above the
+    floor (see `MeshWorld.tour`); a camera looks where it goes. No return: beams that meet nothing
+    within the sensor's range, or within `max_range` if that is shorter. Scan i depends on the mesh, the
+    seed, the number of scans and i only.
+
+    Args:
+        path: PLY, OBJ, STL or whatever else Open3D reads triangles from; metres, z up.
+        n_scans: how many, about 2 m apart: what a mesh holds beyond them is not seen.
+        sensor: "lidar" or "depth_camera".
+        seed: of the sensor's noise.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        n_scans: int = 100,
+        sensor: str = "lidar",
+        seed: int = 0,
+    ) -> None:
+        self._path = existing(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
+        super().__init__(self._path.stem, ranges, stride)
+        self.n_scans = check_whole("n_scans", n_scans, 1)
+        self.seed = check_whole("seed", seed, 0)
+        if sensor not in ("lidar", "depth_camera"):
+            raise InvalidArgumentError(f"sensor={sensor!r} is not known; choose lidar or depth_camera.")
+        make = spinning_lidar if sensor == "lidar" else depth_camera
+        self.sensor = make(max_range=SENSOR_RANGE)
+
+    def _count(self) -> int:
+        return self.n_scans
+
+    @functools.cached_property
+    def world(self) -> MeshWorld:
+        """The mesh, read when it is first needed."""
+        return MeshWorld(read_triangles(self._path))
+
+    @functools.cached_property
+    def poses(self) -> Tensor:
+        """(n_scans, 4, 4) world ← sensor, x ahead on the walk."""
+        places = self.world.tour(self.n_scans)
+        ahead = places.roll(-1, 0) - places if len(places) > 1 else torch.zeros_like(places)
+        if len(places) > 1:
+            ahead[-1] = ahead[-2]
+        heading = torch.atan2(ahead[:, 1], ahead[:, 0])
+        poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+        cos, sin = heading.cos(), heading.sin()
+        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
+        poses[:, :3, 3] = places
+        return poses
+
+    def _read(self, index: int) -> Scan:
+        generator = torch.Generator().manual_seed(self.seed * _SEEDS_APART + 1 + index)
+        pose = self.poses[index]
+        ends, no_return = sense(self.sensor, pose, self.world, generator)
+        return self.ranges.scan(ends, pose[:3, 3], no_return)

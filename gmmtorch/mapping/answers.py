@@ -1,0 +1,124 @@
+"""Answers: what fixed components say of space, by any form of evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.evidence import Evidence, check_prior, occupancy_probability
+from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid
+from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
+from gmmtorch.occupancy.point import PointEvidence, point_evidence
+
+Method = Literal["point", "monte_carlo"]
+METHODS: tuple[str, ...] = get_args(Method)
+
+_RAYS_AT_ONCE = 1 << 20
+
+
+@dataclass(frozen=True)
+class Answering:
+    """How a map answers; none of it changes what a map knows.
+
+    prior: N_p of (3.9), counts given to either outcome before any evidence.
+    cutoff: standard deviations beyond which a component is taken to end.
+    n_samples: Monte Carlo rays drawn from the whole map.
+    sampling: "sobol", "stratified" or "plain".
+    random_state: seed of the rays.
+    memory_limit: bytes that evidence may take.
+    compiled: use torch.compile where there is a compiled form.
+    """
+
+    prior: float = 1.0
+    cutoff: float = CUTOFF
+    n_samples: int = 1_000_000
+    sampling: Sampling = "sobol"
+    random_state: int = 0
+    memory_limit: int = MEMORY_LIMIT
+    compiled: bool = False
+
+    def __post_init__(self) -> None:
+        check_prior(self.prior)
+        for name in ("n_samples", "memory_limit"):
+            check_whole(name, getattr(self, name), 1)
+        check_whole("random_state", self.random_state, 0)
+        if not 0 < self.cutoff < float("inf"):
+            raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
+        if self.sampling not in SAMPLINGS:
+            raise InvalidArgumentError(f"sampling={self.sampling!r} is not one of {', '.join(SAMPLINGS)}.")
+
+
+def check_method(method: str) -> None:
+    """Raises for a form of evidence that is not known."""
+    if method not in METHODS:
+        raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
+
+
+class Answers:
+    """What these cones say of space. What is costly is made once, when it is first asked for."""
+
+    def __init__(self, cones: Cones, options: Answering) -> None:
+        self.cones = cones
+        self.options = options
+        self._lattices: dict[float, BlockEvidence] = {}
+
+    def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
+        """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
+
+        `point` asks of the cube centred at the point; the others of the cell of the lattice
+        [i·resolution, (i+1)·resolution) that holds it. Points at infinity are unknown.
+        """
+        check_method(method)
+        if len(self.cones.counts) == 0:
+            return torch.full_like(points[:, 0], 0.5)
+        if method == "monte_carlo":
+            return self._lattice(resolution).lookup(points, self.options.prior)
+        finite = torch.isfinite(points).all(1)
+        theta = torch.full_like(points[:, 0], 0.5)
+        evidence = self._at_points(points[finite], resolution)
+        theta[finite] = occupancy_probability(*evidence, self.options.prior)
+        return theta
+
+    def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
+        """Hits and misses of every cell of a grid."""
+        check_method(method)
+        evidence = Evidence.empty(grid, self.cones.means.device)
+        if len(self.cones.counts) == 0:
+            return evidence
+        if method == "monte_carlo":
+            self._cast(evidence)
+            return evidence
+        found = self._at_points(grid.centers(self.cones.means.device), grid.resolution)
+        return Evidence(grid, found.hits.view(grid.shape), found.misses.view(grid.shape))
+
+    def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
+        return point_evidence(self.cones, points, resolution, self.options.cutoff)
+
+    def _lattice(self, resolution: float) -> BlockEvidence:
+        """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""
+        if resolution not in self._lattices:
+            options, device = self.options, self.cones.means.device
+            lattice = BlockEvidence(
+                resolution, self.cones.dim, device, options.memory_limit, options.compiled
+            )
+            self._cast(lattice)
+            self._lattices[resolution] = lattice
+        return self._lattices[resolution]
+
+    def _cast(self, evidence: Evidence | BlockEvidence) -> None:
+        """Monte Carlo rays of the whole map, added to `evidence`."""
+        options = self.options
+        generator = torch.Generator().manual_seed(options.random_state)
+        rays = sample_rays(self.cones, options.n_samples, generator, options.sampling)
+        parts = zip(*(field.split(_RAYS_AT_ONCE) for field in rays), strict=True)
+        for origins, ends, weights, is_hit in parts:
+            if isinstance(evidence, Evidence):
+                evidence.add_rays(origins, ends, weights, is_hit, compiled=options.compiled)
+            else:
+                evidence.add_rays(origins, ends, weights, is_hit)
