@@ -16,7 +16,8 @@ import torch
 from tables import hardware, markdown, publish
 
 from gmmtorch import GaussianMap, LearningRule, datasets
-from gmmtorch.evaluation.occupancy import Protocol, evaluate, methods
+from gmmtorch.evaluation.contenders import methods
+from gmmtorch.evaluation.occupancy import Protocol, evaluate
 from gmmtorch.scan import Scan
 
 RULES: dict[str, dict[str, float]] = {
@@ -75,7 +76,7 @@ def factory(changes: dict[str, float], dim: int):
     for whole in ("iterations", "max_origins"):
         if whole in options:
             options[whole] = int(options[whole])
-    return lambda resolution: GaussianMap(window, LearningRule(**options))  # type: ignore[arg-type]
+    return lambda resolution: GaussianMap(LearningRule(window=window, **options))  # type: ignore[arg-type]
 
 
 def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:

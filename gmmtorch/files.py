@@ -78,8 +78,8 @@ def pack_tensors(tensors: Mapping[str, Tensor], kind: str, version: int, **facts
     )
 
 
-def read_tensors(path: str | Path, kind: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and facts of a file of `pack_tensors`.
+def read_tensors(path: str | Path, kind: str, *versions: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and facts of a file of `pack_tensors`, of any of these versions.
 
     Raises `MissingDataError` when it is not there, and `DataError` when it is too large, damaged,
     of another kind, or of a later version.
@@ -94,9 +94,10 @@ def read_tensors(path: str | Path, kind: str, version: int) -> tuple[dict[str, T
     about = _about(data, path, kind)
     if about.get("format") != kind:
         raise DataError(f"{path} holds {about.get('format', 'something else')!r}; expected {kind!r}.")
-    if about.get("version") != version:
+    if about.get("version") not in versions:
         raise DataError(
-            f"{path} is version {about.get('version')!r} of {kind}; this gmmtorch reads version {version}. "
+            f"{path} is version {about.get('version')!r} of {kind}; this gmmtorch reads version "
+            f"{' or '.join(map(str, versions))}. "
             "Update gmmtorch, or write the file again."
         )
     facts = about.get("facts")

@@ -52,6 +52,7 @@ class OccupancyGrid:
     """
 
     any_resolution = False
+    suffix = ".safetensors"
 
     def __init__(
         self,

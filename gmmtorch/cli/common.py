@@ -64,13 +64,19 @@ def run_dir() -> Path:
 
 
 def set_up(config: DictConfig) -> str:
+    """Check the seed and apply the runtime options; returns the device."""
+    from gmmtorch.errors import check_whole
+
+    check_whole("seed", config.seed, 0)
+    return use_runtime(config.runtime)
+
+
+def use_runtime(runtime: DictConfig) -> str:
     """Apply the runtime options; returns the device. Raises `InvalidArgumentError` on a bad one."""
     import torch
 
-    from gmmtorch.errors import InvalidArgumentError, check_whole
+    from gmmtorch.errors import InvalidArgumentError
 
-    runtime = config.runtime
-    check_whole("seed", config.seed, 0)
     if runtime.threads is not None:
         if runtime.threads < 1:
             raise InvalidArgumentError(f"runtime.threads={runtime.threads} must be at least 1, or null.")

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, schema
+from gmmtorch.cli import common, maps, occupancy_studies, schema
 
 if TYPE_CHECKING:
+    from gmmtorch.evaluation.events import Event
     from gmmtorch.evaluation.occupancy import Built, Outcome
-    from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.scan import Scan
 
 _TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
@@ -29,59 +29,47 @@ def _guarded(config: DictConfig) -> float | None:
     return common.run_guarded(run, config)
 
 
-def run(config: DictConfig) -> float:
+def run(config: DictConfig) -> float | None:
     """One run; returns the AUC of the last row, which an optimiser may sweep over."""
-    from gmmtorch.evaluation import occupancy
     from gmmtorch.report.progress import ProgressBars
 
     device = common.set_up(config)
     folder = common.run_dir()
-    limits = {"memory_limit": config.runtime.memory_limit, "compiled": config.runtime.compile}
-    known = occupancy.methods(_map_factory(config, limits), **limits)
-    factories = occupancy.choose(list(config.method), known)
+    with ProgressBars(enabled=config.report.progress) as bars:
+        work = _compare if config.study is None else occupancy_studies.run
+        rows = work(config, device, folder, bars)
+    common.print_files(folder, folder / "results.json")
+    return rows[-1].get("auc")
+
+
+def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[dict[str, Any]]:
+    """A row for each method, share kept and resolution."""
+    from gmmtorch.evaluation import contenders, occupancy
+
+    factories = contenders.choose(list(config.method), maps.known_methods(config))
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     dataset = common.open_dataset(config.dataset)
-    with ProgressBars(enabled=config.report.progress) as bars:
-        scans = common.read_scans(dataset, range(len(dataset)), device, bars)
-        outcome = occupancy.evaluate(
-            dataset.name,
-            scans,
-            factories,
-            protocol,
-            config.seed,
-            bars,
-            # Each row is kept at once: hours of work must not hang on the last of them.
-            lambda rows: common.write_results("occupancy", config, rows, folder),
-        )
-    path = folder / "results.json"
+    scans = common.read_scans(dataset, range(len(dataset)), device, on_event)
+    outcome = occupancy.evaluate(
+        dataset.name,
+        scans,
+        factories,
+        protocol,
+        config.seed,
+        on_event,
+        # Each row is kept at once: hours of work must not hang on the last of them.
+        lambda rows: common.write_results("occupancy", config, rows, folder),
+    )
     _show(config, scans, outcome, folder)
     common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {len(scans)} scans")
-    common.print_files(folder, path)
-    return float(outcome.rows[-1]["auc"])
-
-
-def _map_factory(config: DictConfig, limits: dict[str, Any]) -> Callable[[], GaussianMap]:
-    """Makes empty maps with the options `map.*`."""
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mapping.learning import LearningRule
-
-    options = common.as_options(config.map)
-    options.pop("name")
-    own = {key: options.pop(key) for key in ("window", "n_samples", "sampling", "prior")}
-    rule = LearningRule(**options, dtype=config.runtime.dtype)
-
-    def make() -> GaussianMap:
-        return GaussianMap(learning=rule, random_state=config.seed, **own, **limits)
-
-    make()  # a bad option must not wait for the grids to be built
-    return make
+    return outcome.rows
 
 
 def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
     """Figures as PNG and, with the numbers, in TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    figures = _figures(scans, outcome)
+    figures = _figures(config, scans, outcome)
     if config.report.figures:
         from gmmtorch.report.save import save_figure
 
@@ -91,7 +79,7 @@ def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: P
         _write_board(config, scans, outcome, figures, folder / "tensorboard")
 
 
-def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
+def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
     """Every figure of a run by file name."""
     import torch
 
@@ -103,7 +91,7 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
         mixture_figure,
         roc_figure,
     )
-    from gmmtorch.report.raster import robust_bounds
+    from gmmtorch.report.raster import busiest_regions, robust_bounds
 
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
@@ -114,8 +102,14 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
         panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
         # Cells that grazing beams cross are free more often than hit: half is too strict from above.
         figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory, occupied_above=0.4)
+        regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
+        for number, (corner, other) in enumerate(regions, 1):
+            close = [MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
+            figures[f"map_{resolution:g}m_region_{number}"] = map_figure(close)
         curves = {_label(built): built.roc for built in shown}
-        figures[f"roc_{resolution:g}m"] = roc_figure(curves, f"{shown[0].row['dataset']}, {resolution:g} m")
+        about = f"{shown[0].row['dataset']}, {resolution:g} m"
+        figures[f"roc_{resolution:g}m"] = roc_figure(curves, about)
+        figures[f"reliability_{resolution:g}m"] = _reliability(shown, about)
     for built in outcome.shown:
         if isinstance(built.map, GaussianMap):
             components = built.map.components()
@@ -128,6 +122,19 @@ def _figures(scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
             )
             break
     return figures
+
+
+def _reliability(shown: Sequence[Built], about: str) -> Any:
+    """The reliability diagram of the maps at one resolution."""
+    from gmmtorch.evaluation.calibration import reliability
+    from gmmtorch.evaluation.queries import OCCUPIED
+    from gmmtorch.report import reliability_figure
+
+    curves = {}
+    for built in shown:
+        known = built.asked.labels <= OCCUPIED
+        curves[_label(built)] = reliability(built.theta[known], built.asked.labels[known])
+    return reliability_figure(curves, f"Reliability: {about}")
 
 
 def _label(built: Built) -> str:

@@ -54,7 +54,19 @@ class SyntheticBuildingDataset(SyntheticDataset):
 
 @dataclass
 class Map:
+    """What every map has: how it answers."""
+
     name: str = MISSING
+    n_samples: int = 1000000  # Monte Carlo rays
+    sampling: str = "sobol"  # or stratified, plain
+    prior: float = 1.0  # N_p of (3.9)
+    cutoff: float = 5.0  # standard deviations beyond which a component is taken to end
+    hit_length: float | None = None  # metres, of the point form; null: the side of a cell
+    codec: str = "quantized"  # or float: every number as it is
+
+
+@dataclass
+class WindowedMap(Map):
     window: int = 20  # scans fitted together
     n_components: int | None = None  # of a window at most; null: as many as its surfaces ask for
     noise: float = 0.01  # standard deviation of the range sensor (m)
@@ -63,9 +75,22 @@ class Map:
     max_origins: int = 8  # sensor positions kept for a component
     iterations: int = 5  # of EM
     max_cells: int = 20000  # more points than this are first summed into cells
-    n_samples: int = 1000000  # Monte Carlo rays
-    sampling: str = "sobol"  # or stratified, plain
-    prior: float = 1.0  # N_p of (3.9)
+
+
+@dataclass
+class IncrementalMap(Map):
+    n_components: int | None = None  # of the whole map at most; null: no limit
+    max_bytes: int | None = None  # of its file at most; null: no limit
+    window: int = 8  # scans learned together
+    window_components: int = 250  # of a window at most
+    noise: float = 0.005  # standard deviation of the range sensor (m)
+    length: float = 0.2  # largest standard deviation (m) along a component where it is learned
+    cell: float = 0.03  # side (m) of the cells that points are summed into
+    max_origins: int = 8  # sensor positions kept for a component, at most
+    mean_origins: float | None = 2.0  # and on average; null: as many as there may be
+    iterations: int = 6  # of EM
+    max_cost: float | None = None  # Hellinger distance, squared, up to which components always merge
+    novelty: Any = None  # learn from novel beams only: {} or options of NoveltyRule; null: from all
 
 
 @dataclass
@@ -138,6 +163,27 @@ class SensorModelStudy:
 
 
 @dataclass
+class AucMemoryStudy:
+    name: str = "auc_memory"
+    forms: list[str] = field(default_factory=lambda: ["point"])  # of evidence, from our map
+    n_components: list[int] = field(default_factory=lambda: [100, 200, 300, 500, 1000])  # of our map
+    bgk_points: list[int] = field(default_factory=lambda: [500, 1000, 2000, 5000, 10000])  # stored
+    others: list[str] = field(default_factory=lambda: ["occupancy_grid"])  # methods of one size
+
+
+@dataclass
+class VarianceThresholdStudy:
+    name: str = "variance_threshold"
+    method: str = "point"
+    n_components: list[int] = field(default_factory=lambda: [200, 850])
+    variance_threshold: list[float] = field(default_factory=lambda: [0.06, 0.12, 0.18, 0.24])
+    resolution: float = 0.1
+    test_every: int = 5
+    max_beams: int = 40_000
+    thin_radius: float = 0.4
+
+
+@dataclass
 class Stream:
     chunk_points: int = 1 << 17
     sample_points: int = 100_000
@@ -152,6 +198,7 @@ class Report:
     progress: bool = True
     figures: bool = True
     tensorboard: bool = True
+    magnify: int = 0  # regions of a 2D map that are shown close up, besides
 
 
 @dataclass
@@ -166,9 +213,11 @@ class Runtime:
 @dataclass
 class Occupancy:
     dataset: Any = MISSING
-    map: Map = field(default_factory=Map)
+    map: Any = MISSING
     method: list[str] = field(default_factory=list)
+    method_options: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
+    study: Any = None
     evaluation: Evaluation = field(default_factory=Evaluation)
     report: Report = field(default_factory=Report)
     runtime: Runtime = field(default_factory=Runtime)
@@ -193,12 +242,45 @@ class Fit:
     runtime: Runtime = field(default_factory=Runtime)
 
 
+@dataclass
+class ExportReport:
+    progress: bool = True
+
+
+@dataclass
+class ExportRuntime:
+    device: str = "cpu"
+    threads: int | None = 1
+    memory_limit: int = 4 << 30
+
+
+@dataclass
+class Export:
+    path: str | None = None
+    output: str | None = None
+    format: str = "map_server"
+    method: str | None = None
+    resolution: float | None = None
+    bounds: list[float] | None = None
+    z_min: float | None = None
+    z_max: float | None = None
+    occupied_thresh: float = 0.65
+    free_thresh: float = 0.196
+    n_points: float | None = None
+    report: ExportReport = field(default_factory=ExportReport)
+    runtime: ExportRuntime = field(default_factory=ExportRuntime)
+
+
 def register() -> None:
     """Make the schemas known to Hydra, under the names that the files in conf/ use."""
     store = ConfigStore.instance()
     store.store(name="occupancy_schema", node=Occupancy)
     store.store(name="fit_schema", node=Fit)
-    store.store(group="schema/map", name="map", node=Map)
+    store.store(name="export_schema", node=Export)
+    store.store(group="schema/map", name="windowed", node=WindowedMap)
+    store.store(group="schema/map", name="incremental", node=IncrementalMap)
+    store.store(group="schema/study", name="auc_memory", node=AucMemoryStudy)
+    store.store(group="schema/study", name="variance_threshold", node=VarianceThresholdStudy)
     store.store(group="schema/study", name="component_count", node=ComponentCountStudy)
     store.store(group="schema/study", name="initialization", node=InitializationStudy)
     store.store(group="schema/study", name="sensor_model", node=SensorModelStudy)

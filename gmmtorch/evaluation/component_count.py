@@ -31,6 +31,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.evaluation import occupancy, split
+from gmmtorch.evaluation.contenders import MapFactory
 from gmmtorch.evaluation.estimators import FitOptions
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.fitting import Material, OnRows, Row, row_of
@@ -267,9 +268,9 @@ def map_rows(
     endless = replace(rule, length=1e-9, min_points=1.0)
     cases += [("map_fixed", k, replace(endless, n_components=k)) for k in study.window_components]
 
-    def factory(learning: LearningRule) -> occupancy.MapFactory:
+    def factory(learning: LearningRule) -> MapFactory:
         return lambda resolution: GaussianMap(
-            study.window, learning, n_samples=study.n_samples, random_state=seed
+            learning, window=study.window, n_samples=study.n_samples, random_state=seed
         )
 
     factories = {f"{name} {setting:g}": factory(learning) for name, setting, learning in cases}

@@ -11,13 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import calibration, metrics, queries, split
+from gmmtorch.evaluation.contenders import Form, MapFactory
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
 from gmmtorch.files import check_writable
-from gmmtorch.mapping.answers import METHODS
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import OccupancyMap
@@ -64,24 +63,7 @@ class Protocol:
             raise InvalidArgumentError(f"max_beams={self.max_beams} must be at least 1.")
 
 
-MapFactory = Callable[[float], OccupancyMap]
-"""Makes an empty map for a resolution (m)."""
-
 Answer = Callable[[Tensor], Tensor]
-
-
-@dataclass(frozen=True)
-class Form:
-    """A factory of mixture maps that are asked for one form of evidence.
-
-    Forms with the same `new_map` answer from the same map: it is built once.
-    """
-
-    new_map: Callable[[], GaussianMap]
-    form: str
-
-    def __call__(self, resolution: float) -> GaussianMap:
-        return self.new_map()
 
 
 @dataclass(frozen=True)
@@ -105,30 +87,6 @@ class Outcome:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     shown: list[Built] = field(default_factory=list)
-
-
-def methods(new_map: Callable[[], GaussianMap], **grid_options: Any) -> dict[str, MapFactory]:
-    """Every method by name; `new_map` makes the mixture map that ours answer from.
-
-    `grid_options` are those of `OccupancyGrid`, other than its kind.
-    """
-    return {
-        **{form: Form(new_map, form) for form in METHODS},
-        "occupancy_grid": lambda resolution: OccupancyGrid(resolution, **grid_options),
-        "occupancy_log_odds": lambda resolution: OccupancyGrid(
-            resolution, log_odds=LogOdds(), **grid_options
-        ),
-    }
-
-
-def choose(names: Sequence[str], known: dict[str, MapFactory]) -> dict[str, MapFactory]:
-    """The factories asked for, in that order. An unknown name raises an error that lists the known."""
-    if not names:
-        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(known))}.")
-    for name in names:
-        if name not in known:
-            raise InvalidArgumentError(f"method={name!r} is not known; known are {', '.join(sorted(known))}.")
-    return {name: known[name] for name in names}
 
 
 def evaluate(
@@ -194,8 +152,7 @@ def evaluate(
                     build_seconds=seconds,
                 )
                 if protocol.save_map:
-                    file = Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}.safetensors"
-                    built.save(file)
+                    built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
                 outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
                 on_row(outcome.rows)
                 if kept == largest:
@@ -248,6 +205,7 @@ def _score(
     theta = answer(asked.points).cpu()
     seconds = time.perf_counter() - begin
     occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
+    known = asked.labels != UNKNOWN
     curve = metrics.roc(occupied, free)
     low, high = metrics.auc_interval(occupied, free, curve.auc, seed)
     row: dict[str, Any] = {
@@ -256,6 +214,7 @@ def _score(
         "auc_low": low,
         "auc_high": high,
         "brier": metrics.brier(occupied, free),
+        **calibration.scores(theta[known], asked.labels[known]),
         "n_components": built.n_components if isinstance(built, GaussianMap) else None,
         "nbytes": built.nbytes,
         "query_seconds": seconds,
@@ -276,6 +235,9 @@ _COLUMNS = [
     "auc_low",
     "auc_high",
     "brier",
+    "ece",
+    "log_loss_bits",
+    "accuracy",
     "n_train_points",
     "n_components",
     "nbytes",

@@ -69,17 +69,15 @@ def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int)
     return [scan.select(torch.rand(scan.n_beams, generator=generator) < share) for scan in scans]
 
 
-def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[Scan]:
-    """Each scan moved by a random rigid motion about its sensor.
+def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[torch.Tensor]:
+    """A random rigid motion (D+1, D+1) of each scan about its sensor, float64.
 
     `noise`: standard deviations of the shift along each axis (m) and of the rotation about each
     axis (rad).
     """
     shift, angle = check_noise(noise)
-    if shift == 0 and angle == 0:
-        return list(scans)
     generator = torch.Generator().manual_seed(seed)
-    moved = []
+    motions = []
     for scan in scans:
         dim = scan.dim
         translation = torch.randn(dim, generator=generator, dtype=torch.float64) * shift
@@ -88,8 +86,16 @@ def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> l
         transform[:dim, :dim] = _rotation(turn)
         origin = scan.origin.double().cpu()
         transform[:dim, dim] = origin + translation - transform[:dim, :dim] @ origin
-        moved.append(scan.transformed(transform))
-    return moved
+        motions.append(transform)
+    return motions
+
+
+def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[Scan]:
+    """Each scan moved by its motion of `pose_perturbations`; as it is without noise."""
+    if check_noise(noise) == (0, 0):
+        return list(scans)
+    motions = pose_perturbations(scans, noise, seed)
+    return [scan.transformed(motion) for scan, motion in zip(scans, motions, strict=True)]
 
 
 def _rotation(turn: torch.Tensor) -> torch.Tensor:

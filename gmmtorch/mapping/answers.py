@@ -10,13 +10,16 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.cone_evidence import cone_evidence
+from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.evidence import Evidence, check_prior, occupancy_probability
+from gmmtorch.occupancy.flux import box_flux, flux_evidence
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid
 from gmmtorch.occupancy.monte_carlo import SAMPLINGS, Sampling, sample_rays
-from gmmtorch.occupancy.point import PointEvidence, point_evidence
+from gmmtorch.occupancy.point import PointEvidence, PointForm
 
-Method = Literal["point", "monte_carlo"]
+Method = Literal["point", "flux", "cone", "monte_carlo"]
 METHODS: tuple[str, ...] = get_args(Method)
 
 _RAYS_AT_ONCE = 1 << 20
@@ -28,6 +31,7 @@ class Answering:
 
     prior: N_p of (3.9), counts given to either outcome before any evidence.
     cutoff: standard deviations beyond which a component is taken to end.
+    hit_length: ℓ (m) of the point form, see `PointForm`; None: the side of the cube.
     n_samples: Monte Carlo rays drawn from the whole map.
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
@@ -37,6 +41,7 @@ class Answering:
 
     prior: float = 1.0
     cutoff: float = CUTOFF
+    hit_length: float | None = None
     n_samples: int = 1_000_000
     sampling: Sampling = "sobol"
     random_state: int = 0
@@ -50,6 +55,8 @@ class Answering:
         check_whole("random_state", self.random_state, 0)
         if not 0 < self.cutoff < float("inf"):
             raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
+        if self.hit_length is not None and not 0 < self.hit_length < float("inf"):
+            raise InvalidArgumentError(f"hit_length={self.hit_length} must be metres above zero, or null.")
         if self.sampling not in SAMPLINGS:
             raise InvalidArgumentError(f"sampling={self.sampling!r} is not one of {', '.join(SAMPLINGS)}.")
 
@@ -67,6 +74,8 @@ class Answers:
         self.cones = cones
         self.options = options
         self._lattices: dict[float, BlockEvidence] = {}
+        self._forms: dict[float, PointForm] = {}
+        self._indices: dict[float, ConeIndex] = {}
 
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
         """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
@@ -77,12 +86,16 @@ class Answers:
         check_method(method)
         if len(self.cones.counts) == 0:
             return torch.full_like(points[:, 0], 0.5)
+        if method == "point":
+            evidence = self._form(resolution)(points, self.options.hit_length)
+            return occupancy_probability(*evidence, self.options.prior)
         if method == "monte_carlo":
             return self._lattice(resolution).lookup(points, self.options.prior)
         finite = torch.isfinite(points).all(1)
+        cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
+        evidence = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
         theta = torch.full_like(points[:, 0], 0.5)
-        evidence = self._at_points(points[finite], resolution)
-        theta[finite] = occupancy_probability(*evidence, self.options.prior)
+        theta[finite] = occupancy_probability(*evidence, self.options.prior)[cell]
         return theta
 
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
@@ -94,11 +107,30 @@ class Answers:
         if method == "monte_carlo":
             self._cast(evidence)
             return evidence
-        found = self._at_points(grid.centers(self.cones.means.device), grid.resolution)
+        if method == "flux":
+            return flux_evidence(self.cones, grid, self.options.cutoff)
+        centers = grid.centers(self.cones.means.device)
+        if method == "point":
+            found = self._form(grid.resolution)(centers, self.options.hit_length)
+        else:
+            half = 0.5 * grid.resolution
+            found = self._in_boxes(centers - half, centers + half, grid.resolution, method)
         return Evidence(grid, found.hits.view(grid.shape), found.misses.view(grid.shape))
 
-    def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
-        return point_evidence(self.cones, points, resolution, self.options.cutoff)
+    def _form(self, resolution: float) -> PointForm:
+        if resolution not in self._forms:
+            options = self.options
+            self._forms[resolution] = PointForm(
+                self.cones, resolution, options.cutoff, compiled=options.compiled
+            )
+        return self._forms[resolution]
+
+    def _in_boxes(self, low: Tensor, high: Tensor, resolution: float, method: str) -> PointEvidence:
+        if resolution not in self._indices:
+            self._indices[resolution] = ConeIndex(self.cones, resolution, self.options.cutoff)
+        pairs = self._indices[resolution].candidates(low, high)
+        form = box_flux if method == "flux" else cone_evidence
+        return PointEvidence(*form(self.cones, low, high, pairs, cutoff=self.options.cutoff))
 
     def _lattice(self, resolution: float) -> BlockEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""

@@ -15,6 +15,9 @@ from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import ArrayLike
 
+UNNUMBERED = -1
+"""The sequence, in `ids`, of a component that is new, or not as it was: who owns the map numbers it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Components:
@@ -83,6 +86,14 @@ class Components:
             self.seen_count,
             self.max_range[self.seen_by],
         )
+
+    def rearranged(self, order: Tensor) -> Components:
+        """The components in another order (K,)."""
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order), device=order.device)
+        rows = ("means", "covariances", "support", "max_range", "ids")
+        moved = {name: getattr(self, name)[order] for name in rows}
+        return replace(self, **moved, seen_by=rank[self.seen_by])
 
     def transformed(self, transform: Tensor, chosen: Tensor) -> Components:
         """The components marked in `chosen` (K,) moved by a rigid motion (D+1, D+1), origins with them."""

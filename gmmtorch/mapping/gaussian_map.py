@@ -5,49 +5,62 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
 from gmmtorch.mapping.answers import Answering, Answers, check_method
+from gmmtorch.mapping.codec import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.learning import LearningRule, learn_window
+from gmmtorch.mapping.incremental import IncrementalRule, absorb
+from gmmtorch.mapping.learning import LearningRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
+from gmmtorch.sorting import argsort
+
+Learning = LearningRule | IncrementalRule
+_KINDS: dict[type[Learning], str] = {LearningRule: "windowed", IncrementalRule: "incremental"}
 
 _OF_THE_MACHINE = ("memory_limit", "compiled")  # options of answering that a file does not carry
 _BUFFERS = tuple(f.name for f in fields(Components))
 
 
 class GaussianMap(nn.Module):
-    """A mixture of every window of `window` neighbouring scans; components know whence they were seen.
+    """A map that learns components from windows of neighbouring scans, and knows whence each was seen.
 
     The components are buffers (see `Components` for shapes): means, covariances, support,
-    max_range, ids, origins, seen_by, seen_from, seen_count.
+    max_range, ids, origins, seen_by, seen_from, seen_count. What a map answers from, and what it
+    writes, are these rounded as its file holds them (`components()`), so that a loaded map answers
+    as the saved one.
 
     Args:
-        window: scans fitted together; 1 with `max_origins=1` is the thesis's map.
-        learning: how a window becomes components.
+        learning: how scans become components. `IncrementalRule` (the default) merges them as it
+            goes, under a budget if it is given one; `LearningRule` adds a mixture of every window, and
+            with `window=1, max_origins=1` is the thesis's map.
+        window: scans learned from together, in place of the rule's own.
         resolution: side (m) of the cells that queries without a resolution ask about.
         method: form of evidence that queries without a method ask for: "point", in closed form at
             the point itself; "flux" (exact), "cone" (the thesis's) or "monte_carlo" of the cell that
             holds it.
         random_state: seed; the same scans in the same order then give the same map and answers.
         robot: first half of the components' ids.
+        codec: how components are written, and so what is answered from: "quantized", some 10 bytes
+            each, or "float", every number as it is.
         answering: further options of `Answering`: prior, cutoff, n_samples, …
 
-    Asking a map does not change it: scans of a window that is not full yet are fitted for the
-    answer, and again when the window is. The first question by `monte_carlo` after an insertion
-    casts rays of the whole map (about a second for a million).
-    To keep a map in a file use `save`; `state_dict` restores into a map that has its components.
+    Asking a map does not change it: scans of a window that is not full yet are learned from for the
+    answer, and again when the window is. What an answer needs is prepared at the first question
+    after an insertion: an index of the components, or by `monte_carlo` rays of the whole map (about a
+    second for a million). To keep a map in a file use `save`; `state_dict` restores into a map that
+    has its components.
     """
 
     means: Tensor
@@ -61,33 +74,37 @@ class GaussianMap(nn.Module):
     seen_count: Tensor
 
     any_resolution = True
+    suffix = ".safetensors"
 
     def __init__(
         self,
-        window: int = 20,
-        learning: LearningRule | None = None,
+        learning: Learning | None = None,
         *,
+        window: int | None = None,
         resolution: float = 0.1,
         method: str = "point",
         random_state: int = 0,
         robot: int = 0,
+        codec: str = "quantized",
         **answering: Any,
     ) -> None:
         super().__init__()
-        check_whole("window", window, 1)
         check_method(method)
-        self.window = window
-        self.learning = learning or LearningRule()
+        learning = IncrementalRule() if learning is None else learning
+        self.learning: Learning = learning if window is None else replace(learning, window=window)
+        if codec not in storage.CODECS:
+            raise InvalidArgumentError(f"codec={codec!r} is not one of {', '.join(storage.CODECS)}.")
+        self.codec = codec
         self.resolution = check_resolution(resolution)
         self.method = method
         self.answering = Answering(random_state=random_state, **answering)
         self.random_state = int(random_state)
         self.robot = robot
-        self.frame: Tensor | None = None  # (D,) whole metres, near the first scan
         self._pending: list[Scan] = []
         self._n_windows = 0
+        self._n_numbered = 0
+        self._rounded: Components | None = None
         self._answers: Answers | None = None
-        self._provisional: Components | None = None
 
     @classmethod
     def from_components(
@@ -106,8 +123,9 @@ class GaussianMap(nn.Module):
             origins: (K, D), one sensor position each; or for each component a list of
                 (origin (D,), count), whose counts are scaled to add up to its support.
             max_range: (K,) True for components of beams without return; none if not given.
-            options: as for `GaussianMap`.
+            options: as for `GaussianMap`; `codec` is "float" unless it is given.
         """
+        options = {"codec": "float", **options}
         mean = _tensor(means)
         if mean.ndim != 2 or mean.shape[1] not in (2, 3):
             raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
@@ -122,7 +140,8 @@ class GaussianMap(nn.Module):
         parts = (_tensor(covariances), weight, flags, ids, *sightings)
         components = Components(mean, *(part.to(mean.device) for part in parts)).checked()
         made = cls(**options)
-        made._place(components)
+        made._set(components)
+        made._n_numbered = k
         return made
 
     # -- learning ---------------------------------------------------------------------------------
@@ -134,56 +153,75 @@ class GaussianMap(nn.Module):
             raise InvalidArgumentError(
                 f"scan is {scan.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
-        if self.frame is None:
-            self.frame = scan.origin.detach().double().round()
+        if self.dim is None:
             self._set(Components.empty(scan.dim, scan.points.device))
         self._pending.append(scan.copied(self.means.device))
-        self._forget_answers()
-        if len(self._pending) == self.window:
-            self._set(Components.concatenate([self._committed(), self._learn_pending()]))
-            self._pending = []
-            self._n_windows += 1
+        self._forget()
+        if len(self._pending) == self.learning.window:
+            self._commit()
 
-    def _learn_pending(self) -> Components:
-        frame = cast(Tensor, self.frame)
+    def _commit(self) -> None:
+        """Learn from the scans that wait, for good."""
+        learned = self._with_pending()
+        self._pending, self._n_windows = [], self._n_windows + 1
+        self._set(learned)
+        self._n_numbered = max(self._n_numbered, int(learned.ids[:, 1].max()) + 1 if len(learned) else 0)
+
+    def _with_pending(self) -> Components:
+        """All components, learned from the scans that wait, too."""
+        known = self._committed()
+        if not self._pending:
+            return known
         # A generator of its own for every window: what was asked meanwhile does not matter.
         generator = torch.Generator().manual_seed(hash((self.random_state, self._n_windows)) % 2**63)
-        found = storage.storable(learn_window(self._pending, self.learning, generator), frame)
-        first = int(self.ids[:, 1].max()) + 1 if len(self.ids) else 0
-        sequence = torch.arange(first, first + len(found), device=found.ids.device)
-        return replace(found, ids=torch.stack([torch.full_like(sequence, self.robot), sequence], 1))
+        if isinstance(self.learning, IncrementalRule):
+            learned = absorb(known, self._pending, self.learning, self._size)
+        else:
+            learned = self.learning.absorb(known, self._pending, generator)
+        return self._numbered(learned)
+
+    def _numbered(self, learned: Components) -> Components:
+        # New ones are numbered, and kept, in an order that takes few bytes.
+        fresh = learned.ids[:, 1] < 0
+        rank = torch.zeros(len(learned), dtype=torch.int64, device=fresh.device)
+        rank[spatial_order(learned)] = torch.arange(len(learned), device=fresh.device)
+        learned = learned.rearranged(argsort(torch.where(fresh, len(learned) + rank, 0)))
+        numbers = self._n_numbered + torch.arange(int(fresh.sum()), device=fresh.device)
+        ids = learned.ids.clone()
+        ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, self.robot), numbers], 1)
+        return replace(learned, ids=ids)
+
+    def _size(self, components: Components) -> int:
+        """Bytes of the file of these components, once they are numbered."""
+        return len(self._serialized(self._numbered(components)))
+
+    def _as_written(self, components: Components) -> Components:
+        return components if self.codec == "float" else quantized(components)
 
     def finish(self) -> None:
-        """Fit the scans that wait now, rather than at the first question. Changes no answer."""
+        """Learn now from the scans that wait, rather than at the first question. Changes no answer."""
         if self.dim is not None:
             self.components()
 
     def components(self) -> Components:
-        """All components, those of the unfinished window included."""
-        if not self._pending:
-            return self._committed()
-        if self._provisional is None:
-            self._provisional = Components.concatenate([self._committed(), self._learn_pending()])
-        return self._provisional
+        """All components as they are stored, those of the unfinished window included."""
+        if self._rounded is None:
+            self._rounded = self._as_written(self._with_pending())
+        return self._rounded
 
     def _committed(self) -> Components:
-        if "means" not in self._buffers:
+        if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
         return Components(**{name: getattr(self, name) for name in _BUFFERS})
 
     def _set(self, components: Components) -> None:
         for name in _BUFFERS:
             self.register_buffer(name, getattr(components, name))
-        self._forget_answers()
+        self._forget()
 
-    def _place(self, components: Components) -> None:
-        """Take over components, rounded as they are stored, about a frame near their origins."""
-        center = components.origins if len(components.origins) else components.means
-        self.frame = center.median(0).values.round() if len(center) else center.new_zeros(components.dim)
-        self._set(storage.storable(components, self.frame))
-
-    def _forget_answers(self) -> None:
-        self._answers, self._provisional = None, None
+    def _forget(self) -> None:
+        """The components have changed."""
+        self._rounded, self._answers = None, None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
         """Moves between devices, waiting scans too; positions stay float64 whatever dtype a network
@@ -191,14 +229,13 @@ class GaussianMap(nn.Module):
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if "means" in self._buffers:
             self._pending = [scan.to(self.means.device) for scan in self._pending]
-            self.frame = cast(Tensor, self.frame).to(self.means.device)
-        self._forget_answers()
+        self._forget()
         return self
 
     @property
     def dim(self) -> int | None:
         """2 or 3; None while the map is empty."""
-        return None if self.frame is None else self.frame.shape[0]
+        return self.means.shape[1] if "means" in self._buffers else None
 
     @property
     def n_components(self) -> int:
@@ -209,15 +246,14 @@ class GaussianMap(nn.Module):
 
         `ids` (J, 2) names the components, as in the buffer of that name; all if not given. Ids that
         no component has (of records not received, say) are passed over. A pose
-        correction is this; nothing is fitted again. Scans of an unfinished window are fitted first.
+        correction is this; nothing is fitted again. Scans of an unfinished window are learned from first.
         """
-        components = self.components()
+        if self._pending:
+            self._commit()
+        components = self._committed()
         matrix = _tensor(transform).to(components.means.device)
         check_rigid(matrix, components.dim)
-        moved = components.transformed(matrix, self._chosen(components, ids))
-        if self._pending:
-            self._pending, self._n_windows = [], self._n_windows + 1
-        self._place(moved)
+        self._set(components.transformed(matrix, self._chosen(components, ids)))
 
     @staticmethod
     def _chosen(components: Components, ids: ArrayLike | None) -> Tensor:
@@ -275,37 +311,48 @@ class GaussianMap(nn.Module):
 
     # -- keeping ----------------------------------------------------------------------------------
 
-    def _serialized(self) -> bytes:
+    def _serialized(self, components: Components) -> bytes:
         facts = {
-            "window": self.window,
-            "learning": asdict(self.learning),
+            "learning": {"kind": _KINDS[type(self.learning)], **changed(self.learning)},
             "resolution": self.resolution,
             "method": self.method,
+            "codec": self.codec,
             "robot": self.robot,
-            **{name: value for name, value in asdict(self.answering).items() if name not in _OF_THE_MACHINE},
+            "n_numbered": self._n_numbered,
+            **changed(self.answering, leave_out=_OF_THE_MACHINE),
         }
-        return storage.to_bytes(self.components(), cast(Tensor, self.frame), facts)
+        return storage.to_bytes(components, facts, self.codec)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the file that `save` writes; 0 for an empty map."""
-        return len(self._serialized()) if self.dim is not None else 0
+        return len(self._serialized(self.components())) if self.dim is not None else 0
 
     def save(self, path: str | Path) -> None:
         """Write the map, atomically. An unfinished window is written as it is fitted now."""
-        write_bytes(path, self._serialized())
+        write_bytes(path, self._serialized(self.components()))
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianMap:
         """Read a map that `save` wrote; it gives the same answers. Raises `DataError` if it is not one."""
-        components, frame, facts = storage.from_file(path)
+        components, facts = storage.from_file(path)
         try:
-            made = cls(**{**facts, "learning": LearningRule(**facts["learning"])})
+            n_numbered = int(facts.pop("n_numbered"))
+            options = dict(facts.pop("learning"))
+            rule = {name: kind for kind, name in _KINDS.items()}[options.pop("kind")]
+            made = cls(rule(**options), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._set(components)
-        made.frame = frame
+        largest = int(components.ids[:, 1].max()) if len(components) else -1
+        made._n_numbered = max(n_numbered, largest + 1)
         return made
+
+
+def changed(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+    """The options of a dataclass that are not its defaults."""
+    plain = asdict(type(options)())
+    return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
 
 
 def _tensor(value: ArrayLike) -> Tensor:

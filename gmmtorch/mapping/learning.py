@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mixture import em
 from gmmtorch.mixture.cells import pool_into_cells
 from gmmtorch.mixture.component_count import surface_rule
@@ -28,6 +29,7 @@ class LearningRule:
     max_origins: sensor positions kept for a component, sampled by their counts.
     iterations: of EM, which starts from the flat pieces and so needs few.
     max_cells: more points than this are first summed into cells.
+    window: neighbouring scans that are learned from together.
     dtype: of the exponentials in EM, "float32" or "float64".
     """
 
@@ -38,13 +40,14 @@ class LearningRule:
     max_origins: int = 8
     iterations: int = 5
     max_cells: int = 20_000
+    window: int = 20
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
         for name in ("noise", "length"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        for name in ("max_origins", "iterations", "max_cells"):
+        for name in ("max_origins", "iterations", "max_cells", "window"):
             check_whole(name, getattr(self, name), 1)
         if self.n_components is not None:
             check_whole("n_components", self.n_components, 1)
@@ -65,11 +68,15 @@ class LearningRule:
             apart=10 * self.length,
         )
 
+    def absorb(self, known: Components, scans: Sequence[Scan], generator: torch.Generator) -> Components:
+        """The components of a map, and those of a window of scans, not numbered yet."""
+        return Components.concatenate([known, learn_window(scans, self, generator)])
 
-def learn_window(scans: list[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
+
+def learn_window(scans: Sequence[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
     """Components of the returns, and flagged ones of the no-returns, of neighbouring scans.
 
-    `ids` are left at zero: who calls numbers them.
+    Not numbered: the owner of the map does that.
     """
     origins = torch.stack([scan.origin.double() for scan in scans])
     returns = _learn([scan.points for scan in scans], origins, rule, generator, max_range=False)
@@ -107,7 +114,7 @@ def _learn(
         covariances=found.covariances[alive],
         support=support[alive],
         max_range=torch.full((int(alive.sum()),), max_range, device=points.device),
-        ids=torch.zeros(int(alive.sum()), 2, dtype=torch.int64, device=points.device),
+        ids=torch.full((int(alive.sum()), 2), UNNUMBERED, device=points.device),
         origins=origins,
         seen_by=renumber[seen_by],
         seen_from=seen_from,

@@ -36,9 +36,11 @@ class OccupancyMap(Protocol):
     """A map that learns from scans and answers whether a place is occupied.
 
     any_resolution: whether one map answers at every resolution; else it is made for one.
+    suffix: of the names of its files.
     """
 
     any_resolution: bool
+    suffix: str
 
     def insert(self, scan: Scan) -> None:
         """Learn from one scan, in the world frame."""

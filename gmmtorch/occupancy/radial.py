@@ -33,11 +33,19 @@ def flux_density(white_ray: Tensor, white_offset: Tensor, log_norm: Tensor) -> T
     direction = white_ray / length[..., None]
     along = (white_offset * direction).sum(-1)  # a: where q is, in deviations from the ray's nearest point
     across = white_offset - along[..., None] * direction
-    peak = torch.exp(-0.5 * (across * across).sum(-1) - log_norm) / length
-    nearest = 1 - along / length  # t0
-    tail = _SQRT_HALF_PI * torch.special.erfc(along / math.sqrt(2))  # Q
-    edge = torch.exp(-0.5 * along * along)  # g
+    peak = torch.exp(-0.5 * (across * across).sum(-1) - log_norm)
+    return peak * tail_moment(along, length - along, dim) / length**dim
+
+
+def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:
+    """∫_a^∞ (w + b)^{D−1} e^{−w²/2} dw: what ends beyond a place, in the deviations of one ray.
+
+    along: a, where the place is; depth: b, how far the ray's nearest point to the mean is from the
+    sensor; any shape. With Q = √(π/2) erfc(a/√2) and g = e^{−a²/2} it is b Q + g in 2D and
+    (b² + 1) Q + (2b + a) g in 3D.
+    """
+    tail = _SQRT_HALF_PI * torch.special.erfc(along * math.sqrt(0.5))
+    edge = torch.exp(-0.5 * along * along)
     if dim == 2:
-        return peak * (nearest * tail + edge / length)
-    moment = nearest * nearest * tail + 2 * nearest * edge / length
-    return peak * (moment + (along * edge + tail) / (length * length))
+        return depth * tail + edge
+    return (depth * depth + 1) * tail + (2 * depth + along) * edge

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gmmtorch.report.board import Board as Board
+    from gmmtorch.report.calibration import reliability_figure as reliability_figure
     from gmmtorch.report.comparison import comparison_figure as comparison_figure
     from gmmtorch.report.curves import convergence_figure as convergence_figure
     from gmmtorch.report.curves import roc_figure as roc_figure
@@ -34,6 +35,7 @@ _HOMES = {
     "format_table": "table",
     "map_figure": "maps",
     "mixture_figure": "mixtures",
+    "reliability_figure": "calibration",
     "roc_figure": "curves",
     "save_figure": "save",
 }

@@ -86,6 +86,33 @@ class MapPanel:
         return cls(title, lambda points: evidence.lookup(points, prior), resolution, low, high)
 
 
+def busiest_regions(
+    points: ArrayLike, n: int, side: float | None = None
+) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Corners of `n` squares of the plane that hold the most surface, none beside another; fewer at times.
+
+    Surface is counted in hundredths of the side: points on one another count once.
+
+    Args:
+        points: (N, 2), world metres.
+        n: how many.
+        side: of the squares (m); a tenth of the longer side of the cloud if not given.
+    """
+    cloud = torch.as_tensor(points).detach().cpu().double()
+    cloud = cloud[torch.isfinite(cloud).all(1)]
+    if n < 1 or len(cloud) == 0:
+        return []
+    if side is None:
+        side = max(float((cloud.amax(0) - cloud.amin(0)).max()) / 10, 1e-3)
+    fine = torch.unique((cloud / (side / 100)).floor(), dim=0)
+    tiles, count = torch.unique((fine / 100).floor(), dim=0, return_counts=True)
+    chosen: list[Tensor] = []
+    for tile in tiles[count.argsort(descending=True, stable=True)]:
+        if len(chosen) < n and all(float((tile - other).abs().max()) > 1 for other in chosen):
+            chosen.append(tile)
+    return [(_corner((t * side).numpy()), _corner(((t + 1) * side).numpy())) for t in chosen]
+
+
 def robust_bounds(
     points: ArrayLike, trajectory: ArrayLike | None = None, share: float = 0.99, margin: float = 1.0
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-_FOUR_DECIMALS = ("auc", "brier", "recall", "called")
+_FOUR_DECIMALS = ("accuracy", "auc", "brier", "called", "ece", "recall")
 _PREFIXES = ("", "K", "M", "G", "T")
 
 

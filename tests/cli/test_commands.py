@@ -92,7 +92,13 @@ def test_the_run_directory_holds_results_figures_events_and_configuration(whole_
     files = done.files()
     assert {"results.json", ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml"} <= files
     expected = {
-        "occupancy": {"auc_against_kept.png", "map_0.1m.png", "roc_0.1m.png", "mixture.png"},
+        "occupancy": {
+            "auc_against_kept.png",
+            "map_0.1m.png",
+            "mixture.png",
+            "reliability_0.1m.png",
+            "roc_0.1m.png",
+        },  # fmt: skip
         "fit": {"comparison.png", "convergence.png", "mixture_em.png", "mixture_scikit_learn.png"},
     }[command]
     assert {name for name in files if name.endswith(".png")} == expected

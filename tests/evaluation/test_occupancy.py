@@ -14,7 +14,8 @@ from pillar_room import room_scans
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.occupancy import MapFactory, Outcome, Protocol, choose, evaluate, methods
+from gmmtorch.evaluation.contenders import MapFactory, choose, methods
+from gmmtorch.evaluation.occupancy import Outcome, Protocol, evaluate
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 

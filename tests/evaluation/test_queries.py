@@ -15,7 +15,8 @@ from torch import Tensor
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
-from gmmtorch.evaluation.occupancy import Protocol, choose, evaluate, methods
+from gmmtorch.evaluation.contenders import choose, methods
+from gmmtorch.evaluation.occupancy import Protocol, evaluate
 from gmmtorch.evaluation.queries import (
     FREE,
     OCCUPIED,

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from gmmtorch.datasets import load
-from gmmtorch.evaluation.occupancy import Protocol, choose, evaluate, methods
+from gmmtorch.evaluation.contenders import choose, methods
+from gmmtorch.evaluation.occupancy import Protocol, evaluate
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 

@@ -59,7 +59,7 @@ def drive(n: int, dim: int = 2) -> list[Scan]:
 
 def make(window: int = 20, **options: Any) -> GaussianMap:
     options = {"resolution": RESOLUTION, "n_samples": 20_000, **options}
-    return GaussianMap(window, options.pop("learning", None), **options)
+    return GaussianMap(options.pop("learning", None) or LearningRule(), window=window, **options)
 
 
 def built(scans: list[Scan], window: int = 20, **options: Any) -> GaussianMap:

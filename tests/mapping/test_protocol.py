@@ -15,6 +15,7 @@ from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.incremental import IncrementalRule
 from gmmtorch.mapping.learning import LearningRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -27,7 +28,7 @@ class TestGaussianMapOneOrigin(OccupancyMapContract):
     turn_tolerance = 0.05
 
     def make(self) -> GaussianMap:
-        return GaussianMap(1, LearningRule(max_origins=1), resolution=RESOLUTION, n_samples=20_000)
+        return GaussianMap(LearningRule(window=1, max_origins=1), resolution=RESOLUTION, n_samples=20_000)
 
 
 class TestGaussianMapWindowed(OccupancyMapContract):
@@ -35,7 +36,25 @@ class TestGaussianMapWindowed(OccupancyMapContract):
     turn_tolerance = 0.05
 
     def make(self) -> GaussianMap:
+        return GaussianMap(LearningRule(), resolution=RESOLUTION, n_samples=20_000)
+
+
+class TestGaussianMapIncremental(OccupancyMapContract):
+    """The default: merged as it grows."""
+
+    shift_tolerance = 1e-3
+    turn_tolerance = 0.05
+
+    def make(self) -> GaussianMap:
         return GaussianMap(resolution=RESOLUTION, n_samples=20_000)
+
+
+class TestGaussianMapUnderABudget(OccupancyMapContract):
+    shift_tolerance = 1e-3
+    turn_tolerance = 0.05
+
+    def make(self) -> GaussianMap:
+        return GaussianMap(IncrementalRule(window=2, max_bytes=1000), resolution=RESOLUTION)
 
 
 class GridContract(OccupancyMapContract):

@@ -96,6 +96,14 @@ class OccupancyMapContract(ABC):
     """Most that an answer may change when everything is moved by whole cells."""
     turn_tolerance = 0.0
     """Most that answers may change on average (root mean square) when everything turns by 90°."""
+    thins_scans = False
+    """Whether a point that a scan gives twice tells no more than once; two scans always do."""
+
+    extrapolates = False
+    """Whether it is a regressor whose features are global: it has a word on places that no beam was near,
+    so no answer of exactly ½ is asked of it there. What was seen it must know as all others do."""
+    overshoot = 0.0
+    """How far above ½ a regressor may swing beside space that was only ever seen to be free."""
 
     @abstractmethod
     def make(self) -> Any:
@@ -125,6 +133,8 @@ class OccupancyMapContract(ABC):
         sensor = torch.tensor(SENSOR[:dim], dtype=torch.float64)
         way = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)[:, None]
         assert float(self.ask(made, sensor + way * (points([WALL], dim) - sensor)).max()) < 0.5
+        if self.extrapolates:
+            return
         assert self.ask(made, points([3.5625, 3.8125, 5.0, 50.0], dim)).tolist() == [0.5] * 4
         assert self.ask(made, points([-0.5, -3.0], dim)).tolist() == [0.5] * 2  # behind the sensor
 
@@ -146,7 +156,7 @@ class OccupancyMapContract(ABC):
         assert 0 <= float(theta.min()) <= float(theta.max()) <= 1
         seen = torch.cat([ends, (ends + scan.origin) / 2])
         assert (self.ask(made, seen) != 0.5).any()
-        assert (self.ask(made, inside + 1000) == 0.5).all()
+        assert self.extrapolates or (self.ask(made, inside + 1000) == 0.5).all()
 
     @dims
     def test_before_the_first_scan_everything_is_unknown(self, dim):
@@ -162,14 +172,15 @@ class OccupancyMapContract(ABC):
     @dims
     def test_beams_without_return_free_their_way_and_occupy_nothing(self, dim):
         made = self.built(open_scan(dim))
-        theta = self.ask(made, torch.cat([lattice(dim), open_scan(dim).no_return]))
-        assert float(theta.max()) <= 0.5
+        seen = open_scan(dim).no_return
+        theta = self.ask(made, seen if self.extrapolates else torch.cat([lattice(dim), seen]))
+        assert float(theta.max()) <= 0.5 + self.overshoot
         level = torch.tensor(
             [[x, *SENSOR[1:dim]] for x in (0.8125, 1.8125, 2.8125, 3.8125)], dtype=torch.float64
         )
         assert float(self.ask(made, level).max()) < 0.5
         beyond = torch.tensor([[x, *SENSOR[1:dim]] for x in (5.5, 7.0)], dtype=torch.float64)
-        assert self.ask(made, beyond).tolist() == [0.5] * 2
+        assert self.extrapolates or self.ask(made, beyond).tolist() == [0.5] * 2
 
     @dims
     def test_one_point_is_seen(self, dim):
@@ -182,7 +193,8 @@ class OccupancyMapContract(ABC):
     @dims
     def test_a_point_given_often_is_a_surer_one(self, dim):
         end, origin = points([1.0625], dim), torch.tensor(SENSOR[:dim], dtype=torch.float64)
-        once, often = (self.ask(self.built(Scan(end.repeat(n, 1), origin)), end) for n in (1, 50))
+        scans = [Scan(end, origin)] * 50 if self.thins_scans else [Scan(end.repeat(50, 1), origin)]
+        once, often = (self.ask(self.built(*given), end) for given in ([Scan(end, origin)], scans))
         assert 0.5 < float(once) < float(often) <= 1
 
     # -- how it may be asked -----------------------------------------------------------------------------
@@ -212,7 +224,11 @@ class OccupancyMapContract(ABC):
     @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e9])
     def test_questions_from_nowhere_are_unknown(self, dim, value):
         query = torch.zeros(dim, dim, dtype=torch.float64).fill_diagonal_(value)
-        assert self.ask(self.built(wall_scan(dim)), query).tolist() == [0.5] * dim
+        theta = self.ask(self.built(wall_scan(dim)), query)
+        if self.extrapolates and math.isfinite(value):
+            assert 0 <= float(theta.min()) <= float(theta.max()) <= 1
+        else:
+            assert theta.tolist() == [0.5] * dim
 
     @dims
     def test_a_question_that_holds_nan_is_refused(self, dim):
@@ -380,7 +396,8 @@ class OccupancyMapContract(ABC):
     @given(place=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255), in_header=st.booleans())
     def test_a_damaged_file_is_refused_or_answers_with_probabilities(self, tmp_path, place, value, in_header):
         data = bytearray(self.saved(tmp_path).read_bytes())
-        end = 8 + int.from_bytes(data[:8], "little") if in_header else len(data)
+        header = 8 + int.from_bytes(data[:8], "little")  # of a safetensors file
+        end = min(header, len(data)) if in_header else len(data)
         data[int(place * end)] = value
         path = tmp_path / "damaged.safetensors"
         path.write_bytes(data)

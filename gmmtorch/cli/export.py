@@ -1,0 +1,267 @@
+"""gmmtorch-export: a map or a mixture as a file of another program's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import hydra
+from omegaconf import DictConfig
+
+from gmmtorch.cli import common, schema
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.evaluation.events import Event
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mixture.interchange import PlainMixture
+    from gmmtorch.occupancy.cell_cloud import CellCloud
+    from gmmtorch.occupancy.grid import VoxelGrid
+
+_OF_SPACE = ("map_server", "octomap", "ply", "pcd")
+_OF_COMPONENTS = ("csv", "npz", "mixture")
+_REACH = 3.0  # standard deviations around each component that the cells cover
+
+
+def main() -> None:
+    """Entry point of the command."""
+    schema.register()
+    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="export")(_guarded)()
+
+
+def _guarded(config: DictConfig) -> None:
+    common.run_guarded(run, config)
+
+
+def run(config: DictConfig) -> None:
+    """One export; prints what was written."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.report.progress import ProgressBars
+
+    known = (*_OF_SPACE, *_OF_COMPONENTS)
+    if config.format not in known:
+        raise InvalidArgumentError(f"format={config.format!r} is not one of {', '.join(known)}.")
+    for name in ("path", "output"):
+        if not config[name]:
+            raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
+    device = common.use_runtime(config.runtime)
+    with ProgressBars(enabled=config.report.progress) as bars:
+        if config.format in _OF_COMPONENTS:
+            said = _export_components(config)
+        else:
+            said = _export_space(config, _map(Path(config.path), device), bars)
+    print(said)
+
+
+# -- components -----------------------------------------------------------------------------------
+
+
+def _export_components(config: DictConfig) -> str:
+    """Weights, means and covariances; returns what to say of it."""
+    from gmmtorch.mixture import GaussianMixture, interchange
+
+    mixture = interchange.checked(_components(Path(config.path), config.n_points))
+    output = Path(config.output)
+    if config.format == "csv":
+        interchange.write_gira_csv(output, mixture)
+    elif config.format == "npz":
+        interchange.write_npz(output, mixture)
+    else:
+        GaussianMixture.from_parameters(*mixture[:3]).save(output)
+    k, dim = mixture.means.shape
+    return f"{_size(output)}: {k:,} components in {dim}D"
+
+
+def _components(path: Path, n_points: float | None) -> PlainMixture:
+    """The mixture in a file of any kind; of a map, the components that are surfaces."""
+    from gmmtorch.errors import DataError
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mixture import GaussianMixture, interchange
+
+    if path.suffix == ".csv":
+        return interchange.read_gira_csv(path, n_points)
+    if path.suffix == ".npz":
+        return interchange.read_npz(path)
+    try:
+        found = GaussianMap.load(path).components()
+        surface = ~found.max_range
+        return interchange.PlainMixture.of_support(
+            found.means[surface], found.covariances[surface], found.support[surface]
+        )
+    except DataError as error:
+        no_map = error
+    try:
+        mixture = GaussianMixture.load(path)
+    except DataError as error:
+        raise DataError(f"{path} holds no components to export. {no_map} {error}") from error
+    support = None if n_points is None else mixture.weights * n_points
+    return interchange.PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
+
+
+# -- space ----------------------------------------------------------------------------------------
+
+
+def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
+    """The map in a file. Raises `DataError`, with what each reader said, if it is none."""
+    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.errors import DataError
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    try:
+        return GaussianMap.load(path).to(device)
+    except DataError as error:
+        no_map = error
+    try:
+        return OccupancyGrid.load(path)
+    except DataError as error:
+        raise DataError(f"{path} is no map to export. {no_map} {error}") from error
+
+
+def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
+    """Probabilities of cells; returns what to say of it."""
+    from gmmtorch.occupancy import map_server
+    from gmmtorch.occupancy.cell_cloud import write_pcd, write_ply
+    from gmmtorch.occupancy.octree_export import write_octomap
+    from gmmtorch.occupancy.thresholds import Thresholds
+
+    output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
+    if config.format == "map_server":
+        grid, theta = _dense(config, source, on_event)
+        if grid.dim == 3:
+            grid, theta = map_server.highest_in_band(grid, theta)  # which `_dense` has cut out
+        written = map_server.write_map_server(output, grid, theta, rule)
+        size = " × ".join(map(str, grid.shape))
+        return "\n".join(map(_size, written)) + f": {size} cells of {grid.resolution:g} m"
+    cells = _cloud(config, source, on_event)
+    if config.format == "octomap":
+        write_octomap(output, cells, rule)
+    else:
+        cells = cells.above(rule.occupied)
+        write = write_ply if config.format == "ply" else write_pcd
+        write(output, cells)
+    return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
+
+
+def _cloud(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> CellCloud:
+    """The cells that something is known of; a grid's are at hand."""
+    import torch
+
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.occupancy.cell_cloud import CellCloud
+
+    if isinstance(source, GaussianMap) or config.bounds is not None or _band(config) is not None:
+        return CellCloud.of_grid(*_dense(config, source, on_event))
+    _resolution(config, source)
+    observed = CellCloud.of_blocks(source.evidence())
+    theta = torch.as_tensor(source.occupancy(observed.centers))  # by its own rule: counts or log-odds
+    return CellCloud(observed.centers, theta, observed.resolution)
+
+
+def _dense(
+    config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event
+) -> tuple[VoxelGrid, Tensor]:
+    """Every cell of the box, or of its band, and its probability, of the grid's shape."""
+    import torch
+
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.occupancy.grid import VoxelGrid
+    from gmmtorch.occupancy.rasterize import rasterize
+
+    resolution = _resolution(config, source)
+    low, high = _box(config, source)
+    # A box that ends on a plane between cells ends with the cell before it.
+    high = [max(a, b - 1e-6 * resolution) for a, b in zip(low, high, strict=True)]
+    grid = VoxelGrid.covering(low, high, resolution, config.runtime.memory_limit)
+    method = config.method
+    if isinstance(source, GaussianMap):
+        method = source.method if method is None else method
+        if method != "point":  # the others answer for cells, all at once
+            on_event(f"evidence by {method}", 0, None)
+            return grid, source.evidence(grid, method).probability(source.answering.prior)
+
+    def answer(points: Tensor) -> Tensor:
+        if isinstance(source, GaussianMap):
+            theta = source.occupancy(points, resolution, method)
+        else:
+            theta = source.occupancy(points)
+        return torch.as_tensor(theta)
+
+    return grid, rasterize(answer, grid, on_event)
+
+
+def _resolution(config: DictConfig, source: GaussianMap | OccupancyGrid) -> float:
+    """Of the cells (m). Raises `InvalidArgumentError` for one that a grid does not have."""
+    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.occupancy.grid import check_resolution
+
+    if config.resolution is None:
+        return source.resolution
+    wanted = check_resolution(config.resolution)
+    if isinstance(source, OccupancyGrid) and wanted != source.resolution:
+        raise InvalidArgumentError(
+            f"resolution={wanted} m, but the cells of {config.path} are {source.resolution} m; leave it out."
+        )
+    return wanted
+
+
+def _box(config: DictConfig, source: GaussianMap | OccupancyGrid) -> tuple[list[float], list[float]]:
+    """Lowest and highest corner (m): as asked for, else around what the map holds; cut to the band."""
+    import torch
+
+    from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+    from gmmtorch.errors import DataError, InvalidArgumentError
+
+    if isinstance(source, OccupancyGrid):
+        blocks = source.evidence()
+        empty, dim = blocks.n_blocks == 0, blocks.dim
+        corners = [] if empty else list(blocks.bounds())
+    else:
+        found = source.components()
+        empty, dim = len(found) == 0, found.dim
+        reach = _REACH * found.covariances.diagonal(dim1=1, dim2=2).sqrt()
+        around = torch.cat([found.means - reach, found.means + reach, found.origins])
+        corners = [] if empty else [around.amin(0), around.amax(0)]
+    if config.bounds is not None:
+        if len(config.bounds) != 2 * dim:
+            raise InvalidArgumentError(
+                f"bounds={list(config.bounds)} must be {2 * dim} numbers in {dim}D: the lowest corner, then "
+                "the highest."
+            )
+        low, high = list(config.bounds[:dim]), list(config.bounds[dim:])
+    elif empty:
+        raise DataError(f"{config.path} holds nothing; give bounds, if an empty map is meant.")
+    else:
+        low, high = (corner.tolist() for corner in corners)
+    band = _band(config)
+    if band is not None:
+        if dim == 2:
+            raise InvalidArgumentError(f"z_min={band[0]}, z_max={band[1]}: a 2D map has no heights.")
+        reached = (low[2], high[2])
+        low[2], high[2] = max(low[2], band[0]), min(high[2], band[1])
+        if low[2] > high[2]:
+            raise InvalidArgumentError(
+                f"z_min={band[0]}, z_max={band[1]} misses the map, which reaches from {reached[0]:.3g} to "
+                f"{reached[1]:.3g} m."
+            )
+    return low, high
+
+
+def _band(config: DictConfig) -> tuple[float, float] | None:
+    """Heights (m) that are exported; None for all."""
+    if config.z_min is None and config.z_max is None:
+        return None
+    return (
+        float("-inf") if config.z_min is None else config.z_min,
+        float("inf") if config.z_max is None else config.z_max,
+    )
+
+
+def _size(path: Path) -> str:
+    return f"{path}  {path.stat().st_size:,} bytes"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""Whole numbers as a stream of bits, each column in the shortest of a few codes; see docs/formats.md.
+
+NumPy rather than torch: bits end as bytes, which live on the CPU, and every code here is a handful of
+vector operations, without a loop over numbers.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+Ints = NDArray[np.int64]
+
+MAX_WIDTH = 62
+"""Widest number in bits: int64 less the sign, less the bit that zigzag takes."""
+MAX_BYTES = 1 << 30
+"""Longest stream that is read: bits are spread to bytes while it is."""
+_GROUP = 7  # bits in a group of a single number
+
+
+class Code(IntEnum):
+    """How a column is written."""
+
+    FIXED = 0  # each number less the least, in as many bits as the greatest takes
+    RICE = 1  # each number less the least, in a Rice code
+    DIFFERENCES = 2  # the first number, then differences, zigzag, in a Rice code
+
+
+def zigzag(values: Ints) -> Ints:
+    """0, −1, 1, −2, 2, … as 0, 1, 2, 3, 4, …"""
+    return (values << 1) ^ (values >> 63)
+
+
+def unzigzag(codes: Ints) -> Ints:
+    """The inverse of `zigzag`."""
+    return (codes >> 1) ^ -(codes & 1)
+
+
+class Coding(NamedTuple):
+    """The code of a column, its parameter (width, or low bits), its base, and the bits it takes."""
+
+    code: Code
+    parameter: int
+    base: int
+    n_bits: float
+
+
+def best_code(values: Ints) -> Coding:
+    """The code in which these whole numbers are shortest."""
+    if not len(values):
+        return Coding(Code.FIXED, 0, 0, 0.0)
+    base = int(values.min())
+    width = (int(values.max()) - base).bit_length()
+    if width > MAX_WIDTH - 1 or abs(base) >> MAX_WIDTH:
+        raise InvalidArgumentError(f"Numbers from {base} to {values.max()} take more than {MAX_WIDTH} bits.")
+    above, steps = values - base, zigzag(np.diff(values))
+    low, low_step = _rice_parameter(above), _rice_parameter(steps)
+    codings = [
+        Coding(Code.FIXED, width, base, float(width * len(values))),
+        Coding(Code.RICE, low, base, _rice_size(above, low)),
+        Coding(Code.DIFFERENCES, low_step, int(values[0]), _rice_size(steps, low_step)),
+    ]
+    return min(codings, key=lambda coding: coding.n_bits)
+
+
+class BitWriter:
+    """Bits, most significant first, in the order written."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.uint8]] = []
+
+    def to_bytes(self) -> bytes:
+        """All bits, the last byte filled up with zeros."""
+        return np.packbits(np.concatenate(self._parts)).tobytes() if self._parts else b""
+
+    def fixed(self, values: Ints, widths: Ints | int) -> None:
+        """Each number ≥ 0 in its width of bits."""
+        width = np.broadcast_to(np.asarray(widths, np.int64), values.shape)
+        total, which, place = _spread(width)
+        shift = width[which] - 1 - place
+        self._parts.append(((values[which] >> shift) & 1).astype(np.uint8) if total else _NO_BITS)
+
+    def number(self, value: int) -> None:
+        """One whole number of either sign: zigzag, groups of 7 bits, lowest first, a bit for "more"."""
+        code = 2 * value if value >= 0 else -2 * value - 1
+        if code.bit_length() > MAX_WIDTH + 1:
+            raise InvalidArgumentError(f"{value} does not fit into {MAX_WIDTH} bits.")
+        while True:
+            more, group = code >> _GROUP, code & ((1 << _GROUP) - 1)
+            self.fixed(np.array([(more > 0) << _GROUP | group]), 1 + _GROUP)
+            if not more:
+                return
+            code = more
+
+    def rice(self, values: Ints, low: Ints | int) -> None:
+        """Each number ≥ 0: what is above its `low` bits as so many zeros and a one; then all low bits."""
+        ends = np.cumsum((values >> low) + 1)
+        bits = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
+        bits[ends - 1] = 1
+        self._parts.append(bits)
+        self.fixed(values & ((np.int64(1) << low) - 1), low)
+
+    def column(self, values: Ints) -> None:
+        """Any whole numbers, in the code of `Code` that is shortest: code, parameter, base, numbers."""
+        coding = best_code(values)
+        self.fixed(np.array([coding.code]), 2)
+        self.fixed(np.array([coding.parameter]), 6)
+        self.number(coding.base)
+        if coding.code is Code.FIXED:
+            self.fixed(values - coding.base, coding.parameter)
+        elif coding.code is Code.RICE:
+            self.rice(values - coding.base, coding.parameter)
+        else:
+            self.rice(zigzag(np.diff(values)), coding.parameter)
+
+    def rice_column(self, values: Ints) -> None:
+        """Numbers ≥ 0 in a Rice code, its low bits first: at least a bit for each number."""
+        low = _rice_parameter(values)
+        self.fixed(np.array([low]), 6)
+        self.rice(values, low)
+
+    def scaled(self, values: Ints, scales: Ints) -> None:
+        """Numbers of either sign that are of the order of 2^scale, or a fraction of it that they share.
+
+        A Rice code whose low bits are each number's scale less t, t written first.
+        """
+        codes = zigzag(values)
+        size = [_rice_size(codes, np.maximum(scales - t, 0)) for t in range(16)]
+        t = int(np.argmin(size))
+        self.fixed(np.array([t]), 4)
+        self.rice(codes, np.maximum(scales - t, 0))
+
+
+class BitReader:
+    """Reads what `BitWriter` wrote; `DataError` for anything it could not have written.
+
+    What it allocates is bounded by the length of the data: who reads a count calls `require`.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) > MAX_BYTES:
+            raise DataError(f"{len(data):,} bytes are more than the {MAX_BYTES:,} that are read.")
+        self._bits = np.unpackbits(np.frombuffer(data, np.uint8))
+        self._at = 0
+
+    @property
+    def left(self) -> int:
+        """Bits not read yet."""
+        return len(self._bits) - self._at
+
+    def require(self, n_bits: int) -> None:
+        """Raises unless so many bits are left."""
+        if n_bits > self.left:
+            raise DataError(f"{n_bits:,} bits are announced, {self.left:,} are left: it is truncated.")
+
+    def finish(self) -> None:
+        """Raises if anything but the last byte's filling is left."""
+        if self.left > 7 or self._bits[self._at :].any():
+            raise DataError(f"{self.left:,} bits are left over: it is damaged.")
+
+    def fixed(self, n: int, widths: Ints | int) -> Ints:
+        """So many numbers of these widths."""
+        if isinstance(widths, int):
+            self.require(n * widths)
+        width = np.broadcast_to(np.asarray(widths, np.int64), (n,))
+        if n and (int(width.max()) > MAX_WIDTH or int(width.min()) < 0):
+            raise DataError(f"Numbers of {int(width.max())} bits; at most {MAX_WIDTH} are read.")
+        self.require(int(width.sum()))
+        total, which, place = _spread(width)
+        values = np.zeros(n, np.int64)
+        bits = self._bits[self._at : self._at + total].astype(np.int64) << (width[which] - 1 - place)
+        wide = np.flatnonzero(width)
+        if total:
+            values[wide] = np.add.reduceat(bits, (np.cumsum(width) - width)[wide])
+        self._at += total
+        return values
+
+    def number(self) -> int:
+        """One whole number of either sign."""
+        code = shift = 0
+        while True:
+            group = int(self.fixed(1, 1 + _GROUP)[0])
+            code |= (group & ((1 << _GROUP) - 1)) << shift
+            shift += _GROUP
+            if code.bit_length() > MAX_WIDTH + 1 or shift > 70:
+                raise DataError(f"A number has more than {MAX_WIDTH} bits: it is damaged.")
+            if not group >> _GROUP:
+                return code >> 1 if code % 2 == 0 else -((code + 1) >> 1)
+
+    def rice(self, n: int, low: Ints | int) -> Ints:
+        """So many numbers ≥ 0."""
+        self.require(n)
+        ones = np.flatnonzero(self._bits[self._at :])[:n]
+        if len(ones) < n:
+            raise DataError(f"{n:,} numbers are announced, {len(ones):,} are there: it is truncated.")
+        if n == 0:
+            return np.zeros(0, np.int64)
+        high = np.diff(ones, prepend=-1) - 1
+        self._at += int(ones[-1]) + 1
+        widest = int(np.max(low)) + int(high.max()).bit_length()
+        if widest > MAX_WIDTH:
+            raise DataError(f"A number has {widest} bits; at most {MAX_WIDTH} are read.")
+        return (high << low) | self.fixed(n, low)
+
+    def column(self, n: int) -> Ints:
+        """So many numbers of either sign, |x| < 2⁶²."""
+        code, parameter = int(self.fixed(1, 2)[0]), int(self.fixed(1, 6)[0])
+        base = self.number()
+        if code == Code.FIXED:
+            return _bounded(self.fixed(n, parameter), base)
+        if code == Code.RICE:
+            return _bounded(self.rice(n, parameter), base)
+        if code != Code.DIFFERENCES:
+            raise DataError(f"A column has code {code}, which is none: it is damaged.")
+        steps = unzigzag(self.rice(max(n - 1, 0), parameter))
+        if float(np.abs(steps.astype(np.float64)).sum()) + abs(base) >= 2.0**MAX_WIDTH:
+            raise DataError("A column's differences add up to too much: it is damaged.")
+        return np.concatenate([np.array([base], np.int64), steps]).cumsum()[:n]
+
+    def rice_column(self, n: int) -> Ints:
+        """So many numbers ≥ 0."""
+        return self.rice(n, int(self.fixed(1, 6)[0]))
+
+    def scaled(self, scales: Ints) -> Ints:
+        """A number of either sign for each scale."""
+        t = int(self.fixed(1, 4)[0])
+        return unzigzag(self.rice(len(scales), np.maximum(scales - t, 0)))
+
+
+_NO_BITS = np.zeros(0, np.uint8)
+
+
+def _spread(width: Ints) -> tuple[int, Ints, Ints]:
+    """How many bits there are, and of each bit: whose it is, and which of its bits from the left."""
+    which = np.repeat(np.arange(len(width)), width)
+    place = np.arange(len(which)) - (np.cumsum(width) - width)[which]
+    return len(which), which, place
+
+
+def _bounded(above: Ints, base: int) -> Ints:
+    if len(above) and int(above.max()) + abs(base) >= 1 << MAX_WIDTH:
+        raise DataError("A column's numbers are too large: it is damaged.")
+    return above + base
+
+
+def _rice_size(values: Ints, low: Ints | int) -> float:
+    """Bits of a Rice code; a float, which does not overflow."""
+    return float(((values >> low) + (1.0 + np.asarray(low))).sum())
+
+
+def _rice_parameter(values: Ints) -> int:
+    """The number of low bits that makes the Rice code of these shortest."""
+    about = int(np.log2(float(values.mean()) + 1)) if len(values) else 0
+    return min(range(max(about - 1, 0), min(about + 2, MAX_WIDTH)), key=lambda low: _rice_size(values, low))

@@ -1,0 +1,263 @@
+"""A component's mean and covariance on a lattice that fits its own shape.
+
+Error is measured in a component's own deviations, so that a sheet 1 m wide and 5 mm thick keeps its
+place to a millimetre across and to decimetres along, whichever way it lies. With the axes ordered by
+falling deviation (pivoting), Σ = L diag(d²) Lᵀ, L unit lower triangular with |L_ij| ≤ 1, d₁ ≥ d₂ ≥ d₃.
+Then, with p = `PRECISION`:
+
+- each d_i is a power of 2^(1/`PER_OCTAVE`), and off by half a step at most;
+- each L_ij is a multiple of a power of two in (½, 1] 2⁻ᵖ d_i/d_j. A row is rounded given the rounded rows
+  above it, so that errors do not build up;
+- the mean on axis i is a multiple of a power of two in (½, 1] 2⁻ᵖ d_i. An axis is rounded given the
+  rounded ones before it: where a mean moves along a sheet, it moves on the sheet.
+
+So D⁻¹L̃⁻¹(μ̃ − μ), and the entries below the diagonal of D⁻¹L̃⁻¹L D, are at most 2⁻ᵖ⁻¹: errors in
+deviations (`MEAN_ERROR`, `SHEAR_ERROR`). What is restored is positive definite by construction. The
+lattice is anchored in the world: what a component becomes depends neither on its company nor on a
+frame, and rounding again changes nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+PER_OCTAVE = 4
+"""Steps of deviations, and of counts, in a factor of two."""
+PRECISION = 2
+"""Means and shears have at least 2^PRECISION steps in a deviation."""
+
+MEAN_ERROR = SHEAR_ERROR = 2.0 ** (-PRECISION - 1)
+"""Largest error of a mean, and of a shear, in deviations."""
+DEVIATION_ERROR = 2.0 ** (0.5 / PER_OCTAVE) - 1
+"""Largest relative error of a deviation."""
+
+LARGEST_DEVIATION = 20 * PER_OCTAVE
+"""Steps: 2²⁰ m. Larger ones are refused."""
+LEAST_DEVIATION = -20 * PER_OCTAVE
+"""Steps: 2⁻²⁰ m, a micrometre. Smaller ones become this."""
+LARGEST_RATIO = 20 * PER_OCTAVE
+"""Steps: deviations less than 2⁻²⁰ of the component's largest become that, as double precision tells
+smaller ones from none no more."""
+FARTHEST = 2.0**27
+"""Metres from the world's origin to a mean on each axis, at most."""
+STEEPEST = 2
+"""|L_ij| at most; 1 up to rounding where a covariance is definite."""
+
+AXIS_ORDERS = {dim: torch.tensor(list(itertools.permutations(range(dim)))) for dim in (2, 3)}
+
+# Literals, and of powers of two exact ones: the same bits on every machine.
+_ROOTS = torch.tensor([1.0, 1.189207115002721, 1.4142135623730951, 1.6817928305074292], dtype=torch.float64)
+_EXP2 = torch.tensor([2.0**e for e in range(-256, 256)], dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Places on the lattice, int64: axis_order (K,), an index into `AXIS_ORDERS`; and by falling
+    deviation deviation (K, D), log2 in steps; shear (K, D(D−1)/2): L₂₁, L₃₁, L₃₂; mean (K, D)."""
+
+    axis_order: Tensor
+    deviation: Tensor
+    shear: Tensor
+    mean: Tensor
+
+    @property
+    def dim(self) -> int:
+        return self.mean.shape[1]
+
+    def axes(self) -> Tensor:
+        """World axis (K, D) of each axis."""
+        return AXIS_ORDERS[self.dim][self.axis_order]
+
+    def mean_exponents(self) -> Tensor:
+        """log2 (K, D) of a step of the mean, m."""
+        return floor_divide(self.deviation, PER_OCTAVE) - PRECISION
+
+    def taken(self, rows: Tensor) -> Lattice:
+        """These rows."""
+        return Lattice(self.axis_order[rows], self.deviation[rows], self.shear[rows], self.mean[rows])
+
+    def is_valid(self) -> Tensor:
+        """Which (K,) are within bounds: deviations that do not rise, and shears that are not too steep."""
+        falling = (self.deviation[:, 1:] <= self.deviation[:, :-1]).all(1)
+        ratio = self.deviation[:, 0] - self.deviation[:, -1] <= LARGEST_RATIO
+        inside = (self.deviation[:, 0] <= LARGEST_DEVIATION) & (self.deviation[:, -1] >= LEAST_DEVIATION)
+        gentle = (scaled(self.shear, shear_exponents(self.deviation)).abs() <= STEEPEST).all(1)
+        near = (scaled(self.mean, self.mean_exponents()).abs() <= FARTHEST).all(1)
+        return falling & ratio & inside & gentle & near
+
+    def restored(self) -> tuple[Tensor, Tensor]:
+        """Means (K, D) and covariances (K, D, D)."""
+        variance = power(2 * self.deviation)
+        shear = scaled(self.shear, shear_exponents(self.deviation))
+        mean = scaled(self.mean, self.mean_exponents())
+        # Term by term: a matrix product may sum in another order on another machine.
+        lower = variance.new_zeros(len(mean), self.dim, self.dim)
+        lower[:, 0, 0] = variance[:, 0]
+        lower[:, 1, 0] = shear[:, 0] * variance[:, 0]
+        lower[:, 1, 1] = shear[:, 0] * lower[:, 1, 0] + variance[:, 1]
+        if self.dim == 3:
+            lower[:, 2, 0] = shear[:, 1] * variance[:, 0]
+            lower[:, 2, 1] = shear[:, 1] * lower[:, 1, 0] + shear[:, 2] * variance[:, 1]
+            across = shear[:, 2] * shear[:, 2] * variance[:, 1]
+            lower[:, 2, 2] = shear[:, 1] * lower[:, 2, 0] + across + variance[:, 2]
+        axes = self.axes()
+        covariances = torch.empty_like(lower)
+        covariances[_pairs(axes)] = lower + lower.tril(-1).transpose(1, 2)
+        return torch.empty_like(mean).scatter_(1, axes, mean), covariances
+
+
+def nearest(means: Tensor, covariances: Tensor) -> Lattice:
+    """Where means (K, D) and covariances (K, D, D), float64 on the CPU, go on the lattice.
+
+    Covariances that are not quite positive definite become so. Raises `InvalidArgumentError` beyond
+    `FARTHEST` and `LARGEST_DEVIATION`.
+    """
+    _check(means, covariances)
+    found, exact = _exact(means, covariances)
+    if bool(exact.all()):
+        return found
+    rounded = _rounded(means, covariances, _pivots(covariances))
+    # Of several axis orders that restore the same component the first is taken, whatever order the
+    # component came in with: so the bytes of what was rounded before are the same again.
+    again, same = _exact(*rounded.restored())
+    return _chosen(exact, found, _chosen(same, again, rounded))
+
+
+def shear_exponents(deviation: Tensor) -> Tensor:
+    """log2 (K, D(D−1)/2) of a step of the shears of components with these deviations (K, D)."""
+    rows, cols = torch.tril_indices(deviation.shape[1], deviation.shape[1], -1)
+    return floor_divide(deviation[:, rows] - deviation[:, cols], PER_OCTAVE) - PRECISION
+
+
+def power(steps: Tensor) -> Tensor:
+    """2^(steps / PER_OCTAVE)."""
+    whole = floor_divide(steps, PER_OCTAVE)
+    return _ROOTS[steps - whole * PER_OCTAVE] * _EXP2[whole + 256]
+
+
+def scaled(values: Tensor, exponents: Tensor) -> Tensor:
+    """Whole numbers times powers of two, exactly, float64."""
+    return values.double() * _EXP2[exponents + 256]
+
+
+def floor_divide(values: Tensor, divisor: int) -> Tensor:
+    return torch.div(values, divisor, rounding_mode="floor")
+
+
+def _check(means: Tensor, covariances: Tensor) -> None:
+    largest = 4.0 ** (LARGEST_DEVIATION / PER_OCTAVE)
+    for name, value, limit in (("means", means, FARTHEST), ("covariances", covariances, largest)):
+        bad = ~(value.abs() <= limit).flatten(1).all(1)  # NaN is bad, too
+        if bool(bad.any()):
+            first = int(bad.nonzero()[0])
+            raise InvalidArgumentError(
+                f"{name}[{first}] is {value[first].tolist()}; entries up to {limit:g} can be stored. "
+                "Is it in metres?"
+            )
+
+
+def _exact(means: Tensor, covariances: Tensor) -> tuple[Lattice, Tensor]:
+    """The first axis order in which each component is on the lattice as it is; and which (K,) are at all."""
+    k, dim = means.shape
+    n_orders = len(AXIS_ORDERS[dim])
+    # All orders at once: maps are often so small that the number of operations is what takes time.
+    orders = torch.arange(n_orders).repeat_interleave(k)
+    every_mean, every_covariance = means.repeat(n_orders, 1), covariances.repeat(n_orders, 1, 1)
+    tried = _rounded(every_mean, every_covariance, orders)
+    mean, covariance = tried.restored()
+    same = (mean == every_mean).all(1) & (covariance == every_covariance).flatten(1).all(1)
+    same = (same & tried.is_valid()).view(n_orders, k)
+    row = same.long().argmax(0) * k + torch.arange(k)  # the first that is true, else the first
+    return tried.taken(row), same.any(0)
+
+
+def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
+    """The nearest place with these axis orders (K,)."""
+    dim = means.shape[1]
+    axes = AXIS_ORDERS[dim][axis_order]
+    mean = means.gather(1, axes)
+    variances, shears = _factors(covariances[_pairs(axes)])
+    steps = (torch.log2(variances) * (PER_OCTAVE / 2)).round().long()
+    steps = torch.maximum(steps, steps[:, :1] - LARGEST_RATIO).clamp_min(LEAST_DEVIATION)
+    blank = Lattice(axis_order, steps, steps.new_zeros(len(mean), shears.shape[1]), torch.zeros_like(steps))
+
+    e = shear_exponents(steps)
+    shear = _to_shears(shears[:, :1], e[:, :1])
+    if dim == 3:
+        # x₃ = L₃₁x₁ + L₃₂(x₂ − L₂₁x₁) + …, written with the rounded L₂₁.
+        off = scaled(shear[:, 0], e[:, 0]) - shears[:, 0]
+        given = torch.stack([shears[:, 1] + shears[:, 2] * off, shears[:, 2]], 1)
+        shear = torch.cat([shear, _to_shears(given, e[:, 1:])], 1)
+
+    slope = scaled(shear, e)
+    step = blank.mean_exponents()
+    place = [_to_steps(mean[:, 0], step[:, 0])]
+    error = mean[:, 0] - scaled(place[0], step[:, 0])
+    wanted = mean[:, 1] - slope[:, 0] * error
+    place.append(_to_steps(wanted, step[:, 1]))
+    if dim == 3:
+        rest = wanted - scaled(place[1], step[:, 1])
+        place.append(_to_steps(mean[:, 2] - slope[:, 1] * error - slope[:, 2] * rest, step[:, 2]))
+    return Lattice(axis_order, steps, shear, torch.stack(place, 1).long())
+
+
+def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
+    """d² (K, D) and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances; d² at least what the lattice has."""
+    least = 4.0 ** (LEAST_DEVIATION / PER_OCTAVE)
+    v1 = ordered[:, 0, 0].clamp_min(least)
+    floor = (v1 * 4.0 ** (-LARGEST_RATIO / PER_OCTAVE)).clamp_min(least)
+    l21 = ordered[:, 1, 0] / v1
+    v2 = torch.maximum(ordered[:, 1, 1] - l21 * l21 * v1, floor)
+    if ordered.shape[1] == 2:
+        return torch.stack([v1, v2], 1), l21[:, None]
+    l31 = ordered[:, 2, 0] / v1
+    l32 = (ordered[:, 2, 1] - l31 * ordered[:, 1, 0]) / v2
+    v3 = torch.maximum(ordered[:, 2, 2] - l31 * l31 * v1 - l32 * l32 * v2, floor)
+    return torch.stack([v1, v2, v3], 1), torch.stack([l21, l31, l32], 1)
+
+
+def _chosen(which: Tensor, one: Lattice, other: Lattice) -> Lattice:
+    """Rows of `one` where `which` (K,) is true, of `other` elsewhere."""
+    rows = torch.arange(len(which))
+    joined = Lattice(
+        torch.cat([one.axis_order, other.axis_order]),
+        torch.cat([one.deviation, other.deviation]),
+        torch.cat([one.shear, other.shear]),
+        torch.cat([one.mean, other.mean]),
+    )
+    return joined.taken(torch.where(which, rows, len(rows) + rows))
+
+
+def _pivots(covariances: Tensor) -> Tensor:
+    """The axis order (K,) of complete pivoting: always the axis of which most is unexplained yet."""
+    k, dim = covariances.shape[:2]
+    rows = torch.arange(k)
+    variances = covariances.diagonal(dim1=1, dim2=2)
+    first = variances.argmax(1)
+    column = covariances[rows, :, first]
+    rest = variances - column * column / column[rows, first][:, None].clamp_min(1e-300)
+    rest[rows, first] = -torch.inf
+    orders = AXIS_ORDERS[dim]
+    chosen = (orders[None, :, 0] == first[:, None]) & (orders[None, :, 1] == rest.argmax(1)[:, None])
+    return chosen.long().argmax(1)
+
+
+def _to_steps(values: Tensor, exponents: Tensor) -> Tensor:
+    """Values in whole steps of 2^exponent, still float64."""
+    return (values * _EXP2[256 - exponents]).round()
+
+
+def _to_shears(values: Tensor, exponents: Tensor) -> Tensor:
+    """Shears in whole steps, none steeper than `STEEPEST`: those of covariances that are not definite."""
+    return _to_steps(values.clamp(-STEEPEST, STEEPEST), exponents).long()
+
+
+def _pairs(axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Index that puts rows and columns of (K, D, D) in the order of axes (K, D)."""
+    return torch.arange(len(axes))[:, None, None], axes[:, :, None], axes[:, None, :]

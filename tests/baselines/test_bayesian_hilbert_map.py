@@ -1,0 +1,301 @@
+"""Bayesian Hilbert maps: the contract, quadrature, the bound, and intel."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
+from torch import Tensor
+
+from gmmtorch.baselines.bayesian_hilbert_map import (
+    BayesianHilbertMap,
+    Posterior,
+    evidence_bound,
+    fit,
+    jaakkola_lambda,
+    moderated,
+    moments,
+    variational_step,
+)
+from gmmtorch.baselines.beam_samples import beam_samples
+from gmmtorch.baselines.hilbert_features import LatticeDesign, LatticeFeatures
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.scan import Scan
+
+
+class TestMeanField(OccupancyMapContract):
+    shift_tolerance = 1e-4
+    turn_tolerance = 0.1
+    overshoot = 0.1
+    thins_scans = True
+
+    def make(self) -> BayesianHilbertMap:
+        return BayesianHilbertMap(
+            160.0, spacing=RESOLUTION, free_spacing=0.25, gap=RESOLUTION, thin=RESOLUTION, n_iter=2
+        )
+
+
+class TestDiagonal(OccupancyMapContract):
+    """Narrow kernels: with many at one place the authors' fast form counts the evidence as often."""
+
+    shift_tolerance = 1e-4
+    turn_tolerance = 0.15
+    thins_scans = True
+
+    def make(self) -> BayesianHilbertMap:
+        return BayesianHilbertMap(
+            300.0,
+            spacing=RESOLUTION,
+            covariance="diagonal",
+            free_spacing=0.25,
+            gap=RESOLUTION,
+            thin=RESOLUTION,
+        )
+
+
+# -- inference -------------------------------------------------------------------------------------------
+
+
+def problem(n: int, n_features: int, seed: int = 0) -> tuple[LatticeDesign, Tensor]:
+    """Points on a line of hinges, 0.4 m apart, whose kernels overlap, and labels that change along it."""
+    generator = torch.Generator().manual_seed(seed)
+    x = 0.4 * n_features * torch.rand(n, generator=generator, dtype=torch.float64)
+    points = torch.stack([x, torch.full_like(x, 0.2)], 1)
+    features = LatticeFeatures("rbf", 0.3, 0.4, 2, 2, points.device)
+    features.open(points)
+    assert features.count == n_features
+    odds = 3 * (2 * x).sin() + 0.5
+    return features.design(points), torch.rand(n, generator=generator, dtype=torch.float64) < torch.sigmoid(
+        odds
+    )
+
+
+def prior_of(n_features: int, full: bool, variance: float = 4.0) -> Posterior:
+    precision = torch.full((n_features,), 1 / variance, dtype=torch.float64)
+    return Posterior(torch.zeros_like(precision), precision.diag() if full else precision)
+
+
+def exact(design: LatticeDesign, is_hit: Tensor, variance: float) -> tuple[float, Tensor, Tensor, Tensor]:
+    """ln p(y), mean and covariance of the weights, and mean of σ(wᵀφ), by quadrature over a fine grid."""
+    phi = design.dense()
+    axis = torch.linspace(-12, 12, 601, dtype=torch.float64)
+    w = torch.cartesian_prod(*[axis] * phi.shape[1]).reshape(-1, phi.shape[1])
+    sign = torch.where(is_hit, 1.0, -1.0).double()
+    log = torch.nn.functional.logsigmoid((w @ phi.T) * sign).sum(1)
+    log = log - 0.5 * w.square().sum(1) / variance - 0.5 * w.shape[1] * math.log(2 * math.pi * variance)
+    cell = (axis[1] - axis[0]) ** w.shape[1]
+    total = torch.logsumexp(log, 0)
+    weight = (log - total).exp()
+    mean = weight @ w
+    covariance = ((w - mean) * weight[:, None]).T @ (w - mean)
+    return float(total + cell.log()), mean, covariance, weight @ torch.sigmoid(w @ phi.T)
+
+
+def test_lambda_is_the_bounds_curvature():
+    xi = torch.tensor([1e-9, 1e-3, 0.5, 3.0, 40.0], dtype=torch.float64)
+    expected = (torch.sigmoid(xi) - 0.5) / (2 * xi)
+    torch.testing.assert_close(jaakkola_lambda(xi)[1:], expected[1:])
+    torch.testing.assert_close(jaakkola_lambda(torch.zeros(1).double()), torch.tensor([0.125]).double())
+
+
+@pytest.mark.parametrize("n_features", [1, 2])
+@pytest.mark.parametrize("n", [1, 10, 60])
+def test_against_the_exact_posterior_by_quadrature(n_features, n):
+    design, is_hit = problem(max(n, 8), n_features)
+    design, is_hit = design.rows(torch.arange(n)), is_hit[:n]
+    prior = prior_of(n_features, full=True)
+    evidence, mean, covariance, theta = exact(design, is_hit, 4.0)
+    posterior = fit(design, is_hit, prior, "full", 100)
+    bound = evidence_bound(design, is_hit, prior, posterior)
+    assert bound <= evidence + 1e-9
+    assert bound > evidence - 0.35 * n_features
+    deviation = covariance.diagonal().sqrt()
+    assert float(((posterior.mean - mean) / deviation).abs().max()) < 0.25
+    found = torch.linalg.inv(posterior.precision).diagonal().sqrt()
+    assert bool((found < 1.05 * deviation).all())  # the bound is known to be too sure, never the reverse
+    assert bool((found > 0.6 * deviation).all())
+    assert float((moderated(*moments(design, posterior)) - theta).abs().max()) < 0.05
+
+
+@pytest.mark.parametrize("covariance", ["full", "mean_field"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bound_rises_every_step(covariance, seed):
+    design, is_hit = problem(200, 12, seed)
+    prior = prior_of(12, covariance == "full", 1e4)
+    posteriors = [fit(design, is_hit, prior, covariance, n) for n in range(1, 25)]
+    bounds = [evidence_bound(design, is_hit, prior, posterior) for posterior in posteriors]
+    assert all(later >= earlier - 1e-9 for earlier, later in itertools.pairwise(bounds))
+    assert bounds[-1] - bounds[0] > 0.1
+
+
+def test_the_bound_is_highest_at_its_own_posterior():
+    design, is_hit = problem(100, 4)
+    prior = prior_of(4, full=True)
+    best = fit(design, is_hit, prior, "full", 300)
+    bound = evidence_bound(design, is_hit, prior, best)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        mean = best.mean + 0.05 * torch.randn(4, generator=generator, dtype=torch.float64)
+        assert evidence_bound(design, is_hit, prior, replace(best, mean=mean)) < bound
+    for scale in (0.9, 1.1):
+        other = Posterior(best.mean, best.precision * scale)
+        assert evidence_bound(design, is_hit, prior, other) < bound
+
+
+def test_mean_field_is_the_best_diagonal_normal_for_its_xi():
+    design, is_hit = problem(80, 6)
+    xi = torch.linspace(0.1, 4, 80, dtype=torch.float64)
+    full = variational_step(design, is_hit, prior_of(6, full=True), xi, "full")
+    found = variational_step(design, is_hit, prior_of(6, full=False), xi, "mean_field")
+    torch.testing.assert_close(found.mean, full.mean, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.precision, full.precision.diagonal())
+
+
+def test_the_authors_diagonal_form_is_their_formula_and_right_where_kernels_do_not_overlap():
+    design, is_hit = problem(80, 6)
+    xi, prior = torch.linspace(0.1, 4, 80, dtype=torch.float64), prior_of(6, full=False)
+    found = variational_step(design, is_hit, prior, xi, "diagonal")
+    phi, lam = design.dense().numpy(), jaakkola_lambda(xi).numpy()
+    variance = 1 / (1 / 4.0 + 2 * (phi.T**2 * lam).sum(1))
+    np.testing.assert_allclose(1 / found.precision.numpy(), variance)
+    np.testing.assert_allclose(found.mean.numpy(), variance * (phi.T @ (is_hit.numpy() - 0.5)))
+    apart = LatticeFeatures("rbf", 0.1, 0.4, 2, 2, torch.device("cpu"))
+    points = torch.tensor([[0.2, 0.2], [1.0, 0.2], [1.05, 0.2], [2.6, 0.2]], dtype=torch.float64)
+    apart.open(points)
+    labels = torch.tensor([True, False, False, True])
+    one = fit(apart.design(points), labels, prior_of(3, full=False), "diagonal", 20)
+    other = fit(apart.design(points), labels, prior_of(3, full=True), "full", 20)
+    torch.testing.assert_close(one.mean, other.mean)
+
+
+def test_moderated_answers_are_near_the_mean_of_the_sigmoid():
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    for m in (-4.0, -0.5, 0.0, 2.0):
+        for v in (0.01, 1.0, 20.0):
+            mean = float((weights / (1 + np.exp(-(m + math.sqrt(v) * nodes)))).sum() / weights.sum())
+            found = float(moderated(torch.tensor(m).double(), torch.tensor(v).double()))
+            assert abs(found - mean) < 0.02
+
+
+# -- the map ---------------------------------------------------------------------------------------------
+
+
+def full_map(**options: float) -> BayesianHilbertMap:
+    return BayesianHilbertMap(
+        20.0, spacing=0.3, covariance="full", free_spacing=0.3, gap=0.125, thin=0.25, **options
+    )
+
+
+def test_scan_after_scan_the_posterior_is_the_next_prior():
+    made = full_map()
+    scans = [wall_scan(2), wall_scan(2, 1, (1.3, -0.7, 0.3)), open_scan(2)]
+    drawing = torch.Generator().manual_seed(0)
+    known = Posterior(torch.empty(0).double(), torch.empty(0, 0).double())
+    places = torch.empty(0, 2).double()
+    for scan in scans:
+        points, is_hit = beam_samples(scan, 0.3, gap=0.125, thin=0.25, generator=drawing)
+        made.insert(scan)
+        # The hinges are found by their places, not by their order, which changes as there are more.
+        rows = torch.cdist(places, made.hinges).argmin(1) if len(places) else torch.empty(0).long()
+        mean, precision = torch.zeros(len(made.hinges)).double(), torch.eye(len(made.hinges)).double() / 10
+        mean[rows] = known.mean
+        precision[rows[:, None], rows] = known.precision
+        expected = fit(made._hinges.design(points), is_hit, Posterior(mean, precision), "full", made.n_iter)
+        torch.testing.assert_close(made.posterior.mean, expected.mean, rtol=1e-3, atol=1e-3)
+        known, places = made.posterior, made.hinges
+
+
+def test_a_full_map_is_kept_and_goes_on(tmp_path):
+    made = full_map()
+    for scan in (Scan(torch.empty(0, 2), torch.zeros(2)), open_scan(2)):
+        made.insert(scan)
+        made.save(tmp_path / "map.safetensors")
+        assert made.nbytes == (tmp_path / "map.safetensors").stat().st_size
+        loaded = BayesianHilbertMap.load(tmp_path / "map.safetensors")
+        assert torch.equal(loaded.occupancy(lattice(2)), made.occupancy(lattice(2)))
+    for seed in range(4):
+        loaded.insert(wall_scan(2, seed))
+    theta = loaded.occupancy([[3.0625, 0.2], [2.0, 0.2], [-3.0, 0.2], [math.inf, 0.0]])
+    assert theta[0] > 0.5 > theta[1]
+    assert theta[2:].tolist() == [0.5, 0.5]
+
+
+def test_in_3d_memory_follows_the_data():
+    made = BayesianHilbertMap(20.0, spacing=0.25, free_spacing=0.5)
+    made.insert(Scan([[0.0, 0.0, 5.0], [800.0, 700.0, 0.0]], [0.0, 0.0, 0.0]))
+    assert made.posterior.mean.shape[0] < 5 / 0.5 + 1100 / 0.5  # not the box's 5·10⁷ nodes
+    assert made.occupancy([[800.0, 700.0, 0.0], [400.0, 0.0, 0.0]])[1] == 0.5
+
+
+def test_more_hinges_than_a_full_covariance_is_kept_of_are_refused(monkeypatch):
+    monkeypatch.setattr("gmmtorch.baselines.bayesian_hilbert_map._MAX_FULL", 10)
+    with pytest.raises(MemoryLimitError, match="mean_field"):
+        full_map().insert(wall_scan(2))
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"gamma": 0},
+        {"spacing": -1},
+        {"covariance": "round"},
+        {"prior_variance": math.nan},
+        {"n_iter": 0},
+        {"free_spacing": 0},
+        {"gap": -1},
+        {"thin": 0},
+        {"random_state": -1},
+    ],
+    ids=lambda o: next(iter(o)),
+)
+def test_settings_that_are_none_are_refused(option):
+    with pytest.raises(InvalidArgumentError, match=next(iter(option))):
+        BayesianHilbertMap(**option)
+
+
+def test_hinges_that_leave_gaps_are_refused_at_the_first_scan():
+    with pytest.raises(InvalidArgumentError, match="gaps"):
+        BayesianHilbertMap(100.0, spacing=1.0).insert(wall_scan(2))
+
+
+@pytest.mark.parametrize("covariance", ["mean_field", "full"])
+def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, covariance):
+    made = BayesianHilbertMap(5.0, spacing=0.5, covariance=covariance)
+    made.insert(open_scan(2))
+    path = tmp_path / "map.safetensors"
+    made.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.bayesian_hilbert_map", 1)
+    last = "factor" if covariance == "full" else "precisions"
+    changes = [{name: tensors[name][:-1]} for name in tensors]
+    changes += [{"means": tensors["means"] * math.inf}, {last: -tensors[last] - 1}]
+    for change in changes:
+        path.write_bytes(pack_tensors({**tensors, **change}, "gmmtorch.bayesian_hilbert_map", 1, **facts))
+        with pytest.raises(DataError, match=r"map\.safetensors"):
+            BayesianHilbertMap.load(path)
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.bayesian_hilbert_map", 1, **{**facts, "dim": 1}))
+    with pytest.raises(DataError, match="settings"):
+        BayesianHilbertMap.load(path)
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_on_intel_it_is_at_least_as_good_as_published(real_data):
+    """0.950 is known of Bayesian Hilbert maps at 0.1 m."""
+    scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz"))
+    train, test = split.split_indices(len(scans), 10)
+    asked = queries.hit_and_free(
+        *queries.test_beams([scans[i] for i in test], 4000, 0), free="uniform", resolution=0.1, seed=0
+    )
+    made = BayesianHilbertMap()
+    for i in train:
+        made.insert(scans[i])
+    theta = made.occupancy(asked.points)
+    assert metrics.roc(theta[asked.of(1)], theta[asked.of(0)]).auc > 0.95

@@ -1,0 +1,167 @@
+"""Gaussian process occupancy: the contract, and scikit-learn's processes block by block."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from occupancy.protocol_contract import (
+    RESOLUTION,
+    OccupancyMapContract,
+    lattice,
+    move,
+    points,
+    shifted,
+    wall_scan,
+)
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern
+
+from gmmtorch.baselines.gp_map import GPMap, gp_regression
+from gmmtorch.baselines.thinned_samples import thinned_samples
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.scan import Scan
+
+
+class TestGPMap(OccupancyMapContract):
+    shift_tolerance = 1e-3
+    turn_tolerance = 0.1
+    thins_scans = True
+
+    def make(self) -> GPMap:
+        return GPMap(RESOLUTION)
+
+    @pytest.mark.parametrize("dim", [2, 3])
+    def test_moved_by_whole_cells_it_gives_the_moved_answers(self, dim):
+        """The blocks, each with a process of its own, do not move along: so on average alone."""
+        matrix = shifted(dim, (0.125, -0.375, 0.25))
+        expected = self.ask(self.built(wall_scan(dim)), lattice(dim))
+        theta = self.ask(self.built(wall_scan(dim).transformed(matrix)), move(matrix, lattice(dim)))
+        assert float((theta - expected).square().mean().sqrt()) <= self.turn_tolerance
+
+
+def sklearn_process(length: float, variance: float, noise: float) -> GaussianProcessRegressor:
+    kernel = ConstantKernel(variance, "fixed") * Matern(length, "fixed", nu=1.5)
+    return GaussianProcessRegressor(kernel, alpha=noise, optimizer=None)
+
+
+# -- one process ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(
+    ("length", "variance", "noise"), [(1.0, 1.0, 0.01), (0.2, 2.5, 0.1), (5.0, 0.3, 0.01)]
+)
+def test_padded_processes_are_those_of_scikit_learn(dim, length, variance, noise):
+    generator = torch.Generator().manual_seed(0)
+    sizes = [1, 7, 40]
+    places = torch.randn(3, 40, dim, generator=generator, dtype=torch.float64)
+    values = torch.randn(3, 40, generator=generator, dtype=torch.float64)
+    given = torch.arange(40) < torch.tensor(sizes)[:, None]
+    query = torch.randn(3, 25, dim, generator=generator, dtype=torch.float64)
+    made = gp_regression(places, values, given, query, length=length, variance=variance, noise=noise)
+    for row, size in enumerate(sizes):
+        peer = sklearn_process(length, variance, noise).fit(places[row, :size], values[row, :size])
+        mean, deviation = peer.predict(query[row].numpy(), return_std=True)
+        np.testing.assert_allclose(made.mean[row], mean, atol=1e-9)
+        np.testing.assert_allclose(made.variance[row], deviation**2, atol=1e-9)
+
+
+# -- a map of them -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_map_is_a_committee_of_the_processes_of_its_blocks(dim):
+    """Every cell by hand: scikit-learn on each block's samples, fused over faces and scans."""
+    generator = torch.Generator().manual_seed(dim)
+    made = GPMap(0.25, length=0.8, noise=0.05, free_resolution=0.4, known_variance=0.3, block_side=2)
+    precision: dict[tuple[int, ...], float] = {}
+    weighted: dict[tuple[int, ...], float] = {}
+    for _ in range(2):
+        scan = Scan(
+            2 * torch.rand(6, dim, generator=generator, dtype=torch.float64),
+            torch.rand(dim, generator=generator, dtype=torch.float64),
+        )
+        made.insert(scan)
+        samples, is_hit = thinned_samples(scan, 0.4, 0.25)
+        blocks: dict[tuple[int, ...], list[int]] = {}
+        for index, sample in enumerate(samples.tolist()):
+            blocks.setdefault(tuple(math.floor(x / 0.5) for x in sample), []).append(index)
+        for block, members in blocks.items():
+            peer = sklearn_process(0.8, 1.0, 0.05)
+            peer.fit(samples[members].numpy(), np.where(is_hit[members].numpy(), 1.0, -1.0))
+            for axis, step in [(0, 0), *itertools.product(range(dim), (-1, 1))]:
+                beside = [x + (step if a == axis else 0) for a, x in enumerate(block)]
+                for corner in itertools.product((0, 1), repeat=dim):
+                    cell = tuple(2 * b + c for b, c in zip(beside, corner, strict=True))
+                    mean, deviation = peer.predict([[(x + 0.5) * 0.25 for x in cell]], return_std=True)
+                    precision[cell] = precision.get(cell, 1 / 1000.0) + 1 / deviation[0] ** 2 - 1
+                    weighted[cell] = weighted.get(cell, 0.0) + mean[0] / deviation[0] ** 2
+    cells = list(precision)
+    expected = [
+        1 / (1 + math.exp(-100 * 0.001 * weighted[cell])) if precision[cell] >= 1 / 0.3 else 0.5
+        for cell in cells
+    ]
+    theta = made.occupancy((torch.tensor(cells).double() + 0.5) * 0.25)
+    torch.testing.assert_close(theta, torch.tensor(expected, dtype=torch.float64), rtol=1e-4, atol=1e-5)
+    assert 0.1 < sum(x == 0.5 for x in expected) / len(expected) < 0.9
+
+
+# -- bad input -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "length",
+        "variance",
+        "noise",
+        "gain",
+        "min_variance",
+        "max_variance",
+        "known_variance",
+        "block_side",
+        "free_resolution",
+        "ds_resolution",
+        "max_range",
+    ],
+)
+@pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "much"])
+def test_settings_that_are_none_are_refused(option, value):
+    with pytest.raises(InvalidArgumentError, match=option):
+        GPMap(0.1, **{option: value})
+
+
+def test_a_block_of_too_many_samples_is_refused():
+    scan = Scan(torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(2))
+    with pytest.raises(InvalidArgumentError, match="ds_resolution"):
+        GPMap(1.0, ds_resolution=1e-6).insert(scan)
+
+
+def test_the_same_place_hit_and_free_is_neither():
+    end = torch.tensor([[1.0625, 0.1875]], dtype=torch.float64)
+    made = GPMap(0.125, free_resolution=0.25)
+    made.insert(Scan(end, torch.tensor([0.5, 0.1875])))
+    made.insert(Scan(torch.tensor([[2.0, 0.1875]], dtype=torch.float64), end[0] - torch.tensor([0.25, 0.0])))
+    theta = float(made.occupancy(points([1.0625], 2))[0])
+    assert 0 < theta < 1
+
+
+@pytest.mark.parametrize(
+    "change", [{"fused": torch.tensor([[0.0, -1.0]])}, {"fused": torch.zeros(1, 3)}, {"fused": None}]
+)
+def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, change):
+    path = tmp_path / "map.safetensors"
+    made = GPMap(0.125)
+    made.insert(wall_scan(2))
+    made.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.gp_map", 1)
+    value = change["fused"]
+    tensors.pop("fused") if value is None else tensors.update(fused=value.expand(len(made._table.keys), -1))
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.gp_map", 1, **facts))
+    with pytest.raises(DataError, match=r"map\.safetensors"):
+        GPMap.load(path)

@@ -1,0 +1,327 @@
+"""Hilbert maps: the contract, the exact kernels, scikit-learn's optimum on the same features, and intel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, open_scan, wall_scan
+from sklearn.gaussian_process.kernels import RBF
+from sklearn.kernel_approximation import Nystroem
+from sklearn.linear_model import LogisticRegression
+from torch import Tensor
+
+from gmmtorch.baselines.bgk_map import sparse_kernel
+from gmmtorch.baselines.hilbert_features import (
+    Features,
+    FourierFeatures,
+    LatticeFeatures,
+    NystroemFeatures,
+)
+from gmmtorch.baselines.hilbert_map import HilbertMap, logistic_regression, penalised_loss
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.scan import Scan
+
+LEARNING = {"gap": RESOLUTION, "thin": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}
+
+
+class TestSparse(OccupancyMapContract):
+    shift_tolerance = 1e-4
+    turn_tolerance = 0.1
+    thins_scans = True
+
+    def make(self) -> HilbertMap:
+        return HilbertMap("sparse", length=0.25, spacing=0.125, free_spacing=0.25, epochs=12, **LEARNING)
+
+
+class TestNystroem(OccupancyMapContract):
+    """Its centres are drawn from the points, in another order when the scene is turned."""
+
+    shift_tolerance = 1e-4
+    turn_tolerance = 0.25
+    thins_scans = True
+    extrapolates = True  # as far as five lengths, here 1.25 m
+
+    def make(self) -> HilbertMap:
+        return HilbertMap("nystroem", length=0.25, n_features=300, free_spacing=0.5, epochs=12, **LEARNING)
+
+    def test_five_lengths_from_all_centres_nothing_is_known(self):
+        made = self.built(wall_scan(2))
+        beside = torch.tensor([[3.1, 1.6 + 5 * 0.25], [3.1, 1.5 + 3 * 0.25]], dtype=torch.float64)
+        theta = made.occupancy(beside)
+        assert float(theta[0]) == 0.5 != float(theta[1])
+        assert made.occupancy([[300.0, -2.0]]).tolist() == [0.5]
+
+
+class TestFourier(OccupancyMapContract):
+    """Its features are waves: what it says of unseen places is anything, and so is how that turns."""
+
+    shift_tolerance = 1e-4
+    turn_tolerance = 0.5
+    thins_scans = True
+    extrapolates = True
+
+    def make(self) -> HilbertMap:
+        return HilbertMap("fourier", length=0.4, n_features=300, free_spacing=0.5, epochs=12, **LEARNING)
+
+
+# -- features --------------------------------------------------------------------------------------------
+
+
+def some_points(n: int, dim: int, seed: int = 0) -> Tensor:
+    return 3 * torch.rand(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def matrix(features: Features, points: Tensor) -> Tensor:
+    """Φ (M, F) by asking for one feature after the other."""
+    design = features.design(points)
+    return torch.stack([design.dot(one) for one in torch.eye(features.count, dtype=torch.float64)], 1)
+
+
+def lattice_of(points: Tensor, kernel: str, length: float, spacing: float) -> LatticeFeatures:
+    made = LatticeFeatures(kernel, length, spacing, points.shape[1], 1, points.device)
+    made.open(points)
+    return made
+
+
+def all_features(points: Tensor) -> list[Features]:
+    generator, anchor = torch.Generator().manual_seed(1), points.new_ones(points.shape[1])
+    return [
+        FourierFeatures.drawn(40, 0.7, anchor, generator),
+        NystroemFeatures.of_data(points, 40, 0.7, anchor, generator),
+        lattice_of(points, "sparse", 0.8, 0.4),
+        lattice_of(points, "rbf", 0.2, 0.4),
+    ]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_products_with_features_are_those_of_their_matrix(dim):
+    points, residuals = some_points(70, dim), torch.randn(70, dtype=torch.float64)
+    for features in all_features(points):
+        phi = matrix(features, points)
+        design = features.design(points)
+        weights = torch.randn(features.count, dtype=torch.float64)
+        torch.testing.assert_close(design.dot(weights), phi @ weights)
+        torch.testing.assert_close(design.pull(residuals), phi.T @ residuals)
+        index = torch.tensor([3, 3, 0, 69])
+        torch.testing.assert_close(design.rows(index).dot(weights), (phi @ weights)[index])
+        torch.testing.assert_close(design.rows(index).pull(residuals[:4]), phi[index].T @ residuals[:4])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_fourier_features_approximate_the_rbf_kernel_as_their_number_says(dim):
+    points = some_points(60, dim)
+    exact = torch.as_tensor(RBF(0.6)(points.numpy()))
+    for n_features in (200, 20_000):
+        generator = torch.Generator().manual_seed(0)
+        features = FourierFeatures.drawn(n_features, 0.6, points.new_zeros(dim), generator)
+        phi = matrix(features, points)[:, 1:] if n_features == 200 else features._values(points)[:, 1:]
+        error = phi @ phi.T - exact
+        assert float(error.diagonal().abs().max()) < 1e-6  # cos² + sin²
+        # The variance of cos(ωᵀδ), ½(1 + k(2δ)) − k(δ)², over the F/2 frequencies.
+        variance = (0.5 * (1 + exact**4) - exact**2) / (n_features / 2)
+        assert 0.7 < float((error.square().mean() / variance.mean()).sqrt()) < 1.4
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_nystroem_features_are_scikit_learns_up_to_a_rotation(dim):
+    points = some_points(80, dim)
+    centers = some_points(25, dim, 1)
+    features = NystroemFeatures(centers, points.new_zeros(dim), 0.5)
+    theirs = Nystroem(gamma=1 / (2 * 0.5**2), n_components=25, random_state=0).fit(features.centers.double())
+    expected = theirs.transform(points.numpy())
+    phi = matrix(features, points).numpy()
+    np.testing.assert_allclose(phi @ phi.T, expected @ expected.T, atol=2e-3)  # the ridge of 10⁻⁶
+    at_centers = matrix(features, features.centers.double())
+    exact = torch.as_tensor(RBF(0.5)(features.centers.double().numpy()))
+    assert float((at_centers @ at_centers.T - exact).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize(("kernel", "length"), [("sparse", 0.8), ("rbf", 0.25)])
+@pytest.mark.parametrize("offset", [0.0, 4_000_000.0])
+def test_lattice_features_are_kernels_at_the_cells_that_hold_data(kernel, length, offset):
+    data, points = some_points(30, 3) + offset, some_points(200, 3, 1) * 1.5 - 1 + offset
+    features = lattice_of(data, kernel, length, 0.5)
+    cells = torch.unique(((data - offset) / 0.5).floor(), dim=0)
+    nodes = (cells + 0.5) * 0.5 + offset
+    assert sorted(nodes.tolist()) == sorted(features.table.centers().tolist())
+    distance = (points[:, None] - features.table.centers()).norm(dim=2)
+    if kernel == "sparse":
+        expected = sparse_kernel(distance, length)
+    else:
+        expected = torch.exp(-(distance**2) / (2 * length**2))
+        expected[expected < 1e-3] = 0
+    torch.testing.assert_close(features.design(points).dense(), expected, rtol=1e-6, atol=1e-7)
+    assert torch.equal(features.design(points).known(), (expected > 0).any(1))
+    assert 0 < int(features.design(points).known().sum()) < 200
+
+
+# -- learning --------------------------------------------------------------------------------------------
+
+
+def labelled(n: int = 400) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    points = some_points(n, 2)
+    odds = 4 * (points[:, 0] * 2).sin() + 2 * points[:, 1] - 3
+    return points, torch.rand(n, generator=generator, dtype=torch.float64) < torch.sigmoid(odds)
+
+
+@pytest.mark.parametrize("l1_ratio", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("kind", [0, 1, 2])
+def test_the_optimum_is_scikit_learns_on_the_same_features(kind, l1_ratio):
+    points, is_hit = labelled()
+    features = all_features(points)[kind]
+    design, phi = features.design(points), matrix(features, points).numpy()
+    alpha = 1.5
+    theirs = LogisticRegression(
+        C=1 / alpha, l1_ratio=l1_ratio, solver="saga", fit_intercept=False, max_iter=20_000, tol=1e-7
+    )
+    theirs.fit(phi, is_hit.numpy())
+    best = torch.as_tensor(theirs.coef_[0])
+    optimum = float(penalised_loss(design, is_hit, best, alpha, l1_ratio))
+    weights = logistic_regression(
+        design,
+        is_hit,
+        torch.zeros(features.count, dtype=torch.float64),
+        alpha=alpha,
+        l1_ratio=l1_ratio,
+        epochs=1500,
+        batch_size=400,
+        learning_rate=0.5,
+        generator=torch.Generator().manual_seed(0),
+    )
+    reached = float(penalised_loss(design, is_hit, weights, alpha, l1_ratio))
+    start = 400 * math.log(2)
+    assert -1e-6 * optimum < reached - optimum < 1e-3 * (start - optimum)
+    assert float((torch.sigmoid(design.dot(weights)) - torch.sigmoid(design.dot(best))).abs().max()) < 0.03
+    if l1_ratio == 1 and kind != 1:  # Nyström's are nearly dependent: many sets of zeros are as good
+        assert torch.equal(weights.abs() < 1e-3, best.abs() < 1e-3)
+        assert bool((weights == 0).any())
+
+
+def test_small_batches_come_near_the_optimum_in_a_few_passes():
+    points, is_hit = labelled(4000)
+    features = lattice_of(points, "sparse", 0.8, 0.4)
+    design = features.design(points)
+    theirs = LogisticRegression(C=1.0, fit_intercept=False, max_iter=5000).fit(
+        design.dense().numpy(), is_hit.numpy()
+    )
+    optimum = float(penalised_loss(design, is_hit, torch.as_tensor(theirs.coef_[0]), 1.0))
+    weights = logistic_regression(
+        design,
+        is_hit,
+        torch.zeros(features.count, dtype=torch.float64),
+        alpha=1.0,
+        l1_ratio=0.0,
+        epochs=5,
+        batch_size=64,
+        learning_rate=0.5,
+        generator=torch.Generator().manual_seed(0),
+    )
+    gained = 4000 * math.log(2) - float(penalised_loss(design, is_hit, weights, 1.0))
+    assert gained > 0.98 * (4000 * math.log(2) - optimum)
+
+
+def test_the_penalised_loss_is_what_it_says():
+    points, is_hit = labelled(50)
+    features = all_features(points)[2]
+    weights = torch.randn(features.count, dtype=torch.float64)
+    theta = torch.sigmoid(matrix(features, points) @ weights)
+    expected = -torch.where(is_hit, theta, 1 - theta).log().sum()
+    expected += 0.7 * (0.3 * weights.abs().sum() + 0.35 * weights.square().sum())
+    torch.testing.assert_close(penalised_loss(features.design(points), is_hit, weights, 0.7, 0.3), expected)
+
+
+# -- the map ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"features": "wavelets"},
+        {"length": 0},
+        {"spacing": math.nan},
+        {"n_features": 0},
+        {"alpha": -1},
+        {"l1_ratio": 1.5},
+        {"free_spacing": 0},
+        {"gap": -0.1},
+        {"thin": 0},
+        {"epochs": 0},
+        {"batch_size": 1.5},
+        {"learning_rate": 0},
+        {"random_state": -1},
+    ],
+    ids=lambda o: next(iter(o)),
+)
+def test_settings_that_are_none_are_refused(option):
+    with pytest.raises(InvalidArgumentError, match=next(iter(option))):
+        HilbertMap(**option)
+
+
+def test_kernels_that_leave_gaps_are_refused_at_the_first_scan():
+    made = HilbertMap(length=0.1, spacing=0.5)
+    with pytest.raises(InvalidArgumentError, match="gaps"):
+        made.insert(wall_scan(2))
+
+
+def test_a_loaded_lattice_grows_and_keeps_what_it_knew(tmp_path):
+    made = TestSparse().built(wall_scan(2))
+    made.save(tmp_path / "map.safetensors")
+    loaded = HilbertMap.load(tmp_path / "map.safetensors")
+    elsewhere = Scan([[20.0, 20.0]], [20.0, 18.0])
+    loaded.insert(elsewhere)
+    theta = loaded.occupancy([[3.0625, 0.1875], [20.0, 20.0], [20.0, 19.0], [10.0, 10.0]])
+    assert theta[0] > 0.6
+    assert theta[1] > 0.5 > theta[2]
+    assert theta[3] == 0.5
+
+
+@pytest.mark.parametrize("kind", ["sparse", "nystroem", "fourier"])
+def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, kind):
+    made = HilbertMap(kind, length=0.5, n_features=20, epochs=1)
+    made.insert(open_scan(2))
+    path = tmp_path / "map.safetensors"
+    made.save(path)
+    tensors, facts = read_tensors(path, "gmmtorch.hilbert_map", 1)
+    for name in tensors:
+        broken = {**tensors, name: tensors[name][:-1]}
+        path.write_bytes(pack_tensors(broken, "gmmtorch.hilbert_map", 1, **facts))
+        with pytest.raises(DataError, match=r"map\.safetensors"):
+            HilbertMap.load(path)
+    nan = {**tensors, "weights": tensors["weights"] * math.nan}
+    path.write_bytes(pack_tensors(nan, "gmmtorch.hilbert_map", 1, **facts))
+    with pytest.raises(DataError, match="weights"):
+        HilbertMap.load(path)
+    path.write_bytes(pack_tensors(tensors, "gmmtorch.hilbert_map", 1, **{**facts, "dim": 4}))
+    with pytest.raises(DataError, match="settings"):
+        HilbertMap.load(path)
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_on_intel_it_is_as_good_as_published(real_data):
+    """Nyström features reach the 0.926 known of them at 0.1 m; sparse ones are far better."""
+    scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz"))
+    train, test = split.split_indices(len(scans), 10)
+    asked = queries.hit_and_free(
+        *queries.test_beams([scans[i] for i in test], 4000, 0), free="uniform", resolution=0.1, seed=0
+    )
+    area = {}
+    for kind in ("sparse", "nystroem"):
+        made = (
+            HilbertMap(kind, epochs=1, free_spacing=3.0)
+            if kind == "sparse"
+            else HilbertMap(kind, epochs=1, free_spacing=3.0, length=0.5, n_features=2000, alpha=0.1)
+        )
+        for i in train:
+            made.insert(scans[i])
+        theta = made.occupancy(asked.points)
+        area[kind] = metrics.roc(theta[asked.of(1)], theta[asked.of(0)]).auc
+    assert area["sparse"] > 0.965
+    assert area["nystroem"] > 0.92

@@ -1,0 +1,159 @@
+"""OctoMap behind the protocol: the contract, and its update rule by hand."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
+
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.baselines.octomap_map import OctoMapMap
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.scan import Scan
+
+pyoctomap = pytest.importorskip("pyoctomap")
+
+
+class TestOctoMapMap(OccupancyMapContract):
+    thins_scans = True
+
+    def make(self) -> OctoMapMap:
+        return OctoMapMap(RESOLUTION)
+
+
+class TestOctoMapMapByRay(OccupancyMapContract):
+    def make(self) -> OctoMapMap:
+        return OctoMapMap(RESOLUTION, by_ray=True)
+
+
+def log_odds(p: float) -> float:
+    return math.log(p / (1 - p))
+
+
+def by_hand(hits: torch.Tensor, misses: torch.Tensor) -> torch.Tensor:
+    """OctoMap's sensor model, one scan: a cell that has any hit is hit, else missed, once."""
+    value = torch.where(hits > 0, log_odds(0.7), log_odds(0.4))
+    return torch.where(hits + misses > 0, torch.sigmoid(value), 0.5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_one_scan_updates_each_cell_once_as_the_sensor_model_says(dim):
+    scan = wall_scan(dim)
+    both = Scan(scan.points, scan.origin, open_scan(dim).no_return + torch.tensor([0.0, 0.5, 0.0])[:dim])
+    for given in (scan, open_scan(dim), both):
+        counts = OccupancyGrid(RESOLUTION)
+        counts.insert(given)
+        ends = given.ends()[0]
+        query = torch.cat([lattice(dim), ends, (ends + given.origin) / 2])
+        hits, misses = counts.evidence().evidence_at(query)
+        made = OctoMapMap(RESOLUTION)
+        made.insert(given)
+        expected = by_hand(hits, misses).double()
+        wrong = (made.occupancy(query) - expected).abs() > 1e-6
+        # OctoMap follows beams in single precision: rays that touch a corner may name its other cell.
+        assert float(wrong.double().mean()) < 0.01
+        assert len(expected.unique()) >= 2
+
+
+def test_by_ray_every_beam_updates_the_cells_it_meets():
+    end, origin = torch.tensor([[1.0625, 0.1875, 0.0625]]).double(), torch.tensor([0.31, 0.19, 0.06]).double()
+    scan = Scan(end.repeat(3, 1), origin)
+    once, by_ray = OctoMapMap(RESOLUTION), OctoMapMap(RESOLUTION, by_ray=True)
+    once.insert(scan)
+    by_ray.insert(scan)
+    between = (end + origin) / 2
+    for place, p in ((end, 0.7), (between, 0.4)):
+        assert float(once.occupancy(place)[0]) == pytest.approx(p, abs=1e-6)
+        expected = 1 / (1 + math.exp(-3 * log_odds(p)))
+        assert float(by_ray.occupancy(place)[0]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_probabilities_are_clamped():
+    made = OctoMapMap(RESOLUTION)
+    for _ in range(30):
+        made.insert(wall_scan(3))
+    theta = made.occupancy(lattice(3))
+    assert float(theta.max()) == pytest.approx(0.971, abs=1e-6)
+    assert float(theta.min()) == pytest.approx(0.1192, abs=1e-6)
+
+
+def test_beams_are_cut_at_the_range_and_free_their_way_only():
+    made = OctoMapMap(RESOLUTION, max_range=1.5)
+    made.insert(wall_scan(3))
+    made.insert(open_scan(3))
+    assert float(made.occupancy(lattice(3)).max()) == 0.5
+    assert made.occupancy([[1.2, 0.19, 0.44], [2.5, 0.19, 0.44]]).tolist()[1] == 0.5
+    assert made.occupancy([[1.2, 0.19, 0.44]])[0] < 0.5
+
+
+# -- files -------------------------------------------------------------------------------------------------
+
+
+def test_its_file_is_an_octomap_file(tmp_path: Path):
+    made = OctoMapMap(RESOLUTION)
+    made.insert(wall_scan(3))
+    made.save(tmp_path / "map.ot")
+    tree = pyoctomap.OcTree(0.1).read(str(tmp_path / "map.ot"))
+    assert tree.getResolution() == RESOLUTION
+    shift = made._anchor.double() * RESOLUTION
+    theirs = [tree.search(x) for x in (lattice(3) - shift).numpy()]
+    theta = [0.5 if node is None else node.getOccupancy() for node in theirs]
+    assert made.occupancy(lattice(3)).tolist() == theta
+
+
+def test_the_binary_file_is_smaller_and_asking_its_size_changes_nothing():
+    made = OctoMapMap(RESOLUTION)
+    assert made.nbytes_binary == 0
+    for _ in range(3):
+        made.insert(wall_scan(3))
+    before, size = made.occupancy(lattice(3)), made.nbytes
+    assert 0 < made.nbytes_binary < size / 3
+    assert torch.equal(made.occupancy(lattice(3)), before)
+    assert made.nbytes == size
+
+
+def test_settings_and_resolution_are_kept_to_the_last_digit(tmp_path: Path):
+    made = OctoMapMap(0.123456789, hit=0.8, miss=0.3, clamp_low=0.05, clamp_high=0.99, max_range=7.0)
+    made.insert(wall_scan(3))
+    made.save(tmp_path / "map.ot")
+    loaded = OctoMapMap.load(tmp_path / "map.ot")
+    for each in (made, loaded):
+        each.insert(wall_scan(3, 1))
+    assert torch.equal(loaded.occupancy(lattice(3)), made.occupancy(lattice(3)))
+    assert loaded.resolution == made.resolution
+    assert len(made.occupancy(lattice(3)).unique()) == 3
+
+
+def test_an_octomap_file_of_others_is_refused(tmp_path: Path):
+    (tmp_path / "map.ot").write_bytes(pyoctomap.OcTree(0.1).write())
+    with pytest.raises(DataError, match=r"map\.ot"):
+        OctoMapMap.load(tmp_path / "map.ot")
+
+
+# -- bad input ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -1.0, math.nan])
+@pytest.mark.parametrize("option", ["hit", "miss", "clamp_low", "clamp_high"])
+def test_settings_that_are_no_probabilities_are_refused(option, value):
+    with pytest.raises(InvalidArgumentError, match=option):
+        OctoMapMap(0.1, **{option: value})
+
+
+def test_a_beam_that_leaves_the_octree_is_refused_and_changes_nothing():
+    made = OctoMapMap(0.01)
+    made.insert(Scan(torch.tensor([[1.0, 0, 0]]), torch.zeros(3)))
+    size = made.nbytes
+    with pytest.raises(InvalidArgumentError, match="coarser"):
+        made.insert(Scan(torch.tensor([[400.0, 0, 0]]), torch.zeros(3)))
+    assert made.nbytes == size
+
+
+def test_without_the_package_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoctomap", None)
+    with pytest.raises(MissingDataError, match=r"pip install .*baselines"):
+        OctoMapMap(0.1).insert(wall_scan(3))

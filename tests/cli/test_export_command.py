@@ -1,0 +1,296 @@
+"""gmmtorch-export: from files to files, and how it fails."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_runs import CHECKOUT, COMMANDS, Finished, as_it_was, run_here, run_python, run_script
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
+from gmmtorch.cli import common, export, schema
+from gmmtorch.datasets import load
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.interchange import read_gira_csv, read_npz
+from gmmtorch.occupancy.map_server import read_map_server
+from gmmtorch.scan import Scan
+
+CONF = Path(common.conf_dir())
+Run = Callable[..., Finished]
+
+
+@pytest.fixture(autouse=True)
+def hydra_as_it_was():
+    with as_it_was():
+        yield
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs the command in this process, from an empty folder."""
+    monkeypatch.setitem(COMMANDS, "export", export)
+    monkeypatch.chdir(tmp_path)
+
+    def run_command(*options: str) -> Finished:
+        return run_here(monkeypatch, "export", tmp_path, "report.progress=false", *options)
+
+    return run_command
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps and grids in 2D and 3D, and a mixture."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("files")
+    for dim, name in ((2, "synthetic_building_2d"), (3, "synthetic_building")):
+        dataset = load(name, n_scans=3)
+        built, counted = GaussianMap(n_samples=20_000), OccupancyGrid(0.25)
+        updated = OccupancyGrid(0.25, log_odds=LogOdds())
+        for i in range(3):
+            scan = dataset[i]
+            thinned = scan.select(torch.arange(scan.n_beams) % (1 if dim == 2 else 5) == 0)
+            for place in (built, counted, updated):
+                place.insert(thinned)
+        built.save(folder / f"map_{dim}.safetensors")
+        counted.save(folder / f"grid_{dim}.safetensors")
+        updated.save(folder / f"log_odds_{dim}.safetensors")
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    GaussianMixture(3, random_state=0).fit(points).save(folder / "mixture.safetensors")
+    return folder
+
+
+def succeeded(done: Finished) -> Finished:
+    assert done.status == 0, done.stderr
+    return done
+
+
+# -- space ----------------------------------------------------------------------------------------
+
+
+def test_a_flat_map_becomes_an_image_of_its_own_answers(run, files, tmp_path):
+    done = succeeded(run(f"path={files / 'map_2.safetensors'}", "output=floor.yaml", "resolution=0.2"))
+    found = read_map_server(tmp_path / "floor.yaml")
+    built = GaussianMap.load(files / "map_2.safetensors")
+    theta = torch.as_tensor(built.occupancy(found.grid.centers(), 0.2)).view(found.grid.shape)
+    assert float((found.probability - theta).abs().max()) <= 1 / 255
+    assert found.grid.resolution == 0.2
+    assert {"floor.yaml", "floor.pgm"} == {path.name for path in tmp_path.iterdir()}  # and nothing else
+    assert re.search(r"floor\.pgm  [\d,]+ bytes: \d+ × \d+ cells of 0\.2 m", done.stdout)
+    inside = (
+        (built.components().origins / 0.2).floor() * 0.2 >= torch.tensor(found.grid.origin) - 1e-9
+    ).all()
+    assert bool(inside)
+
+
+def test_other_forms_of_evidence_fill_the_same_cells(run, files, tmp_path):
+    source = f"path={files / 'map_2.safetensors'}"
+    succeeded(run(source, "output=a.yaml", "method=monte_carlo", "resolution=0.2"))
+    found = read_map_server(tmp_path / "a.yaml")
+    built = GaussianMap.load(files / "map_2.safetensors")
+    theta = built.evidence(found.grid, "monte_carlo").probability()
+    assert float((found.probability - theta).abs().max()) <= 1 / 255
+
+
+@pytest.mark.parametrize("kind", ["grid", "log_odds"])
+def test_a_grid_becomes_an_image_of_its_own_cells(kind, run, files, tmp_path):
+    succeeded(run(f"path={files / f'{kind}_2.safetensors'}", "output=floor.yaml"))
+    found = read_map_server(tmp_path / "floor.yaml")
+    grid = OccupancyGrid.load(files / f"{kind}_2.safetensors")
+    theta = torch.as_tensor(grid.occupancy(found.grid.centers())).view(found.grid.shape)
+    assert float((found.probability - theta).abs().max()) <= 1 / 255
+    n_cells = grid.evidence().n_blocks * grid.evidence().cells_per_block
+    assert 0 < int((theta != 0.5).sum()) <= n_cells
+
+
+def test_a_band_of_heights_becomes_an_image(run, files, tmp_path):
+    options = ["output=band.yaml", "resolution=0.5", "z_min=0.3", "z_max=1.2"]
+    succeeded(run(f"path={files / 'map_3.safetensors'}", *options))
+    found = read_map_server(tmp_path / "band.yaml")
+    built = GaussianMap.load(files / "map_3.safetensors")
+    columns = torch.cat(
+        [
+            torch.cat([found.grid.centers(), torch.full((found.grid.n_cells, 1), z)], 1)
+            for z in (0.25, 0.75, 1.25)  # the cells that the band meets
+        ]
+    )
+    theta = torch.as_tensor(built.occupancy(columns, 0.5)).view(3, *found.grid.shape).amax(0)
+    assert float((found.probability - theta).abs().max()) <= 1 / 255
+
+
+@pytest.mark.parametrize(
+    ("kind", "dim", "form"), [("map", 2, "ply"), ("map", 3, "pcd"), ("grid", 2, "pcd"), ("grid", 3, "ply")]
+)
+def test_occupied_cells_become_points(kind, dim, form, run, files, tmp_path):
+    name = f"cells.{form}"
+    open3d = pytest.importorskip("open3d")
+    resolution = ["resolution=0.5"] if kind == "map" else []
+    succeeded(
+        run(
+            f"path={files / f'{kind}_{dim}.safetensors'}",
+            f"format={form}",
+            f"output={name}",
+            "occupied_thresh=0.55",
+            *resolution,
+        )
+    )
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / name))
+    points, theta = cloud.point.positions.numpy(), cloud.point.intensity.numpy()[:, 0]
+    assert len(points) > 10
+    assert theta.min() > 0.55
+    load_map = GaussianMap.load if kind == "map" else OccupancyGrid.load
+    answers = load_map(files / f"{kind}_{dim}.safetensors").occupancy(points[:, :dim].astype(float), 0.5)
+    np.testing.assert_allclose(theta, answers, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["map_3", "grid_3", "log_odds_2"])
+def test_maps_become_octrees(name, run, files, tmp_path):
+    pyoctomap = pytest.importorskip("pyoctomap")
+    resolution = ["resolution=0.5"] if name == "map_3" else []
+    options = ["format=octomap", "output=map.ot", *resolution]
+    done = succeeded(run(f"path={files / f'{name}.safetensors'}", *options))
+    said = int(re.search(r"([\d,]+) cells", done.stdout)[1].replace(",", ""))
+    tree = pyoctomap.OcTree(1.0).read(str(tmp_path / "map.ot"))
+    assert tree.getResolution() == (0.5 if name == "map_3" else 0.25)
+    assert 0 < tree.getNumLeafNodes() <= said
+    loaded = (GaussianMap if name == "map_3" else OccupancyGrid).load(files / f"{name}.safetensors")
+    leaves = [leaf.getCoordinate() for leaf in tree.begin_leafs(16) if leaf.getSize() == tree.getResolution()]
+    centers = np.array(leaves[::7])
+    answers = loaded.occupancy(centers[:, : int(name[-1])], 0.5)
+    found = [tree.search(center).getOccupancy() for center in centers]
+    np.testing.assert_allclose(found, answers, atol=1e-5)
+
+
+def test_bounds_cut_the_cells_out(run, files, tmp_path):
+    succeeded(
+        run(f"path={files / 'map_2.safetensors'}", "output=cut.yaml", "bounds=[1,2,4,3]", "resolution=0.1")
+    )
+    assert read_map_server(tmp_path / "cut.yaml").grid.shape == (30, 10)
+
+
+# -- components -----------------------------------------------------------------------------------
+
+
+def test_components_go_round(run, files, tmp_path):
+    succeeded(run(f"path={files / 'map_3.safetensors'}", "format=npz", "output=a.npz"))
+    succeeded(run("path=a.npz", "format=csv", "output=b.csv"))
+    succeeded(run("path=b.csv", "format=mixture", "output=c.safetensors"))
+    succeeded(run("path=c.safetensors", "format=npz", "output=d.npz", "n_points=1000"))
+    built = GaussianMap.load(files / "map_3.safetensors").components()
+    surface = ~built.max_range
+    assert bool(built.max_range.any())  # or nothing would be left out
+    first, last = read_npz(tmp_path / "a.npz"), read_npz(tmp_path / "d.npz")
+    assert torch.equal(first.support, built.support[surface])
+    for found in (first, read_gira_csv(tmp_path / "b.csv"), last):
+        torch.testing.assert_close(found.means, built.means[surface], rtol=1e-14, atol=0)
+        torch.testing.assert_close(found.covariances, built.covariances[surface], rtol=1e-14, atol=0)
+        torch.testing.assert_close(found.weights, first.weights, rtol=1e-14, atol=0)
+    assert float(last.support.sum()) == pytest.approx(1000)
+
+
+def test_a_fitted_mixture_becomes_gira_s(run, files, tmp_path):
+    done = succeeded(run(f"path={files / 'mixture.safetensors'}", "format=csv", "output=m.csv"))
+    assert "3 components in 3D" in done.stdout
+    fitted = GaussianMixture.load(files / "mixture.safetensors")
+    np.testing.assert_allclose(read_gira_csv(tmp_path / "m.csv").means, fitted.means_, rtol=1e-15)
+
+
+# -- failing --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["path={map_2}"], "output is not set"),
+        (["output=a.yaml"], "path is not set"),
+        (["path={map_2}", "output=a", "format=dwg"], "format='dwg' is not one of map_server"),
+        (["path=nowhere.safetensors", "output=a.yaml"], "nowhere.safetensors does not exist"),
+        (["path={mixture}", "output=a.yaml"], "is no map to export"),
+        (["path={grid_2}", "output=a.csv", "format=csv"], "holds no components to export"),
+        (["path={grid_2}", "output=a.yaml", "resolution=0.1"], "cells of .* are 0.25 m"),
+        (["path={map_2}", "output=a.yaml", "method=guess"], "method='guess' is not one of"),
+        (["path={map_2}", "output=a.yaml", "bounds=[0,1]"], "must be 4 numbers in 2D"),
+        (["path={map_2}", "output=a.yaml", "z_min=0"], "a 2D map has no heights"),
+        (["path={map_3}", "output=a.yaml", "z_min=50"], "misses the map"),
+        (["path={map_3}", "output=a.yaml", "resolution=0.0001"], "above the limit of .* m or more fits"),
+        (["path={map_2}", "output=a.yaml", "resolution=-1"], "resolution=-1"),
+        (["path={map_2}", "output=a.txt", "format=octomap", "resolution=1"], r"must end in \.bt"),
+        (["path={map_2}", "output=a.yaml", "free_thresh=0.9"], "free_thresh=0.9"),
+        (["path={map_2}", "output=a.yaml", "runtime.device=abacus"], "runtime.device=abacus"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(options, says, run, files, tmp_path):
+    names = {path.stem: str(path) for path in files.iterdir()}
+    done = run(*(option.format(**names) for option in options))
+    assert done.status == 1
+    assert re.search(says, done.stderr), done.stderr
+    assert done.stderr.startswith("gmmtorch: error: ")
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_map_needs_bounds(run, tmp_path):
+    empty = GaussianMap()
+    empty.insert(Scan(torch.empty(0, 2), torch.zeros(2)))
+    empty.save(tmp_path / "empty.safetensors")
+    done = run("path=empty.safetensors", "output=a.yaml")
+    assert "holds nothing; give bounds" in done.stderr
+    succeeded(run("path=empty.safetensors", "output=a.yaml", "bounds=[0,0,1,1]"))
+    assert bool((read_map_server(tmp_path / "a.yaml").probability - 0.5).abs().max() <= 1 / 255)
+
+
+# -- the command itself ---------------------------------------------------------------------------
+
+
+def test_the_script_of_the_checkout_runs(files, tmp_path):
+    done = succeeded(
+        run_script("export", tmp_path, f"path={files / 'map_2.safetensors'}", "format=npz", "output=m.npz")
+    )
+    assert (tmp_path.parent / "m.npz").is_file()
+    assert not done.files()
+
+
+def test_the_configuration_repeats_the_defaults_and_shows_every_option():
+    schema.register()
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        assert OmegaConf.to_container(compose("export")) == asdict(schema.Export())
+    text = (CONF / "export.yaml").read_text(encoding="utf-8")
+    documented = (
+        (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").split("## gmmtorch-export")[1]
+    )
+    for name in (*asdict(schema.Export()), "memory_limit"):
+        assert re.search(rf"^ *{name}:", text, re.MULTILINE), name
+        assert f"`{name}" in documented or f"`.{name}`" in documented, name
+
+
+def test_the_examples_of_the_help_compose():
+    schema.register()
+    text = (CONF / "export.yaml").read_text(encoding="utf-8")
+    examples = re.findall(r"^ +gmmtorch-export (path.*)$", text, re.MULTILINE)
+    assert len(examples) >= 5
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        for example in examples:
+            assert compose("export", overrides=example.split()).format in (
+                *export._OF_SPACE, *export._OF_COMPONENTS,
+            )  # fmt: skip
+
+
+def test_help_is_shown_without_loading_anything_heavy(tmp_path):
+    code = (
+        "import sys\nfrom gmmtorch.cli.export import main\nsys.argv = ['gmmtorch-export', '--help']\n"
+        "try:\n    main()\nfinally:\n    sys.stdout.flush()\n    print(*sys.modules, file=sys.stderr)\n"
+    )
+    done = run_python(["-c", code], cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not {"torch", "numpy", "open3d", "PIL", "pyoctomap"} & set(done.stderr.split())
+    assert "Examples:" in done.stdout
+    for name in (*export._OF_SPACE, *export._OF_COMPONENTS):
+        assert name in done.stdout
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,37 @@
+"""AUC against bytes: the rows are those of the plain evaluation, with sizes."""
+
+from __future__ import annotations
+
+from evaluation.pillar_room import room_scans
+
+from gmmtorch.evaluation import auc_memory
+from gmmtorch.evaluation.auc_memory import Sized
+from gmmtorch.evaluation.contenders import Form, MapFactory, methods
+from gmmtorch.evaluation.occupancy import Protocol, evaluate
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning import LearningRule
+
+PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
+
+
+def sized_map(n: int) -> MapFactory:
+    return Form(lambda: GaussianMap(window=5, learning=LearningRule(n_components=n)), "point")
+
+
+def test_every_contender_has_a_row_with_its_method_and_size():
+    scans = room_scans(12)
+    grid = methods(GaussianMap)["occupancy_grid"]
+    contenders = [
+        Sized("point", 4, sized_map(4)),
+        Sized("point", 12, sized_map(12)),
+        Sized("grid", None, grid),
+    ]
+    told: list[int] = []
+    rows = auc_memory.run("room", scans, contenders, PROTOCOL, on_rows=lambda rows: told.append(len(rows)))
+    assert [(row["method"], row["size"]) for row in rows] == [("point", 4), ("point", 12), ("grid", None)]
+    assert told == [1, 2, 3]
+    assert rows[0]["nbytes"] < rows[1]["nbytes"]
+    assert rows[0]["n_components"] < rows[1]["n_components"]
+    (alone,) = evaluate("room", scans, {"grid": grid}, PROTOCOL).rows
+    assert rows[2]["auc"] == alone["auc"]
+    assert rows[2]["nbytes"] == alone["nbytes"]

@@ -1,0 +1,182 @@
+"""Calibration, against scikit-learn, brute force and what is known in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import brier_score_loss, log_loss
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.calibration import (
+    accuracy,
+    brier_parts,
+    log_loss_bits,
+    prior_and_dead_band,
+    reliability,
+    scores,
+)
+from gmmtorch.occupancy.evidence import occupancy_probability
+
+
+def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Probabilities, some of them exactly 0, ½ and 1, and labels that are true with θ^bend."""
+    rng = np.random.default_rng(seed)
+    theta = rng.beta(0.6, 0.8, n)
+    theta[: n // 20] = 0.5
+    theta[n // 20 : n // 10] = rng.integers(2, size=n // 10 - n // 20)
+    labels = (rng.random(n) < theta**bend).astype(np.int64)
+    return torch.from_numpy(theta), torch.from_numpy(labels)
+
+
+@pytest.mark.parametrize("n_bins", [1, 2, 10, 15])
+@pytest.mark.parametrize(("binning", "strategy"), [("width", "uniform"), ("count", "quantile")])
+def test_the_curve_is_scikit_learns(n_bins, binning, strategy):
+    theta, labels = drawn()
+    curve = reliability(theta, labels, n_bins, binning)
+    observed, predicted = calibration_curve(labels, theta, n_bins=n_bins, strategy=strategy)
+    np.testing.assert_allclose(curve.observed, observed, atol=1e-12)
+    np.testing.assert_allclose(curve.predicted, predicted, atol=1e-12)
+    assert curve.n_points.sum() == len(theta)
+
+
+def test_the_calibration_errors_are_those_of_a_loop_over_bins():
+    theta, labels = drawn(700, bend=2.0)
+    gaps, sizes = [], []
+    for low, high in zip(np.linspace(0, 1, 11)[:-1], np.linspace(0, 1, 11)[1:], strict=True):
+        inside = [i for i, p in enumerate(theta.tolist()) if low < p <= high or (low == 0 and p == 0)]
+        if inside:
+            gaps.append(abs(float(theta[inside].mean()) - float(labels[inside].double().mean())))
+            sizes.append(len(inside))
+    curve = reliability(theta, labels, 10)
+    assert curve.expected_error == pytest.approx(np.average(gaps, weights=sizes), abs=1e-12)
+    assert curve.maximum_error == pytest.approx(max(gaps), abs=1e-12)
+    assert curve.n_points.tolist() == sizes
+
+
+def test_what_is_calibrated_has_little_error_and_what_is_bent_has_that_of_the_bend():
+    theta, labels = drawn(200_000)
+    assert reliability(theta, labels).expected_error < 0.005
+    theta, labels = drawn(200_000, bend=2.0)
+    expected = float((theta - theta**2).abs().mean())
+    assert reliability(theta, labels).expected_error == pytest.approx(expected, abs=0.005)
+
+
+def test_equal_counts_hold_equally_many_points():
+    theta = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    assert set(reliability(theta, theta > 0.5, 10, "count").n_points.tolist()) == {100}
+
+
+@pytest.mark.parametrize("binning", ["width", "count"])
+@given(st.integers(1, 20), st.integers(1, 60), st.integers(0, 1000))
+def test_the_parts_of_the_brier_score_add_up(binning, n_bins, n, seed):
+    rng = np.random.default_rng(seed)
+    theta = torch.from_numpy(rng.choice([rng.random(n), rng.integers(0, 5, n) / 4], axis=0))
+    labels = torch.from_numpy(rng.integers(2, size=n))
+    parts = brier_parts(theta, labels, n_bins, binning)
+    assert parts.brier == pytest.approx(float(((theta - labels) ** 2).mean()), abs=1e-12)
+    total = parts.reliability - parts.resolution + parts.uncertainty + parts.within
+    assert total == pytest.approx(parts.brier, abs=1e-12)
+    assert min(parts.reliability, parts.resolution, parts.uncertainty) >= 0
+    assert parts.resolution <= parts.uncertainty + 1e-12
+
+
+def test_with_one_value_a_bin_the_decomposition_is_murphys():
+    theta = torch.tensor([0.1, 0.1, 0.1, 0.7, 0.7, 0.7, 0.7])
+    labels = torch.tensor([0, 1, 0, 1, 1, 0, 1])
+    parts = brier_parts(theta.double(), labels, 2)
+    share = 4 / 7
+    assert parts.within == pytest.approx(0, abs=1e-15)
+    gap = (3 * (0.1 - 1 / 3) ** 2 + 4 * (0.7 - 0.75) ** 2) / 7
+    assert parts.reliability == pytest.approx(gap, abs=1e-7)
+    assert parts.resolution == pytest.approx((3 * (1 / 3 - share) ** 2 + 4 * (0.75 - share) ** 2) / 7)
+    assert parts.uncertainty == pytest.approx(share * (1 - share))
+
+
+def test_brier_and_cross_entropy_are_scikit_learns():
+    theta, labels = drawn()
+    assert brier_parts(theta, labels).brier == pytest.approx(brier_score_loss(labels, theta), abs=1e-12)
+    assert log_loss_bits(theta, labels) == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
+
+
+def test_knowing_nothing_costs_a_bit_and_a_certain_mistake_fifty_two():
+    labels = torch.tensor([0, 1])
+    assert log_loss_bits(torch.tensor([0.5, 0.5]), labels) == 1
+    assert log_loss_bits(torch.tensor([0.0, 1.0]), labels) == pytest.approx(0, abs=1e-12)
+    assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
+
+
+def test_exactly_one_half_is_half_right():
+    theta = torch.tensor([0.9, 0.1, 0.9, 0.5, 0.5])
+    labels = torch.tensor([1, 0, 0, 1, 0])
+    assert accuracy(theta, labels) == pytest.approx((2 + 2 * 0.5) / 5)
+
+
+def test_scores_of_a_row():
+    theta, labels = drawn()
+    found = scores(theta.float(), labels)
+    assert list(found) == ["ece", "log_loss_bits", "accuracy"]
+    assert found["ece"] == pytest.approx(reliability(theta, labels, 15).expected_error, abs=1e-4)
+    assert found["accuracy"] == accuracy(theta, labels)
+    assert all(type(value) is float for value in found.values())
+
+
+def test_prior_and_dead_band_against_counting():
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(2, (400,), generator=generator)
+    hits = labels * torch.randint(0, 9, (400,), generator=generator).double()
+    misses = torch.randint(0, 9, (400,), generator=generator).double()
+    rows = prior_and_dead_band(
+        lambda prior: occupancy_probability(hits, misses, prior), labels, (0.5, 1.0), (0.25, 0.1)
+    )
+    assert [(row["prior"], row["variance_threshold"]) for row in rows] == [
+        (0.5, 0.25), (0.5, 0.1), (1.0, 0.25), (1.0, 0.1),
+    ]  # fmt: skip
+    for row in rows:
+        theta = (hits + row["prior"]) / (hits + misses + 2 * row["prior"])
+        decided = [i for i in range(400) if theta[i] * (1 - theta[i]) < row["variance_threshold"] - 1e-15]
+        right = [i for i in decided if (theta[i] > 0.5) == (labels[i] == 1)]
+        assert row["decided"] == pytest.approx(len(decided) / 400)
+        assert row["accuracy_decided"] == pytest.approx(len(right) / len(decided))
+        assert row["brier"] == pytest.approx(float(((theta - labels) ** 2).mean()))
+        assert row["ece"] == pytest.approx(reliability(theta, labels).expected_error)
+    # A stronger prior and a wider band both leave more undecided.
+    assert rows[0]["decided"] > rows[1]["decided"] > rows[3]["decided"]
+
+
+def test_a_band_that_leaves_nothing_decided_has_no_accuracy():
+    theta, labels = torch.full((4,), 0.5), torch.tensor([0, 1, 0, 1])
+    (row,) = prior_and_dead_band(lambda prior: theta, labels, (1.0,), (0.25,))
+    assert row["decided"] == 0
+    assert row["accuracy_decided"] is None
+    assert row["accuracy"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("theta", "labels", "says"),
+    [
+        ([0.5], [2], "labels must be 0"),
+        ([0.5, 0.5], [1], "labels \\(1,\\)"),
+        ([], [], "one point at least"),
+        ([1.5], [1], "outside \\[0, 1\\]"),
+        ([float("nan")], [1], "NaN"),
+        ([[0.5]], [[1]], "must be \\(M,\\)"),
+    ],
+)
+@pytest.mark.parametrize("score", [reliability, brier_parts, log_loss_bits, accuracy])
+def test_what_cannot_be_scored_is_refused(score, theta, labels, says):
+    with pytest.raises(InvalidArgumentError, match=says):
+        score(torch.tensor(theta), torch.tensor(labels))
+
+
+def test_bins_are_checked():
+    theta, labels = drawn(10)
+    with pytest.raises(InvalidArgumentError, match="n_bins=0"):
+        reliability(theta, labels, 0)
+    with pytest.raises(InvalidArgumentError, match="binning='wide' is not one of width, count"):
+        reliability(theta, labels, 5, "wide")

@@ -1,0 +1,480 @@
+"""The codec: what comes back is near, always a mixture, and the same whatever batch it went in."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components, rotations
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.mapping import lattice
+from gmmtorch.mapping.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
+from gmmtorch.mapping.codec import decode, encode, quantized, spatial_order
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning import LearningRule, learn_window
+from gmmtorch.mapping.quantization import COUNT_ERROR, ORIGIN_STEP
+from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.point import point_evidence
+
+dims = pytest.mark.parametrize("dim", [2, 3])
+
+# Least and largest factor by which a deviation in any direction changes: the extreme singular values of
+# (I + N) diag(f), N strictly lower triangular with entries up to 1/8 (the last of 3D up to 1/8 + 1/64), f
+# within 2^(±1/8), over all signs.
+STRETCH = {2: (0.8614, 1.1608), 3: (0.8114, 1.2388)}
+
+drawn = st.builds(
+    random_components,
+    dim=st.sampled_from([2, 3]),
+    k=st.integers(0, 30),
+    seed=st.integers(0, 10**6),
+    center=st.sampled_from([0.0, -3.7, 5e5, 4.2e6]),
+    extent=st.sampled_from([0.0, 1.0, 300.0, 2e4]),
+    deviations=st.sampled_from([(1e-4, 100.0), (5e-3, 1.0), (0.1, 0.1), (1e-4, 1e-3), (20.0, 5e3)]),
+    counts=st.sampled_from([(0.01, 1e9), (1.0, 100.0)]),
+    n_origins=st.integers(3, 40),
+    max_sightings=st.integers(1, 3),
+)
+
+
+def assert_same(one: Components, other: Components) -> None:
+    for field in fields(Components):
+        assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
+
+
+def part(components: Components, begin: int, end: int) -> Components:
+    """Components begin … end−1, with the whole table of origins."""
+    c = components
+    kept = (c.seen_by >= begin) & (c.seen_by < end)
+    own = {n: getattr(c, n)[begin:end] for n in ("means", "covariances", "support", "max_range", "ids")}
+    return replace(
+        c, **own, seen_by=c.seen_by[kept] - begin, seen_from=c.seen_from[kept], seen_count=c.seen_count[kept]
+    )
+
+
+def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
+    """Of each component: counts by place."""
+    found: list[dict[tuple[float, ...], float]] = [{} for _ in range(len(components))]
+    c = components
+    for by, place, count in zip(
+        c.seen_by.tolist(), c.origins[c.seen_from].tolist(), c.seen_count.tolist(), strict=True
+    ):
+        found[by][tuple(place)] = found[by].get(tuple(place), 0.0) + count
+    return found
+
+
+# -- what comes back ---------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60)
+@given(components=drawn)
+def test_decoded_is_what_quantized_says_to_the_bit(components):
+    assert_same(decode(encode(components)), quantized(components))
+
+
+@settings(max_examples=60)
+@given(components=drawn)
+def test_quantizing_again_changes_nothing(components):
+    once = quantized(components)
+    assert_same(quantized(once), once)
+    assert encode(once) == encode(components)
+
+
+@settings(max_examples=60)
+@given(components=drawn)
+def test_errors_stay_within_their_bounds(components):
+    found = quantized(components)
+    for i in range(len(components)):
+        meant, stored = components.covariances[i].numpy(), found.covariances[i].numpy()
+        offset = (components.means[i] - found.means[i]).numpy()
+        whitened = np.abs(
+            scipy.linalg.solve_triangular(scipy.linalg.cholesky(stored, lower=True), offset, lower=True)
+        )
+        rounding = 1e-9 * (1 + np.abs(components.means[i].numpy()).max())  # of a number of metres itself
+        smallest = math.sqrt(np.linalg.eigvalsh(stored)[0])
+        assert np.linalg.norm(whitened) <= math.sqrt(components.dim) * (
+            lattice.MEAN_ERROR + rounding / smallest
+        )
+        ratio = np.sqrt(scipy.linalg.eigh(meant, stored, eigvals_only=True))
+        low, high = STRETCH[components.dim]
+        assert 1 / high - 1e-3 <= ratio[0] <= ratio[-1] <= 1 / low + 1e-3
+    error = (found.support / components.support - 1).abs()
+    assert float(error.max() if len(error) else 0.0) <= COUNT_ERROR + 1e-12
+
+
+@settings(max_examples=40)
+@given(components=drawn)
+def test_origins_and_shares_come_back(components):
+    for meant, found in zip(sightings(components), sightings(quantized(components)), strict=True):
+        total = sum(meant.values())
+        places, stored = np.array(list(meant)), np.array(list(found))
+        nearest = np.abs(places[:, None] - stored[None]).max(-1).argmin(1)
+        assert np.abs(places - stored[nearest]).max() <= ORIGIN_STEP / 2 * (1 + 1e-9)
+        merged = np.zeros(len(stored))
+        np.add.at(merged, nearest, np.array(list(meant.values())) / total)
+        shares = np.array(list(found.values())) / sum(found.values())
+        ratio = (shares / shares.max()) / (merged / merged.max())
+        assert np.abs(np.log2(ratio)).max() <= 0.25 + 1e-9  # half a step of 2^(1/2), to the largest
+
+
+@settings(max_examples=40)
+@given(components=drawn)
+def test_counts_add_up_to_the_support_and_flags_and_ids_are_kept(components):
+    found = quantized(components)
+    total = torch.zeros_like(found.support).index_add_(0, found.seen_by, found.seen_count)
+    torch.testing.assert_close(total, found.support)
+    assert torch.equal(found.max_range, components.max_range)
+    assert torch.equal(found.ids, components.ids)
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 10**6),
+    dim=st.sampled_from([2, 3]),
+    rank=st.integers(0, 2),
+    negative=st.sampled_from([0.0, 1e-12, 1e-7]),
+)
+def test_covariances_that_are_flat_or_hardly_definite_come_back_definite(seed, dim, rank, negative):
+    components = random_components(dim, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    turn = rotations(len(components), dim, generator)
+    values = torch.rand(len(components), dim, generator=generator, dtype=torch.float64) + 0.1
+    values[:, rank:] = -negative
+    flat = turn @ torch.diag_embed(values) @ turn.transpose(1, 2)
+    found = quantized(replace(components, covariances=(flat + flat.transpose(1, 2)) / 2))
+    assert int(torch.linalg.cholesky_ex(found.covariances).info.max()) == 0
+    assert bool(torch.isfinite(found.means).all())
+    assert_same(quantized(found), found)
+
+
+@dims
+def test_the_lattice_is_that_of_the_world(dim):
+    """Whole metres change nothing, nor do quarter turns: a map moves with its scans."""
+    components = random_components(dim, deviations=(1e-3, 2.0))
+    here = quantized(components)
+    shift = torch.tensor([512.0, -4096.0, 64.0], dtype=torch.float64)[:dim]
+    means = torch.round(components.means * 2**20) / 2**20  # so that the sum is exact
+    origins = torch.round(components.origins * 2**20) / 2**20
+    there = quantized(replace(components, means=means + shift, origins=origins + shift))
+    torch.testing.assert_close(
+        there.means - shift, quantized(replace(components, means=means)).means, rtol=0, atol=0
+    )
+    assert torch.equal(there.covariances, here.covariances)
+
+    turn = torch.eye(dim, dtype=torch.float64)
+    turn[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    turned = quantized(
+        replace(
+            components, means=components.means @ turn.T, covariances=turn @ components.covariances @ turn.T
+        )
+    )
+    assert torch.equal(turned.means, here.means @ turn.T)
+    assert torch.equal(turned.covariances, turn @ here.covariances @ turn.T)
+
+
+@pytest.mark.parametrize("size", [1, 7, 40])
+@dims
+def test_batches_may_be_split_and_joined(dim, size):
+    whole = quantized(random_components(dim))
+    parts = [decode(encode(part(whole, i, min(i + size, 40)))) for i in range(0, 40, size)]
+    joined = quantized(Components.concatenate(parts))
+    for name in ("means", "covariances", "support", "max_range", "ids", "seen_by", "seen_count"):
+        assert torch.equal(getattr(joined, name), getattr(whole, name)), name
+    assert torch.equal(joined.origins[joined.seen_from], whole.origins[whole.seen_from])
+
+
+# -- edges -------------------------------------------------------------------------------------------------
+
+
+@dims
+def test_no_components_are_a_batch(dim):
+    empty = decode(encode(Components.empty(dim)))
+    assert_same(empty, Components.empty(dim))
+
+
+def test_counts_of_nothing_stay_nothing():
+    components = random_components(3, k=3)
+    nothing = replace(components, support=torch.tensor([0.0, 1e-9, 0.01], dtype=torch.float64))
+    nothing = replace(nothing, seen_count=nothing.support[components.seen_by] / 3)
+    found = quantized(nothing)
+    assert found.support.tolist()[:2] == [0.0, 0.0]
+    assert found.support[2] == pytest.approx(0.01, rel=COUNT_ERROR)
+    assert_same(decode(encode(nothing)), found)
+    assert encode(found) == encode(nothing)
+
+
+def test_sightings_of_one_place_are_one_and_unused_origins_are_dropped():
+    c = random_components(2, k=1, n_origins=4, max_sightings=1)
+    places = [[9.0, 9.0], [1.0, 2.0], [1.0, 2.0 + ORIGIN_STEP / 4], [3.0, 4.0]]
+    c = replace(
+        c,
+        origins=torch.tensor(places, dtype=torch.float64),
+        seen_by=torch.zeros(3, dtype=torch.int64),
+        seen_from=torch.tensor([2, 3, 1]),
+        seen_count=torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64) * c.support / 4,
+    )
+    found = quantized(c)
+    assert found.origins.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert (found.seen_count / found.support).tolist() == [0.5, 0.5]
+
+
+def test_a_component_that_nothing_saw_is_kept():
+    c = random_components(2, k=2)
+    seen = c.seen_by == 0
+    c = replace(c, seen_by=c.seen_by[seen], seen_from=c.seen_from[seen], seen_count=c.seen_count[seen])
+    assert_same(decode(encode(c)), quantized(c))
+    assert len(quantized(c)) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("means", 1e9),
+        ("means", math.nan),
+        ("means", math.inf),
+        ("covariances", 1e13),
+        ("covariances", math.nan),
+        ("support", 1e13),
+        ("support", -1.0),
+        ("support", math.nan),
+        ("origins", -1e9),
+        ("origins", math.nan),
+        ("ids", 2**62),
+    ],
+)
+def test_what_cannot_be_stored_is_named(name, value):
+    components = random_components(3, k=5, max_sightings=1, n_origins=1)
+    changed = getattr(components, name).clone()
+    changed.view(-1)[0] = value
+    with pytest.raises(InvalidArgumentError, match="Numbers from" if name == "ids" else rf"{name}\[0\]"):
+        encode(replace(components, **{name: changed}))
+
+
+@given(
+    runs=st.lists(
+        st.tuples(st.integers(0, 2**40), st.integers(0, 2**60), st.integers(1, 9)), min_size=1, max_size=5
+    )
+)
+def test_any_ids_come_back(runs):
+    ids = torch.tensor([[robot, first + i] for robot, first, n in runs for i in range(n)])
+    components = replace(random_components(2, k=len(ids)), ids=ids)
+    assert torch.equal(decode(encode(components)).ids, ids)
+
+
+def test_components_thinner_than_a_micrometre_get_one():
+    c = random_components(3, k=1)
+    flat = replace(c, covariances=torch.diag(torch.tensor([1e-4, 1e-4, 1e-16], dtype=torch.float64))[None])
+    assert torch.linalg.eigvalsh(quantized(flat).covariances)[0, 0].sqrt() == pytest.approx(2.0**-20)
+
+
+# -- size --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("dim", "most"), [(2, 8.0), (3, 12.0)])
+def test_a_component_with_one_origin_takes_few_bytes(dim, most):
+    components = random_components(dim, k=300, extent=30.0, n_origins=20, max_sightings=1)
+    ordered = replace(components.rearranged(spatial_order(components)), ids=components.ids)
+    assert len(encode(ordered)) <= most * 300
+    assert len(encode(components)) - len(encode(ordered)) > 0.7 * 300  # log2(300!)/300 is 6.8 bits
+
+
+@dims
+def test_a_batch_by_itself_is_short(dim):
+    assert len(encode(random_components(dim, k=1, n_origins=1, max_sightings=1))) <= 80
+    fits = part(random_components(dim, k=200, extent=5.0, max_sightings=1), 0, 90)
+    assert len(encode(fits)) <= 1200
+
+
+def test_the_spatial_order_is_one():
+    components = random_components(3)
+    order = spatial_order(components)
+    assert torch.equal(order.sort().values, torch.arange(len(components)))
+
+
+# -- what is no batch --------------------------------------------------------------------------------------
+
+
+def sealed(body: bytes) -> bytes:
+    """A body with a checksum that is right."""
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+@pytest.fixture(scope="module")
+def sound() -> bytes:
+    return encode(random_components(3, k=12))
+
+
+def test_every_cut_and_every_flipped_bit_is_noticed(sound):
+    for length in range(len(sound)):
+        with pytest.raises(DataError):
+            decode(sound[:length])
+    for bit in range(8 * len(sound)):
+        damaged = bytearray(sound)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(DataError):
+            decode(bytes(damaged))
+
+
+def test_more_than_a_batch_is_refused(sound):
+    for longer in (sound + b"\0", sealed(sound[:-4] + b"\0"), sealed(sound[:-4] + b"\1\2\3")):
+        with pytest.raises(DataError):
+            decode(longer)
+
+
+def test_another_version_is_refused_by_name(sound):
+    with pytest.raises(DataError, match="version 9"):
+        decode(sealed(b"\x09" + sound[1:-4]))
+
+
+@settings(max_examples=200)
+@given(
+    changes=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
+    ),
+    cut=st.sampled_from([0, 0, 1, 8]),
+)
+def test_forged_batches_are_refused_or_are_components(sound, changes, cut):
+    body = bytearray(sound[:-4])
+    for place, value in changes:
+        body[1 + int(place * (len(body) - 1))] = value
+    try:
+        found = decode(sealed(bytes(body[: len(body) - cut])))
+    except DataError:
+        return
+    found.checked()
+    assert bool((found.seen_count >= 0).all())
+    assert_same(decode(encode(found)), quantized(found))
+
+
+@settings(max_examples=150)
+@given(body=st.binary(max_size=200))
+def test_noise_is_refused_or_is_components(body):
+    try:
+        decode(sealed(b"\x01" + body)).checked()
+    except DataError:
+        return
+
+
+@pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
+@pytest.mark.parametrize("what", ["components", "origins"])
+def test_counts_that_nothing_backs_take_no_memory(k, what):
+    writer = BitWriter()
+    for number in (3, k, 1) if what == "components" else (3, 1, k):
+        writer.number(number)
+    with pytest.raises(DataError, match="announced"):
+        decode(sealed(b"\x01" + writer.to_bytes() + bytes(2000)))
+
+
+def test_errors_of_the_codec_are_one_family():
+    assert issubclass(DataError, GmmTorchError)
+    with pytest.raises(DataError, match="too few"):
+        decode(b"")
+
+
+# -- bits --------------------------------------------------------------------------------------------------
+
+whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
+
+
+@settings(max_examples=100)
+@given(values=whole_numbers)
+def test_columns_come_back(values):
+    column = np.array(values, np.int64)
+    writer = BitWriter()
+    writer.column(column)
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(len(column)).tolist() == values
+    reader.finish()
+
+
+@given(values=st.lists(st.integers(-(2**40), 2**40)), scales=st.data())
+def test_scaled_numbers_and_single_ones_come_back(values, scales):
+    scale = np.array(
+        [max(abs(v).bit_length() + scales.draw(st.integers(-3, 3)), 0) for v in values], np.int64
+    )
+    writer = BitWriter()
+    writer.scaled(np.array(values, np.int64), scale)
+    small = zigzag(np.array(values, np.int64)) % 1000
+    writer.rice_column(small)
+    for value in values:
+        writer.number(value)
+    reader = BitReader(writer.to_bytes())
+    assert reader.scaled(scale).tolist() == values
+    assert reader.rice_column(len(values)).tolist() == [
+        int(v) for v in zigzag(np.array(values, np.int64)) % 1000
+    ]
+    assert [reader.number() for _ in values] == values
+    reader.finish()
+
+
+def test_a_rice_code_by_hand():
+    """5 with 2 low bits is 1 above and 01 below: 0 1, then 01; 2 is none above and 10 below: 1, then 10."""
+    writer = BitWriter()
+    writer.rice(np.array([5, 2]), 2)
+    assert writer.to_bytes() == bytes([0b011_01_10_0])
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ([7] * 50, Code.FIXED),
+        (list(range(1000, 1050)), Code.DIFFERENCES),
+        ([0] * 40 + [1, 2, 0, 30], Code.RICE),
+        ([3, 0, 2, 1] * 12, Code.FIXED),
+    ],
+)
+def test_the_shortest_code_is_taken(values, code):
+    column = np.array(values, np.int64)
+    coding = best_code(column)
+    assert coding.code is code
+    writer = BitWriter()
+    writer.column(column)
+    assert len(writer.to_bytes()) <= math.ceil((8 + 70 + coding.n_bits) / 8)
+
+
+def test_zigzag_is_its_inverse():
+    values = np.array([0, -1, 1, -2, 2, 2**60, -(2**60)], np.int64)
+    assert zigzag(values).tolist()[:5] == [0, 1, 2, 3, 4]
+    assert unzigzag(zigzag(values)).tolist() == values.tolist()
+
+
+# -- a real map --------------------------------------------------------------------------------------------
+
+
+def auc(components: Components, asked: queries.Queries, resolution: float) -> float:
+    evidence = point_evidence(components.cones(), asked.points, resolution)
+    theta = occupancy_probability(evidence.hits, evidence.misses)
+    return metrics.roc(theta[asked.of(1)], theta[asked.of(0)]).auc
+
+
+@pytest.mark.real_data
+def test_a_real_map_loses_nothing(real_data):
+    frames = load("depth_frames", path=real_data / "kinect", pixel_stride=8)
+    train, test = split.split_indices(len(frames), 5)
+    rule = LearningRule(n_components=300, max_origins=2)
+    learned = learn_window([frames[i] for i in train], rule, torch.Generator().manual_seed(0))
+    learned = learned.rearranged(spatial_order(learned))
+    ids = torch.stack([torch.zeros(len(learned)), torch.arange(len(learned))], 1).long()
+    learned = replace(learned, ids=ids)
+    origins, ends = queries.test_beams([frames[i] for i in test], 4000, 0)
+    asked = queries.hit_and_free(origins, ends, "uniform", 0.05, 0)
+    # Single roundings move the score up or down; their mean over four places of the lattice shows a loss.
+    losses = []
+    for shift in torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64):
+        moved = replace(learned, means=learned.means + shift, origins=learned.origins + shift)
+        back = quantized(moved)
+        back = replace(back, means=back.means - shift, origins=back.origins - shift)
+        losses.append(auc(learned, asked, 0.05) - auc(back, asked, 0.05))
+    assert abs(float(np.mean(losses))) < 1e-3
+    assert len(encode(learned)) <= 11 * len(learned)
+    assert_same(decode(encode(learned)), quantized(learned))

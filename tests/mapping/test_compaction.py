@@ -1,0 +1,248 @@
+"""Merging under a budget or an error bound, and which origins are kept."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mapping.component_cases import counts_add_up, random_components, total_moments
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.compaction import (
+    UNNUMBERED,
+    compact,
+    compact_to_bytes,
+    estimated_bytes,
+    merged,
+)
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.sightings import limit_origins
+
+
+def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (False, False)) -> Components:
+    """Two equal components, `offset` metres apart, of ten points each."""
+    means = torch.tensor([[1.0, 2.0], [1.0 + offset, 2.0]], dtype=torch.float64)
+    return Components(
+        means=means,
+        covariances=(deviation**2 * torch.eye(2, dtype=torch.float64)).repeat(2, 1, 1),
+        support=torch.tensor([10.0, 10.0], dtype=torch.float64),
+        max_range=torch.tensor(flags),
+        ids=torch.tensor([[7, 4], [7, 5]]),
+        origins=torch.zeros(1, 2, dtype=torch.float64),
+        seen_by=torch.tensor([0, 1]),
+        seen_from=torch.tensor([0, 0]),
+        seen_count=torch.tensor([10.0, 10.0], dtype=torch.float64),
+    ).checked()
+
+
+@given(
+    k=st.integers(1, 60),
+    dim=st.sampled_from([2, 3]),
+    seed=st.integers(0, 1000),
+    limit=st.integers(2, 60),
+    empty=st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_keeps_the_moments_of_either_kind_and_the_budget(k, dim, seed, limit, empty):
+    given_ = random_components(k, dim, seed, empty=empty)
+    left = compact(given_, limit).checked()
+    assert len(left) == min(k, limit)
+    assert counts_add_up(left)
+    for flag in (False, True):
+        before = total_moments(given_, given_.max_range == flag)
+        after = total_moments(left, left.max_range == flag)
+        for a, b in zip(before, after, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_what_is_not_merged_keeps_every_bit_and_its_number():
+    far = random_components(12, 3, 0, spread=100.0)
+    near = replace(far, means=far.means.clone())
+    near.means[1] = near.means[0] + 0.01
+    left = compact(near, 11)
+    fresh = left.ids[:, 1] == UNNUMBERED
+    assert int(fresh.sum()) == 1
+    for row in (~fresh).nonzero().squeeze(1).tolist():
+        old = int(left.ids[row, 1])
+        for name in ("means", "covariances", "support", "max_range"):
+            assert torch.equal(getattr(left, name)[row], getattr(near, name)[old])
+
+
+def test_merged_origins_are_united():
+    given_ = random_components(6, 2, 1)
+    labels = torch.tensor([0, 1, 0, 2, 1, 0])
+    found = merged(given_, labels)
+    expected: dict[tuple[int, int], float] = {}
+    for by, whence, count in zip(given_.seen_by, given_.seen_from, given_.seen_count, strict=True):
+        key = (int(labels[by]), int(whence))
+        expected[key] = expected.get(key, 0.0) + float(count)
+    got = {
+        (int(by), int(whence)): float(count)
+        for by, whence, count in zip(found.seen_by, found.seen_from, found.seen_count, strict=True)
+    }
+    assert got.keys() == expected.keys()
+    assert all(math.isclose(got[key], expected[key]) for key in got)
+
+
+def test_surfaces_never_merge_with_empty_ends():
+    both = pair(0.0, flags=(False, True))
+    assert len(compact(both, max_cost=0.9)) == 2
+    left = compact(both, 1)
+    assert left.max_range.tolist() == [False]
+    assert left.origins.shape[0] == 1
+    assert counts_add_up(left)
+
+
+def test_a_cheap_merge_is_made_and_a_dear_one_is_not():
+    # Equal covariances: H² = 1 − exp(−δ²/8σ²).
+    offset, deviation = 0.05, 0.1
+    squared = 1 - math.exp(-((offset / deviation) ** 2) / 8)
+    assert len(compact(pair(offset, deviation), max_cost=squared * 1.01)) == 1
+    assert len(compact(pair(offset, deviation), max_cost=squared * 0.99)) == 2
+
+
+def test_the_cheapest_pair_by_support_is_merged_first():
+    # Two pairs equally far apart; the light one is cheaper to merge.
+    heavy, light = pair(0.1), pair(0.1)
+    light = replace(
+        light, means=light.means + 50, support=light.support / 10, seen_count=light.seen_count / 10
+    )
+    left = compact(Components.concatenate([heavy, light]), 3)
+    assert sorted(left.support.tolist()) == [2.0, 10.0, 10.0]
+
+
+def test_far_from_the_origin_the_same_pairs_merge():
+    near = random_components(40, 3, 5)
+    shift = torch.tensor([5e5, -4e5, 100.0], dtype=torch.float64)
+    far = replace(near, means=near.means + shift, origins=near.origins + shift)
+    a, b = compact(near, 15), compact(far, 15)
+    torch.testing.assert_close(a.means + shift, b.means, rtol=0, atol=1e-8)
+    torch.testing.assert_close(a.covariances, b.covariances, rtol=1e-6, atol=1e-9)
+    assert torch.equal(a.seen_from, b.seen_from)
+    assert torch.equal(a.ids, b.ids)
+
+
+@pytest.mark.parametrize("bad", [{}, {"max_components": 0}, {"max_components": 2, "max_cost": -1.0}])
+def test_bad_limits_are_refused(bad):
+    with pytest.raises(InvalidArgumentError):
+        compact(random_components(3, 2, 0), **bad)
+
+
+def test_nothing_to_merge():
+    nothing = Components.empty(3)
+    assert len(compact(nothing, 5, 0.5)) == len(limit_origins(nothing, 2)) == 0
+    assert len(compact_to_bytes(nothing, 1, 2)) == 0
+
+
+# -- origins --------------------------------------------------------------------------------------
+
+
+def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> set[tuple[int, int]]:
+    """The sightings to keep, one after the other."""
+    reach = [0.0] * len(components.origins)
+    for _, whence, count in sightings(components):
+        reach[int(whence)] += float(count)
+    first, further = set(), []
+    for k in range(len(components)):
+        rows = [e for e in range(len(components.seen_by)) if int(components.seen_by[e]) == k]
+        places = {e: components.origins[components.seen_from[e]] for e in rows}
+        mine: list[int] = []
+        while rows and len(mine) < limit:
+            adds = [
+                math.sqrt(float(components.seen_count[e]))
+                * reach[int(components.seen_from[e])]
+                * min((float((places[e] - places[m]).norm()) for m in mine), default=1.0)
+                for e in rows
+            ]
+            best = rows.pop(adds.index(max(adds)))
+            if mine:
+                further.append((max(adds), (k, int(components.seen_from[best]))))
+            else:
+                first.add((k, int(components.seen_from[best])))
+            mine.append(best)
+    if mean is None:
+        return first | {key for _, key in further}
+    return first | {key for _, key in sorted(further)[::-1][: int(mean * len(components)) - len(first)]}
+
+
+@given(
+    k=st.integers(1, 12),
+    dim=st.sampled_from([2, 3]),
+    seed=st.integers(0, 1000),
+    limit=st.integers(1, 6),
+    mean=st.sampled_from([None, 1.0, 1.7, 3.0]),
+)
+def test_origins_that_see_much_and_lie_apart_are_kept(k, dim, seed, limit, mean):
+    given_ = random_components(k, dim, seed, n_origins=7)
+    left = limit_origins(given_, limit, mean).checked()
+    table = {tuple(row): i for i, row in enumerate(given_.origins.tolist())}
+    got = {
+        (int(by), table[tuple(left.origins[whence].tolist())])
+        for by, whence in zip(left.seen_by, left.seen_from, strict=True)
+    }
+    assert len(got) <= min(limit, mean or limit) * k
+    assert counts_add_up(left)
+    assert torch.equal(torch.unique(left.seen_from), torch.arange(left.origins.shape[0]))
+    within = len(given_.seen_by) <= (mean or limit) * k and int(torch.bincount(given_.seen_by).max()) <= limit
+    assert got == (
+        {*zip(given_.seen_by.tolist(), given_.seen_from.tolist(), strict=True)}
+        if within
+        else kept_by_a_loop(given_, limit, mean)
+    )
+
+
+def test_counts_of_what_is_kept_stay_in_proportion():
+    given_ = random_components(8, 2, 3, n_origins=6)
+    left = limit_origins(given_, 2)
+    count = {(int(b), tuple(given_.origins[f].tolist())): float(c) for b, f, c in sightings(given_)}
+    for rows in ((left.seen_by == k).nonzero().squeeze(1) for k in range(8)):
+        for a, b in itertools.combinations(rows.tolist(), 2):
+            keys = [(int(left.seen_by[e]), tuple(left.origins[left.seen_from[e]].tolist())) for e in (a, b)]
+            ratio = float(left.seen_count[a] / left.seen_count[b])
+            assert math.isclose(ratio, count[keys[0]] / count[keys[1]], rel_tol=1e-9)
+
+
+def sightings(components: Components):
+    return zip(components.seen_by, components.seen_from, components.seen_count, strict=True)
+
+
+# -- bytes ----------------------------------------------------------------------------------------
+
+
+@given(
+    k=st.integers(1, 80),
+    seed=st.integers(0, 100),
+    max_bytes=st.integers(330, 2500),
+    empty=st.sampled_from([0, 0.5]),
+)
+def test_the_budget_in_bytes_is_kept(k, seed, max_bytes, empty):
+    given_ = random_components(k, 3, seed, empty=empty)
+    left = compact_to_bytes(given_, max_bytes, 3)
+    assert len(left) >= 1
+    assert estimated_bytes(left) <= max_bytes
+    if estimated_bytes(limit_origins(given_, 3)) <= max_bytes:
+        assert len(left) == k
+    else:
+        # No more is given up than one more component would take, and what goes with it.
+        assert len(left) == 1 or estimated_bytes(left) > 0.7 * max_bytes - 100
+
+
+def test_any_measure_of_size_is_respected():
+    given_ = random_components(50, 2, 0)
+    left = compact_to_bytes(given_, 1000, 2, size=lambda c: len(c) ** 2)
+    assert 10 <= len(left) <= 31
+
+
+@pytest.mark.parametrize(("limit", "mean"), [(0, None), (2, 0.5), (2, math.nan)])
+def test_bad_numbers_of_origins_are_refused(limit, mean):
+    with pytest.raises(InvalidArgumentError, match="_origins="):
+        limit_origins(random_components(3, 2, 0), limit, mean)
+
+
+def test_a_budget_below_one_component_is_refused():
+    with pytest.raises(InvalidArgumentError, match="max_bytes=10"):
+        compact_to_bytes(random_components(5, 2, 0), 10, 2)

@@ -1,0 +1,282 @@
+"""Maps that grow under a budget: what is counted, what is kept, and what they answer."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.component_cases import counts_add_up
+from occupancy.protocol_contract import WALL, dims, empty_scan, open_scan, points, quarter_turn, wall_scan
+from torch import Tensor
+
+import gmmtorch
+from gmmtorch.datasets.depth_frames import back_project
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.mapping.compaction import UNNUMBERED, estimated_bytes
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.incremental import IncrementalRule, absorb, absorb_depth
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.point import point_evidence
+from gmmtorch.scan import Scan
+
+RULE = IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=2, window_components=30)
+INTRINSICS = torch.tensor([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def drive(n: int, dim: int) -> list[Scan]:
+    """The wall from n places along it, and some open beams."""
+    places = [(0.3125, -1.0 + 0.25 * i, 0.0625 * i) for i in range(n)]
+    scans = [wall_scan(dim, i, place) for i, place in enumerate(places)]
+    return [replace(scan, no_return=open_scan(dim).no_return[::20]) for scan in scans]
+
+
+def grown(scans: list[Scan], rule: IncrementalRule = RULE) -> Components:
+    return absorb(Components.empty(scans[0].dim), scans, rule).checked()
+
+
+def occupancy(components: Components, x: Tensor, resolution: float = 0.125) -> Tensor:
+    return occupancy_probability(*point_evidence(components.cones(), x, resolution))
+
+
+def equal(a: Components, b: Components) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Components))
+
+
+@given(
+    n=st.integers(1, 5),
+    dim=st.sampled_from([2, 3]),
+    limit=st.sampled_from([None, 2, 9]),
+    window=st.integers(1, 3),
+)
+@settings(max_examples=15)
+def test_every_point_is_counted_and_the_budget_is_kept(n, dim, limit, window):
+    scans = drive(n, dim)
+    found = grown(scans, replace(RULE, n_components=limit, window=window, max_origins=2, mean_origins=None))
+    assert counts_add_up(found)
+    total = {flag: float(found.support[found.max_range == flag].sum()) for flag in (False, True)}
+    assert total[False] == pytest.approx(sum(len(scan.points) for scan in scans), rel=1e-9)
+    assert total[True] == pytest.approx(sum(len(scan.no_return) for scan in scans), rel=1e-9)
+    assert int(torch.bincount(found.seen_by).max()) <= 2
+    if limit is not None:
+        assert len(found) <= limit
+    places = {tuple(scan.origin.tolist()) for scan in scans}
+    assert {tuple(row) for row in found.origins.tolist()} <= places
+
+
+@dims
+def test_the_budget_in_bytes_is_kept_after_every_scan(dim):
+    rule = replace(RULE, max_bytes=500, window=1)
+    found = Components.empty(dim)
+    for scan in drive(5, dim):
+        found = absorb(found, [scan], rule)
+        assert 330 < estimated_bytes(found) <= 500
+
+
+@dims
+def test_the_same_scans_give_the_same_map(dim):
+    scans = drive(4, dim)
+    rule = replace(RULE, n_components=8, max_cost=0.01)
+    whole = grown(scans, rule)
+    assert equal(whole, grown(scans, rule))
+    parts = absorb(grown(scans[:2], rule), scans[2:], rule)
+    assert equal(whole, parts)
+
+
+@dims
+def test_walls_are_occupied_and_what_lies_before_them_is_free(dim):
+    scans = [Scan(scan.points, scan.origin) for scan in drive(5, dim)]
+    found = grown(scans, replace(RULE, n_components=6, max_origins=3))
+    theta = occupancy(found, points([1.0, 2.0, 2.8, WALL, 3.9], dim))
+    assert (theta[:3] < 0.2).all()
+    assert theta[3] > 0.5
+    assert abs(float(theta[4]) - 0.5) < 0.05
+
+
+@dims
+def test_scans_with_nothing_in_them_add_nothing(dim):
+    before = grown(drive(2, dim))
+    assert equal(absorb(before, [empty_scan(dim)] * 3, RULE), before)
+    assert equal(absorb(before, [], RULE), before)
+    assert len(grown([empty_scan(dim)])) == 0
+
+
+@dims
+def test_beams_without_return_alone(dim):
+    found = grown([open_scan(dim), open_scan(dim)], replace(RULE, n_components=4))
+    assert bool(found.max_range.all())
+    middle = open_scan(dim).origin.expand(2, -1) + torch.tensor([[2.0, 0, 0], [4.3, 0, 0]])[:, :dim]
+    theta = occupancy(found, middle.double())
+    assert float(theta[0]) < 0.2
+    assert 0.2 < float(theta[1]) <= 0.5
+
+
+@dims
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_few_points_are_enough(dim, n):
+    scan = wall_scan(dim)
+    few = Scan(scan.points[:: len(scan.points) // n][:n], scan.origin)
+    found = grown([few], replace(RULE, n_components=1))
+    assert len(found) == 1
+    assert float(found.support.sum()) == pytest.approx(n)
+
+
+def test_far_from_the_origin_the_map_is_the_same():
+    shift = torch.tensor([524_288.0, -262_144.0, 1024.0], dtype=torch.float64)
+    scans = drive(4, 3)
+    rule = replace(RULE, n_components=8)
+    near = grown(scans, rule)
+    far = grown([Scan(s.points + shift, s.origin + shift, s.no_return + shift) for s in scans], rule)
+    assert len(near) == len(far)
+    x = points([1.0, 2.0, 2.9, WALL, 3.3], 3)
+    torch.testing.assert_close(occupancy(far, x + shift), occupancy(near, x), rtol=0, atol=1e-3)
+
+
+@dims
+def test_a_motion_moves_components_and_their_origins(dim):
+    found = grown(drive(4, dim), replace(RULE, n_components=8))
+    turn = quarter_turn(dim, (2.0, -1.0, 0.5))
+    moved = found.transformed(turn, torch.ones(len(found), dtype=torch.bool))
+    x = points([1.0, 2.0, 2.9, WALL, 3.3], dim)
+    there = x @ turn[:dim, :dim].T + turn[:dim, dim]
+    torch.testing.assert_close(occupancy(moved, there), occupancy(found, x), rtol=0, atol=1e-6)
+
+
+def test_new_components_have_no_number_and_old_ones_keep_theirs():
+    scans = drive(4, 3)
+    first = grown(scans[:2])
+    assert bool((first.ids[:, 1] == UNNUMBERED).all())
+    numbered = replace(first, ids=torch.stack([torch.zeros(len(first)), torch.arange(len(first))], 1).long())
+    there = Scan(scans[2].points + 50, scans[2].origin + 50)
+    second = absorb(numbered, [there], replace(RULE, max_cost=0.0))
+    assert torch.equal(second.ids[: len(first)], numbered.ids)
+    assert bool((second.ids[len(first) :, 1] == UNNUMBERED).all())
+    assert torch.equal(second.means[: len(first)], first.means)
+
+
+# -- the thesis's way -----------------------------------------------------------------------------
+
+NOVEL = replace(RULE, novelty=NoveltyRule(resolution=0.125, threshold=0.5, distance=0.3), window=1)
+
+
+@dims
+def test_seeing_the_same_again_adds_little(dim):
+    once = grown([wall_scan(dim, seed) for seed in range(2)], NOVEL)
+    again = absorb(once, [wall_scan(dim, seed) for seed in range(2, 6)], NOVEL)
+    without = grown([wall_scan(dim, seed) for seed in range(6)], replace(RULE, window=1))
+    assert len(again) - len(once) < 0.5 * (len(without) - len(once))
+    assert float(again.support.sum()) < float(without.support.sum())
+
+
+@dims
+def test_new_space_is_learned(dim):
+    once = grown([wall_scan(dim)], NOVEL)
+    beyond = wall_scan(dim, 1)
+    beyond = Scan(beyond.points + 8.0, beyond.origin + 8.0)
+    both = absorb(once, [beyond], NOVEL)
+    assert float(both.support.sum() - once.support.sum()) == pytest.approx(len(beyond.points))
+    x = points([2.0, WALL], dim)
+    torch.testing.assert_close(occupancy(both, x + 8.0), occupancy(once, x), rtol=0, atol=0.1)
+
+
+def test_novel_points_that_are_explained_are_counted_not_learned():
+    # Nothing is old news under a threshold of zero bits; what is explained is counted all the same.
+    rule = replace(NOVEL, novelty=NoveltyRule(resolution=0.125, threshold=0.0, distance=0.3, explained=1e9))
+    once = grown([wall_scan(3)], rule)
+    scan = wall_scan(3, 1)
+    twice = absorb(once, [scan], rule)
+    assert len(twice) == len(once)
+    assert torch.equal(twice.means, once.means)
+    gained = float(twice.support.sum() - once.support.sum())
+    assert 0.5 * len(scan.points) < gained <= len(scan.points) + 1e-6
+
+
+# -- depth images ---------------------------------------------------------------------------------
+
+
+def depth_frames(n: int = 3) -> list[tuple[Tensor, Tensor]]:
+    """A slanted wall, a hole in the image, and a camera that moves aside."""
+    v, u = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    frames = []
+    for i in range(n):
+        depth = 2 + 0.01 * u + 0.002 * torch.sin(37 * u + 11 * v + i)
+        depth[:8, :8] = float("nan")
+        depth[-4:] = 0.0
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = 0.2 * i
+        frames.append((depth.float(), pose))
+    return frames
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_depth_images_are_learned_as_their_points_are(stride):
+    frames = depth_frames()
+    found = absorb_depth(Components.empty(3), frames, INTRINSICS, RULE, pixel_stride=stride)
+    scans = []
+    for depth, pose in frames:
+        at = back_project(torch.nan_to_num(depth.double()), INTRINSICS, stride)
+        scans.append(Scan(at + pose[:3, 3], pose[:3, 3]))
+    expected = grown(scans)
+    assert float(found.support.sum()) == pytest.approx(stride**2 * sum(len(s.points) for s in scans))
+    torch.testing.assert_close(found.means, expected.means, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.support, expected.support * stride**2, rtol=1e-6, atol=1e-6)
+
+
+def test_far_pixels_are_left_out_and_an_empty_image_is_nothing():
+    near = absorb_depth(Components.empty(3), depth_frames(1), INTRINSICS, RULE, 1, max_range=2.3)
+    scan_points = back_project(torch.nan_to_num(depth_frames(1)[0][0]).double(), INTRINSICS)
+    assert float(near.support.sum()) == pytest.approx(int((scan_points[:, 2] < 2.3).sum()))
+    blank = [(torch.zeros(48, 64), torch.eye(4, dtype=torch.float64))]
+    assert len(absorb_depth(Components.empty(3), blank, INTRINSICS, RULE)) == 0
+
+
+# -- bad input and real data ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"noise": 0.0},
+        {"length": float("nan")},
+        {"cell": float("inf")},
+        {"window": 0},
+        {"window_components": 0},
+        {"iterations": 0},
+        {"n_components": 0},
+        {"max_bytes": 0},
+        {"max_origins": 0},
+        {"mean_origins": 0.5},
+        {"max_cost": 1.0},
+        {"max_cost": -0.1},
+    ],
+)
+def test_rules_that_cannot_be_are_refused(bad):
+    with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
+        IncrementalRule(**bad)
+
+
+def test_scans_of_another_dimension_are_refused():
+    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
+        absorb(Components.empty(3), [wall_scan(2)], RULE)
+    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
+        absorb_depth(Components.empty(2), depth_frames(1), INTRINSICS, RULE)
+
+
+@pytest.mark.real_data
+def test_a_hall_in_eight_kilobytes(real_data: Path):
+    scans = list(gmmtorch.datasets.load("scan_folder", path=real_data / "hall"))
+    train, test = split.split_indices(len(scans), 5)
+    rule = IncrementalRule(
+        noise=0.02, length=1.0, cell=0.15, window=12, window_components=500, max_bytes=8000
+    )
+    found = grown([scans[i] for i in train], rule)
+    origins, ends = queries.test_beams([scans[i] for i in test], 2000, 0)
+    asked = queries.hit_and_free(origins, ends, "uniform", 0.2, 0)
+    theta = occupancy(found, asked.points, 0.2)
+    assert estimated_bytes(found) <= 8000
+    assert metrics.roc(theta[asked.of(queries.OCCUPIED)], theta[asked.of(queries.FREE)]).auc > 0.985

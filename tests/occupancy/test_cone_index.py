@@ -1,0 +1,129 @@
+"""Tests of gmmtorch.occupancy.cone_index: nothing that matters is missed, and little else is listed."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from occupancy.cone_examples import random_cones, tiled
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.cone_index import ConeIndex
+from gmmtorch.occupancy.cones import CUTOFF, Cones
+
+
+def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """n places on the segments from the sensor to the ellipsoid, many on their rim, and whose they are."""
+    generator = torch.Generator().manual_seed(seed)
+    dim = cones.dim
+    which = torch.randint(len(cones.counts), (n,), generator=generator)
+    unit = torch.nn.functional.normalize(torch.randn(n, dim, generator=generator, dtype=torch.float64), dim=1)
+    inner = torch.rand(n, 1, generator=generator, dtype=torch.float64).clamp_min(0.5) * 2
+    factor = torch.linalg.cholesky(cones.covariances)[which]
+    ends = cones.means[which] + (factor @ (cutoff * inner.clamp_max(0.9999) * unit)[:, :, None])[:, :, 0]
+    share = torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    origin = cones.origins[which]
+    return origin + share * (ends - origin), which
+
+
+def pairs_of(
+    index: ConeIndex, low: torch.Tensor, high: torch.Tensor, **options: int
+) -> list[tuple[int, int]]:
+    parts = index.candidates(low, high, **options)
+    return [pair for box, cone in parts for pair in zip(box.tolist(), cone.tolist(), strict=True)]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@given(
+    seed=st.integers(0, 10_000),
+    extent=st.sampled_from([0.001, 0.02, 0.2, 1.0, 10.0]),
+    entries=st.sampled_from([1, 20, 200]),
+    cutoff=st.sampled_from([1.0, 3.0, CUTOFF]),
+)
+def test_no_box_that_a_cone_meets_goes_without_it(dim, seed, extent, entries, cutoff):
+    cones = random_cones(dim, 12, seed)
+    index = ConeIndex(cones, extent, cutoff, entries_per_cone=entries)
+    places, which = places_on_rays(cones, 400, cutoff, seed)
+    generator = torch.Generator().manual_seed(seed)
+    # Boxes that just hold the place: anywhere inside, corners more often than not.
+    side = extent * torch.rand(400, dim, generator=generator, dtype=torch.float64)
+    corner = torch.rand(400, dim, generator=generator, dtype=torch.float64).mul(3).sub(1).clamp(0.001, 0.999)
+    low = places - corner * side
+    pairs = set(pairs_of(index, low, low + side))
+    assert all((box, int(cone)) in pairs for box, cone in enumerate(which))
+
+
+def test_boxes_far_from_every_ray_get_no_cone():
+    cones = random_cones(3, 30, 0)
+    index = ConeIndex(cones, 0.1)
+    low = torch.tensor([[50.0, 0, 0], [-1e9, 0, 0], [float("inf"), 0, 0]], dtype=torch.float64)
+    assert pairs_of(index, low, low + 0.1) == []
+
+
+def test_lists_are_short():
+    """Mean list length near what brute force finds at the very points."""
+    cones = random_cones(3, 300, 1, room=True)
+    index = ConeIndex(cones, 0.05)
+    places, _ = places_on_rays(cones, 500, CUTOFF, 0)
+    length = index.list_lengths()[index.buckets(places)].double().mean()
+    assert float(length) < 0.45 * 300
+
+
+def test_pairs_come_once_in_order_whatever_the_portions():
+    cones = random_cones(2, 20, 3)
+    index = ConeIndex(cones, 0.1)
+    places, _ = places_on_rays(cones, 200, CUTOFF, 0)
+    whole = pairs_of(index, places, places)
+    assert len(set(whole)) == len(whole) > 200
+    assert [box for box, _ in whole] == sorted(box for box, _ in whole)
+    assert pairs_of(index, places, places, chunk_pairs=7) == whole
+    portions = [set(box.tolist()) for box, _ in index.candidates(places, places, chunk_pairs=7)]
+    assert sum(map(len, portions)) == len(set().union(*portions))
+
+
+def test_cost_and_memory_follow_the_density_not_the_world():
+    small, step = random_cones(3, 60, 4, room=True), 30.0
+    large = tiled(small, 16, step)
+    one, many = ConeIndex(small, 0.1), ConeIndex(large, 0.1)
+    assert many.side == one.side
+    assert many.entries.numel() < 20 * one.entries.numel()
+    places, _ = places_on_rays(small, 500, CUTOFF, 0)
+    shift = torch.tensor([5 * step, 0, 0], dtype=torch.float64)
+    here = one.list_lengths()[one.buckets(places)].double().mean()
+    there = many.list_lengths()[many.buckets(places + shift)].double().mean()
+    assert float(there) < 1.5 * float(here)
+
+
+def test_two_maps_on_other_sides_of_the_earth_share_an_index():
+    small = random_cones(3, 10, 5)
+    shift = torch.tensor([1.2e7, 0, 0], dtype=torch.float64)
+    far = small._replace(means=small.means + shift, origins=small.origins + shift)
+    both = Cones(*(torch.cat(pair) for pair in zip(small, far, strict=True)))
+    index = ConeIndex(both, 0.1)
+    places, which = places_on_rays(both, 200, CUTOFF - 0.01, 0)
+    pairs = set(pairs_of(index, places, places))
+    assert all((box, int(cone)) in pairs for box, cone in enumerate(which))
+    assert index.entries.numel() < 600 * 20
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_cones_list_nothing(dim):
+    empty = Cones(*(field[:0] for field in random_cones(dim, 1, 0)))
+    index = ConeIndex(empty, 0.1)
+    places = torch.zeros(4, dim, dtype=torch.float64)
+    assert index.n_buckets == 0
+    assert pairs_of(index, places, places) == []
+    full = ConeIndex(random_cones(dim, 3, 0), 0.1)
+    assert pairs_of(full, places[:0], places[:0]) == []
+
+
+def test_a_box_larger_than_the_extent_is_refused():
+    index = ConeIndex(random_cones(3, 3, 0), 0.1)
+    low = torch.zeros(1, 3, dtype=torch.float64)
+    with pytest.raises(InvalidArgumentError, match="extent"):
+        list(index.candidates(low, low + 0.2))
+
+
+@pytest.mark.parametrize("extent", [0, -1, float("nan")])
+def test_an_extent_that_is_no_size_is_refused(extent):
+    with pytest.raises(InvalidArgumentError):
+        ConeIndex(random_cones(3, 3, 0), extent)

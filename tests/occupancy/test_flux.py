@@ -1,0 +1,291 @@
+"""Face flux against brute-force integration of the angular form, against rays, and in the worst places."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from exact_angular import exact_evidence
+from flux_cases import count_rays, normal, one_each, only, random_covariances, uniform
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.culling import reach
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.flux import box_flux, flux_evidence
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.monte_carlo import sample_rays
+from gmmtorch.occupancy.panels import TOLERANCE
+
+
+def cases(dim: int, n: int, seed: int, deviations=(1e-3, 2.0), distances=(0.1, 10.0), sizes=(1e-2, 1.0)):
+    """Cones, and for each the corners of a cell that some of its rays meet 0.1 m or farther away."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def log_uniform(bounds, *shape):
+        return uniform(generator, *shape, low=math.log(bounds[0]), high=math.log(bounds[1])).exp()
+
+    covariances = random_covariances(generator, log_uniform(deviations, n, dim))
+    directions = torch.nn.functional.normalize(normal(generator, n, dim))
+    toward = directions * log_uniform(distances, n)[:, None]
+    factors = torch.linalg.cholesky(covariances)
+    end = toward + (factors @ normal(generator, n, dim, 1)).squeeze(-1)
+    size = log_uniform(sizes, n)
+    share = torch.where(torch.arange(n) % 2 == 0, 1.0, uniform(generator, n, high=1.05))
+    share = torch.maximum(share, (0.1 + size) / end.norm(dim=1))
+    origins = normal(generator, n, dim)
+    center = origins + end * share[:, None] + (uniform(generator, n, dim) - 0.5) * size[:, None]
+    half = 0.5 * size[:, None]
+    return one_each(origins + toward, covariances, origins), center - half, center + half
+
+
+def evaluated(cones, low, high, **options):
+    """hits, misses (n, 2) of every box with its own cone."""
+    own = torch.arange(len(low))
+    return torch.stack(box_flux(cones, low, high, [(own, own)], **options), 1)
+
+
+# -- accuracy ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_evidence_is_that_of_the_angular_form(dim, dtype):
+    n = 40 if dim == 2 else 16
+    cones, low, high = cases(dim, n, seed=5, deviations=(0.01, 0.3), distances=(3.2, 10.0))
+    parts = zip(cones.means, cones.covariances, cones.origins, low, high, strict=True)
+    exact = torch.tensor([exact_evidence(*part, panels=60) for part in parts], dtype=torch.float64)
+    assert float((exact > 0.02).double().mean()) > 0.4  # the cells are where something happens
+    error = (evaluated(cones, low, high, dtype=dtype) - exact).abs()
+    assert float(error.max()) < 2e-4
+    assert float(error.median()) < 1e-5
+    finer = (evaluated(cones, low, high, tolerance=1e-8) - exact).abs()
+    assert float(finer.max()) < 5e-6  # what the cutoff takes: exp(−12.5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_evidence_is_that_of_rays_from_a_millimetre_to_two_metres(dim, dtype):
+    cones, low, high = cases(dim, 60, seed=7)
+    counted = torch.tensor([count_rays(only(cones, i), low[i], high[i]) for i in range(len(low))])
+    error = (evaluated(cones, low, high, dtype=dtype) - counted.double()).abs()
+    assert float(error.max()) < 1e-3
+    assert float(error.median()) < 1e-4
+
+
+@pytest.mark.parametrize("incidence", [0.0, 0.6, 1.2, 1.5])
+def test_a_thin_sheet_that_cuts_the_faces_is_integrated_exactly(incidence):
+    """The case that defeats a fixed number of nodes: 1 cm, then 1 mm, against a 0.2 m voxel."""
+    turn = torch.tensor(
+        [
+            [math.cos(incidence), -math.sin(incidence), 0],
+            [math.sin(incidence), math.cos(incidence), 0],
+            [0, 0, 1],
+        ]
+    )
+    for thickness in (1e-2, 1e-3):
+        deviations = torch.tensor([thickness, 0.5, 0.35])
+        covariance = (turn @ torch.diag(deviations**2) @ turn.T).double()[None]
+        mean = torch.tensor([[9.7, 0.03, 0.02]], dtype=torch.float64)
+        cone = one_each(mean, covariance, torch.zeros(1, 3, dtype=torch.float64))
+        low = torch.tensor([9.6, -0.1, -0.1], dtype=torch.float64)
+        hits, misses = box_flux(cone, low[None], low[None] + 0.2)
+        counted = count_rays(cone, low, low + 0.2, 1 << 20)
+        assert float(hits) == pytest.approx(counted[0], abs=1e-4)
+        assert float(misses) == pytest.approx(counted[1], abs=1e-4)
+
+
+def test_a_smaller_tolerance_is_more_exact():
+    cones, low, high = cases(3, 60, seed=3)
+    finest = evaluated(cones, low, high, tolerance=1e-8)
+    errors = [
+        float((evaluated(cones, low, high, tolerance=t) - finest).abs().max()) for t in (0.3, 1e-2, 1e-4)
+    ]
+    assert errors[0] > 5 * errors[1] > 25 * errors[2]
+
+
+# -- grids ---------------------------------------------------------------------------------------------
+
+
+def grid_case(dim: int, seed: int = 0) -> tuple[Cones, VoxelGrid]:
+    generator = torch.Generator().manual_seed(seed)
+    deviations = torch.tensor([0.01, 0.15, 0.3], dtype=torch.float64)[:dim].expand(5, dim)
+    means, origins = normal(generator, 5, dim), normal(generator, 5, dim)
+    origins[4] = means[4] + 0.05  # a sensor inside its component
+    counts = torch.tensor([1.0, 2.0, 0.0, 0.5, 1.0], dtype=torch.float64)
+    max_range = torch.tensor([False, True, False, False, False])
+    cones = Cones(means, random_covariances(generator, deviations), origins, counts, max_range)
+    return cones, VoxelGrid((-1.5, -1.4, -1.6)[:dim], 0.2, (15, 14, 16)[:dim])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_grid_is_what_rays_through_it_count(dim):
+    cones, grid = grid_case(dim)
+    evidence, counted = flux_evidence(cones, grid), Evidence.empty(grid)
+    counted.add_rays(*sample_rays(cones, 300_000))
+    assert float(counted.misses.max()) > 1
+    torch.testing.assert_close(evidence.hits, counted.hits, atol=2e-3, rtol=0)
+    torch.testing.assert_close(evidence.misses, counted.misses, atol=3e-3, rtol=0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_grid_is_its_cells_asked_one_by_one(dim):
+    cones, grid = grid_case(dim, seed=1)
+    evidence = flux_evidence(cones, grid)
+    low = grid.centers() - 0.5 * grid.resolution
+    hits, misses = box_flux(cones, low, low + grid.resolution)
+    torch.testing.assert_close(evidence.hits.flatten(), hits, atol=1e-5, rtol=1e-9)
+    torch.testing.assert_close(evidence.misses.flatten(), misses, atol=5e-5, rtol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_outside_every_cone_have_no_evidence_at_all(dim):
+    cones, grid = grid_case(dim)
+    cones = only(cones, 0)
+    evidence = flux_evidence(cones, grid)
+    low, high = reach(cones)
+    outside = ((grid.centers() + 0.1 < low) | (grid.centers() - 0.1 > high)).any(1)
+    assert 0 < int(outside.sum()) < grid.n_cells
+    assert evidence.probability().flatten()[outside].unique().tolist() == [0.5]
+    # and of the cells inside this box most lie beside the cone
+    assert float((evidence.misses.flatten()[~outside] == 0).double().mean()) > 0.3
+
+
+def test_rays_without_return_never_hit():
+    cones, grid = grid_case(3)
+    evidence = flux_evidence(cones._replace(max_range=torch.ones(5, dtype=torch.bool)), grid)
+    assert float(evidence.hits.max()) == 0
+    assert torch.equal(evidence.misses, flux_evidence(cones, grid).misses)
+    low = grid.centers()[:200] - 0.1
+    assert float(box_flux(only(cones, 1), low, low + 0.2)[0].max()) == 0
+
+
+def test_no_cones_no_evidence():
+    cones, grid = grid_case(3)
+    none = Cones(*(part[:0] for part in cones))
+    assert float(flux_evidence(none, grid).misses.abs().max()) == 0
+    low = grid.centers()[:3]
+    assert [float(x.abs().max()) for x in box_flux(none, low, low + 0.1)] == [0, 0]
+    assert [x.shape for x in box_flux(cones, low[:0], low[:0])] == [(0,), (0,)]
+
+
+def test_moving_everything_to_utm_coordinates_changes_nothing():
+    cones, grid = grid_case(3)
+    shift = torch.tensor([5e5, 5.4e6, 100.0], dtype=torch.float64)
+    moved = cones._replace(means=cones.means + shift, origins=cones.origins + shift)
+    there = VoxelGrid(tuple((torch.tensor(grid.origin) + shift).tolist()), grid.resolution, grid.shape)
+    a, b = flux_evidence(cones, grid), flux_evidence(moved, there)
+    torch.testing.assert_close(a.misses, b.misses, atol=1e-4, rtol=0)
+    torch.testing.assert_close(a.hits, b.hits, atol=1e-4, rtol=0)
+
+
+# -- conservation and bad places -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("size", [1e-4, 0.1, 100.0])
+@pytest.mark.parametrize("spread", [1e-3, 0.1, 2.0])
+def test_a_cell_with_the_sensor_in_on_or_beside_it(dim, size, spread):
+    """All positions −½ … 1½ of the sensor about a cell in half steps: corners, edges, faces, inside."""
+    steps = torch.tensor(list(itertools.product((-0.5, 0.0, 0.5, 1.0, 1.5), repeat=dim)), dtype=torch.float64)
+    low = -steps * size
+    mean = torch.tensor([[0.5, 0.2, -0.3][:dim]], dtype=torch.float64)
+    covariance = spread**2 * torch.diag(torch.tensor([1e-3, 1.0, 0.25][:dim])).double()[None]
+    cone = one_each(mean, covariance, torch.zeros(1, dim, dtype=torch.float64))
+    hits, misses = box_flux(cone, low, low + size)
+    assert bool(torch.isfinite(hits + misses).all())
+    assert float(hits.min()) >= 0 <= float(misses.min())
+    assert float((hits + misses).max()) <= 1 + 1e-3
+    holds = ((steps > 0) & (steps < 1)).all(1)
+    torch.testing.assert_close(
+        (hits + misses)[holds], torch.ones(int(holds.sum())).double(), atol=1e-3, rtol=0
+    )
+
+
+@given(
+    dim=st.sampled_from([2, 3]),
+    seed=st.integers(0, 10**6),
+    scale=st.sampled_from([1e-3, 1.0, 1e3]),
+    inside=st.booleans(),
+)
+def test_never_more_rays_than_there_are(dim, seed, scale, inside):
+    """Cells a thousand times larger and smaller than the component, sensors anywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    deviations = 10 ** uniform(generator, 1, dim, low=-2, high=0)
+    mean = normal(generator, 1, dim)
+    origin = mean + 0.5 * deviations if inside else 3 * normal(generator, 1, dim)
+    cone = one_each(mean, random_covariances(generator, deviations), origin)
+    low = mean + normal(generator, 6, dim) * (1 if scale < 1 else 0.3) * scale - 0.5 * scale
+    hits, misses = box_flux(cone, low, low + scale)
+    assert bool(torch.isfinite(hits + misses).all())
+    assert float(hits.min()) >= 0 <= float(misses.min())
+    assert float((hits + misses).max()) <= 1 + 1e-3
+
+
+def test_a_cell_behind_the_sensor_sees_no_ray():
+    mean = torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)
+    cone = one_each(mean, 0.04 * torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3).double())
+    low = torch.tensor([[-1.0, -0.5, -0.5], [-4.0, -0.1, -0.1]], dtype=torch.float64)
+    assert [x.tolist() for x in box_flux(cone, low, low + 0.9)] == [[0, 0], [0, 0]]
+
+
+def test_a_whole_world_as_one_cell_holds_every_ray():
+    cones, _ = grid_case(3)
+    low = torch.full((1, 3), -1e3, dtype=torch.float64)
+    hits, misses = box_flux(cones, low, -low)
+    assert float(hits) == pytest.approx(float((cones.counts * ~cones.max_range).sum()), abs=1e-3)
+    assert float(misses) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([[0.0, 0.0, 0.0]], [[1.0, 0.0, 1.0]]),
+        ([[0.0, 0.0, 0.0]], [[1.0, math.nan, 1.0]]),
+        ([[0.0, 0.0, -math.inf]], [[1.0, 1.0, 1.0]]),
+        ([[0.0, 0.0]], [[1.0, 1.0]]),
+    ],
+)
+def test_what_is_no_box_is_refused(low, high):
+    cones, _ = grid_case(3)
+    with pytest.raises(InvalidArgumentError, match="low"):
+        box_flux(cones, torch.tensor(low), torch.tensor(high))
+
+
+def test_other_arguments_are_checked():
+    cones, _ = grid_case(3)
+    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
+        flux_evidence(cones, VoxelGrid((0, 0), 0.1, (3, 3)))
+    with pytest.raises(InvalidArgumentError, match=f"tolerance=0 .*{TOLERANCE}"):
+        flux_evidence(cones, VoxelGrid((0, 0, 0), 0.1, (3, 3, 3)), tolerance=0)
+
+
+# -- gradients -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradients_in_box_sensor_and_mixture(dim):
+    cones, low, high = cases(dim, 2, seed=11, deviations=(0.1, 0.3), distances=(2.0, 3.0), sizes=(0.2, 0.4))
+    pairs = [(torch.arange(2), torch.arange(2))]
+
+    def evidence(low, high, origins, means, factors, counts):
+        moved = Cones(means, factors @ factors.mT, origins, counts, cones.max_range)
+        return box_flux(moved, low, high, pairs, tolerance=1e-3)
+
+    factors = torch.linalg.cholesky(cones.covariances)
+    arguments = (low, high, cones.origins, cones.means, factors, 3 * cones.counts)
+    inputs = [x.clone().requires_grad_() for x in arguments]
+    assert min(float(x.detach().max()) for x in evidence(*inputs)) > 0.05
+    assert torch.autograd.gradcheck(evidence, inputs, eps=1e-6, atol=1e-5)
+
+
+def test_gradients_reach_the_mixture_from_a_grid():
+    cones, grid = grid_case(2)
+    means = cones.means.clone().requires_grad_()
+    flux_evidence(cones._replace(means=means), grid).probability().sum().backward()
+    assert bool(torch.isfinite(means.grad).all())
+    assert float(means.grad[0].abs().max()) > 0

@@ -1,0 +1,360 @@
+"""Tests of gmmtorch.occupancy.point: formulas by quadrature, rays by simulation, what must never happen."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from occupancy.cone_examples import random_cones
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.point import PointForm, point_evidence
+
+
+def one_cone(mean, covariance, origin, count=100.0, max_range=False) -> Cones:
+    covariance = torch.as_tensor(covariance, dtype=torch.float64)
+    return Cones(
+        torch.tensor([mean], dtype=torch.float64),
+        (torch.diag(covariance) if covariance.ndim == 1 else covariance)[None],
+        torch.tensor([origin], dtype=torch.float64),
+        torch.tensor([count], dtype=torch.float64),
+        torch.tensor([max_range]),
+    )
+
+
+def near_rays(cones: Cones, n: int, seed: int, spread: float = 1.0) -> Tensor:
+    """Places on the rays of cones and a little beyond their ends."""
+    generator = torch.Generator().manual_seed(seed)
+    which = torch.randint(len(cones.counts), (n,), generator=generator)
+    normal = torch.randn(n, cones.dim, 1, generator=generator, dtype=torch.float64)
+    ends = cones.means[which] + spread * (torch.linalg.cholesky(cones.covariances)[which] @ normal)[:, :, 0]
+    share = 1.1 * torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    return cones.origins[which] + share * (ends - cones.origins[which])
+
+
+def by_quadrature(cones: Cones, x: np.ndarray, h: float) -> tuple[float, float]:
+    """Hits and misses at x as the formulas of `PointForm` read, without a cutoff."""
+    hits = misses = 0.0
+    dim = cones.dim
+    for mean, covariance, origin, count, empty in zip(*(field.numpy() for field in cones), strict=True):
+        u = x - origin
+        eye = np.eye(dim) * h * h / 12
+        hit = min(h**dim * multivariate_normal(mean, covariance + eye).pdf(x), 1)
+        widened = covariance + eye * ((mean - origin) @ (mean - origin)) / (u @ u)
+        normal = multivariate_normal(mean, widened)
+        leave = 1 + 0.5 * h / np.abs(u).sum()
+        nearest = (u @ np.linalg.solve(widened, mean - origin)) / (u @ np.linalg.solve(widened, u))
+        reach = 12 / math.sqrt(u @ np.linalg.solve(widened, u))
+        low, high = max(leave, nearest - reach), max(leave, nearest + reach)
+        integral, _ = quad(lambda t: t ** (dim - 1) * normal.pdf(origin + t * u), low, high, epsrel=1e-10)  # noqa: B023
+        area = h ** (dim - 1) * np.abs(u).sum()
+        miss = 1 - hit if np.abs(u).max() <= h / 2 else min(area * integral, 1 - hit)
+        hits += 0 if empty else count * hit
+        misses += count * miss
+    return hits, misses
+
+
+# -- the formulas --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("resolution", [0.02, 0.2, 1.0])
+def test_the_evidence_is_what_the_formulas_say(dim, resolution):
+    cones = random_cones(dim, 6, 0)
+    points = near_rays(cones, 30, 1, spread=0.5)
+    found = point_evidence(cones, points, resolution, cutoff=9.0)
+    expected = np.array([by_quadrature(cones, x, resolution) for x in points.numpy()])
+    np.testing.assert_allclose(found.hits.numpy(), expected[:, 0], rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(found.misses.numpy(), expected[:, 1], rtol=1e-7, atol=1e-9)
+    assert expected[:, 0].max() > 1e-3
+    assert np.median(expected[:, 1]) > 1e-3
+
+
+def simulated(cones: Cones, x: Tensor, h: float, n: int) -> tuple[float, float]:
+    """Shares of the rays of one cone that end in, and that pass through and end beyond, the cube at x."""
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(n, cones.dim, generator=generator, dtype=torch.float64)
+    ends = cones.means + normal @ torch.linalg.cholesky(cones.covariances)[0].T
+    step = ends - cones.origins
+    one, other = ((x + s * h / 2 - cones.origins) / step for s in (-1, 1))
+    enter = torch.minimum(one, other).amax(1).clamp_min(0)
+    leave = torch.maximum(one, other).amin(1)
+    crossed = enter < leave
+    inside = crossed & (leave > 1) & (enter <= 1)
+    return float(inside.double().mean()), float((crossed & (leave <= 1)).double().mean())
+
+
+@pytest.mark.parametrize(
+    ("mean", "deviations", "place", "h"),
+    [
+        ((3.0, 1.0, 0.5), (0.05, 0.5, 0.4), (1.5, 0.5, 0.25), 0.1),  # on the way, cone wider than the cube
+        ((3.0, 1.0, 0.5), (0.2, 0.5, 0.4), (2.9, 1.1, 0.4), 0.1),  # in the component
+        ((3.0, 1.0, 0.5), (0.2, 0.3, 0.3), (3.1, 1.0, 0.5), 0.2),
+        ((0.0, 4.0, 0.0), (0.5, 0.02, 0.5), (0.1, 3.6, 0.0), 0.1),  # before a wall
+        ((0.0, 4.0, 0.0), (0.5, 0.02, 0.5), (0.1, 4.0, 0.0), 0.3),  # a thin wall through the middle
+    ],
+)
+def test_it_counts_the_rays_of_a_cube(mean, deviations, place, h):
+    cones = one_cone(mean, [d * d for d in deviations], (0.0, 0.0, 0.0), count=1.0)
+    x = torch.tensor([place], dtype=torch.float64)
+    hits, misses = (float(value) for value in point_evidence(cones, x, h))
+    expected = simulated(cones, x, h, 400_000)
+    # The Gaussian that stands for the cube gives a thin wall through its middle √(6/π) = 1.38 of its weight.
+    assert hits == pytest.approx(expected[0], rel=0.05 if min(deviations) > h / 2 else 0.4, abs=5e-4)
+    assert misses == pytest.approx(expected[1], rel=0.05, abs=0.05 * expected[0] + 5e-4)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.015, 0.0), (-0.01, 0.02)])
+def test_a_cone_narrower_than_the_cube_is_not_missed_by_the_centre(offset):
+    """Near the sensor every ray passes through one cell, wherever in it the centre lies."""
+    cones = one_cone((4.0, 0.3, 0.2), (0.02**2, 0.05**2, 0.05**2), (0.0, 0.0, 0.0), count=1.0)
+    x = torch.tensor([[0.4, 0.03 + offset[0], 0.02 + offset[1]]], dtype=torch.float64)
+    expected = simulated(cones, x, 0.1, 100_000)[1]
+    assert expected > 0.99
+    assert 0.5 < float(point_evidence(cones, x, 0.1).misses) <= 1
+
+
+def test_hits_add_up_to_the_count():
+    cones = one_cone((0.3, -0.2), (0.04, 0.0025), (-3.0, 0.0), count=70.0)
+    axis = torch.arange(-40, 60, dtype=torch.float64) * 0.05
+    points = torch.cartesian_prod(axis, axis)
+    assert float(point_evidence(cones, points, 0.05).hits.sum()) == pytest.approx(70.0, rel=1e-4)
+
+
+def test_components_at_maximum_range_only_miss():
+    seen = one_cone((3.0, 0.0, 0.0), (0.04, 0.04, 0.04), (0.0, 0.0, 0.0))
+    empty = seen._replace(max_range=torch.tensor([True]))
+    points = near_rays(seen, 50, 0)
+    one, other = point_evidence(seen, points, 0.1), point_evidence(empty, points, 0.1)
+    assert float(one.hits.min()) >= 0 < float(one.hits.max())
+    assert float(other.hits.abs().max()) == 0
+    assert torch.equal(one.misses, other.misses)
+
+
+def test_a_hit_length_scales_hits_alone():
+    cones = random_cones(3, 5, 0)
+    points = near_rays(cones, 20, 0)
+    form = PointForm(cones, 0.1)
+    plain, longer = form(points), form(points, hit_length=2.0)
+    torch.testing.assert_close(longer.hits, plain.hits * 20)
+    assert torch.equal(longer.misses, plain.misses)
+    assert torch.equal(form(points, hit_length=0.1).hits, plain.hits)
+
+
+# -- which cones are visited, and how, changes nothing -------------------------------------------------
+
+
+def same(one, other) -> None:
+    torch.testing.assert_close(one.hits, other.hits, rtol=1e-10, atol=1e-13)
+    torch.testing.assert_close(one.misses, other.misses, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@given(
+    seed=st.integers(0, 10_000),
+    resolution=st.sampled_from([0.001, 0.05, 0.3, 2.0, 10.0]),
+    cutoff=st.sampled_from([2.0, 5.0]),
+)
+def test_the_index_changes_nothing(dim, seed, resolution, cutoff):
+    cones = random_cones(dim, 10, seed)
+    points = near_rays(cones, 150, seed, spread=3.0)
+    points = torch.cat([points, cones.origins, cones.origins + 0.6 * resolution, cones.means])
+    indexed = PointForm(cones, resolution, cutoff)
+    dense = PointForm(cones, resolution, cutoff, indexed=False)
+    assert dense.index.n_buckets == 1
+    same(indexed(points), dense(points))
+
+
+def test_order_and_portions_change_nothing():
+    cones = random_cones(3, 60, 0, room=True)
+    points = near_rays(cones, 2000, 0)
+    form = PointForm(cones, 0.05)
+    whole = form(points)
+    order = torch.randperm(2000, generator=torch.Generator().manual_seed(0))
+    mixed = form(points[order])
+    same(mixed, type(whole)(whole.hits[order], whole.misses[order]))
+    same(form(points, chunk_pairs=50), whole)
+    alone = [form(point[None]) for point in points[:40]]
+    same(
+        type(whole)(*(torch.cat(part) for part in zip(*alone, strict=True))),
+        type(whole)(*(v[:40] for v in whole)),
+    )
+    turned = Cones(*(field.flip(0) for field in cones))
+    same(PointForm(turned, 0.05)(points), whole)
+    same(point_evidence(cones, points.float().double(), 0.05), form(points.float()))
+
+
+@pytest.mark.slow
+def test_compiled_evidence_is_the_same():
+    cones = random_cones(3, 60, 0, room=True)
+    points = near_rays(cones, 500, 0)
+    same(PointForm(cones, 0.05, compiled=True)(points), PointForm(cones, 0.05)(points))
+
+
+def test_counts_of_several_origins_add():
+    cones = random_cones(2, 8, 0)
+    points = near_rays(cones, 100, 0)
+    each = [point_evidence(Cones(*(field[i : i + 1] for field in cones)), points, 0.1) for i in range(8)]
+    whole = point_evidence(cones, points, 0.1)
+    torch.testing.assert_close(whole.hits, torch.stack([e.hits for e in each]).sum(0))
+    torch.testing.assert_close(whole.misses, torch.stack([e.misses for e in each]).sum(0))
+
+
+@pytest.mark.parametrize("shift", [5e5, -3e6])
+def test_far_from_the_origin_of_the_world(shift):
+    cones = random_cones(3, 20, 0)
+    points = near_rays(cones, 200, 0)
+    moved = cones._replace(means=cones.means + shift, origins=cones.origins + shift)
+    one, other = point_evidence(cones, points, 0.1), point_evidence(moved, points + shift, 0.1)
+    for a, b in zip(one, other, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-4, atol=1e-6)
+
+
+def test_turning_the_world_by_right_angles_changes_nothing():
+    cones = random_cones(3, 20, 0)
+    points = near_rays(cones, 200, 0)
+    turn = torch.tensor([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=torch.float64)
+    turned = cones._replace(
+        means=cones.means @ turn.T,
+        origins=cones.origins @ turn.T,
+        covariances=turn @ cones.covariances @ turn.T,
+    )
+    one, other = point_evidence(cones, points, 0.1), point_evidence(turned, points @ turn.T, 0.1)
+    for a, b in zip(one, other, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-6, atol=1e-9)
+
+
+# -- what must never happen ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@given(
+    seed=st.integers(0, 10_000),
+    resolution=st.sampled_from([0.001, 0.1, 10.0]),
+    thinnest=st.sampled_from([1e-4, 1e-3, 1.0]),
+    widest=st.sampled_from([1e-3, 1.0, 1e3]),
+)
+def test_no_cone_gives_more_than_its_rays(dim, seed, resolution, thinnest, widest):
+    cones = random_cones(dim, 1, seed)._replace(max_range=torch.tensor([False]))
+    values, axes = torch.linalg.eigh(cones.covariances)
+    values[:, 0], values[:, 1:] = min(thinnest, widest) ** 2, widest**2
+    cones = cones._replace(covariances=(axes * values[:, None]) @ axes.transpose(1, 2))
+    origin, mean = cones.origins, cones.means
+    points = torch.cat([origin, origin + 1e-9, mean, 2 * origin - mean, near_rays(cones, 60, seed)])
+    hits, misses = point_evidence(cones, points, resolution)
+    assert bool(torch.isfinite(hits).all() & torch.isfinite(misses).all())
+    assert float(torch.minimum(hits, misses).min()) >= 0
+    assert float((hits + misses).max()) <= float(cones.counts) * (1 + 1e-12)
+    theta = occupancy_probability(hits, misses)
+    assert bool(((theta >= 0) & (theta <= 1)).all())
+
+
+@pytest.mark.parametrize("resolution", [0.001, 0.1, 10.0])
+def test_every_ray_begins_in_the_cube_that_holds_the_sensor(resolution):
+    cones = one_cone((2.0, 1.0, 0.0), (0.01, 0.01, 0.01), (0.0, 0.0, 0.0), count=50.0)
+    inside = torch.tensor([[0, 0, 0], [0.49, 0.49, 0.49], [-0.49, 0, 0.3]], dtype=torch.float64) * resolution
+    hits, misses = point_evidence(cones, inside, resolution)
+    torch.testing.assert_close(hits + misses, torch.full_like(hits, 50.0), rtol=1e-12, atol=0)
+
+
+def test_a_sensor_inside_its_component_is_no_trouble():
+    cones = one_cone((1.0, 1.0, 1.0), (0.09, 0.04, 0.01), (1.0, 1.0, 1.0))
+    points = torch.cat([cones.origins, near_rays(cones, 50, 0)])
+    hits, misses = point_evidence(cones, points, 0.1)
+    assert bool(torch.isfinite(hits + misses).all())
+    assert float(misses[0] + hits[0]) == pytest.approx(100)
+
+
+def test_outside_every_cutoff_nothing_is_known():
+    cones = one_cone((3.0, 0.0, 0.0), (0.01, 0.01, 0.01), (0.0, 0.0, 0.0))
+    inf = float("inf")
+    places = [[-1, 0, 0], [0, 1, 0], [4, 0, 0], [1.5, 0.5, 0], [1e300, 1, 1], [inf, 0, 0], [0, -inf, inf]]
+    points = torch.tensor(places, dtype=torch.float64)
+    for indexed in (True, False):
+        evidence = PointForm(cones, 0.05, indexed=indexed)(points)
+        assert occupancy_probability(*evidence).tolist() == [0.5] * len(places)
+
+
+def test_evidence_has_no_edge_at_the_cutoff():
+    cones = one_cone((3.0, 0.0), (0.01, 0.01), (0.0, 0.0), count=1e6)
+    across = torch.linspace(0, 0.8, 200_001, dtype=torch.float64)
+    for along in (1.5, 3.0):
+        points = torch.stack([torch.full_like(across, along), across], 1)
+        for values in point_evidence(cones, points, 0.05)[0 if along == 3 else 1 :]:
+            tail = values[values < 1e-4 * values[0]]
+            assert float(tail[-1]) == 0
+            # Cut off at five deviations it would fall by e^−12.5 = 3.7e-6 of its peak at once.
+            assert float(tail.diff().abs().max()) < 1e-7 * float(values[0])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_points_and_no_cones(dim):
+    cones = random_cones(dim, 3, 0)
+    none = Cones(*(field[:0] for field in cones))
+    for indexed in (True, False):
+        assert PointForm(cones, 0.1, indexed=indexed)(torch.zeros(0, dim)).hits.shape == (0,)
+        found = PointForm(none, 0.1, indexed=indexed)(torch.zeros(2, dim))
+        assert found.hits.tolist() == found.misses.tolist() == [0, 0]
+
+
+def test_what_is_no_question_is_refused():
+    cones = random_cones(3, 3, 0)
+    with pytest.raises(InvalidArgumentError, match="NaN"):
+        point_evidence(cones, torch.full((1, 3), float("nan")), 0.1)
+    with pytest.raises(InvalidArgumentError, match="shape"):
+        point_evidence(cones, torch.zeros(1, 2), 0.1)
+    with pytest.raises(InvalidArgumentError, match="resolution"):
+        point_evidence(cones, torch.zeros(1, 3), 0)
+    with pytest.raises(InvalidArgumentError, match="cutoff"):
+        point_evidence(cones, torch.zeros(1, 3), 0.1, cutoff=0)
+    with pytest.raises(InvalidArgumentError, match="hit_length"):
+        point_evidence(cones, torch.zeros(1, 3), 0.1, hit_length=-1)
+    with pytest.raises(NumericalError, match=r"covariances\[0\]"):
+        point_evidence(cones._replace(covariances=-cones.covariances), torch.zeros(1, 3), 0.1)
+
+
+# -- gradients -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize("round_component", [False, True])
+def test_gradients_of_occupancy(dim, indexed, round_component):
+    cones = random_cones(dim, 3, 2)
+    if round_component:  # eigenvectors have no gradient here
+        cones = cones._replace(covariances=0.04 * torch.eye(dim, dtype=torch.float64).repeat(3, 1, 1))
+    points = near_rays(cones, 5, 1, spread=0.7)
+
+    def theta(x, means, factors, origins, counts):
+        covariances = factors @ factors.transpose(1, 2)
+        given_cones = Cones(means, covariances, origins, counts, cones.max_range)
+        return occupancy_probability(*PointForm(given_cones, 0.1, indexed=indexed)(x))
+
+    inputs = (points, cones.means, torch.linalg.cholesky(cones.covariances), cones.origins, cones.counts)
+    inputs = tuple(value.clone().requires_grad_() for value in inputs)
+    assert torch.autograd.gradcheck(theta, inputs, eps=1e-7, atol=1e-5, rtol=1e-3)
+    for value, gradient in zip(inputs, torch.autograd.grad(theta(*inputs).sum(), inputs), strict=True):
+        assert float(gradient.abs().max()) > 1e-7, value.shape
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("resolution", [0.001, 0.1, 10.0])
+def test_gradients_are_never_nan(dim, resolution):
+    cones = random_cones(dim, 5, 0)
+    cones = cones._replace(origins=torch.cat([cones.means[:1], cones.origins[1:]]))
+    points = torch.cat(
+        [cones.origins, cones.means, cones.origins + 0.5 * resolution, 2 * cones.origins - cones.means]
+    )
+    points = torch.cat([points, torch.full((1, dim), 1e9, dtype=torch.float64)]).requires_grad_()
+    fields = [field.clone().requires_grad_() for field in cones[:4]]
+    for indexed in (True, False):
+        evidence = PointForm(Cones(*fields, cones.max_range), resolution, indexed=indexed)(points)
+        gradients = torch.autograd.grad(occupancy_probability(*evidence).sum(), [points, *fields])
+        assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)

@@ -1,0 +1,93 @@
+"""Figures of the occupancy studies: what they draw, and the regions they choose."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gmmtorch.report import auc_memory, variance_threshold
+from gmmtorch.report.raster import busiest_regions
+
+
+def memory_rows() -> list[dict]:
+    sizes = [("point", n, 0.98 + 0.005 * i, 16 * n) for i, n in enumerate((100, 300, 1000))]
+    sizes += [("bgk_points", n, 0.93 + 0.02 * i, 13 * n) for i, n in enumerate((500, 5000))]
+    sizes += [("occupancy_grid", None, 0.985, 2_000_000)]
+    return [
+        {
+            "dataset": "hall",
+            "method": method,
+            "size": size,
+            "resolution": 0.2,
+            "auc": auc,
+            "auc_low": auc - 0.001,
+            "auc_high": auc + 0.001,
+            "nbytes": nbytes,
+        }
+        for method, size, auc, nbytes in sizes
+    ]
+
+
+def test_every_method_has_a_line_through_its_sizes():
+    (figure,) = auc_memory.figures(memory_rows()).values()
+    (axes,) = figure.axes
+    lines = {container.get_label(): container.lines[0] for container in axes.containers}
+    assert list(lines) == ["point", "bgk points", "occupancy grid"]
+    assert lines["point"].get_xdata().tolist() == [1600, 4800, 16000]
+    assert lines["point"].get_ydata().tolist() == pytest.approx([0.98, 0.985, 0.99])
+    assert {text.get_text() for text in axes.texts} == {"100", "300", "1,000", "500", "5,000"}
+    assert axes.get_xscale() == "log"
+
+
+def test_thresholds_are_drawn_a_line_a_size():
+    rows = [
+        {
+            "dataset": "hall",
+            "method": "point",
+            "n_components": n,
+            "variance_threshold": v,
+            "occupied_recall": v,
+            "thin_recall": None,
+            "free_recall": 2 * v,
+            "share_decided": 3 * v,
+        }
+        for n in (200, 850)
+        for v in (0.06, 0.2)
+    ]
+    (figure,) = variance_threshold.figures(rows).values()
+    first, thin, free, _ = figure.axes
+    assert [list(line.get_ydata()) for line in first.lines] == [[0.06, 0.2]] * 2
+    assert [list(line.get_ydata()) for line in free.lines] == [[0.12, 0.4]] * 2
+    assert all(len(line.get_ydata()) == 0 for line in thin.lines)
+
+
+def test_cells_are_those_that_the_threshold_calls_occupied(generator):
+    def occupancy(points: torch.Tensor) -> torch.Tensor:
+        return torch.where(points[:, 2] < 0.5, 0.99, 0.8).double()  # variances 0.0099 and 0.16
+
+    hits = torch.rand(100, 3, generator=generator, dtype=torch.float64)
+    box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    figure = variance_threshold.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
+    measured, strict, loose = figure.axes
+    assert len(measured.collections[0].get_offsets()) == 100
+    assert strict.get_title() == "v = 0.06: 500 cells" and loose.get_title() == "v = 0.2: 1,000 cells"
+
+
+def test_the_closest_look_is_where_most_thin_points_are():
+    thin = torch.tensor([[x, 9.0, 1.0] for x in torch.linspace(8.2, 9.8, 50)] + [[1.0, 1.0, 1.0]])
+    hits = torch.cat([thin, torch.tensor([[9.0, 9.0, 3.0]])]).double()
+    low, high = variance_threshold.closest_look(thin.double(), hits, side=4.0)
+    assert low[:2] == (8.0, 8.0) and high[:2] == (12.0, 12.0)
+    assert low[2] == pytest.approx(0.8, abs=0.02) and high[2] > 2.5
+
+
+def test_busy_regions_hold_the_most_surface_and_lie_apart(generator):
+    def uniform(n: int) -> torch.Tensor:
+        return torch.rand(n, 2, generator=generator, dtype=torch.float64)
+
+    sparse, dense, denser = uniform(50) * 100, 20 + 10 * uniform(2000), 70 + 10 * uniform(4000)
+    stacked = torch.full((50_000, 2), 45.0, dtype=torch.float64)  # one place, however often it was measured
+    points = torch.cat([sparse, dense, denser, stacked])
+    assert busiest_regions(points, 2, 10.0) == [((70.0, 70.0), (80.0, 80.0)), ((20.0, 20.0), (30.0, 30.0))]
+    assert busiest_regions(points, 0) == [] == busiest_regions(torch.empty(0, 2), 3)
+    assert len(busiest_regions(torch.zeros(5, 2), 3)) == 1

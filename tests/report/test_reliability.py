@@ -1,0 +1,46 @@
+"""Reliability diagrams."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.calibration import Reliability
+from gmmtorch.report import reliability_figure, save_figure
+
+CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
+
+
+def test_a_line_a_method_in_both_panels_with_its_error_in_the_legend():
+    curves = {"point": CURVE, "occupancy_grid": CURVE._replace(observed=CURVE.predicted)}
+    figure = reliability_figure(curves, title="Kinect, 0.05 m")
+    upper, lower = figure.axes
+    drawn = [line for line in upper.lines if len(line.get_xdata()) == 3]
+    np.testing.assert_array_equal(drawn[0].get_ydata(), CURVE.observed)
+    np.testing.assert_array_equal(drawn[1].get_ydata(), CURVE.predicted)
+    for line in lower.lines:
+        np.testing.assert_allclose(line.get_ydata(), [0.5, 0.25, 0.25])
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["point, ECE 0.100", "occupancy grid, ECE 0.000"]
+    assert figure.get_suptitle() == "Kinect, 0.05 m"
+
+
+def test_fuller_bins_have_larger_markers():
+    figure = reliability_figure({"point": CURVE})
+    (markers,) = [c for c in figure.axes[0].collections if len(c.get_sizes()) == 3]
+    sizes = markers.get_sizes()
+    assert sizes[0] > sizes[1] == sizes[2]
+
+
+@pytest.mark.parametrize("n_methods", [1, 9])
+def test_any_number_of_methods_can_be_saved(n_methods, tmp_path):
+    single = Reliability(np.array([0.5]), np.array([1.0]), np.array([7]))
+    figure = reliability_figure({f"method_{i}": single for i in range(n_methods)})
+    path = save_figure(figure, tmp_path / "reliability.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_curve_is_an_error():
+    with pytest.raises(InvalidArgumentError, match="curves is empty"):
+        reliability_figure({})
