@@ -23,12 +23,16 @@ Keep = Callable[[Rows], object]
 
 
 class Found(NamedTuple):
-    """Rows of results.json, figures by file name, columns of the table, and what it is about."""
+    """Rows of results.json, figures by file name, columns of the table, and what it is about.
+
+    shown: the rows of the table; all of them if None.
+    """
 
     rows: Rows
     figures: dict[str, Any]
     table: str
     about: str
+    shown: Rows | None = None
 
 
 def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> Rows:
@@ -48,16 +52,17 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> Rows:
 
     found = STUDIES[config.study.name](config, device, on_event, keep)
     keep(found.rows)
+    shown = found.rows if found.shown is None else found.shown
     common.save_figures(config, found.figures, folder)
     if config.report.tensorboard:
         from gmmtorch.report import Board
 
         with Board(folder / "tensorboard") as board:
-            for step, row in enumerate(found.rows):
+            for step, row in enumerate(shown):
                 board.scalars(row, str(row["method"]), step=step)
             for name, figure in found.figures.items():
                 board.figure(f"figures/{name}", figure)
-    common.print_table(found.rows, found.table.split(), found.about)
+    common.print_table(shown, found.table.split(), found.about)
     return found.rows
 
 
@@ -130,4 +135,35 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
     return Found(found.rows, figures, table, f"{name}: {len(scans)} scans")
 
 
-STUDIES = {"auc_memory": _auc_memory, "variance_threshold": _variance_threshold}
+def _approximation_error(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
+    """Every form of evidence against the exact angular form; needs no data set."""
+    from gmmtorch.evaluation import approximation_error
+    from gmmtorch.report import approximation_error as report
+
+    options = approximation_error.Options(**_options(config))
+    rows = approximation_error.run(options, config.seed, on_event, keep)
+    swept = [row for row in rows if row["study"] == "sweep"]
+    table = "method dim hits_max hits_p99 hits_median misses_max misses_p99 misses_median probability_max"
+    return Found(rows, report.figures(rows), table, "errors a ray of one component, at random", swept)
+
+
+def _pose_correction(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
+    """Maps of perturbed poses, before and after the poses are put right."""
+    from gmmtorch.evaluation import occupancy, pose_correction
+    from gmmtorch.report import pose_correction as report
+
+    protocol = occupancy.Protocol(**common.as_options(config.evaluation))
+    name, scans = _scans(config, device, on_event)
+    new_map = maps.map_factory(config)
+    methods = _options(config)["methods"]
+    rows = pose_correction.evaluate_correction(name, scans, new_map, protocol, methods, config.seed)
+    table = "method resolution auc auc_corrected auc_clean n_components nbytes"
+    return Found(rows, report.figures(rows), table, f"{name}: {len(scans)} scans")
+
+
+STUDIES = {
+    "approximation_error": _approximation_error,
+    "auc_memory": _auc_memory,
+    "pose_correction": _pose_correction,
+    "variance_threshold": _variance_threshold,
+}

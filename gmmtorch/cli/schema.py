@@ -163,6 +163,29 @@ class SensorModelStudy:
 
 
 @dataclass
+class ApproximationErrorStudy:
+    name: str = "approximation_error"
+    dims: list[int] = field(default_factory=lambda: [2, 3])
+    support: float = 100.0
+    prior: float = 1.0
+    n_pixels: int = 24
+    n_components: int = 64
+    n_cells: int = 8
+    n_samples: int = 1024
+    n_large_samples: int = 1 << 17
+    n_scans: int = 1
+    resolution: float = 0.25
+    n_rays: list[int] = field(default_factory=lambda: [1 << n for n in (10, 12, 14, 16, 18)])
+    tolerance: list[float] = field(default_factory=lambda: [0.1, 1e-2, 1e-3, 1e-4])
+
+
+@dataclass
+class PoseCorrectionStudy:
+    name: str = "pose_correction"
+    methods: list[str] = field(default_factory=lambda: ["point"])
+
+
+@dataclass
 class AucMemoryStudy:
     name: str = "auc_memory"
     forms: list[str] = field(default_factory=lambda: ["point"])  # of evidence, from our map
@@ -279,7 +302,9 @@ def register() -> None:
     store.store(name="export_schema", node=Export)
     store.store(group="schema/map", name="windowed", node=WindowedMap)
     store.store(group="schema/map", name="incremental", node=IncrementalMap)
+    store.store(group="schema/study", name="approximation_error", node=ApproximationErrorStudy)
     store.store(group="schema/study", name="auc_memory", node=AucMemoryStudy)
+    store.store(group="schema/study", name="pose_correction", node=PoseCorrectionStudy)
     store.store(group="schema/study", name="variance_threshold", node=VarianceThresholdStudy)
     store.store(group="schema/study", name="component_count", node=ComponentCountStudy)
     store.store(group="schema/study", name="initialization", node=InitializationStudy)

@@ -18,8 +18,9 @@ Ints = NDArray[np.int64]
 
 MAX_WIDTH = 62
 """Widest number in bits: int64 less the sign, less the bit that zigzag takes."""
-MAX_BYTES = 1 << 30
-"""Longest stream that is read: bits are spread to bytes while it is."""
+MAX_BYTES = 1 << 28
+"""Longest stream, some 25 million components: bits are spread to bytes while it is read."""
+_BLOCK = 1 << 16  # numbers taken apart at once: their bits take 24 bytes each meanwhile
 _GROUP = 7  # bits in a group of a single number
 
 
@@ -76,14 +77,20 @@ class BitWriter:
 
     def to_bytes(self) -> bytes:
         """All bits, the last byte filled up with zeros."""
-        return np.packbits(np.concatenate(self._parts)).tobytes() if self._parts else b""
+        data = np.packbits(np.concatenate(self._parts)).tobytes() if self._parts else b""
+        if len(data) > MAX_BYTES:
+            raise InvalidArgumentError(
+                f"{len(data):,} bytes are more than {MAX_BYTES:,}; write several parts."
+            )
+        return data
 
     def fixed(self, values: Ints, widths: Ints | int) -> None:
         """Each number ≥ 0 in its width of bits."""
         width = np.broadcast_to(np.asarray(widths, np.int64), values.shape)
-        total, which, place = _spread(width)
-        shift = width[which] - 1 - place
-        self._parts.append(((values[which] >> shift) & 1).astype(np.uint8) if total else _NO_BITS)
+        for begin in range(0, len(values), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            which, shift = _spread(width[block])
+            self._parts.append(((values[block][which] >> shift) & 1).astype(np.uint8))
 
     def number(self, value: int) -> None:
         """One whole number of either sign: zigzag, groups of 7 bits, lowest first, a bit for "more"."""
@@ -171,13 +178,15 @@ class BitReader:
         if n and (int(width.max()) > MAX_WIDTH or int(width.min()) < 0):
             raise DataError(f"Numbers of {int(width.max())} bits; at most {MAX_WIDTH} are read.")
         self.require(int(width.sum()))
-        total, which, place = _spread(width)
         values = np.zeros(n, np.int64)
-        bits = self._bits[self._at : self._at + total].astype(np.int64) << (width[which] - 1 - place)
-        wide = np.flatnonzero(width)
-        if total:
-            values[wide] = np.add.reduceat(bits, (np.cumsum(width) - width)[wide])
-        self._at += total
+        for begin in range(0, n, _BLOCK):
+            block = width[begin : begin + _BLOCK]
+            which, shift = _spread(block)
+            bits = self._bits[self._at : self._at + len(which)].astype(np.int64) << shift
+            wide = np.flatnonzero(block)
+            if len(wide):
+                values[begin + wide] = np.add.reduceat(bits, (np.cumsum(block) - block)[wide])
+            self._at += len(which)
         return values
 
     def number(self) -> int:
@@ -232,14 +241,10 @@ class BitReader:
         return unzigzag(self.rice(len(scales), np.maximum(scales - t, 0)))
 
 
-_NO_BITS = np.zeros(0, np.uint8)
-
-
-def _spread(width: Ints) -> tuple[int, Ints, Ints]:
-    """How many bits there are, and of each bit: whose it is, and which of its bits from the left."""
+def _spread(width: Ints) -> tuple[Ints, Ints]:
+    """Of each bit of numbers of these widths, highest first: whose it is, and how far from the lowest."""
     which = np.repeat(np.arange(len(width)), width)
-    place = np.arange(len(which)) - (np.cumsum(width) - width)[which]
-    return len(which), which, place
+    return which, np.cumsum(width)[which] - 1 - np.arange(len(which))
 
 
 def _bounded(above: Ints, base: int) -> Ints:

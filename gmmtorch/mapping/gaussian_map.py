@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping import storage
@@ -20,6 +20,7 @@ from gmmtorch.mapping.codec import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
 from gmmtorch.mapping.incremental import IncrementalRule, absorb
 from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -99,7 +100,7 @@ class GaussianMap(nn.Module):
         self.method = method
         self.answering = Answering(random_state=random_state, **answering)
         self.random_state = int(random_state)
-        self.robot = robot
+        self.robot = check_whole("robot", robot, 0)
         self._pending: list[Scan] = []
         self._n_windows = 0
         self._n_numbered = 0
@@ -138,7 +139,8 @@ class GaussianMap(nn.Module):
         ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
         sightings = sightings_of(origins, weight.cpu(), mean.shape[1])
         parts = (_tensor(covariances), weight, flags, ids, *sightings)
-        components = Components(mean, *(part.to(mean.device) for part in parts)).checked()
+        # Copies: arrays that are written to again do not change the map.
+        components = Components(mean.clone(), *(part.to(mean.device, copy=True) for part in parts)).checked()
         made = cls(**options)
         made._set(components)
         made._n_numbered = k
@@ -158,14 +160,22 @@ class GaussianMap(nn.Module):
         self._pending.append(scan.copied(self.means.device))
         self._forget()
         if len(self._pending) == self.learning.window:
-            self._commit()
+            try:
+                self._commit(self._with_pending())
+            except GmmTorchError:
+                self._pending.pop()  # what cannot be learned from is as if it had not been given
+                raise
 
-    def _commit(self) -> None:
-        """Learn from the scans that wait, for good."""
-        learned = self._with_pending()
-        self._pending, self._n_windows = [], self._n_windows + 1
+    def _commit(self, learned: Components) -> None:
+        """Keep what was learned, the scans that waited included, for good."""
+        self._n_windows += bool(self._pending)
+        self._pending = []
         self._set(learned)
-        self._n_numbered = max(self._n_numbered, int(learned.ids[:, 1].max()) + 1 if len(learned) else 0)
+        self._n_numbered = self._next_number(learned)
+
+    def _next_number(self, components: Components) -> int:
+        """The sequence that the next new component gets after these: none is given twice."""
+        return max(self._n_numbered, int(components.ids[:, 1].max()) + 1 if len(components) else 0)
 
     def _with_pending(self) -> Components:
         """All components, learned from the scans that wait, too."""
@@ -232,6 +242,12 @@ class GaussianMap(nn.Module):
         self._forget()
         return self
 
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        if self.dim is not None:
+            self._pending = []
+            self._commit(self._committed())
+
     @property
     def dim(self) -> int | None:
         """2 or 3; None while the map is empty."""
@@ -248,12 +264,10 @@ class GaussianMap(nn.Module):
         no component has (of records not received, say) are passed over. A pose
         correction is this; nothing is fitted again. Scans of an unfinished window are learned from first.
         """
-        if self._pending:
-            self._commit()
-        components = self._committed()
+        components = self._with_pending()
         matrix = _tensor(transform).to(components.means.device)
         check_rigid(matrix, components.dim)
-        self._set(components.transformed(matrix, self._chosen(components, ids)))
+        self._commit(components.transformed(matrix, self._chosen(components, ids)))
 
     @staticmethod
     def _chosen(components: Components, ids: ArrayLike | None) -> Tensor:
@@ -318,7 +332,7 @@ class GaussianMap(nn.Module):
             "method": self.method,
             "codec": self.codec,
             "robot": self.robot,
-            "n_numbered": self._n_numbered,
+            "n_numbered": self._next_number(components),
             **changed(self.answering, leave_out=_OF_THE_MACHINE),
         }
         return storage.to_bytes(components, facts, self.codec)
@@ -337,15 +351,13 @@ class GaussianMap(nn.Module):
         """Read a map that `save` wrote; it gives the same answers. Raises `DataError` if it is not one."""
         components, facts = storage.from_file(path)
         try:
-            n_numbered = int(facts.pop("n_numbered"))
-            options = dict(facts.pop("learning"))
-            rule = {name: kind for kind, name in _KINDS.items()}[options.pop("kind")]
-            made = cls(rule(**options), **facts)
+            n_numbered = check_whole("n_numbered", facts.pop("n_numbered"), 0)
+            made = cls(_rule(**facts.pop("learning")), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._set(components)
-        largest = int(components.ids[:, 1].max()) if len(components) else -1
-        made._n_numbered = max(n_numbered, largest + 1)
+        made._n_numbered = n_numbered
+        made._n_numbered = made._next_number(components)
         return made
 
 
@@ -353,6 +365,13 @@ def changed(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
     """The options of a dataclass that are not its defaults."""
     plain = asdict(type(options)())
     return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
+
+
+def _rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> Learning:
+    """The rule that a file holds the kind and the changed options of."""
+    if novelty is not None:
+        options["novelty"] = NoveltyRule(**novelty)
+    return {name: rule for rule, name in _KINDS.items()}[kind](**options)
 
 
 def _tensor(value: ArrayLike) -> Tensor:

@@ -95,8 +95,8 @@ def absorb_depth(
 ) -> Components:
     """Depth images added to a map: `frames` of depth (H, W), metres, and pose (4, 4), world ← camera.
 
-    Every `pixel_stride`-th pixel of every so manieth row is taken, for as many as it stands for. What is
-    beyond `max_range` metres along the axis, zero or not finite, is left out.
+    Every `pixel_stride`-th pixel of every `pixel_stride`-th row is taken, and stands for as many as that
+    leaves out. What is beyond `max_range` metres along the axis, zero or not finite, is left out.
     """
     for begin in range(0, len(frames), rule.window):
         scans = [

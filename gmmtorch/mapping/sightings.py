@@ -29,13 +29,12 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     """At most `max_origins` sightings of each component, and `mean_origins` on average; the counts of
     what is left again add up to each component's support.
 
-    A sighting is worth √count · reach: its origin's reach is what was seen from there in all. Of each
-    component the worthiest one is kept, then again and again that of the largest product of its worth and
-    its distance from the nearest origin kept, for neighbouring places tell the same of space. Where that
-    leaves too many, those further ones go, over all components, whose product was least. So large
-    surfaces keep many origins and small ones one; a place that saw little of a component, which would
-    claim to have seen all of it, is rarely kept; and components share origins, whose cones then cover
-    space without gaps. They are real ones: centroids lose the space around the sensors.
+    Of each component the sighting of the largest count is kept, then again and again the one with the
+    largest √count times its distance from the nearest origin kept: neighbouring places tell the same of
+    space, and a place that saw little of a component would claim to have seen all of it. Where that
+    leaves too many, those further ones go, over all components, whose product was least: so large
+    surfaces keep many origins and small ones one. Origins are real ones: centroids lose the space
+    around the sensors.
 
     Origins that nothing was seen from are dropped. Raises `InvalidArgumentError` for less than one.
     """
@@ -58,15 +57,13 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
 
 def _most_worth(components: Components, max_origins: int, mean_origins: float | None) -> Tensor:
     """Which sightings (E,) to keep."""
-    by, whence, count = components.seen_by, components.seen_from, components.seen_count
+    by, count = components.seen_by, components.seen_count
     n, rows = len(components), torch.arange(components.seen_by.shape[0], device=components.seen_by.device)
     limit = n * max_origins if mean_origins is None else int(n * mean_origins)
     left = count > 0
     if n == 0 or (int(left.sum()) <= limit and int(torch.bincount(by[left]).max()) <= max_origins):
         return left
-    reach = count.new_zeros(components.origins.shape[0]).index_add_(0, whence, count)
-    worth = count.sqrt() * reach[whence]
-    position = components.origins[whence]
+    worth, position = count.sqrt(), components.origins[components.seen_from]
     apart = torch.ones_like(count)
     rank = torch.full_like(count, -1.0)  # of what is chosen: how much it adds
     for step in range(max_origins):

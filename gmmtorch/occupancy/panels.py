@@ -14,14 +14,16 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from gmmtorch.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 TOLERANCE = 1e-4
 """Error that a rule may make on a panel, as a share of the integrand's peak there."""
@@ -115,7 +117,7 @@ def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> T
     """Integral over each patch (P,); `like` (D, P) gives dimension, dtype and device.
 
     Differentiable: cuts and orders are chosen on values alone and do not depend on the parameters.
-    What is cut waits on a stack, at most `CHUNK_PANELS` panels are worked on at once.
+    What is cut waits on a stack; about `CHUNK_PANELS` panels are worked on at once.
     """
     limits = tuple((tolerance / error) ** (0.5 / n) for n, error in zip(_ORDERS, _ERROR, strict=True))
     total = like.new_zeros(len(patches))

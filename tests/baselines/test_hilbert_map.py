@@ -27,7 +27,7 @@ from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan
 
-LEARNING = {"gap": RESOLUTION, "thin": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}
+LEARNING = {"gap": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}
 
 
 class TestSparse(OccupancyMapContract):
@@ -36,7 +36,9 @@ class TestSparse(OccupancyMapContract):
     thins_scans = True
 
     def make(self) -> HilbertMap:
-        return HilbertMap("sparse", length=0.25, spacing=0.125, free_spacing=0.25, epochs=12, **LEARNING)
+        return HilbertMap(
+            "sparse", length=0.25, spacing=0.125, free_spacing=0.25, thin=RESOLUTION, epochs=8, **LEARNING
+        )
 
 
 class TestNystroem(OccupancyMapContract):
@@ -48,7 +50,9 @@ class TestNystroem(OccupancyMapContract):
     extrapolates = True  # as far as five lengths, here 1.25 m
 
     def make(self) -> HilbertMap:
-        return HilbertMap("nystroem", length=0.25, n_features=300, free_spacing=0.5, epochs=12, **LEARNING)
+        return HilbertMap(
+            "nystroem", length=0.25, n_features=300, free_spacing=0.5, thin=0.25, epochs=12, **LEARNING
+        )
 
     def test_five_lengths_from_all_centres_nothing_is_known(self):
         made = self.built(wall_scan(2))
@@ -67,7 +71,9 @@ class TestFourier(OccupancyMapContract):
     extrapolates = True
 
     def make(self) -> HilbertMap:
-        return HilbertMap("fourier", length=0.4, n_features=300, free_spacing=0.5, epochs=12, **LEARNING)
+        return HilbertMap(
+            "fourier", length=0.4, n_features=300, free_spacing=0.5, thin=0.25, epochs=12, **LEARNING
+        )
 
 
 # -- features --------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.angular_reference import angular_evidence
-from gmmtorch.evaluation.approximation_error import Scene, cast_rays, random_scene
+from gmmtorch.evaluation.error_scenes import Scene, cast_rays, random_scene
 from gmmtorch.occupancy.cones import Cones
 
 

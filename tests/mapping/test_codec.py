@@ -466,7 +466,7 @@ def test_a_real_map_loses_nothing(real_data):
     learned = learned.rearranged(spatial_order(learned))
     ids = torch.stack([torch.zeros(len(learned)), torch.arange(len(learned))], 1).long()
     learned = replace(learned, ids=ids)
-    origins, ends = queries.test_beams([frames[i] for i in test], 4000, 0)
+    origins, ends = queries.test_beams([frames[i] for i in test], 2000, 0)
     asked = queries.hit_and_free(origins, ends, "uniform", 0.05, 0)
     # Single roundings move the score up or down; their mean over four places of the lattice shows a loss.
     losses = []

@@ -143,9 +143,6 @@ def test_nothing_to_merge():
 
 def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> set[tuple[int, int]]:
     """The sightings to keep, one after the other."""
-    reach = [0.0] * len(components.origins)
-    for _, whence, count in sightings(components):
-        reach[int(whence)] += float(count)
     first, further = set(), []
     for k in range(len(components)):
         rows = [e for e in range(len(components.seen_by)) if int(components.seen_by[e]) == k]
@@ -154,7 +151,6 @@ def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> se
         while rows and len(mine) < limit:
             adds = [
                 math.sqrt(float(components.seen_count[e]))
-                * reach[int(components.seen_from[e])]
                 * min((float((places[e] - places[m]).norm()) for m in mine), default=1.0)
                 for e in rows
             ]

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from mapping.random_components import random_components
 from torch import Tensor
 
 from gmmtorch.errors import DataError, MissingDataError
@@ -18,7 +19,6 @@ from gmmtorch.mapping.codec import encode, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning import LearningRule
-from mapping.random_components import random_components
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

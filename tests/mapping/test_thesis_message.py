@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.thesis_message import (
@@ -16,7 +17,6 @@ from gmmtorch.mapping.thesis_message import (
     encode_thesis,
     encode_thesis_updates,
 )
-from mapping.random_components import random_components
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

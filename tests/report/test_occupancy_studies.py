@@ -70,15 +70,18 @@ def test_cells_are_those_that_the_threshold_calls_occupied(generator):
     figure = variance_threshold.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
     measured, strict, loose = figure.axes
     assert len(measured.collections[0].get_offsets()) == 100
-    assert strict.get_title() == "v = 0.06: 500 cells" and loose.get_title() == "v = 0.2: 1,000 cells"
+    assert strict.get_title() == "v = 0.06: 500 cells"
+    assert loose.get_title() == "v = 0.2: 1,000 cells"
 
 
 def test_the_closest_look_is_where_most_thin_points_are():
     thin = torch.tensor([[x, 9.0, 1.0] for x in torch.linspace(8.2, 9.8, 50)] + [[1.0, 1.0, 1.0]])
     hits = torch.cat([thin, torch.tensor([[9.0, 9.0, 3.0]])]).double()
     low, high = variance_threshold.closest_look(thin.double(), hits, side=4.0)
-    assert low[:2] == (8.0, 8.0) and high[:2] == (12.0, 12.0)
-    assert low[2] == pytest.approx(0.8, abs=0.02) and high[2] > 2.5
+    assert low[:2] == (8.0, 8.0)
+    assert high[:2] == (12.0, 12.0)
+    assert low[2] == pytest.approx(0.8, abs=0.02)
+    assert high[2] > 2.5
 
 
 def test_busy_regions_hold_the_most_surface_and_lie_apart(generator):

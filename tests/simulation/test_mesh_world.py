@@ -55,7 +55,9 @@ def test_places_stand_above_the_floor_away_from_walls_and_inside():
     assert torch.allclose(places[:, 2], torch.full((len(places),), 1.2, dtype=torch.float64), atol=1e-4)
     in_hall = (places[:, 0] < 20) & (places[:, :2].amin(1) >= 0.5 - 1e-5) & (places[:, 1] <= 5.5 + 1e-5)
     in_small = (places[:, 0] > 40.4) & (places[:, 0] < 43.6) & (places[:, 1] < 3.6)
-    assert bool((in_hall | in_small).all()) and bool(in_hall.any()) and bool(in_small.any())
+    assert bool((in_hall | in_small).all())
+    assert bool(in_hall.any())
+    assert bool(in_small.any())
     # On the roofs there is a floor to stand on, but nothing around.
     assert float(places[:, 2].max()) < 2
 
@@ -63,17 +65,20 @@ def test_places_stand_above_the_floor_away_from_walls_and_inside():
 def test_a_walk_stays_in_the_largest_part_and_in_sight_of_where_it_was():
     world = MeshWorld(torch.cat([HALL, SMALL]))
     stops = world.tour(15, stride=1)
-    assert stops.shape == (15, 3) and float(stops[:, 0].max()) < 20
+    assert stops.shape == (15, 3)
+    assert float(stops[:, 0].max()) < 20
     step = stops[1:] - stops[:-1]
     length = step.norm(dim=1)
-    assert float(length.max()) <= 1.5 + 1e-6 and float(length.min()) > 0
+    assert float(length.max()) <= 1.5 + 1e-6
+    assert float(length.min()) > 0
     assert bool((world.distances(stops[:-1], step / length[:, None]) > length).all())
     assert float(stops[:, 0].max() - stops[:, 0].min()) > 10  # it goes along the hall, not to and fro
 
 
 def test_a_walk_that_has_seen_everything_spreads_its_stops():
     stops = MeshWorld(SMALL).tour(50, stride=3)
-    assert stops.shape == (50, 3) and bool(torch.isfinite(stops).all())
+    assert stops.shape == (50, 3)
+    assert bool(torch.isfinite(stops).all())
     assert torch.equal(stops, MeshWorld(SMALL).tour(50, stride=3))
 
 

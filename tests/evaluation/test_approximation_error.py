@@ -1,0 +1,149 @@
+"""The study of errors: its rows, its seeds, what it must find of each form, and its figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.approximation_error import Options, map_rows, run, sweep_rows
+from gmmtorch.evaluation.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.report.approximation_error import figures
+
+SMALL = Options(
+    dims=(2,),
+    n_pixels=6,
+    n_components=12,
+    n_cells=4,
+    n_samples=256,
+    n_large_samples=1 << 14,
+    resolution=0.5,
+    n_rays=(256, 4096),
+    tolerance=(0.1, 1e-3),
+)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    return run(SMALL, seed=0)
+
+
+def of(rows: list[dict[str, Any]], study: str) -> Iterator[dict[str, Any]]:
+    return (row for row in rows if row["study"] == study)
+
+
+def test_rows_are_plain_and_name_their_study(rows):
+    json.dumps(rows, allow_nan=False)
+    assert {row["study"] for row in rows} == {"map", "sweep", "curve"}
+    assert [row["method"] for row in of(rows, "sweep")] == [
+        name for name in methods(1, 1) if name != "cone_exact"
+    ]
+    first = next(of(rows, "map"))
+    assert len(first["error"]) == len(first["depths"]) == 6
+    assert len(first["error"][0]) == len(first["distances"]) == 6
+
+
+def test_flux_is_within_a_thousandth_and_the_approximations_are_not(rows):
+    worst = {row["method"]: max(row["hits_max"], row["misses_max"]) for row in of(rows, "sweep")}
+    median = {row["method"]: max(row["hits_median"], row["misses_median"]) for row in of(rows, "sweep")}
+    for method in ("flux", "flux_float32"):
+        assert worst[method] < 1e-3
+        assert median[method] < 1e-4
+    assert min(worst["cone"], worst["point"]) > 0.01
+    assert 1e-4 < worst["monte_carlo_sobol"] < 0.1
+    assert worst["monte_carlo_large"] < 3e-3
+    flux = next(row for row in of(rows, "sweep") if row["method"] == "flux")
+    assert flux["probability_max"] < 1e-3
+
+
+def test_in_3d_flux_is_within_a_thousandth_too():
+    options = Options(n_components=6, n_cells=4, n_samples=64, n_large_samples=64)
+    rows = {row["method"]: row for row in sweep_rows(3, options, torch.Generator().manual_seed(1))}
+    assert max(rows["flux"]["hits_max"], rows["flux"]["misses_max"]) < 1e-3
+    assert list(rows) == list(methods(1, 1))
+
+
+def test_the_cones_error_falls_with_distance_and_its_map_leaves_out_what_lies_behind():
+    options = Options(n_pixels=9)
+    rows = {row["method"]: row for row in map_rows(2, options, torch.Generator().manual_seed(0))}
+    error = rows["cone"]["error"]
+    near, far = ([line[column] for line in error if line[column] is not None] for column in (2, 8))
+    assert max(near) > 0.05
+    assert max(far) < 0.01
+    behind = [(i, j) for i, line in enumerate(error) for j, value in enumerate(line) if value is None]
+    assert behind
+    for i, j in behind:
+        assert rows["cone"]["depths"][i] + rows["cone"]["distances"][j] <= 1e-6
+
+
+def test_on_a_grid_monte_carlo_and_tighter_flux_come_nearer_the_truth(rows):
+    curve = list(of(rows, "curve"))
+    for method in ("monte_carlo_plain", "monte_carlo_stratified", "monte_carlo_sobol"):
+        few, many = (row["error"] for row in curve if row["method"] == method)
+        assert many < 0.6 * few
+    coarse, fine = (row["error"] for row in curve if row["method"] == "flux")
+    assert fine < coarse
+    assert fine < 1e-3
+    at_most = {row["method"]: row["error"] for row in curve if row["setting"] in (4096.0, None)}
+    assert at_most["monte_carlo_sobol"] < at_most["monte_carlo_stratified"] < at_most["monte_carlo_plain"]
+    assert 1e-3 < at_most["cone"] < 0.5
+
+
+def test_the_seed_decides_and_progress_ends_at_all(rows):
+    def timeless(given: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in given]
+
+    events: list[tuple[str, int, int | None]] = []
+    seen: list[int] = []
+    again = run(SMALL, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))
+    assert timeless(again) == timeless(rows)
+    assert [done for _, done, _ in events] == [0, 1, 2, 3]
+    assert seen == list(range(1, len(rows) + 1))
+    other = sweep_rows(2, SMALL, torch.Generator().manual_seed(1))
+    assert timeless(list(other)) != timeless([r for r in rows if r["study"] == "sweep"])
+
+
+def test_rays_that_start_or_end_in_a_box_or_pass_it_by_are_told_apart(generator):
+    scene = random_scene(2, 1, generator)
+    mean, origin = scene.cone.means, scene.cone.origins
+    cone = scene.cone._replace(covariances=1e-18 * torch.eye(2).double()[None])
+    along = [origin - 0.01, 0.5 * mean - 0.01, mean - 0.01, 1.5 * mean, -mean]
+    low = torch.cat(along)
+    hits, misses = cast_rays(Scene(cone, low, low + 0.02), 50, generator)
+    assert hits.tolist() == pytest.approx([0, 0, 1, 0, 0])
+    assert misses.tolist() == pytest.approx([1, 1, 0, 0, 0])
+
+
+def test_every_study_has_its_figures(rows):
+    drawn = figures(rows)
+    assert list(drawn) == [
+        "approximation_error",
+        "approximation_error_probability",
+        "approximation_error_sweep",
+        "approximation_error_curve",
+    ]
+    for figure in drawn.values():
+        figure.canvas.draw()
+        assert figure.get_suptitle()
+    assert list(figures(list(of(rows, "sweep")))) == ["approximation_error_sweep"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dims": (4,)}, "dims=4"),
+        ({"dims": ()}, r"study\.dims is empty"),
+        ({"n_pixels": 0}, "n_pixels=0"),
+        ({"n_rays": ()}, r"study\.n_rays is empty"),
+        ({"support": float("nan")}, "support=nan"),
+        ({"prior": -1.0}, "prior=-1"),
+        ({"resolution": 0.0}, "resolution=0"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Options(**options)

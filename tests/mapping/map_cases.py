@@ -1,0 +1,110 @@
+"""Maps to test with: drives towards a wall, given components, motions, and what must be equal."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from occupancy.protocol_contract import RESOLUTION, move, open_scan, wall_scan
+from torch import Tensor
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
+from gmmtorch.mapping.incremental import IncrementalRule
+from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.scan import Scan
+
+FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
+"""Some twenty components a window: enough to merge."""
+
+
+def sensor(x: float, dim: int = 2) -> tuple[float, ...]:
+    return (x + 2**-9, 0.1875 + 2**-9, 0.3125 + 2**-9)[:dim]
+
+
+def drive(n: int, dim: int = 2) -> list[Scan]:
+    """Scans of the wall from n places on the way to it."""
+    return [wall_scan(dim, seed, sensor(0.25 * seed, dim)) for seed in range(n)]
+
+
+def open_drive(n: int, dim: int = 2) -> list[Scan]:
+    """The same, with some beams without return."""
+    return [replace(scan, no_return=open_scan(dim).no_return[::10]) for scan in drive(n, dim)]
+
+
+def built(scans: list[Scan], learning: Learning | None = None, **options: Any) -> GaussianMap:
+    """A map of these scans: windowed, exact and of few rays, unless options say otherwise."""
+    options = {"resolution": RESOLUTION, "n_samples": 20_000, "codec": "float", **options}
+    made = GaussianMap(LearningRule() if learning is None else learning, **options)
+    for scan in scans:
+        made.insert(scan)
+    return made
+
+
+def given_parts(dim: int = 2, k: int = 4, seed: int = 0) -> dict[str, Tensor]:
+    """Arguments of `from_components`."""
+    generator = torch.Generator().manual_seed(seed)
+    root = 0.2 * torch.randn(k, dim, dim, generator=generator, dtype=torch.float64)
+    return {
+        "means": 1.5 * torch.randn(k, dim, generator=generator, dtype=torch.float64),
+        "covariances": root @ root.mT + 0.01 * torch.eye(dim).double(),
+        "support": torch.arange(1.0, k + 1, dtype=torch.float64) * 10,
+        "origins": torch.randn(k, dim, generator=generator, dtype=torch.float64),
+    }
+
+
+def moved_parts(parts: dict[str, Tensor], matrix: Tensor) -> dict[str, Tensor]:
+    rotation = matrix[:-1, :-1]
+    return {
+        "means": move(matrix, parts["means"]),
+        "covariances": rotation @ parts["covariances"] @ rotation.T,
+        "support": parts["support"],
+        "origins": move(matrix, parts["origins"]),
+    }
+
+
+def some_motion(dim: int) -> Tensor:
+    generator = torch.Generator().manual_seed(3)
+    rotation = torch.linalg.qr(torch.randn(dim, dim, generator=generator, dtype=torch.float64))[0]
+    rotation[:, 0] *= torch.linalg.det(rotation).sign()
+    matrix = torch.eye(dim + 1, dtype=torch.float64)
+    matrix[:dim, :dim], matrix[:dim, dim] = rotation, torch.tensor([1.5, -0.7, 0.2])[:dim]
+    return matrix
+
+
+def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
+    """For each component: origin → count."""
+    table: list[dict[tuple[float, ...], float]] = [{} for _ in range(len(made))]
+    for k, s, count in zip(
+        made.seen_by.tolist(), made.seen_from.tolist(), made.seen_count.tolist(), strict=True
+    ):
+        place = tuple(made.origins[s].tolist())
+        assert place not in table[k]
+        table[k][place] = count
+    return table
+
+
+def names(ids: Tensor) -> set[tuple[int, ...]]:
+    """Ids (K, 2) as a set, which are all different."""
+    found = {tuple(row) for row in ids.tolist()}
+    assert len(found) == len(ids)
+    return found
+
+
+def assert_same_components(one: Components, other: Components) -> None:
+    """To the bit."""
+    for field in fields(Components):
+        assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
+
+
+def assert_close_components(one: Components, other: Components, atol: float = 1e-9) -> None:
+    """In the same order, with the same sightings."""
+    for name in ("means", "covariances", "support"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=atol)
+    assert torch.equal(one.max_range, other.max_range)
+    for seen, expected in zip(sightings(one), sightings(other), strict=True):
+        assert sorted(seen.values()) == pytest.approx(sorted(expected.values()))
+        ours, theirs = (torch.tensor(sorted(s), dtype=torch.float64) for s in (seen, expected))
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=atol)
