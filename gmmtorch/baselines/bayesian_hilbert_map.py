@@ -22,7 +22,6 @@ from gmmtorch.files import pack_tensors, read_tensors, require
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.bayesian_hilbert_map", 1
-_QUERIES_AT_ONCE = 1 << 16
 _MAX_FULL = 4096  # hinges whose full covariance is kept
 _CONJUGATE_STEPS = 10  # each lowers the error, and every round goes on from the last one's mean
 
@@ -161,7 +160,8 @@ class BayesianHilbertMap(BaselineMap):
     """A normal distribution over the weights of RBF kernels hinged at the nodes of a lattice.
 
     Senanayake & Ramos 2017, "Bayesian Hilbert maps for dynamic continuous occupancy mapping": each
-    scan's posterior, by Jaakkola and Jordan's bound, is the next one's prior, so that no points are
+    scan's posterior, by Jaakkola and Jordan's bound, is the next one's prior (a large scan is learned in
+    parts), so that no points are
     kept, and answers are moderated by the weights' variance. Nodes are hinged where data is, rather
     than throughout a box; kernels are cut at 10⁻³, and there is no constant term, so that θ is
     exactly ½ out of all hinges' reach.
@@ -247,9 +247,20 @@ class BayesianHilbertMap(BaselineMap):
         if not points.shape[0]:
             return
         self._open(points)
-        prior = self.posterior
+        n_parts = math.ceil(points.shape[0] / self._at_once)
+        posterior = self.posterior
+        for part in range(n_parts):  # every n-th point, so that each part is of the whole scan
+            design = self._hinges.design(points[part::n_parts])
+            posterior = fit(design, is_hit[part::n_parts], posterior, self.covariance, self.n_iter)
+        self._keep(posterior)
+
+    @property
+    def _at_once(self) -> int:
+        """Points that are worked on together."""
+        return self._hinges.points_at_once if self.covariance != "full" else 1 << 12
+
+    def _keep(self, posterior: Posterior) -> None:
         table = self._hinges.table
-        posterior = fit(self._hinges.design(points), is_hit, prior, self.covariance, self.n_iter)
         if self.covariance == "full":
             added = torch.zeros_like(posterior.mean)
             self._factor = posterior.factor.float().contiguous()  # as it is stored, and as it is read
@@ -289,7 +300,7 @@ class BayesianHilbertMap(BaselineMap):
             return theta
         posterior = self.posterior
         finite = torch.isfinite(query).all(1).nonzero().squeeze(1)
-        for index in finite.split(_QUERIES_AT_ONCE if self.covariance != "full" else 1 << 12):
+        for index in finite.split(self._at_once):
             theta[index] = moderated(*moments(self._hinges.design(query[index]), posterior))
         return theta
 

@@ -24,6 +24,7 @@ from gmmtorch.files import require
 RBF_CUTOFF = 1e-3
 """Kernels on a lattice are taken as zero below this, as the authors of Hilbert maps do."""
 
+_VALUES_AT_ONCE = 1 << 22
 _NYSTROEM_REACH = 5.0  # lengths from every centre beyond which nothing is known
 
 Kernel = Callable[[Tensor, float], Tensor]
@@ -75,6 +76,11 @@ class Features(ABC):
     def count(self) -> int:
         """How many there are, F."""
 
+    @property
+    def points_at_once(self) -> int:
+        """Points to make a design of at most, where there are many, so that memory stays bounded."""
+        return 1 << 16
+
     @abstractmethod
     def design(self, points: Tensor) -> Design:
         """Features of finite points (M, D), float64."""
@@ -106,7 +112,7 @@ class _DenseDesign(Design):
         return self.values(self._portions()[0])
 
     def _portions(self) -> tuple[Tensor, ...]:
-        return self.points.split(max(1, (1 << 22) // max(1, self.count)))
+        return self.points.split(max(1, _VALUES_AT_ONCE // max(1, self.count)))
 
     def _each(self) -> Iterator[Tensor]:
         yield self._first
@@ -323,6 +329,10 @@ class LatticeFeatures(Features):
     @property
     def count(self) -> int:
         return self.table.keys.shape[0]
+
+    @property
+    def points_at_once(self) -> int:
+        return max(1, _VALUES_AT_ONCE // self.offsets.shape[0])
 
     def open(self, points: Tensor) -> None:
         """See that the cells of these points (M, D) have a node."""

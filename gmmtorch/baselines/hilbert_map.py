@@ -25,7 +25,6 @@ from gmmtorch.files import pack_tensors, read_tensors, require
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.hilbert_map", 1
-_QUERIES_AT_ONCE = 1 << 16
 
 FeatureKind = Literal["sparse", "nystroem", "fourier"]
 _LENGTHS: dict[str, float] = {"sparse": 0.3, "nystroem": 0.5, "fourier": 0.5}
@@ -237,7 +236,7 @@ class HilbertMap(BaselineMap):
         if model is not None:
             features, weights = model
             finite = torch.isfinite(query).all(1).nonzero().squeeze(1)
-            for index in finite.split(_QUERIES_AT_ONCE):
+            for index in finite.split(features.points_at_once):
                 design = features.design(query[index])
                 theta[index] = torch.where(design.known(), torch.sigmoid(design.dot(weights.double())), 0.5)
         return theta

@@ -81,11 +81,11 @@ class WindowedMap(Map):
 class IncrementalMap(Map):
     n_components: int | None = None  # of the whole map at most; null: no limit
     max_bytes: int | None = None  # of its file at most; null: no limit
-    window: int = 8  # scans learned together
-    window_components: int = 250  # of a window at most
-    noise: float = 0.005  # standard deviation of the range sensor (m)
-    length: float = 0.2  # largest standard deviation (m) along a component where it is learned
-    cell: float = 0.03  # side (m) of the cells that points are summed into
+    window: int | None = None  # scans learned together; null, here and below: from the first scans
+    window_components: int = 500  # of a window at most
+    noise: float | None = None  # standard deviation of the range sensor (m)
+    length: float | None = None  # largest standard deviation (m) along a component where it is learned
+    cell: float | None = None  # side (m) of the cells that points are summed into
     max_origins: int = 8  # sensor positions kept for a component, at most
     mean_origins: float | None = 2.0  # and on average; null: as many as there may be
     iterations: int = 6  # of EM

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,19 +16,15 @@ from gmmtorch.mixture.partition import FlatnessRule, partition, pool
 _FEW_POINTS, _MOST_CELLS = 1_000, 50_000  # fewer are not pooled; no more cells are worth their time
 
 
-class CellRule(Protocol):
-    """What `learn_cells` asks of a rule; see `IncrementalRule`."""
+@dataclass(frozen=True)
+class CellRule:
+    """What `learn_cells` goes by; the fields are those of `IncrementalRule`."""
 
-    @property
-    def noise(self) -> float: ...
-    @property
-    def length(self) -> float: ...
-    @property
-    def cell(self) -> float: ...
-    @property
-    def window_components(self) -> int: ...
-    @property
-    def iterations(self) -> int: ...
+    noise: float
+    length: float
+    cell: float
+    window_components: int
+    iterations: int
 
 
 def learn_cells(

@@ -155,7 +155,11 @@ def sightings_of(
             f"origins has {len(origins)} entries for {k} components; one each is needed."
         )
     if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
-        table = torch.as_tensor(origins).double().cpu() if k else torch.zeros(0, dim, dtype=torch.float64)
+        table = (
+            torch.as_tensor(origins, dtype=torch.float64).cpu()
+            if k
+            else torch.zeros(0, dim, dtype=torch.float64)
+        )
         return table, torch.arange(k), torch.arange(k), support
     rows: list[Tensor] = []
     by: list[int] = []
@@ -167,7 +171,7 @@ def sightings_of(
                 f"origins[{component}] needs counts of at least zero that add up to more than zero."
             )
         for origin, count in seen:
-            rows.append(torch.as_tensor(origin).double().cpu())
+            rows.append(torch.as_tensor(origin, dtype=torch.float64).cpu())
             by.append(component)
             counts.append(float(count) / total * float(support[component]))
             if rows[-1].shape != (dim,):

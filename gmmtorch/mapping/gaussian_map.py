@@ -30,6 +30,7 @@ from gmmtorch.sorting import argsort
 Learning = LearningRule | IncrementalRule
 _KINDS: dict[type[Learning], str] = {LearningRule: "windowed", IncrementalRule: "incremental"}
 
+_LONGEST_WINDOW = 40  # scans that wait for one that says how many are to
 _OF_THE_MACHINE = ("memory_limit", "compiled")  # options of answering that a file does not carry
 _BUFFERS = tuple(f.name for f in fields(Components))
 
@@ -135,13 +136,12 @@ class GaussianMap(nn.Module):
         if weight.shape != (k,):
             raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
         flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
-        robot = int(options.get("robot", 0))
-        ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
+        made = cls(**options)
+        ids = torch.stack([torch.full((k,), made.robot), torch.arange(k)], 1)
         sightings = sightings_of(origins, weight.cpu(), mean.shape[1])
         parts = (_tensor(covariances), weight, flags, ids, *sightings)
         # Copies: arrays that are written to again do not change the map.
         components = Components(mean.clone(), *(part.to(mean.device, copy=True) for part in parts)).checked()
-        made = cls(**options)
         made._set(components)
         made._n_numbered = k
         return made
@@ -159,12 +159,19 @@ class GaussianMap(nn.Module):
             self._set(Components.empty(scan.dim, scan.points.device))
         self._pending.append(scan.copied(self.means.device))
         self._forget()
-        if len(self._pending) == self.learning.window:
+        rule = self._rule()
+        if len(self._pending) >= (rule.window or _LONGEST_WINDOW):
             try:
                 self._commit(self._with_pending())
+                self.learning = rule
             except GmmTorchError:
                 self._pending.pop()  # what cannot be learned from is as if it had not been given
                 raise
+
+    def _rule(self) -> Learning:
+        """The rule, with what it takes from the first scans."""
+        rule = self.learning
+        return rule.fitted(self._pending) if isinstance(rule, IncrementalRule) else rule
 
     def _commit(self, learned: Components) -> None:
         """Keep what was learned, the scans that waited included, for good."""
@@ -375,4 +382,4 @@ def _rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> L
 
 
 def _tensor(value: ArrayLike) -> Tensor:
-    return torch.as_tensor(value).double()
+    return torch.as_tensor(value, dtype=torch.float64)  # not by way of float32, as lists would go

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from gmmtorch.datasets.depth_frames import back_project
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.mapping.cell_learning import learn_cells
+from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.compaction import Size, compact, compact_to_bytes, estimated_bytes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule, novel_beams
@@ -23,7 +24,7 @@ from gmmtorch.scan import Scan
 
 @dataclass(frozen=True)
 class IncrementalRule:
-    """How scans are added to a map.
+    """How scans are added to a map. What is None is taken from the first scans, see `fitted`.
 
     noise: standard deviation of the range sensor (m); its square is the least variance of a component,
         and pieces of twice that thickness count as flat.
@@ -40,11 +41,11 @@ class IncrementalRule:
         explain already to those (the thesis's way); None learns from all.
     """
 
-    noise: float = 0.005
-    length: float = 0.2
-    cell: float = 0.03
-    window: int = 8
-    window_components: int = 250
+    noise: float | None = None
+    length: float | None = None
+    cell: float | None = None
+    window: int | None = None
+    window_components: int = 500
     iterations: int = 6
     n_components: int | None = None
     max_bytes: int | None = None
@@ -55,11 +56,12 @@ class IncrementalRule:
 
     def __post_init__(self) -> None:
         for name in ("noise", "length", "cell"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        for name in ("window", "window_components", "iterations", "max_origins"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InvalidArgumentError(f"{name}={value} must be above zero metres, or null.")
+        for name in ("window_components", "iterations", "max_origins"):
             check_whole(name, getattr(self, name), 1)
-        for name in ("n_components", "max_bytes"):
+        for name in ("window", "n_components", "max_bytes"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name), 1)
         if self.mean_origins is not None and not 1 <= self.mean_origins < math.inf:
@@ -68,6 +70,46 @@ class IncrementalRule:
             raise InvalidArgumentError(
                 f"max_cost={self.max_cost} must be at least 0 (equal) and below 1 (no overlap)."
             )
+
+    def fitted(self, scans: Sequence[Scan]) -> IncrementalRule:
+        """The rule with what is None taken from scans, such as the first ones of a map.
+
+        Sensors differ in scale: lengths are in proportion to the median range r of the scans, and a window
+        is as many of them as hold enough points to learn surfaces from. Measured on a depth camera, two
+        lidars and a laser; scans without a return settle nothing.
+        """
+        ranges = [(scan.points - scan.origin).norm(dim=1) for scan in scans if len(scan.points)]
+        if not ranges or None not in (self.noise, self.length, self.cell, self.window):
+            return self
+        scale = _SCALES[scans[0].dim]
+        r = max(float(torch.cat(ranges).median()), _LEAST_RANGE)
+        per_scan = sum(map(len, ranges)) / len(ranges)
+        return replace(
+            self,
+            noise=r * scale.noise if self.noise is None else self.noise,
+            length=r * scale.length if self.length is None else self.length,
+            cell=r * scale.cell if self.cell is None else self.cell,
+            window=max(8, min(40, round(scale.points / per_scan))) if self.window is None else self.window,
+        )
+
+    def cells(self) -> CellRule:
+        """Of a rule that is `fitted`, what a window is learned by."""
+        if self.noise is None or self.length is None or self.cell is None:
+            raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
+        return CellRule(self.noise, self.length, self.cell, self.window_components, self.iterations)
+
+
+class _Scale(NamedTuple):
+    """Lengths in shares of the median range; points that a window holds."""
+
+    noise: float
+    length: float
+    cell: float
+    points: float
+
+
+_SCALES = {2: _Scale(1 / 175, 1 / 12, 1 / 175, 5e3), 3: _Scale(1 / 350, 1 / 4, 1 / 40, 2e5)}
+_LEAST_RANGE = 0.01  # metres
 
 
 def absorb(
@@ -79,8 +121,9 @@ def absorb(
     Components that are not as they were are not numbered (see `compaction.UNNUMBERED`). Nothing is drawn
     at random: the same scans in the same order give the same map. Empty scans add nothing.
     """
-    for begin in range(0, len(scans), rule.window):
-        components = _absorb_window(components, scans[begin : begin + rule.window], rule, size)
+    rule = rule.fitted(scans)
+    for begin in range(0, len(scans), rule.window or len(scans)):
+        components = _absorb_window(components, scans[begin:][: rule.window], rule, size)
     return components
 
 
@@ -98,10 +141,11 @@ def absorb_depth(
     Every `pixel_stride`-th pixel of every `pixel_stride`-th row is taken, and stands for as many as that
     leaves out. What is beyond `max_range` metres along the axis, zero or not finite, is left out.
     """
-    for begin in range(0, len(frames), rule.window):
+    if frames:
+        rule = rule.fitted([_seen(*frames[0], intrinsics, pixel_stride, max_range)])
+    for begin in range(0, len(frames), rule.window or len(frames)):
         scans = [
-            _seen(*frame, intrinsics, pixel_stride, max_range)
-            for frame in frames[begin : begin + rule.window]
+            _seen(*frame, intrinsics, pixel_stride, max_range) for frame in frames[begin:][: rule.window]
         ]
         components = _absorb_window(components, scans, rule, size, float(pixel_stride**2))
     return components
@@ -128,11 +172,21 @@ def _absorb_window(
             )
     if rule.novelty is not None:
         components, scans = _explain(components, scans, rule.novelty, weight)
+    if not any(scan.n_beams for scan in scans):
+        return components
     origins = torch.stack([scan.origin.double() for scan in scans])
-    returns = learn_cells([scan.points for scan in scans], origins, rule, weight=weight)
-    empty = learn_cells([scan.no_return for scan in scans], origins, rule, max_range=True, weight=weight)
+    ends, by = [(scan.points, scan.no_return) for scan in scans], _rule_of(scans, rule)
+    returns = learn_cells([points for points, _ in ends], origins, by, weight=weight)
+    empty = learn_cells([points for _, points in ends], origins, by, max_range=True, weight=weight)
     added = [part for part in (returns, empty) if len(part)]
     return _within_budget(Components.concatenate([components, *added]), rule, size) if added else components
+
+
+def _rule_of(scans: Sequence[Scan], rule: IncrementalRule) -> CellRule:
+    """Scans of nothing but beams without return say as much of the scale by where those were cut off."""
+    if rule.noise is None or rule.length is None or rule.cell is None:
+        rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
+    return rule.cells()
 
 
 def _explain(

@@ -23,7 +23,7 @@ def check_queries(points: ArrayLike, dim: int | None) -> Tensor:
 
     Raises `InvalidArgumentError` for another shape, and for NaN. Infinite points are unknown space.
     """
-    query = torch.as_tensor(points).double()
+    query = torch.as_tensor(points, dtype=torch.float64)
     if query.ndim != 2 or query.shape[1] != (dim or query.shape[1]):
         raise InvalidArgumentError(f"points has shape {tuple(query.shape)}; expected (M, {dim or 'D'}).")
     if bool(torch.isnan(query).any()):

@@ -228,6 +228,15 @@ def test_a_full_map_is_kept_and_goes_on(tmp_path):
     assert theta[2:].tolist() == [0.5, 0.5]
 
 
+def test_a_large_scan_is_learned_in_parts_of_the_whole_scan(monkeypatch):
+    whole = TestMeanField().built(wall_scan(2))
+    monkeypatch.setattr("gmmtorch.baselines.hilbert_features._VALUES_AT_ONCE", 1500)
+    parts = TestMeanField().built(wall_scan(2))
+    theta = [made.occupancy(lattice(2)) for made in (whole, parts)]
+    assert not torch.equal(*theta)
+    assert float((theta[0] - theta[1]).abs().max()) < 0.1
+
+
 def test_in_3d_memory_follows_the_data():
     made = BayesianHilbertMap(20.0, spacing=0.25, free_spacing=0.5)
     made.insert(Scan([[0.0, 0.0, 5.0], [800.0, 700.0, 0.0]], [0.0, 0.0, 0.0]))

@@ -31,7 +31,7 @@ def drive(n: int, dim: int = 2) -> list[Scan]:
 
 def open_drive(n: int, dim: int = 2) -> list[Scan]:
     """The same, with some beams without return."""
-    return [replace(scan, no_return=open_scan(dim).no_return[::10]) for scan in drive(n, dim)]
+    return [replace(scan, no_return=open_scan(dim).no_return[i::10]) for i, scan in enumerate(drive(n, dim))]
 
 
 def built(scans: list[Scan], learning: Learning | None = None, **options: Any) -> GaussianMap:

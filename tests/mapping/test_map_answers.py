@@ -1,0 +1,177 @@
+"""What a GaussianMap answers, by every method: probabilities, grids, gradients, and what must not matter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from mapping.map_cases import FINE, built, drive, given_parts, open_drive
+from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
+
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.mapping.answers import METHODS
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.grid import VoxelGrid
+
+methods = pytest.mark.parametrize("method", METHODS)
+
+
+@dims
+@methods
+@pytest.mark.parametrize("codec", ["quantized", "float"])
+def test_answers_are_probabilities_and_a_half_far_away(dim, method, codec):
+    made = built(open_drive(2, dim), FINE, method=method, codec=codec)
+    theta = made.occupancy(lattice(dim))
+    assert 0 <= float(theta.min()) < 0.3
+    assert 0.6 < float(theta.max()) <= 1
+    away = torch.cat([lattice(dim)[::40] + 100, lattice(dim)[::40] - 1e7, torch.full((2, dim), math.inf)])
+    assert (made.occupancy(away) == 0.5).all()
+    sensor = torch.tensor(SENSOR[:dim], dtype=torch.float64)
+    at = torch.stack([sensor, drive(2, dim)[1].origin, sensor + 1e-9])
+    assert float(made.occupancy(at).max()) < 0.5
+    assert float(made.occupancy(points([WALL], dim))) > 0.5
+
+
+@dims
+@methods
+@pytest.mark.parametrize("resolution", [1e-3, 10.0])
+def test_cells_of_a_millimetre_and_of_ten_metres_have_answers(dim, method, resolution):
+    if method == "monte_carlo" and resolution < 0.01:
+        return  # takes memory by the cell: see the test of its limit
+    query = torch.cat([points([0.3125, 1.0, 2.0, 3.0, WALL, 3.0715, 4.0], dim), lattice(dim)[::60]])
+    theta = built(drive(1, dim), FINE).occupancy(query, resolution, method)
+    assert 0 <= float(theta.min()) <= float(theta.max()) <= 1
+
+
+@dims
+@methods
+def test_far_from_the_origin_the_answers_are_the_same(dim, method):
+    parts = given_parts(dim)
+    shift = torch.tensor([524_288.0, -262_144.0, 1024.0], dtype=torch.float64)[:dim]
+    far = {**parts, "means": parts["means"] + shift, "origins": parts["origins"] + shift}
+    query = lattice(dim)[::3] + 2.0**-9
+    near, there = (
+        GaussianMap.from_components(**given, method=method, n_samples=1 << 14) for given in (parts, far)
+    )
+    expected = near.occupancy(query, 0.125)
+    theta = there.occupancy(query + shift, 0.125)
+    if method == "monte_carlo":  # a ray that crosses a corner may go the other way round it
+        assert float((theta - expected).abs().mean()) < 1e-4
+    else:
+        torch.testing.assert_close(theta, expected, rtol=0, atol=1e-5)
+
+
+@dims
+@methods
+def test_the_order_and_the_company_of_questions_do_not_matter(dim, method):
+    made = built(open_drive(2, dim), FINE, method=method)
+    query = lattice(dim)
+    order = torch.randperm(len(query), generator=torch.Generator().manual_seed(0))
+    theta = made.occupancy(query)
+    torch.testing.assert_close(made.occupancy(query[order]), theta[order], rtol=0, atol=1e-12)
+    torch.testing.assert_close(made.occupancy(query[:7]), theta[:7], rtol=0, atol=1e-12)
+    torch.testing.assert_close(made.occupancy(query.repeat(2, 1)), theta.repeat(2), rtol=0, atol=1e-12)
+
+
+@dims
+@methods
+def test_evidence_on_a_grid_is_what_its_centres_are_told(dim, method):
+    made = built(drive(2, dim), method=method)
+    grid = VoxelGrid.covering([-1.0] * dim, [3.5] * dim, 0.25)
+    evidence = made.evidence(grid)
+    assert float(evidence.hits.min()) >= 0
+    assert float(evidence.misses.min()) >= 0
+    theta = evidence.probability().flatten()
+    torch.testing.assert_close(made.occupancy(grid.centers(), 0.25), theta, rtol=1e-6, atol=1e-6)
+    assert len(theta.unique()) > 10
+
+
+@dims
+@pytest.mark.parametrize(("method", "tolerance"), [("flux", 0.01), ("cone", 0.1), ("point", 0.1)])
+def test_all_methods_speak_of_the_same_map(dim, method, tolerance):
+    made = built(drive(2, dim), n_samples=1 << 17)
+    exact = made.occupancy(lattice(dim), method="monte_carlo")
+    theta = made.occupancy(lattice(dim), method=method)
+    assert float((theta - exact).abs().mean()) < tolerance
+
+
+@dims
+@pytest.mark.parametrize("learning", [None, FINE])
+def test_gradients_in_the_points_are_those_of_finite_differences(dim, learning):
+    made = built(drive(2, dim), learning)
+    generator = torch.Generator().manual_seed(0)
+    on_wall = points([WALL], dim) + 0.05 * torch.randn(20, dim, generator=generator, dtype=torch.float64)
+    query = torch.cat([lattice(dim)[::17], on_wall]).requires_grad_()
+    made.occupancy(query, 0.125, "point").sum().backward()
+    assert query.grad is not None
+    step = 1e-6
+    for axis in range(dim):
+        shift = step * torch.eye(dim, dtype=torch.float64)[axis]
+        above, below = (made.occupancy(query.detach() + sign * shift, 0.125, "point") for sign in (1, -1))
+        torch.testing.assert_close(query.grad[:, axis], (above - below) / (2 * step), rtol=1e-4, atol=1e-6)
+    assert float(query.grad.abs().max()) > 1
+
+
+def test_the_prior_is_the_maps_own():
+    weak, strong = (built([wall_scan(2)], prior=prior) for prior in (0.1, 10.0))
+    query = points([3.0625], 2)
+    assert 0.5 < float(strong.occupancy(query)) < float(weak.occupancy(query))
+
+
+@methods
+def test_without_a_resolution_and_a_method_they_are_the_maps_own(method):
+    made = built([wall_scan(2)], resolution=0.25, method=method)
+    assert torch.equal(made.occupancy(lattice(2)), made.occupancy(lattice(2), 0.25, method))
+    assert not torch.equal(made.occupancy(lattice(2)), made.occupancy(lattice(2), 0.125))
+    other = METHODS[METHODS.index(method) - 1]
+    assert not torch.equal(made.occupancy(lattice(2)), made.occupancy(lattice(2), method=other))
+
+
+def test_more_samples_are_less_noise_and_no_other_answer():
+    few, many = (built(drive(2), n_samples=n, method="monte_carlo") for n in (3_000, 100_000))
+    difference = (few.occupancy(lattice(2)) - many.occupancy(lattice(2))).abs()
+    assert 0 < float(difference.mean()) < 0.01
+
+
+# -- what is refused -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resolution", [0, -1.0, math.nan, math.inf])
+def test_a_resolution_that_is_none_is_refused(resolution):
+    with pytest.raises(InvalidArgumentError, match="resolution"):
+        built([wall_scan(2)]).occupancy(lattice(2), resolution)
+
+
+def test_an_unknown_method_is_refused_by_name():
+    for made in (built([wall_scan(2)]), GaussianMap(resolution=RESOLUTION)):
+        with pytest.raises(InvalidArgumentError, match="method='magic'"):
+            made.occupancy(lattice(2), method="magic")
+        with pytest.raises(InvalidArgumentError, match="method='magic'"):
+            made.evidence(VoxelGrid((0, 0), 1.0, (2, 2)), method="magic")
+
+
+def test_a_grid_of_another_dimension_is_refused():
+    with pytest.raises(InvalidArgumentError, match="dimensional"):
+        built([wall_scan(2)]).evidence(VoxelGrid((0, 0, 0), 1.0, (2, 2, 2)))
+
+
+@methods
+def test_an_empty_map_has_no_evidence(method):
+    made = GaussianMap(method=method)
+    assert made.evidence(VoxelGrid((0, 0), 1.0, (2, 2))).probability().unique().tolist() == [0.5]
+
+
+def test_evidence_beyond_the_memory_limit_is_refused():
+    with pytest.raises(MemoryLimitError, match="resolution"):
+        built([wall_scan(2)], memory_limit=1 << 16).occupancy(lattice(2), 0.005, "monte_carlo")
+
+
+def test_lists_of_numbers_are_as_exact_as_arrays():
+    # A list that became float32 on the way would be off by 2 cm there.
+    matrix = shifted(2, (524_288.3, -262_144.7))
+    made = built([wall_scan(2).transformed(matrix)], FINE)
+    query = points([3.0], 2) + matrix[:2, 2]
+    assert made.occupancy(query.tolist()).tolist() == made.occupancy(query).tolist()
+    given = {name: value.tolist() for name, value in given_parts().items()}
+    assert torch.equal(GaussianMap.from_components(**given).origins, given_parts()["origins"])
