@@ -60,8 +60,8 @@ class Map:
     n_samples: int = 1000000  # Monte Carlo rays
     sampling: str = "sobol"  # or stratified, plain
     prior: float = 1.0  # N_p of (3.9)
-    cutoff: float = 5.0  # standard deviations beyond which a component is taken to end
-    hit_length: float | None = None  # metres, of the point form; null: the side of a cell
+    cutoff: float = 3.0  # standard deviations beyond which a component is taken to end
+    hit_length: float | None = 1.0  # metres, of the point form; null: the side of a cell
     codec: str = "quantized"  # or float: every number as it is
 
 

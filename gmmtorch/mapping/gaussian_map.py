@@ -30,6 +30,7 @@ from gmmtorch.sorting import argsort
 Learning = LearningRule | IncrementalRule
 _KINDS: dict[type[Learning], str] = {LearningRule: "windowed", IncrementalRule: "incremental"}
 
+_ROOM_FOR_SETTINGS = 48  # bytes: they may change once the map is built, and within its budget
 _LONGEST_WINDOW = 40  # scans that wait for one that says how many are to
 _OF_THE_MACHINE = ("memory_limit", "compiled")  # options of answering that a file does not carry
 _BUFFERS = tuple(f.name for f in fields(Components))
@@ -159,11 +160,9 @@ class GaussianMap(nn.Module):
             self._set(Components.empty(scan.dim, scan.points.device))
         self._pending.append(scan.copied(self.means.device))
         self._forget()
-        rule = self._rule()
-        if len(self._pending) >= (rule.window or _LONGEST_WINDOW):
+        if len(self._pending) >= (self._rule().window or _LONGEST_WINDOW):
             try:
                 self._commit(self._with_pending())
-                self.learning = rule
             except GmmTorchError:
                 self._pending.pop()  # what cannot be learned from is as if it had not been given
                 raise
@@ -175,6 +174,7 @@ class GaussianMap(nn.Module):
 
     def _commit(self, learned: Components) -> None:
         """Keep what was learned, the scans that waited included, for good."""
+        self.learning = self._rule()
         self._n_windows += bool(self._pending)
         self._pending = []
         self._set(learned)
@@ -210,7 +210,7 @@ class GaussianMap(nn.Module):
 
     def _size(self, components: Components) -> int:
         """Bytes of the file of these components, once they are numbered."""
-        return len(self._serialized(self._numbered(components)))
+        return len(self._serialized(self._numbered(components))) + _ROOM_FOR_SETTINGS
 
     def _as_written(self, components: Components) -> Components:
         return components if self.codec == "float" else quantized(components)
@@ -334,7 +334,7 @@ class GaussianMap(nn.Module):
 
     def _serialized(self, components: Components) -> bytes:
         facts = {
-            "learning": {"kind": _KINDS[type(self.learning)], **changed(self.learning)},
+            "learning": {"kind": _KINDS[type(self.learning)], **changed(self._rule())},
             "resolution": self.resolution,
             "method": self.method,
             "codec": self.codec,

@@ -21,7 +21,7 @@ from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.hulls import Hulls
 from gmmtorch.sorting import argsort, number_distinct
 
-_ENTRIES_PER_CONE = 512  # bounds the memory, in proportion to the map
+_ENTRIES_PER_CONE = {2: 64, 3: 256}  # bounds memory and the time to build, in proportion to the map
 _SPAN = 4  # buckets along an axis that a cone's search begins with, at most
 _KEY_BITS = {2: 31, 3: 21}  # of a packed bucket coordinate
 _TESTS_AT_ONCE = 1 << 13
@@ -65,7 +65,7 @@ class ConeIndex:
             every = torch.arange(len(cones.counts), device=low.device)
             cone, cell, self.side = every, torch.zeros(len(every), self.dim).to(every), max(span, finest)
         else:
-            budget = (entries_per_cone or _ENTRIES_PER_CONE) * len(cones.counts)
+            budget = (entries_per_cone or _ENTRIES_PER_CONE[self.dim]) * len(cones.counts)
             lattice = _Lattice(low - self.origin, high - self.origin, self.origin, finest)
             cone, cell, self.side = _search(hulls, lattice, budget)
         key = self._pack(cell)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,8 @@ codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
     [
         LearningRule(noise=0.02, max_origins=3, window=2),
         LearningRule(),
-        IncrementalRule(noise=0.02, mean_origins=None, max_cost=0.01, window=2),
-        IncrementalRule(max_bytes=5000, n_components=20),
+        replace(FINE, mean_origins=None, max_cost=0.01),
+        replace(FINE, window=8, max_bytes=5000, n_components=20),
     ],
     ids=["windowed", "windowed, plain", "incremental", "under budgets"],
 )
@@ -54,12 +54,12 @@ def test_settings_and_components_come_back(dim, codec, learning, tmp_path):
 
 
 def test_settings_are_written_where_they_are_not_the_defaults(tmp_path):
-    made = built([wall_scan(2)], IncrementalRule(noise=0.02), n_samples=1_000_000, compiled=True)
+    made = built([wall_scan(2)], FINE, n_samples=1_000_000, compiled=True)
     made.save(tmp_path / "m.safetensors")
     facts = read_tensors(tmp_path / "m.safetensors", storage.FILE_KIND, storage.FILE_VERSION)[1]
     assert facts.pop("n_numbered") == made.n_components
     assert facts == {
-        "learning": {"kind": "incremental", "noise": 0.02},
+        "learning": {"kind": "incremental", "noise": 0.01, "length": 0.1, "cell": 0.05, "window": 2},
         "resolution": made.resolution,
         "method": "point",
         "codec": "float",
