@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from tables import ROOT, hardware, markdown, publish
 
-from gmmtorch import GaussianMap, LearningRule, datasets
+from gmmtorch import GaussianMap, WindowedRule, datasets
 from gmmtorch.datasets import Dataset
 from gmmtorch.evaluation.contenders import methods
 from gmmtorch.evaluation.occupancy import Protocol, evaluate
@@ -46,7 +46,7 @@ def main() -> None:
     short: list[list[object]] = []
     factories = {
         **methods(GaussianMap),
-        "monte_carlo, per scan": lambda resolution: GaussianMap(LearningRule(window=1, max_origins=1)),
+        "monte_carlo, per scan": lambda resolution: GaussianMap(WindowedRule(window=1, max_origins=1)),
     }
     for name, (dataset, test_every, resolutions) in sources(options.data).items():
         if options.names and name not in options.names:

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from tables import hardware, markdown, publish
 
-from gmmtorch import GaussianMap, LearningRule, datasets
+from gmmtorch import GaussianMap, WindowedRule, datasets
 from gmmtorch.evaluation.contenders import methods
 from gmmtorch.evaluation.occupancy import Protocol, evaluate
 from gmmtorch.scan import Scan
@@ -76,7 +76,7 @@ def factory(changes: dict[str, float], dim: int):
     for whole in ("iterations", "max_origins"):
         if whole in options:
             options[whole] = int(options[whole])
-    return lambda resolution: GaussianMap(LearningRule(window=window, **options))  # type: ignore[arg-type]
+    return lambda resolution: GaussianMap(WindowedRule(window=window, **options))  # type: ignore[arg-type]
 
 
 def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.point import PointForm
 from gmmtorch.scan import Scan
@@ -29,7 +29,7 @@ RESOLUTION = 0.05
 
 def map_of(scans: list[Scan], n_components: int) -> GaussianMap:
     # Low noise makes small pieces, so that there are as many components as are asked for.
-    rule = LearningRule(n_components=n_components, max_origins=2, noise=0.005)
+    rule = WindowedRule(n_components=n_components, max_origins=2, noise=0.005)
     built = GaussianMap(window=len(scans), learning=rule)
     for scan in scans:
         built.insert(scan)

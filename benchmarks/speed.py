@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.mapping.learning import LearningRule, learn_window
+from gmmtorch.mapping.learning import WindowedRule, learn_window
 from gmmtorch.mixture import em
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence
@@ -178,7 +178,7 @@ def hall_by_stage(folder: Path, resolution: float = 0.2) -> None:
         return result
 
     scans = stage("read scans", lambda: list(dataset))
-    rule, generator = LearningRule(), torch.Generator().manual_seed(0)
+    rule, generator = WindowedRule(), torch.Generator().manual_seed(0)
     windows = [scans[i : i + 20] for i in range(0, len(scans), 20)]  # type: ignore[index,arg-type]
     stage("learn windows of 20 scans", lambda: [learn_window(w, rule, generator) for w in windows])
     built = GaussianMap()

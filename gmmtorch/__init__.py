@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
-    from gmmtorch.mapping.learning import LearningRule as LearningRule
+    from gmmtorch.mapping.incremental import IncrementalRule as IncrementalRule
+    from gmmtorch.mapping.learning import WindowedRule as WindowedRule
+    from gmmtorch.mapping.novelty import NoveltyRule as NoveltyRule
     from gmmtorch.mixture.deconvolved_mixture import DeconvolvedGaussianMixture as DeconvolvedGaussianMixture
     from gmmtorch.mixture.depth_image import fit_depth_image as fit_depth_image
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
@@ -43,13 +45,15 @@ _HOMES = {
     "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
     "GmmTorchError": "gmmtorch.errors",
     "HierarchicalGaussianMixture": "gmmtorch.mixture.hierarchical",
-    "LearningRule": "gmmtorch.mapping.learning",
+    "IncrementalRule": "gmmtorch.mapping.incremental",
+    "NoveltyRule": "gmmtorch.mapping.novelty",
     "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
     "RiemannianGaussianMixture": "gmmtorch.mixture.riemannian",
     "Scan": "gmmtorch.scan",
     "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.sliced_wasserstein",
     "VariationalGaussianMixture": "gmmtorch.mixture.variational",
     "VoxelGrid": "gmmtorch.occupancy.grid",
+    "WindowedRule": "gmmtorch.mapping.learning",
     "fit_depth_image": "gmmtorch.mixture.depth_image",
     "merge": "gmmtorch.mixture.reduction",
     "prune": "gmmtorch.mixture.pruning",
@@ -63,13 +67,15 @@ __all__ = [
     "GaussianMixture",
     "GmmTorchError",
     "HierarchicalGaussianMixture",
-    "LearningRule",
+    "IncrementalRule",
+    "NoveltyRule",
     "OccupancyGrid",
     "RiemannianGaussianMixture",
     "Scan",
     "SlicedWassersteinGaussianMixture",
     "VariationalGaussianMixture",
     "VoxelGrid",
+    "WindowedRule",
     "datasets",
     "fit_depth_image",
     "merge",

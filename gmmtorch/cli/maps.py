@@ -52,10 +52,10 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
 def _rule(options: dict[str, Any], dtype: str) -> Learning:
     """The learning rule of the options `map.*` that are left."""
     from gmmtorch.mapping.incremental import IncrementalRule
-    from gmmtorch.mapping.learning import LearningRule
+    from gmmtorch.mapping.learning import WindowedRule
     from gmmtorch.mapping.novelty import NoveltyRule
 
     if options.pop("name") != "incremental":
-        return LearningRule(**options, dtype=dtype)
+        return WindowedRule(**options, dtype=dtype)
     novelty = options.pop("novelty")
     return IncrementalRule(**options, novelty=None if novelty is None else NoveltyRule(**novelty))

@@ -36,7 +36,7 @@ from gmmtorch.evaluation.estimators import FitOptions
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.fitting import Material, OnRows, Row, row_of
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.mixture.component_count import surface_pieces
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
@@ -259,7 +259,7 @@ def map_rows(
     dataset: str, scans: Sequence[Scan], study: CountStudy, seed: int = 0, on_event: Event = ignore
 ) -> list[Row]:
     """Maps of the training scans, by flat pieces and with fixed numbers of components a window."""
-    rule = LearningRule(noise=study.noise)
+    rule = WindowedRule(noise=study.noise)
     cases = [
         ("map_flat_pieces", multiple, replace(rule, noise=multiple * study.noise))
         for multiple in study.multiples
@@ -268,7 +268,7 @@ def map_rows(
     endless = replace(rule, length=1e-9, min_points=1.0)
     cases += [("map_fixed", k, replace(endless, n_components=k)) for k in study.window_components]
 
-    def factory(learning: LearningRule) -> MapFactory:
+    def factory(learning: WindowedRule) -> MapFactory:
         return lambda resolution: GaussianMap(
             learning, window=study.window, n_samples=study.n_samples, random_state=seed
         )

@@ -19,7 +19,7 @@ from gmmtorch.mapping.answers import Answering, Answers, check_method
 from gmmtorch.mapping.codec import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
 from gmmtorch.mapping.incremental import IncrementalRule, absorb
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
@@ -27,8 +27,8 @@ from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 from gmmtorch.sorting import argsort
 
-Learning = LearningRule | IncrementalRule
-_KINDS: dict[type[Learning], str] = {LearningRule: "windowed", IncrementalRule: "incremental"}
+Learning = WindowedRule | IncrementalRule
+_KINDS: dict[type[Learning], str] = {WindowedRule: "windowed", IncrementalRule: "incremental"}
 
 _ROOM_FOR_SETTINGS = 48  # bytes: they may change once the map is built, and within its budget
 _LONGEST_WINDOW = 40  # scans that wait for one that says how many are to
@@ -46,7 +46,7 @@ class GaussianMap(nn.Module):
 
     Args:
         learning: how scans become components. `IncrementalRule` (the default) merges them as it
-            goes, under a budget if it is given one; `LearningRule` adds a mixture of every window, and
+            goes, under a budget if it is given one; `WindowedRule` adds a mixture of every window, and
             with `window=1, max_origins=1` is the thesis's map.
         window: scans learned from together, in place of the rule's own.
         resolution: side (m) of the cells that queries without a resolution ask about.

@@ -18,7 +18,7 @@ from gmmtorch.scan import Scan
 
 
 @dataclass(frozen=True)
-class LearningRule:
+class WindowedRule:
     """How a window of scans becomes components.
 
     noise: standard deviation of the range sensor (m); its square is the least variance of a
@@ -73,7 +73,7 @@ class LearningRule:
         return Components.concatenate([known, learn_window(scans, self, generator)])
 
 
-def learn_window(scans: Sequence[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
+def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Generator) -> Components:
     """Components of the returns, and flagged ones of the no-returns, of neighbouring scans.
 
     Not numbered: the owner of the map does that.
@@ -85,7 +85,7 @@ def learn_window(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gen
 
 
 def _learn(
-    clouds: list[Tensor], origins: Tensor, rule: LearningRule, generator: torch.Generator, max_range: bool
+    clouds: list[Tensor], origins: Tensor, rule: WindowedRule, generator: torch.Generator, max_range: bool
 ) -> Components:
     sizes = torch.tensor([cloud.shape[0] for cloud in clouds], device=origins.device)
     scan_index = torch.repeat_interleave(sizes)

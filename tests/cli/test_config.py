@@ -26,7 +26,7 @@ from gmmtorch.evaluation import component_count, initialization, sensor_noise
 from gmmtorch.evaluation.estimators import METHODS, FitOptions
 from gmmtorch.evaluation.occupancy import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 CONF = Path(common.conf_dir())
 COMMANDS = ["occupancy", "fit"]
@@ -178,7 +178,7 @@ def test_the_protocol_takes_what_the_options_offer_with_the_same_defaults():
 
 def test_the_learning_rule_takes_what_the_options_offer_with_the_same_defaults():
     options = asdict(schema.Map())
-    for name, value in asdict(LearningRule()).items():
+    for name, value in asdict(WindowedRule()).items():
         assert options.pop(name, value) == value, name
     made = GaussianMap()
     assert options.pop("window") == made.window

@@ -9,13 +9,13 @@ from gmmtorch.evaluation.auc_memory import Sized
 from gmmtorch.evaluation.contenders import Form, MapFactory, methods
 from gmmtorch.evaluation.occupancy import Protocol, evaluate
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
 
 
 def sized_map(n: int) -> MapFactory:
-    return Form(lambda: GaussianMap(window=5, learning=LearningRule(n_components=n)), "point")
+    return Form(lambda: GaussianMap(window=5, learning=WindowedRule(n_components=n)), "point")
 
 
 def test_every_contender_has_a_row_with_its_method_and_size():

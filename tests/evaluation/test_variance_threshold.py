@@ -9,7 +9,7 @@ from evaluation.pillar_room import room_scans
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.variance_threshold import ThresholdStudy, decided, on_lines, run
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 
 def test_shares_are_those_counted_by_hand():
@@ -61,7 +61,7 @@ def test_a_larger_threshold_decides_more_and_every_case_has_a_row():
     study = ThresholdStudy(n_components=(5, 20), variance_threshold=(0.06, 0.2), resolution=0.2, test_every=4)
 
     def new_map(n: int) -> GaussianMap:
-        return GaussianMap(window=20, learning=LearningRule(n_components=n))
+        return GaussianMap(window=20, learning=WindowedRule(n_components=n))
 
     found = run("room", room_scans(12, dim=3, n_beams=400), new_map, study, "point")
     cases = [(row["n_components"], row["variance_threshold"]) for row in found.rows]

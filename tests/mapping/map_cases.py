@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
 from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.scan import Scan
 
 FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
@@ -37,7 +37,7 @@ def open_drive(n: int, dim: int = 2) -> list[Scan]:
 def built(scans: list[Scan], learning: Learning | None = None, **options: Any) -> GaussianMap:
     """A map of these scans: windowed, exact and of few rays, unless options say otherwise."""
     options = {"resolution": RESOLUTION, "n_samples": 20_000, "codec": "float", **options}
-    made = GaussianMap(LearningRule() if learning is None else learning, **options)
+    made = GaussianMap(WindowedRule() if learning is None else learning, **options)
     for scan in scans:
         made.insert(scan)
     return made

@@ -21,7 +21,7 @@ from gmmtorch.mapping import lattice
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
 from gmmtorch.mapping.codec import decode, encode, quantized, spatial_order
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning import LearningRule, learn_window
+from gmmtorch.mapping.learning import WindowedRule, learn_window
 from gmmtorch.mapping.quantization import COUNT_ERROR, ORIGIN_STEP
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.point import point_evidence
@@ -461,7 +461,7 @@ def auc(components: Components, asked: queries.Queries, resolution: float) -> fl
 def test_a_real_map_loses_nothing(real_data):
     frames = load("depth_frames", path=real_data / "kinect", pixel_stride=8)
     train, test = split.split_indices(len(frames), 5)
-    rule = LearningRule(n_components=300, max_origins=2)
+    rule = WindowedRule(n_components=300, max_origins=2)
     learned = learn_window([frames[i] for i in train], rule, torch.Generator().manual_seed(0))
     learned = learned.rearranged(spatial_order(learned))
     ids = torch.stack([torch.zeros(len(learned)), torch.arange(len(learned))], 1).long()

@@ -17,7 +17,7 @@ from gmmtorch.mapping.codec import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.scan import Scan
 
 BUFFERS = [
@@ -37,7 +37,7 @@ BUFFERS = [
 
 
 @dims
-@pytest.mark.parametrize("learning", [LearningRule(), FINE])
+@pytest.mark.parametrize("learning", [WindowedRule(), FINE])
 def test_components_describe_the_points(dim, learning):
     scan = wall_scan(dim)
     parts = built([scan], learning).components()
@@ -67,7 +67,7 @@ def test_counts_of_sightings_add_up_to_the_support(dim, window):
 @pytest.mark.parametrize("max_origins", [1, 2, 8])
 def test_components_keep_a_few_origins_and_real_ones(max_origins):
     scans = drive(6)
-    parts = built(scans, LearningRule(max_origins=max_origins, window=6)).components()
+    parts = built(scans, WindowedRule(max_origins=max_origins, window=6)).components()
     real = {tuple(scan.origin.tolist()) for scan in scans}
     table = sightings(parts)
     assert max(len(seen) for seen in table) == min(max_origins, 6)
@@ -78,21 +78,21 @@ def test_components_keep_a_few_origins_and_real_ones(max_origins):
 def test_with_room_for_every_origin_the_counts_are_those_of_the_points():
     near, far = drive(5)[::4]
     half = Scan(far.points[::2], far.origin)
-    parts = built([near, half], LearningRule(max_origins=2, window=2)).components()
+    parts = built([near, half], WindowedRule(max_origins=2, window=2)).components()
     for seen in sightings(parts):
         counts = [seen[tuple(s.origin.tolist())] for s in (near, half)]
         assert counts[0] / counts[1] == pytest.approx(2, rel=0.15)
 
 
 def test_the_thesis_map_has_one_origin_a_component_that_of_its_scan():
-    scans, rule = drive(3), LearningRule(max_origins=1, window=1)
+    scans, rule = drive(3), WindowedRule(max_origins=1, window=1)
     made = built(scans, rule)
     one_by_one = [built([scan], rule) for scan in scans]
     assert all(len(seen) == 1 for seen in sightings(made.components()))
     assert torch.equal(made.means, torch.cat([m.means for m in one_by_one]))
 
 
-@pytest.mark.parametrize("learning", [LearningRule(), FINE])
+@pytest.mark.parametrize("learning", [WindowedRule(), FINE])
 def test_a_window_is_closed_when_it_is_full(learning):
     made = built([], learning, window=3)
     sizes = []
@@ -104,14 +104,14 @@ def test_a_window_is_closed_when_it_is_full(learning):
     assert made.n_components > sizes[6]  # the unfinished window counts at once
 
 
-@pytest.mark.parametrize("learning", [LearningRule(), FINE])
+@pytest.mark.parametrize("learning", [WindowedRule(), FINE])
 def test_each_window_is_learned_alone(learning):
     scans = drive(6)
     both, first, second = (built(part, learning, window=3) for part in (scans, scans[:3], scans[3:]))
     assert torch.equal(both.means, torch.cat([first.means, second.means]))
     torch.testing.assert_close(both.covariances, torch.cat([first.covariances, second.covariances]))
     # The origins of the incremental map are limited over all of it.
-    if isinstance(learning, LearningRule):
+    if isinstance(learning, WindowedRule):
         assert sightings(both.components()) == sightings(first.components()) + sightings(second.components())
 
 
@@ -121,7 +121,7 @@ def test_ids_name_the_robot_and_count_on():
     assert ids[:, 1].tolist() == list(range(len(ids)))
 
 
-@pytest.mark.parametrize("learning", [LearningRule(), FINE])
+@pytest.mark.parametrize("learning", [WindowedRule(), FINE])
 def test_beams_without_return_become_flagged_components_of_their_own(learning):
     parts = built([wall_scan(2), open_scan(2)], learning).components()
     support = float(parts.support[parts.max_range].sum())
@@ -131,12 +131,12 @@ def test_beams_without_return_become_flagged_components_of_their_own(learning):
 
 
 def test_a_bound_on_the_components_of_a_window_is_kept():
-    assert built(drive(4), LearningRule(n_components=5, length=0.05), window=2).n_components <= 10
-    assert built(drive(4), LearningRule(length=0.05), window=2).n_components > 20
+    assert built(drive(4), WindowedRule(n_components=5, length=0.05), window=2).n_components <= 10
+    assert built(drive(4), WindowedRule(length=0.05), window=2).n_components > 20
 
 
 def test_the_seed_decides_which_origins_are_kept():
-    rule = LearningRule(max_origins=1, window=6)
+    rule = WindowedRule(max_origins=1, window=6)
     first, again, other = (built(drive(6), rule, random_state=seed) for seed in (0, 0, 1))
     assert torch.equal(first.seen_from, again.seen_from)
     assert not torch.equal(first.seen_from, other.seen_from)
@@ -188,18 +188,18 @@ def test_bad_settings_are_named_when_the_map_is_made(name, value):
 @pytest.mark.parametrize("value", [0, -1])
 def test_bad_learning_rules_are_named(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
-        LearningRule(**{name: value})
+        WindowedRule(**{name: value})
 
 
 @pytest.mark.parametrize("name", ["noise", "length", "min_points"])
 def test_learning_rules_that_are_no_numbers_are_named(name):
     with pytest.raises(InvalidArgumentError, match=name):
-        LearningRule(**{name: math.nan})
+        WindowedRule(**{name: math.nan})
 
 
 def test_the_window_given_is_the_rules():
     assert GaussianMap(window=3).learning == IncrementalRule(window=3)
-    assert GaussianMap(LearningRule(noise=0.02), window=3).learning == LearningRule(noise=0.02, window=3)
+    assert GaussianMap(WindowedRule(noise=0.02), window=3).learning == WindowedRule(noise=0.02, window=3)
 
 
 # -- what is inserted ------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_arrays_that_are_used_again_do_not_change_what_was_inserted():
         assert theta[1] == 0.5
 
 
-@pytest.mark.parametrize("learning", [LearningRule(window=2), IncrementalRule(window=2)])
+@pytest.mark.parametrize("learning", [WindowedRule(window=2), IncrementalRule(window=2)])
 def test_a_scan_that_cannot_be_learned_from_is_refused_and_the_map_goes_on_without_it(learning):
     scans = drive(3)
     made = built(scans[:1], learning, codec="quantized")

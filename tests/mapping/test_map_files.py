@@ -20,7 +20,7 @@ from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping import storage
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
 
@@ -33,8 +33,8 @@ codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
 @pytest.mark.parametrize(
     "learning",
     [
-        LearningRule(noise=0.02, max_origins=3, window=2),
-        LearningRule(),
+        WindowedRule(noise=0.02, max_origins=3, window=2),
+        WindowedRule(),
         replace(FINE, mean_origins=None, max_cost=0.01),
         replace(FINE, window=8, max_bytes=5000, n_components=20),
     ],

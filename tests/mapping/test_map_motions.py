@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 
 @dims
@@ -79,7 +79,7 @@ def correction(dim: int) -> Tensor:
 
 @dims
 def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
-    rule = LearningRule(window=1, dtype="float64")
+    rule = WindowedRule(window=1, dtype="float64")
     scans, matrix = [drive(1, dim)[0], *open_drive(3, dim)[1:]], correction(dim)
     made = built([], rule)
     of_window = []
@@ -143,7 +143,7 @@ def test_a_motion_far_away_keeps_its_place():
     torch.testing.assert_close(made.means, move(matrix, parts["means"]), rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("learning", [LearningRule(window=20), FINE])
+@pytest.mark.parametrize("learning", [WindowedRule(window=20), FINE])
 def test_moving_closes_the_unfinished_window_and_learning_goes_on(learning):
     made = built(drive(3), learning)
     ids = made.components().ids

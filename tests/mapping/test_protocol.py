@@ -16,7 +16,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -28,7 +28,7 @@ class TestGaussianMapOneOrigin(OccupancyMapContract):
     turn_tolerance = 0.05
 
     def make(self) -> GaussianMap:
-        return GaussianMap(LearningRule(window=1, max_origins=1), resolution=RESOLUTION, n_samples=20_000)
+        return GaussianMap(WindowedRule(window=1, max_origins=1), resolution=RESOLUTION, n_samples=20_000)
 
 
 class TestGaussianMapWindowed(OccupancyMapContract):
@@ -36,7 +36,7 @@ class TestGaussianMapWindowed(OccupancyMapContract):
     turn_tolerance = 0.05
 
     def make(self) -> GaussianMap:
-        return GaussianMap(LearningRule(), resolution=RESOLUTION, n_samples=20_000)
+        return GaussianMap(WindowedRule(), resolution=RESOLUTION, n_samples=20_000)
 
 
 class TestGaussianMapIncremental(OccupancyMapContract):

@@ -18,7 +18,7 @@ from gmmtorch.mapping import storage
 from gmmtorch.mapping.codec import encode, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import LearningRule
+from gmmtorch.mapping.learning import WindowedRule
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 
@@ -115,7 +115,7 @@ def test_files_of_version_1_load(dim, tmp_path):
     assert loaded.n_components == len(components)
     assert loaded.resolution == 0.3
     assert loaded.method == "monte_carlo"
-    assert loaded.learning == LearningRule(noise=0.02, window=4)
+    assert loaded.learning == WindowedRule(noise=0.02, window=4)
 
 
 DAMAGE = {
