@@ -61,7 +61,7 @@ class Map:
     sampling: str = "sobol"  # or stratified, plain
     prior: float = 1.0  # N_p of (3.9)
     cutoff: float = 3.0  # standard deviations beyond which a component is taken to end
-    hit_length: float | None = 1.0  # metres, of the point form; null: the side of a cell
+    hit_length: float | None = 1.0  # metres; hits weigh as if cells were so deep; null: the side of a cell
     codec: str = "quantized"  # or float: every number as it is
 
 

@@ -26,9 +26,9 @@ def build_by_scan(empty: GaussianMap, scans: Sequence[Scan]) -> list[Tensor]:
 
     Raises `InvalidArgumentError` for a map whose components are of several scans (window above 1).
     """
-    if empty.window != 1:
+    if empty.learning.window != 1:
         raise InvalidArgumentError(
-            f"window={empty.window}: a scan's pose can be put right only where components are of one scan; "
+            f"window={empty.learning.window}: a scan's pose can be put right only where components are of one scan; "
             "take map=per_scan."
         )
     born = []

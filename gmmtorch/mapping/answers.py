@@ -31,7 +31,9 @@ class Answering:
 
     prior: N_p of (3.9), counts given to either outcome before any evidence.
     cutoff: standard deviations beyond which a component is taken to end.
-    hit_length: ℓ (m) of the point form, see `PointForm`; None: the side of the cube.
+    hit_length: ℓ (m): the occupancy of a cell of side h weighs its hits by ℓ/h, as if cells were so deep.
+        Of a thin surface a ray ends in one cell of many that it would have passed: this puts θ on the
+        right side of ½ and hardly changes the order. None: h, so that hits are counts.
     n_samples: Monte Carlo rays drawn from the whole map.
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
@@ -87,19 +89,26 @@ class Answers:
         if len(self.cones.counts) == 0:
             return torch.full_like(points[:, 0], 0.5)
         if method == "point":
-            evidence = self._form(resolution)(points, self.options.hit_length)
-            return occupancy_probability(*evidence, self.options.prior)
+            return self._probability(self._form(resolution)(points), resolution)
         if method == "monte_carlo":
-            return self._lattice(resolution).lookup(points, self.options.prior)
+            return self._probability(self._lattice(resolution).evidence_at(points), resolution)
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
         evidence = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
         theta = torch.full_like(points[:, 0], 0.5)
-        theta[finite] = occupancy_probability(*evidence, self.options.prior)[cell]
+        theta[finite] = self._probability(evidence, resolution)[cell]
         return theta
 
+    def _probability(self, evidence: tuple[Tensor, Tensor], resolution: float) -> Tensor:
+        """θ (M,) of hits (M,) and misses (M,)."""
+        hits, misses = evidence
+        length = self.options.hit_length
+        return occupancy_probability(
+            hits if length is None else hits * (length / resolution), misses, self.options.prior
+        )
+
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
-        """Hits and misses of every cell of a grid."""
+        """Hits and misses of every cell of a grid: counts, whatever `hit_length` is."""
         check_method(method)
         evidence = Evidence.empty(grid, self.cones.means.device)
         if len(self.cones.counts) == 0:
@@ -111,7 +120,7 @@ class Answers:
             return flux_evidence(self.cones, grid, self.options.cutoff)
         centers = grid.centers(self.cones.means.device)
         if method == "point":
-            found = self._form(grid.resolution)(centers, self.options.hit_length)
+            found = self._form(grid.resolution)(centers)
         else:
             half = 0.5 * grid.resolution
             found = self._in_boxes(centers - half, centers + half, grid.resolution, method)

@@ -359,7 +359,7 @@ class GaussianMap(nn.Module):
         components, facts = storage.from_file(path)
         try:
             n_numbered = check_whole("n_numbered", facts.pop("n_numbered"), 0)
-            made = cls(_rule(**facts.pop("learning")), **facts)
+            made = cls(_read_rule(**facts.pop("learning")), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
         made._set(components)
@@ -374,7 +374,7 @@ def changed(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
     return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
 
 
-def _rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> Learning:
+def _read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> Learning:
     """The rule that a file holds the kind and the changed options of."""
     if novelty is not None:
         options["novelty"] = NoveltyRule(**novelty)

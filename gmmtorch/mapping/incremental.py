@@ -86,9 +86,9 @@ class IncrementalRule:
         per_scan = sum(map(len, ranges)) / len(ranges)
         return replace(
             self,
-            noise=r * scale.noise if self.noise is None else self.noise,
-            length=r * scale.length if self.length is None else self.length,
-            cell=r * scale.cell if self.cell is None else self.cell,
+            noise=_rounded(r * scale.noise) if self.noise is None else self.noise,
+            length=_rounded(r * scale.length) if self.length is None else self.length,
+            cell=_rounded(r * scale.cell) if self.cell is None else self.cell,
             window=max(8, min(40, round(scale.points / per_scan))) if self.window is None else self.window,
         )
 
@@ -97,6 +97,11 @@ class IncrementalRule:
         if self.noise is None or self.length is None or self.cell is None:
             raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
         return CellRule(self.noise, self.length, self.cell, self.window_components, self.iterations)
+
+
+def _rounded(length: float) -> float:
+    """To three digits, which take few bytes in a file."""
+    return float(f"{length:.3g}")
 
 
 class _Scale(NamedTuple):

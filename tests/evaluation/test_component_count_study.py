@@ -114,7 +114,7 @@ def test_modes_are_counted_at_a_share_of_the_size_of_the_cloud(generator):
 
 def test_a_map_row_is_of_the_map_that_the_rule_learns(rows, scans):
     first = of(rows, "map_flat_pieces")[0]
-    built = GaussianMap(5, component_count.WindowedRule(noise=0.02), n_samples=20_000)
+    built = GaussianMap(component_count.WindowedRule(noise=0.02, window=5), n_samples=20_000)
     for number, scan in enumerate(scans):
         if number % 4:
             built.insert(scan)

@@ -14,13 +14,14 @@ from gmmtorch.evaluation.occupancy import Protocol
 from gmmtorch.evaluation.pose_correction import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.evaluation.split import perturb_poses, pose_perturbations
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.scan import Scan
 
 NOISE = (0.3, 0.1)
 
 
 def per_scan() -> GaussianMap:
-    return GaussianMap(window=1, n_samples=20_000)
+    return GaussianMap(WindowedRule(window=1), n_samples=20_000)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +103,7 @@ def test_a_scan_without_points_has_no_components_to_move():
 
 
 def test_windows_of_several_scans_cannot_be_put_right():
-    with pytest.raises(InvalidArgumentError, match=r"window=20.*map=per_scan"):
+    with pytest.raises(InvalidArgumentError, match=r"window=None.*map=per_scan"):
         build_by_scan(GaussianMap(), room_scans(2))
 
 
