@@ -28,8 +28,8 @@ def build_by_scan(empty: GaussianMap, scans: Sequence[Scan]) -> list[Tensor]:
     """
     if empty.learning.window != 1:
         raise InvalidArgumentError(
-            f"window={empty.learning.window}: a scan's pose can be put right only where components are of one scan; "
-            "take map=per_scan."
+            f"window={empty.learning.window}: a scan's pose can be put right only where components are of "
+            "one scan; take map=per_scan."
         )
     born = []
     for scan in scans:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from gmmtorch.mapping import storage
 from gmmtorch.mapping.answers import Answering, Answers, check_method
 from gmmtorch.mapping.codec import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.incremental import IncrementalRule, absorb
+from gmmtorch.mapping.incremental import IncrementalRule, absorb, absorb_depth, depth_scan
 from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.occupancy.evidence import Evidence
@@ -166,6 +167,44 @@ class GaussianMap(nn.Module):
             except GmmTorchError:
                 self._pending.pop()  # what cannot be learned from is as if it had not been given
                 raise
+
+    def insert_depth(
+        self,
+        frames: Sequence[tuple[Tensor, Tensor]],
+        intrinsics: Tensor,
+        pixel_stride: int = 4,
+        max_range: float = math.inf,
+    ) -> None:
+        """Learn from depth images, for good: a quick way that only an `IncrementalRule` has.
+
+        Args:
+            frames: depth (H, W), metres along the axis, and pose (4, 4), world ← camera, of each.
+            intrinsics: (3, 3).
+            pixel_stride: every so manieth pixel of every so manieth row stands for those left out.
+            max_range: what is at or beyond it is left out, as is what is zero or not finite.
+        """
+        if not isinstance(self.learning, IncrementalRule):
+            raise InvalidArgumentError(
+                "insert_depth needs a map with an IncrementalRule; insert scans instead."
+            )
+        if self.dim not in (None, 3):
+            raise InvalidArgumentError(
+                f"depth images are 3-dimensional, but the map is {self.dim}-dimensional."
+            )
+        if not frames:
+            return
+        if self.dim is None:
+            self._set(Components.empty(3, frames[0][0].device))
+        if self._pending:
+            self._commit(self._with_pending())
+        self.learning = self.learning.fitted([depth_scan(*frames[0], intrinsics, pixel_stride, max_range)])
+        self._commit(
+            self._numbered(
+                absorb_depth(
+                    self._committed(), frames, intrinsics, self.learning, pixel_stride, max_range, self._size
+                )
+            )
+        )
 
     def _rule(self) -> Learning:
         """The rule, with what it takes from the first scans."""

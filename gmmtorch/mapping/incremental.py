@@ -147,16 +147,17 @@ def absorb_depth(
     leaves out. What is beyond `max_range` metres along the axis, zero or not finite, is left out.
     """
     if frames:
-        rule = rule.fitted([_seen(*frames[0], intrinsics, pixel_stride, max_range)])
+        rule = rule.fitted([depth_scan(*frames[0], intrinsics, pixel_stride, max_range)])
     for begin in range(0, len(frames), rule.window or len(frames)):
         scans = [
-            _seen(*frame, intrinsics, pixel_stride, max_range) for frame in frames[begin:][: rule.window]
+            depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames[begin:][: rule.window]
         ]
         components = _absorb_window(components, scans, rule, size, float(pixel_stride**2))
     return components
 
 
-def _seen(depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: int, max_range: float) -> Scan:
+def depth_scan(depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: int, max_range: float) -> Scan:
+    """The scan of a depth image, of every so manieth pixel; see `absorb_depth`."""
     rotation, translation = check_rigid(pose, 3)
     taken = depth[::pixel_stride, ::pixel_stride]
     valid = torch.isfinite(taken) & (taken < max_range)

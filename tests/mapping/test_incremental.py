@@ -19,7 +19,9 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.mapping.compaction import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.incremental import IncrementalRule, absorb, absorb_depth
+from gmmtorch.mapping.learning import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.point import point_evidence
@@ -233,6 +235,26 @@ def test_far_pixels_are_left_out_and_an_empty_image_is_nothing():
     assert float(near.support.sum()) == pytest.approx(int((scan_points[:, 2] < 2.3).sum()))
     blank = [(torch.zeros(48, 64), torch.eye(4, dtype=torch.float64))]
     assert len(absorb_depth(Components.empty(3), blank, INTRINSICS, RULE)) == 0
+
+
+def test_a_map_learns_depth_images_as_its_rule_does():
+    made, frames = GaussianMap(RULE, codec="float"), depth_frames()
+    made.insert_depth(frames, INTRINSICS, pixel_stride=2)
+    expected = absorb_depth(Components.empty(3), frames, INTRINSICS, RULE, pixel_stride=2)
+    found = made.components()
+    assert sorted(found.support.tolist()) == sorted(expected.support.tolist())
+    assert sorted(found.ids[:, 1].tolist()) == list(range(len(found)))
+    small = GaussianMap(replace(RULE, max_bytes=900))
+    small.insert(wall_scan(3))
+    small.insert_depth(frames, INTRINSICS)
+    assert small.nbytes <= 900 < made.nbytes
+    small.insert_depth([], INTRINSICS)
+    with pytest.raises(InvalidArgumentError, match="IncrementalRule"):
+        GaussianMap(WindowedRule()).insert_depth(frames, INTRINSICS)
+    flat = GaussianMap()
+    flat.insert(wall_scan(2))
+    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
+        flat.insert_depth(frames, INTRINSICS)
 
 
 # -- bad input and real data ----------------------------------------------------------------------
