@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.contenders import MapFactory
     from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
+    from gmmtorch.mapping.novelty import NoveltyRule
 
 _ANSWERING = ("n_samples", "sampling", "prior", "cutoff", "hit_length", "codec")
 
@@ -34,13 +37,31 @@ def known_methods(config: DictConfig) -> dict[str, MapFactory]:
     return contenders.methods(map_factory(config), options, **limits(config))
 
 
+def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> None:
+    """Make an empty map of each: a bad option must not wait for the maps before it to be built."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    for name, factory in factories.items():
+        try:
+            factory(resolution)
+        except TypeError as error:  # text, say, where a baseline compares numbers
+            raise InvalidArgumentError(
+                f"method_options.{name} has a value of the wrong type: {error}."
+            ) from error
+
+
 def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]:
     """Makes empty maps with the options `map.*`, of which `changes` replace some."""
+    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mixture.em import SOFTMAX_DTYPES
 
+    dtype = config.runtime.dtype
+    if dtype not in SOFTMAX_DTYPES:  # of an incremental map it is checked alone
+        raise InvalidArgumentError(f"runtime.dtype={dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
     options = {**common.as_options(config.map), **changes}
     answering = {key: options.pop(key) for key in _ANSWERING}
-    rule = _rule(options, config.runtime.dtype)
+    rule = _rule(options, dtype)
 
     def make() -> GaussianMap:
         return GaussianMap(rule, **answering, **limits(config))
@@ -53,9 +74,27 @@ def _rule(options: dict[str, Any], dtype: str) -> Learning:
     """The learning rule of the options `map.*` that are left."""
     from gmmtorch.mapping.incremental import IncrementalRule
     from gmmtorch.mapping.learning import WindowedRule
-    from gmmtorch.mapping.novelty import NoveltyRule
 
     if options.pop("name") != "incremental":
         return WindowedRule(**options, dtype=dtype)
     novelty = options.pop("novelty")
-    return IncrementalRule(**options, novelty=None if novelty is None else NoveltyRule(**novelty))
+    return IncrementalRule(**options, novelty=None if novelty is None else _novelty(novelty))
+
+
+def _novelty(options: Any) -> NoveltyRule:
+    """The rule of the options `map.novelty`, whose names and types no schema has checked."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.mapping.novelty import NoveltyRule
+
+    chosen: DictConfig = OmegaConf.structured(NoveltyRule)
+    OmegaConf.set_readonly(chosen, False)  # as the dataclass is
+    try:
+        if not isinstance(options, dict):
+            raise TypeError("these are no options")
+        chosen.merge_with(options)
+        return NoveltyRule(**common.as_options(chosen))
+    except (OmegaConfBaseException, TypeError) as error:
+        raise InvalidArgumentError(
+            f"map.novelty={options}: {str(error).splitlines()[0]}; it takes "
+            f"{{{', '.join(item.name for item in fields(NoveltyRule))}}}, or null."
+        ) from error

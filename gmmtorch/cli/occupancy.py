@@ -44,10 +44,13 @@ def run(config: DictConfig) -> float | None:
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[dict[str, Any]]:
     """A row for each method, share kept and resolution."""
+    from gmmtorch.errors import check_whole
     from gmmtorch.evaluation import contenders, occupancy
 
+    check_whole("report.magnify", config.report.magnify, 0)
     factories = contenders.choose(list(config.method), maps.known_methods(config))
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
+    maps.check_factories(factories, protocol.resolution[0])
     dataset = common.open_dataset(config.dataset)
     scans = common.read_scans(dataset, range(len(dataset)), device, on_event)
     outcome = occupancy.evaluate(
@@ -70,11 +73,7 @@ def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: P
     if not (config.report.figures or config.report.tensorboard):
         return
     figures = _figures(config, scans, outcome)
-    if config.report.figures:
-        from gmmtorch.report.save import save_figure
-
-        for name, figure in figures.items():
-            save_figure(figure, folder / f"{name}.png")
+    common.save_figures(config, figures, folder)
     if config.report.tensorboard:
         _write_board(config, scans, outcome, figures, folder / "tensorboard")
 

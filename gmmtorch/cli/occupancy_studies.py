@@ -77,13 +77,17 @@ def _scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[
 
 
 def _auc_memory(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
-    """Every method of the run at its one size, and those of `study.sizes` at each of theirs."""
+    """Our map and BGK's at each of their sizes, and `study.others` at the one they have."""
+    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.evaluation import auc_memory, contenders, occupancy
     from gmmtorch.evaluation.auc_memory import Sized
+    from gmmtorch.mapping.answers import check_method
     from gmmtorch.report import auc_memory as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     options = _options(config)
+    for form in options["forms"]:
+        check_method(form)
     found = [
         Sized(form, n, contenders.Form(maps.map_factory(config, n_components=n), form))
         for form in options["forms"]
@@ -96,6 +100,12 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, keep: Keep) ->
     ]
     others = contenders.choose(options["others"], maps.known_methods(config)) if options["others"] else {}
     found += [Sized(name, None, factory) for name, factory in others.items()]
+    if not found:
+        raise InvalidArgumentError(
+            "study.n_components, .bgk_points and .others leave no map; give one of them."
+        )
+    for sized in found:
+        maps.check_factories({sized.method: sized.factory}, protocol.resolution[0])
     name, scans = _scans(config, device, on_event)
     rows = auc_memory.run(name, scans, found, protocol, config.seed, on_event, keep)
     table = "method size resolution auc auc_low auc_high brier nbytes build_seconds query_seconds"
@@ -107,10 +117,12 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
     import torch
 
     from gmmtorch.evaluation import variance_threshold
+    from gmmtorch.mapping.answers import check_method
     from gmmtorch.report import variance_threshold as report
 
     options = _options(config)
     method = options.pop("method")
+    check_method(method)
     study = variance_threshold.ThresholdStudy(**options)
     name, scans = _scans(config, device, on_event)
 
@@ -149,14 +161,22 @@ def _approximation_error(config: DictConfig, device: str, on_event: Event, keep:
 
 def _pose_correction(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
     """Maps of perturbed poses, before and after the poses are put right."""
+    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.evaluation import occupancy, pose_correction
+    from gmmtorch.mapping.answers import METHODS, check_method
     from gmmtorch.report import pose_correction as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
-    name, scans = _scans(config, device, on_event)
-    new_map = maps.map_factory(config)
     methods = _options(config)["methods"]
-    rows = pose_correction.evaluate_correction(name, scans, new_map, protocol, methods, config.seed)
+    if not methods:
+        raise InvalidArgumentError(f"study.methods is empty; name at least one of {', '.join(METHODS)}.")
+    for method in methods:
+        check_method(method)
+    new_map = maps.map_factory(config)
+    name, scans = _scans(config, device, on_event)
+    rows = pose_correction.evaluate_correction(
+        name, scans, new_map, protocol, methods, config.seed, on_event, keep
+    )
     table = "method resolution auc auc_corrected auc_clean n_components nbytes"
     return Found(rows, report.figures(rows), table, f"{name}: {len(scans)} scans")
 

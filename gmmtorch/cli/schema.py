@@ -221,6 +221,10 @@ class Report:
     progress: bool = True
     figures: bool = True
     tensorboard: bool = True
+
+
+@dataclass
+class OccupancyReport(Report):
     magnify: int = 0  # regions of a 2D map that are shown close up, besides
 
 
@@ -242,7 +246,7 @@ class Occupancy:
     seed: int = 0
     study: Any = None
     evaluation: Evaluation = field(default_factory=Evaluation)
-    report: Report = field(default_factory=Report)
+    report: OccupancyReport = field(default_factory=OccupancyReport)
     runtime: Runtime = field(default_factory=Runtime)
 
 

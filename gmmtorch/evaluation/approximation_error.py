@@ -39,6 +39,7 @@ from gmmtorch.occupancy.evidence import Evidence, check_prior, occupancy_probabi
 from gmmtorch.occupancy.flux import flux_evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.monte_carlo import Sampling, sample_rays
+from gmmtorch.occupancy.panels import check_tolerance
 
 Row = dict[str, Any]
 OnRows = Callable[[list[Row]], object]
@@ -80,6 +81,10 @@ class Options:
         for dim in self.dims:
             if dim not in _DATASETS:
                 raise InvalidArgumentError(f"study.dims={dim} must be 2 or 3.")
+        for n in self.n_rays:
+            check_whole("study.n_rays", n, 1)
+        for tolerance in self.tolerance:
+            check_tolerance(tolerance)
         if not 0 < self.support < math.inf:
             raise InvalidArgumentError(f"study.support={self.support} must be a number of rays above zero.")
         check_prior(self.prior)

@@ -72,6 +72,10 @@ def methods(
                 f"method_options.{name} is not known; known are {', '.join(_BASELINES)}. Options of our own "
                 "map are map.*."
             )
+        if not isinstance(options[name], Mapping):
+            raise InvalidArgumentError(
+                f"method_options.{name}={options[name]!r} must be options, such as {{NAME: VALUE}}."
+            )
     return {
         **{form: Form(new_map, form) for form in METHODS},
         **{name: baseline(name, limits, **options.get(name, {})) for name in _BASELINES},

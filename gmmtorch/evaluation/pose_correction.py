@@ -67,6 +67,7 @@ def evaluate_correction(
     methods: Sequence[str] = ("point",),
     seed: int = 0,
     on_event: Event = ignore,
+    on_rows: Callable[[list[dict[str, Any]]], object] = lambda rows: None,
 ) -> list[dict[str, Any]]:
     """The test of `evaluation.occupancy`, of maps learned from perturbed poses, before and after correction.
 
@@ -78,9 +79,10 @@ def evaluate_correction(
         methods: forms of evidence that the maps are asked for.
         seed: of the perturbations, the thinning and the free points.
         on_event: told of progress.
+        on_rows: given all rows so far, whenever there are more.
 
     Returns a row for each share kept, method and resolution: `dataset, method, removal, kept,
-    resolution, pose_noise_m, pose_noise_rad, n_components`, and the areas `auc` (of the map as it was
+    resolution, pose_noise_m, pose_noise_rad, n_components, nbytes`, and the areas `auc` (of the map as it was
     learned from the wrong poses), `auc_corrected` and `auc_clean` (of one learned from right ones).
     """
     train_index, test_index = split.split_indices(len(scans), protocol.test_every)
@@ -97,7 +99,7 @@ def evaluate_correction(
         build_by_scan(right, shown)
         on_event("pose correction", 1, 3)
         born = build_by_scan(wrong, moved)
-        n_components = wrong.n_components
+        n_components, nbytes = wrong.n_components, wrong.nbytes
         cases = [(method, resolution) for method in methods for resolution in protocol.resolution]
         clean, before = (
             {case: _auc(built, *case, asked[case[1]]) for case in cases} for built in (right, wrong)
@@ -115,11 +117,13 @@ def evaluate_correction(
                     "pose_noise_m": float(protocol.pose_noise[0]),
                     "pose_noise_rad": float(protocol.pose_noise[1]),
                     "n_components": n_components,
+                    "nbytes": nbytes,
                     "auc": before[method, resolution],
                     "auc_corrected": _auc(wrong, method, resolution, asked[resolution]),
                     "auc_clean": clean[method, resolution],
                 }
             )
+        on_rows(rows)
         on_event("pose correction", 3, 3)
     return rows
 

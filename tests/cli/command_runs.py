@@ -51,6 +51,21 @@ class Finished:
         return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
 
 
+def succeeded(done: Finished) -> Finished:
+    assert done.status == 0, done.stderr
+    return done
+
+
+def refused(done: Finished) -> str:
+    """The one line that a command ends with when something is wrong."""
+    assert done.status == 1
+    assert not (done.folder / "results.json").exists()
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr[-2000:]
+    assert lines[0].startswith("gmmtorch: error: ")
+    return lines[0]
+
+
 @contextlib.contextmanager
 def as_it_was() -> Iterator[None]:
     """Hydra's own state and the loggers that it sets up are put back."""

@@ -11,11 +11,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_runs import CHECKOUT, QUIET, TINY, Finished, environment, run_here, run_script, timeless
+from command_runs import (
+    CHECKOUT,
+    QUIET,
+    TINY,
+    Finished,
+    environment,
+    refused,
+    run_here,
+    run_script,
+    succeeded,
+    timeless,
+)
 
 import gmmtorch
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
 Run = Callable[..., Finished]
@@ -38,11 +50,6 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
         return run_here(monkeypatch, command, tmp_path / name, *TINY[command], *QUIET, *options)
 
     return run_command
-
-
-def succeeded(done: Finished) -> Finished:
-    assert done.status == 0, done.stderr
-    return done
 
 
 # -- a whole run, from the checkout's scripts -----------------------------------------------------
@@ -73,7 +80,8 @@ def test_results_are_as_the_contract_says(whole_run):
     assert results["command"] == command
     assert results["version"] == gmmtorch.__version__
     assert results["seed"] == results["config"]["seed"] == 0
-    assert results["config"]["report"] == {"progress": True, "figures": True, "tensorboard": True}
+    extra = {"magnify": 0} if command == "occupancy" else {}
+    assert results["config"]["report"] == {"progress": True, "figures": True, "tensorboard": True, **extra}
     fields = OCCUPANCY_FIELDS if command == "occupancy" else FIT_FIELDS
     assert len(results["rows"]) == 2
     for row in results["rows"]:
@@ -84,23 +92,16 @@ def test_results_are_as_the_contract_says(whole_run):
 def test_components_are_null_for_grids_only(occupancy_run):
     rows = {row["method"]: row for row in occupancy_run.results()["rows"]}
     assert rows["occupancy_grid"]["n_components"] is None
-    assert rows["monte_carlo"]["n_components"] > 0
+    assert rows["point"]["n_components"] > 0
 
 
 def test_the_run_directory_holds_results_figures_events_and_configuration(whole_run):
     command, done = whole_run
     files = done.files()
     assert {"results.json", ".hydra/config.yaml", ".hydra/overrides.yaml", ".hydra/hydra.yaml"} <= files
-    expected = {
-        "occupancy": {
-            "auc_against_kept.png",
-            "map_0.1m.png",
-            "mixture.png",
-            "reliability_0.1m.png",
-            "roc_0.1m.png",
-        },  # fmt: skip
-        "fit": {"comparison.png", "convergence.png", "mixture_em.png", "mixture_scikit_learn.png"},
-    }[command]
+    of_occupancy = "auc_against_kept map_0.1m mixture reliability_0.1m roc_0.1m"
+    of_fit = "comparison convergence mixture_em mixture_scikit_learn"
+    expected = {f"{name}.png" for name in (of_occupancy if command == "occupancy" else of_fit).split()}
     assert {name for name in files if name.endswith(".png")} == expected
     for name in expected:
         assert (done.folder / name).read_bytes().startswith(b"\x89PNG")
@@ -133,7 +134,7 @@ def test_progress_goes_to_standard_error_and_leaves_no_trace(whole_run):
 def test_the_event_files_hold_scalars_figures_and_hyperparameters(occupancy_run, fit_run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    for done, method in ((occupancy_run, "monte_carlo"), (fit_run, "em")):
+    for done, method in ((occupancy_run, "point"), (fit_run, "em")):
         events = EventAccumulator(str(done.folder / "tensorboard")).Reload()
         tags = events.Tags()
         assert any(method in tag for tag in tags["scalars"])
@@ -218,9 +219,22 @@ def test_a_log_of_ones_own_can_be_mapped(monkeypatch, tmp_path):
     assert {row["dataset"] for row in done.results()["rows"]} == {"own"}
 
 
-@pytest.mark.parametrize(("name", "window", "max_origins"), [("per_scan", 1, 1), ("windowed", 20, 8)])
-def test_the_map_is_made_with_the_options_of_its_group(name, window, max_origins, run, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "more", "expected"),
+    [
+        (
+            "per_scan",
+            "map.min_points=4",
+            {"window": 1, "max_origins": 1, "min_points": 4, "dtype": "float64"},
+        ),
+        ("windowed", "map.max_cells=500", {"window": 20, "max_origins": 8, "max_cells": 500}),
+        ("incremental", "map.window=3 map.n_components=30", {"window": 3, "n_components": 30}),
+        ("incremental", "+map.novelty={threshold:2}", {"novelty": NoveltyRule(threshold=2)}),
+    ],
+)
+def test_the_map_is_made_with_the_options_of_its_group(name, more, expected, run, tmp_path):
     options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
+    options += ["map.cutoff=4", "map.hit_length=null", "map.codec=float", *more.split()]
     succeeded(
         run(
             "occupancy",
@@ -231,10 +245,11 @@ def test_the_map_is_made_with_the_options_of_its_group(name, window, max_origins
         )
     )
     made = GaussianMap.load(tmp_path / "maps" / "monte_carlo_1_0.1.safetensors")
-    assert (made.window, made.learning.max_origins) == (window, max_origins)
-    assert (made.learning.noise, made.learning.dtype) == (0.02, "float64")
+    assert made.learning.noise == 0.02
+    assert {option: getattr(made.learning, option) for option in expected} == expected
     how = made.answering
     assert (how.n_samples, how.sampling, how.prior, how.random_state) == (20_000, "plain", 0.5, 7)
+    assert (how.cutoff, how.hit_length, made.codec) == (4, None, "float")
 
 
 def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
@@ -357,16 +372,6 @@ def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
 # -- failing --------------------------------------------------------------------------------------
 
 
-def refused(done: Finished) -> str:
-    """The one line that a command ends with when something is wrong."""
-    assert done.status == 1
-    assert not (done.folder / "results.json").exists()
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1, done.stderr[-2000:]
-    assert lines[0].startswith("gmmtorch: error: ")
-    return lines[0]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -383,6 +388,19 @@ def refused(done: Finished) -> str:
         ("map.noise=0", "noise=0.0"),
         ("map.n_samples=0", "n_samples=0"),
         ("map.prior=-1", "prior=-1"),
+        ("map.cutoff=0", "cutoff=0"),
+        ("map.hit_length=0", "hit_length=0"),
+        ("map.codec=zip", "codec='zip' quantized float"),
+        ("map.max_bytes=10", "max_bytes=10"),
+        ("map.mean_origins=0", "mean_origins=0"),
+        ("map.max_cost=1", "max_cost=1"),
+        ("+map.novelty={resolutoin:1}", "map.novelty resolutoin threshold"),
+        ("+map.novelty={threshold:high}", "map.novelty high Float"),
+        ("+map.novelty={threshold:-1}", "threshold=-1"),
+        ("map.novelty=all", "map.novelty=all null"),
+        ("map=per_scan map.min_points=0", "min_points=0"),
+        ("map=windowed map.window=0", "window=0"),
+        ("report.magnify=-1", "report.magnify=-1"),
         ("dataset.stride=0", "stride=0"),
         ("dataset.n_scans=1", "1 scans at least 2"),
         ("dataset.max_range=-1", "max_range=-1"),
@@ -532,5 +550,5 @@ def test_ctrl_c_leaves_no_half_written_file(tmp_path):
     assert 3 <= len(written) < 1000
     assert all(path.suffix == ".safetensors" and not path.name.startswith(".") for path in written)
     for path in written:
-        kind = GaussianMap if path.name.startswith("monte_carlo") else OccupancyGrid
+        kind = GaussianMap if path.name.startswith("point") else OccupancyGrid
         assert kind.load(path).nbytes > 0
