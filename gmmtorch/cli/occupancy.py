@@ -100,7 +100,9 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
         panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
         # Cells that grazing beams cross are free more often than hit: half is too strict from above.
-        figures[f"map_{resolution:g}m"] = map_figure(panels, trajectory, occupied_above=0.4)
+        figures[f"map_{resolution:g}m"] = map_figure(
+            panels, trajectory, occupied_above=0.4, **_coarser(shown)
+        )
         regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
             close = [MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
@@ -134,6 +136,13 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
         known = built.asked.labels <= OCCUPIED
         curves[_label(built)] = reliability(built.theta[known], built.asked.labels[known])
     return reliability_figure(curves, f"Reliability: {about}")
+
+
+def _coarser(shown: Sequence[Built]) -> dict[str, int]:
+    """Integrals over cells, exact or the thesis's, are too dear in 3D to be drawn as finely as the rest."""
+    if shown[0].asked.points.shape[1] == 3 and any(b.row["method"] in ("flux", "cone") for b in shown):
+        return {"max_pixels": 250, "max_queries": 100_000}
+    return {}
 
 
 def _label(built: Built) -> str:

@@ -1,0 +1,177 @@
+"""gmmtorch-occupancy with every method: files that answer the same, their options, bytes, and close looks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_runs import QUIET, Finished, refused, run_here, succeeded
+
+from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.baselines.bgk_map import BGKMap
+from gmmtorch.baselines.bgk_points_map import BGKPointsMap
+from gmmtorch.baselines.gp_map import GPMap
+from gmmtorch.baselines.hilbert_map import HilbertMap
+from gmmtorch.baselines.ndt_map import NDTMap
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.baselines.octomap_map import OctoMapMap
+from gmmtorch.evaluation import contenders
+from gmmtorch.evaluation.queries import FREE, OCCUPIED
+from gmmtorch.mapping.gaussian_map import GaussianMap
+
+Run = Callable[..., Finished]
+BASELINES = {
+    "occupancy_grid": OccupancyGrid,
+    "occupancy_log_odds": OccupancyGrid,
+    "hilbert": HilbertMap,
+    "bayesian_hilbert": BayesianHilbertMap,
+    "bgk": BGKMap,
+    "bgk_points": BGKPointsMap,
+    "gp": GPMap,
+    "ndt": NDTMap,
+    "octomap": OctoMapMap,
+}
+OURS = ("point", "flux", "cone", "monte_carlo")
+SMALL = [*QUIET, "dataset.n_scans=8", "evaluation.resolution=[0.25]", "map.n_samples=20000"]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    def run_small(*options: str, name: str = "run") -> Finished:
+        return run_here(monkeypatch, "occupancy", tmp_path / name, *SMALL, *options)
+
+    return run_small
+
+
+# -- every method ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def all_methods(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """One run of every method, with its maps in maps/ and its test in queries.npz of the run's folder."""
+    pytest.importorskip("pyoctomap")
+    folder = tmp_path_factory.mktemp("all") / "run"
+    options = [f"evaluation.save_map={folder / 'maps'}", f"evaluation.save_queries={folder / 'queries.npz'}"]
+    names = ",".join([*OURS, *BASELINES])
+    with pytest.MonkeyPatch.context() as patch:
+        return succeeded(run_here(patch, "occupancy", folder, *SMALL, f"method=[{names}]", *options))
+
+
+def test_these_are_all_the_methods():
+    assert set(contenders.methods(GaussianMap)) == {*OURS, *BASELINES}
+
+
+@pytest.mark.parametrize("method", [*OURS, *BASELINES])
+def test_a_saved_map_answers_the_test_as_the_map_did(method, all_methods):
+    """The file alone, asked at the run's test points, has the area, the score and the bytes of the row."""
+    (row,) = (row for row in all_methods.results()["rows"] if row["method"] == method)
+    kind = BASELINES.get(method, GaussianMap)
+    path = all_methods.folder / "maps" / f"{method}_1_0.25{kind.suffix}"
+    assert path.suffix == (".ot" if method == "octomap" else ".safetensors")
+    assert path.stat().st_size == row["nbytes"] > 0
+    with np.load(all_methods.folder / "queries.npz") as asked:
+        points, labels = asked["points"], asked["labels"]
+    loaded = kind.load(path)
+    theta = loaded.occupancy(points, 0.25)
+    assert loaded.nbytes == row["nbytes"]
+    assert len(theta) == row["n_queries"]
+    occupied, free = theta[labels == OCCUPIED], theta[labels == FREE]
+    assert np.mean([*((1 - occupied) ** 2), *(free**2)]) == pytest.approx(row["brier"], rel=1e-9)
+    above = (occupied[:, None] > free[None]).mean() + (occupied[:, None] == free[None]).mean() / 2
+    assert above == pytest.approx(row["auc"], rel=1e-9)
+    assert row["auc"] > 0.7
+    assert (row["n_components"] is None) == (method in BASELINES)
+
+
+def test_nothing_else_is_saved_and_forms_share_one_map(all_methods):
+    maps = {path.name for path in (all_methods.folder / "maps").iterdir()}
+    assert len(maps) == len(OURS) + len(BASELINES)
+    rows = {row["method"]: row for row in all_methods.results()["rows"]}
+    assert len({(rows[form]["n_components"], rows[form]["build_seconds"]) for form in OURS}) == 1
+
+
+# -- options of one method ------------------------------------------------------------------------
+
+
+def test_options_reach_the_baseline_they_are_for(run, tmp_path):
+    options = "{bgk:{length:0.9,prior:0.01},ndt:{spread:3},hilbert:{features:nystroem,n_features:50}}"
+    succeeded(
+        run(
+            "method=[bgk,ndt,hilbert,gp]",
+            f"+method_options={options}",
+            f"evaluation.save_map={tmp_path / 'maps'}",
+        )
+    )
+    made = {
+        name: BASELINES[name].load(tmp_path / "maps" / f"{name}_1_0.25.safetensors")
+        for name in ("bgk", "ndt", "hilbert", "gp")
+    }
+    assert (made["bgk"].length, made["bgk"].prior) == (0.9, 0.01)
+    assert made["ndt"].spread == 3
+    assert (made["hilbert"].features, made["hilbert"].n_features) == ("nystroem", 50)
+    assert made["gp"].length == 1.0  # its own default, not the length of bgk
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("+method_options={octree:{depth:16}}", "method_options.octree hilbert octomap map.*"),
+        ("+method_options={point:{n_samples:1}}", "method_options.point map.*"),
+        ("+method_options={bgk:{lenght:1}}", "method_options.bgk.lenght bgk length"),
+        ("+method_options={bgk:{resolution:1}}", "method_options.bgk.resolution length"),
+        ("+method_options={bgk:0.6}", "method_options.bgk=0.6"),
+        ("method=[point,bgk] +method_options={bgk:{length:-1}}", "length=-1"),
+        ("method=[point,octomap] +method_options={octomap:{hit:high}}", "method_options.octomap type"),
+        (
+            "method=[point,hilbert] +method_options={hilbert:{features:fourrier}}",
+            "features='fourrier' sparse",
+        ),
+        ("method=[point,octomap] +method_options={octomap:{hit:0.3}}", "hit=0.3"),
+        ("+method_options.bgk.length=-1 method=[point,bgk]", "length=-1"),
+    ],
+)
+def test_a_bad_option_of_a_method_is_named_in_one_line_before_anything_is_built(options, words, run):
+    line = refused(run(*options.split()))
+    assert all(word in line for word in words.split()), line
+
+
+# -- bytes ----------------------------------------------------------------------------------------
+
+
+def test_a_budget_is_kept_by_the_saved_file(run, tmp_path):
+    found = {}
+    for limit in ("900", "1400", "null"):
+        maps = tmp_path / f"maps_{limit}"
+        done = succeeded(
+            run(
+                "method=[point]", f"map.max_bytes={limit}", f"evaluation.save_map={maps}", name=f"run_{limit}"
+            )
+        )
+        (row,) = done.results()["rows"]
+        assert (maps / "point_1_0.25.safetensors").stat().st_size == row["nbytes"]
+        assert GaussianMap.load(maps / "point_1_0.25.safetensors").n_components == row["n_components"]
+        found[limit] = row
+    assert 450 < found["900"]["nbytes"] <= 900  # and what there is, is used
+    assert 900 < found["1400"]["nbytes"] <= 1400 < found["null"]["nbytes"]
+    assert found["900"]["n_components"] < found["1400"]["n_components"] < found["null"]["n_components"]
+
+
+# -- close looks ----------------------------------------------------------------------------------
+
+
+def test_regions_of_a_2d_map_are_shown_close_up(run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    shown = ["method=[point]", "report.figures=true", "report.tensorboard=true", "report.magnify=2"]
+    done = succeeded(run(*shown))
+    names = {Path(name).stem for name in done.files() if name.endswith(".png")}
+    close = {"map_0.25m_region_1", "map_0.25m_region_2"}
+    assert close <= names
+    assert "map_0.25m_region_3" not in names
+    first, second = ((done.folder / f"{name}.png").read_bytes() for name in sorted(close))
+    assert first.startswith(b"\x89PNG")
+    assert first != second
+    images = EventAccumulator(str(done.folder / "tensorboard")).Reload().Tags()["images"]
+    assert {f"figures/{name}" for name in close} <= set(images)

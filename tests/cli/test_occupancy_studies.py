@@ -1,0 +1,157 @@
+"""The studies of gmmtorch-occupancy, at sizes that say nothing: their rows, figures, events and errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from command_runs import QUIET, Finished, refused, run_here, succeeded
+
+Run = Callable[..., Finished]
+SHOWN = ["report.figures=true", "report.tensorboard=true"]
+TINY = {
+    "fig3_3_approximation_error": (
+        "study.n_pixels=3 study.n_components=2 study.n_cells=2 study.n_rays=[64] study.tolerance=[0.1] "
+        "study.n_large_samples=256 study.n_samples=64 study.resolution=1"
+    ),
+    "tab3_1_auc_memory": (
+        "dataset=synthetic_building_2d dataset.n_scans=12 study.n_components=[5,10] study.bgk_points=[64] "
+        "study.others=[occupancy_grid]"
+    ),
+    "pose_correction": "dataset.n_scans=10 evaluation.pose_noise=[0.3,0.1] study.methods=[point,monte_carlo] "
+    "map.n_samples=20000",
+    "fig3_8_variance_threshold": (
+        "dataset.n_scans=6 study.max_beams=300 study.n_components=[20,40] "
+        "study.variance_threshold=[0.06,0.24] study.test_every=3"
+    ),
+}
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs an experiment in this process, small."""
+
+    def run_experiment(name: str, *options: str) -> Finished:
+        given = [f"experiment={name}", *QUIET, *TINY[name].split(), *options]
+        return run_here(monkeypatch, "occupancy", tmp_path / "run", *given)
+
+    return run_experiment
+
+
+def assert_shown(done: Finished, pictures: set[str], *tags: str) -> None:
+    """The figures are there, as files and as events, and scalars under these tags."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    assert {Path(name).stem for name in done.files() if name.endswith(".png")} == pictures
+    for name in pictures:
+        assert (done.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    found = EventAccumulator(str(done.folder / "tensorboard")).Reload().Tags()
+    assert set(found["images"]) == {f"figures/{name}" for name in pictures}
+    assert set(tags) <= set(found["scalars"])
+
+
+def test_approximation_error(run):
+    done = succeeded(run("fig3_3_approximation_error", *SHOWN))
+    rows = done.results()["rows"]
+    assert {(row["study"], row["dim"]) for row in rows} == {
+        (study, dim) for study in ("map", "sweep", "curve") for dim in (2, 3)
+    }
+    for row in rows:
+        if row["study"] == "map":
+            assert len(row["error"]) == len(row["distances"]) == len(row["depths"]) == 3
+        if row["study"] == "sweep":
+            assert row["n_cases"] >= 2 * 2
+        if row["study"] == "curve":
+            assert row["n_cells"] > 0
+    settings = {(row["method"], row["setting"]) for row in rows if row["study"] == "curve"}
+    assert {("flux", 0.1), ("monte_carlo_sobol", 64.0), ("cone", None)} <= settings
+    parts = ("", "_probability", "_sweep", "_curve")
+    assert_shown(done, {f"approximation_error{part}" for part in parts}, "flux/hits_max", "cone/misses_p99")
+    assert "errors a ray of one component" in done.stdout
+
+
+def test_auc_memory(run):
+    done = succeeded(run("tab3_1_auc_memory", *SHOWN))
+    rows = {(row["method"], row["size"]): row for row in done.results()["rows"]}
+    assert list(rows) == [("point", 5), ("point", 10), ("bgk_points", 64), ("occupancy_grid", None)]
+    for (method, size), row in rows.items():
+        assert row["auc_low"] <= row["auc"] <= row["auc_high"]
+        assert row["nbytes"] > 0
+        assert (row["n_components"] or 0) <= (size if method == "point" else 0)
+    assert rows["point", 5]["nbytes"] < rows["point", 10]["nbytes"] < rows["occupancy_grid", None]["nbytes"]
+    assert_shown(done, {"auc_memory"}, "point/auc", "bgk_points/nbytes", "occupancy_grid/auc")
+
+
+def test_pose_correction(run):
+    done = succeeded(run("pose_correction", *SHOWN))
+    rows = done.results()["rows"]
+    assert [row["method"] for row in rows] == ["point", "monte_carlo"]
+    for row in rows:
+        assert (row["pose_noise_m"], row["pose_noise_rad"]) == (0.3, 0.1)
+        assert row["nbytes"] > row["n_components"] > 0
+        assert row["auc"] < row["auc_corrected"] <= 1
+        assert row["auc_corrected"] == pytest.approx(row["auc_clean"], abs=0.02)
+    assert_shown(done, {"pose_correction"}, "point/auc_corrected", "monte_carlo/auc")
+
+
+def test_variance_threshold(run):
+    done = succeeded(run("fig3_8_variance_threshold", *SHOWN))
+    rows = done.results()["rows"]
+    assert len(rows) == 2 * 2
+    assert [row["variance_threshold"] for row in rows] == [0.06, 0.24] * 2
+    assert all(row["n_components"] <= limit for row, limit in zip(rows, (20, 20, 40, 40), strict=True))
+    for strict, lenient in (rows[:2], rows[2:]):
+        assert strict["auc"] == lenient["auc"]
+        assert strict["nbytes"] == lenient["nbytes"] > 0
+        assert strict["share_decided"] <= lenient["share_decided"]  # of v = ¼ nothing but ½ is unknown
+    assert rows[0]["nbytes"] < rows[2]["nbytes"]
+    assert_shown(done, {"variance_threshold", "variance_threshold_cells"}, "point/free_recall", "point/auc")
+
+
+@pytest.mark.parametrize("name", ["tab3_1_auc_memory", "pose_correction"])
+def test_nothing_is_drawn_unless_wanted_and_results_tell_what_ran(name, run):
+    done = succeeded(run(name, "seed=3"))
+    assert not [file for file in done.files() if file.endswith(".png") or "tfevents" in file]
+    results = done.results()
+    assert (results["command"], results["seed"]) == ("occupancy", 3)
+    assert results["config"]["study"]["name"] == name.removeprefix("tab3_1_")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("fig3_3_approximation_error", "study.dims=[4]", "study.dims=4 2 3"),
+        ("fig3_3_approximation_error", "study.n_pixels=0", "study.n_pixels=0"),
+        ("fig3_3_approximation_error", "study.n_rays=[64,0]", "study.n_rays=0"),
+        ("fig3_3_approximation_error", "study.tolerance=[]", "study.tolerance empty"),
+        ("fig3_3_approximation_error", "study.tolerance=[2]", "tolerance=2"),
+        ("fig3_3_approximation_error", "study.support=-1", "study.support=-1"),
+        ("fig3_3_approximation_error", "study.resolution=0", "resolution=0"),
+        ("fig3_3_approximation_error", "study.name=errors", "study.name='errors' auc_memory pose_correction"),
+        ("tab3_1_auc_memory", "study.forms=[octree]", "method='octree' flux"),
+        ("tab3_1_auc_memory", "study.n_components=[5,0]", "n_components=0"),
+        ("tab3_1_auc_memory", "study.bgk_points=[0]", "max_points=0"),
+        ("tab3_1_auc_memory", "study.others=[octree]", "method='octree' occupancy_grid"),
+        (
+            "tab3_1_auc_memory",
+            "study.forms=[] study.bgk_points=[] study.others=[]",
+            "study.n_components .others",
+        ),
+        ("tab3_1_auc_memory", "evaluation.test_every=1", "test_every=1"),
+        ("pose_correction", "map=incremental", "map=per_scan"),
+        ("pose_correction", "study.methods=[]", "study.methods point flux"),
+        ("pose_correction", "study.methods=[occupancy_grid]", "method='occupancy_grid' point"),
+        ("pose_correction", "evaluation.pose_noise=[0.1]", "pose_noise"),
+        ("pose_correction", "runtime.dtype=float16", "dtype='float16'"),
+        ("fig3_8_variance_threshold", "study.method=bgk", "method='bgk' point"),
+        ("fig3_8_variance_threshold", "study.n_components=[]", "study.n_components empty"),
+        ("fig3_8_variance_threshold", "study.n_components=[0]", "study.n_components=0"),
+        ("fig3_8_variance_threshold", "study.variance_threshold=[-1]", "threshold=-1"),
+        ("fig3_8_variance_threshold", "study.thin_radius=0", "study.thin_radius=0"),
+        ("fig3_8_variance_threshold", "study.max_beams=0", "study.max_beams=0"),
+    ],
+)
+def test_a_bad_option_of_a_study_is_named_in_one_line(name, options, words, run):
+    line = refused(run(name, *options.split()))
+    assert all(word in line for word in words.split()), line
