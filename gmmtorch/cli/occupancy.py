@@ -138,7 +138,7 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     return reliability_figure(curves, f"Reliability: {about}")
 
 
-def _coarser(shown: Sequence[Built]) -> dict[str, int]:
+def _coarser(shown: Sequence[Built]) -> dict[str, Any]:
     """Integrals over cells, exact or the thesis's, are too dear in 3D to be drawn as finely as the rest."""
     if shown[0].asked.points.shape[1] == 3 and any(b.row["method"] in ("flux", "cone") for b in shown):
         return {"max_pixels": 250, "max_queries": 100_000}
