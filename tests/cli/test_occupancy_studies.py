@@ -13,7 +13,7 @@ SHOWN = ["report.figures=true", "report.tensorboard=true"]
 TINY = {
     "fig3_3_approximation_error": (
         "study.n_pixels=3 study.n_components=2 study.n_cells=2 study.n_rays=[64] study.tolerance=[0.1] "
-        "study.n_large_samples=256 study.n_samples=64 study.resolution=1"
+        "study.n_large_samples=256 study.n_samples=64 study.resolution=2"
     ),
     "tab3_1_auc_memory": (
         "dataset=synthetic_building_2d dataset.n_scans=12 study.n_components=[5,10] study.bgk_points=[64] "
