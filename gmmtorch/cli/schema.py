@@ -60,7 +60,7 @@ class Map:
     n_samples: int = 1000000  # Monte Carlo rays
     sampling: str = "sobol"  # or stratified, plain
     prior: float = 1.0  # N_p of (3.9)
-    cutoff: float = 3.0  # standard deviations beyond which a component is taken to end
+    cutoff: float | None = None  # standard deviations at which a component ends; null: 3, or 5 of few points
     hit_length: float | None = 1.0  # metres; hits weigh as if cells were so deep; null: the side of a cell
     codec: str = "quantized"  # or float: every number as it is
 

@@ -23,6 +23,7 @@ Method = Literal["point", "flux", "cone", "monte_carlo"]
 METHODS: tuple[str, ...] = get_args(Method)
 
 _RAYS_AT_ONCE = 1 << 20
+_SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,9 @@ class Answering:
     """How a map answers; none of it changes what a map knows.
 
     prior: N_p of (3.9), counts given to either outcome before any evidence.
-    cutoff: standard deviations beyond which a component is taken to end.
+    cutoff: standard deviations beyond which a component is taken to end. None: 3 where components stand
+        for many points, so that tails do not claim space that nothing saw; `CUTOFF` where they stand for
+        few, which do not tell where a surface ends.
     hit_length: ℓ (m): the occupancy of a cell of side h weighs its hits by ℓ/h, as if cells were so deep.
         Of a thin surface a ray ends in one cell of many that it would have passed: this puts θ on the
         right side of ½ and hardly changes the order. None: h, so that hits are counts.
@@ -42,7 +45,7 @@ class Answering:
     """
 
     prior: float = 1.0
-    cutoff: float = CUTOFF
+    cutoff: float | None = CUTOFF
     hit_length: float | None = None
     n_samples: int = 1_000_000
     sampling: Sampling = "sobol"
@@ -55,7 +58,7 @@ class Answering:
         for name in ("n_samples", "memory_limit"):
             check_whole(name, getattr(self, name), 1)
         check_whole("random_state", self.random_state, 0)
-        if not 0 < self.cutoff < float("inf"):
+        if self.cutoff is not None and not 0 < self.cutoff < float("inf"):
             raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
         if self.hit_length is not None and not 0 < self.hit_length < float("inf"):
             raise InvalidArgumentError(f"hit_length={self.hit_length} must be metres above zero, or null.")
@@ -69,12 +72,19 @@ def check_method(method: str) -> None:
         raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
 
 
+def fitting_cutoff(cones: Cones) -> float:
+    """The cutoff for these cones where none is given: by the points that half of them stand for, or more."""
+    counts = cones.counts[cones.counts > 0]
+    return _SHARP_CUTOFF if counts.numel() and float(counts.median()) >= _MANY_POINTS else CUTOFF
+
+
 class Answers:
     """What these cones say of space. What is costly is made once, when it is first asked for."""
 
     def __init__(self, cones: Cones, options: Answering) -> None:
         self.cones = cones
         self.options = options
+        self.cutoff = fitting_cutoff(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, BlockEvidence] = {}
         self._forms: dict[float, PointForm] = {}
         self._indices: dict[float, ConeIndex] = {}
@@ -117,7 +127,7 @@ class Answers:
             self._cast(evidence)
             return evidence
         if method == "flux":
-            return flux_evidence(self.cones, grid, self.options.cutoff)
+            return flux_evidence(self.cones, grid, self.cutoff)
         centers = grid.centers(self.cones.means.device)
         if method == "point":
             found = self._form(grid.resolution)(centers)
@@ -130,16 +140,16 @@ class Answers:
         if resolution not in self._forms:
             options = self.options
             self._forms[resolution] = PointForm(
-                self.cones, resolution, options.cutoff, compiled=options.compiled
+                self.cones, resolution, self.cutoff, compiled=options.compiled
             )
         return self._forms[resolution]
 
     def _in_boxes(self, low: Tensor, high: Tensor, resolution: float, method: str) -> PointEvidence:
         if resolution not in self._indices:
-            self._indices[resolution] = ConeIndex(self.cones, resolution, self.options.cutoff)
+            self._indices[resolution] = ConeIndex(self.cones, resolution, self.cutoff)
         pairs = self._indices[resolution].candidates(low, high)
         form = box_flux if method == "flux" else cone_evidence
-        return PointEvidence(*form(self.cones, low, high, pairs, cutoff=self.options.cutoff))
+        return PointEvidence(*form(self.cones, low, high, pairs, cutoff=self.cutoff))
 
     def _lattice(self, resolution: float) -> BlockEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""

@@ -243,7 +243,7 @@ def test_a_map_takes_what_the_options_offer_with_the_same_defaults(name):
     for option in ("n_samples", "sampling", "prior"):
         assert options.pop(option) == getattr(made.answering, option), option
     # The commands ask for maps that are right at ½, the library for counts: see docs/commands.md.
-    assert options == {"cutoff": 3, "hit_length": 1}
+    assert options == {"cutoff": None, "hit_length": 1}
     assert (made.answering.cutoff, made.answering.hit_length) == (5, None)
     limits = {"random_state", "memory_limit", "compiled"}  # which are runtime.* and the seed
     assert {item.name for item in fields(Answering)} == limits | {

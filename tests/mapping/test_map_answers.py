@@ -10,8 +10,9 @@ from mapping.map_cases import FINE, built, drive, given_parts, open_drive
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping.answers import METHODS
+from gmmtorch.mapping.answers import METHODS, Answering, Answers, fitting_cutoff
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import VoxelGrid
 
 methods = pytest.mark.parametrize("method", METHODS)
@@ -175,3 +176,19 @@ def test_lists_of_numbers_are_as_exact_as_arrays():
     assert made.occupancy(query.tolist()).tolist() == made.occupancy(query).tolist()
     given = {name: value.tolist() for name, value in given_parts().items()}
     assert torch.equal(GaussianMap.from_components(**given).origins, given_parts()["origins"])
+
+
+def test_a_cutoff_that_is_not_given_follows_the_points_of_the_components():
+    def cones(*counts: float) -> Cones:
+        k = len(counts)
+        eye = torch.eye(2, dtype=torch.float64).repeat(k, 1, 1)
+        place = torch.zeros(k, 2, dtype=torch.float64)
+        weight = torch.tensor(counts, dtype=torch.float64)
+        return Cones(place, eye, place + 5, weight, torch.zeros(k, dtype=torch.bool))
+
+    assert fitting_cutoff(cones(1000.0, 60.0, 50.0)) == 3
+    assert fitting_cutoff(cones(1000.0, 40.0, 3.0)) == CUTOFF
+    assert fitting_cutoff(cones(0.0, 0.0, 70.0)) == 3
+    assert fitting_cutoff(cones()) == CUTOFF
+    fixed = Answers(cones(1000.0), Answering(cutoff=4.0))
+    assert (fixed.cutoff, Answers(cones(1000.0), Answering(cutoff=None)).cutoff) == (4, 3)
