@@ -21,7 +21,7 @@ from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.hulls import Hulls
 from gmmtorch.sorting import argsort, number_distinct
 
-_ENTRIES_PER_CONE = {2: 64, 3: 256}  # bounds memory and the time to build, in proportion to the map
+_ENTRIES_PER_CONE = {2: 64, 3: 512}  # bounds memory and the time to build, in proportion to the map
 _SPAN = 4  # buckets along an axis that a cone's search begins with, at most
 _KEY_BITS = {2: 31, 3: 21}  # of a packed bucket coordinate
 _TESTS_AT_ONCE = 1 << 13
