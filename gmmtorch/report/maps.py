@@ -60,7 +60,7 @@ def map_figure(
     max_pixels: int = MAX_PIXELS,
     max_queries: int = MAX_QUERIES,
 ) -> Figure:
-    """One panel a method: occupied dark, free light, unknown (θ exactly ½) blue-grey.
+    """One panel a method: occupied dark, free light, unknown (θ within 0.02 of ½) blue-grey.
 
     In 3D each method has a horizontal slice above, and below it the height of the highest occupied
     cell as seen from the top.
@@ -257,7 +257,7 @@ def _label(grid: np.ndarray, n_panels: int, n_views: int) -> None:
 
 
 def _legend(figure: Figure, path: np.ndarray | None, dim: int) -> None:
-    handles: list[Patch | Line2D] = [Patch(facecolor=UNKNOWN, edgecolor="#666666", label="unknown (θ = ½)")]
+    handles: list[Patch | Line2D] = [Patch(facecolor=UNKNOWN, edgecolor="#666666", label="unknown (θ ≈ ½)")]
     if dim == 3:
         handles.append(Patch(facecolor=_NONE, edgecolor="#666666", label="no such cell"))
     if path is not None and len(path):

@@ -24,6 +24,7 @@ MAX_QUERIES = 4_000_000
 """Cells asked for one view of heights."""
 
 _QUERIES_AT_ONCE = 1 << 18
+_UNKNOWN_BAND = 0.02  # of θ around ½
 _SLACK = 1e-3  # of a cell: corners in float32 are the planes of cells that they were meant to be
 
 
@@ -169,7 +170,7 @@ def plan(panel: MapPanel, max_pixels: int = MAX_PIXELS) -> Raster:
 def slice_image(
     panel: MapPanel, height: float = 0.0, max_pixels: int = MAX_PIXELS, shown_pixels: int | None = None
 ) -> tuple[np.ndarray, Raster]:
-    """Occupancy (H, W) of the plane, in 3D of the cells at `height` (m); NaN where it is exactly ½.
+    """Occupancy (H, W) of the plane, in 3D of the cells at `height` (m); NaN where it is unknown: ½, to 0.02.
 
     With `shown_pixels` the image is shrunk to about that many pixels along its longer side. Each
     takes its highest occupancy where that is above ½, so that thin walls stay visible; else the
@@ -177,9 +178,14 @@ def slice_image(
     """
     raster = plan(panel, max_pixels)
     theta = _ask(panel, _plane(raster, panel.dim, height)).reshape(len(raster.y), len(raster.x))
-    image = np.where(theta == 0.5, np.nan, theta)
+    image = np.where(_is_unknown(theta), np.nan, theta)
     factor = 1 if shown_pixels is None else round(max(image.shape) / max(shown_pixels, 1))
     return _shrunk(image, raster, factor) if factor > 1 else (image, raster)
+
+
+def _is_unknown(theta: np.ndarray) -> np.ndarray:
+    """Where nothing to speak of is known: the last traces of a component's tails are no evidence to show."""
+    return np.abs(theta - 0.5) < _UNKNOWN_BAND
 
 
 def _shrunk(image: np.ndarray, raster: Raster, factor: int) -> tuple[np.ndarray, Raster]:
@@ -224,7 +230,7 @@ def height_image(
         points = columns[torch.from_numpy(still_open)]
         points[:, 2] = level
         theta = _ask(panel, points)
-        heights[still_open[(theta > occupied_above) & (theta != 0.5)]] = level
+        heights[still_open[(theta > occupied_above) & ~_is_unknown(theta)]] = level
     return heights.reshape(len(raster.y), len(raster.x)), raster
 
 
@@ -237,7 +243,7 @@ def roof_above(panel: MapPanel, path: np.ndarray, occupied_above: float, headroo
     points = stops[:, None].repeat(1, len(levels), 1)
     points[:, :, 2] = levels
     theta = _ask(panel, points.reshape(-1, 3)).reshape(len(stops), -1)
-    occupied = (theta > occupied_above) & (theta != 0.5)
+    occupied = (theta > occupied_above) & ~_is_unknown(theta)
     occupied &= points[:, :, 2].numpy() > stops[:, 2:].numpy() + headroom
     return bool(occupied.any(1).mean() > 0.5)
 
