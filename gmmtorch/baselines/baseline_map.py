@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.files import write_bytes
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.files import read_tensors, write_bytes
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
@@ -61,6 +62,23 @@ class BaselineMap(ABC):
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
         write_bytes(path, self._serialized())
+
+    @classmethod
+    def _opened(cls, path: str | Path, kind: str, version: int) -> tuple[Self, dict[str, Tensor]]:
+        """An empty map with the settings of a file, and the file's tensors.
+
+        `facts` of the file are the constructor's arguments, and `dim`. Raises `DataError` if they are not.
+        """
+        tensors, facts = read_tensors(path, kind, version)
+        try:
+            options = dict(facts)
+            dim = {2: 2, 3: 3}[options.pop("dim")]
+            made = cls(**options)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
+        made._start(dim, torch.device("cpu"))
+        made.dim = dim
+        return made, tensors
 
     @property
     @abstractmethod

@@ -18,7 +18,7 @@ from gmmtorch.baselines.hilbert_features import LatticeDesign, LatticeFeatures, 
 from gmmtorch.baselines.hilbert_map import check_between
 from gmmtorch.baselines.thinned_samples import check_length
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.files import pack_tensors, require
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.bayesian_hilbert_map", 1
@@ -333,15 +333,7 @@ class BayesianHilbertMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> BayesianHilbertMap:
         """Read a map that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            options = dict(facts)
-            dim = {2: 2, 3: 3}[options.pop("dim")]
-            made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        made._start(dim, torch.device("cpu"))
-        made.dim = dim
+        made, tensors = cls._opened(path, _FILE_KIND, _FILE_VERSION)
         table = made._hinges.table
         table.fill(tensors, path)
         n = table.keys.shape[0]

@@ -12,7 +12,7 @@ from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.thinned_samples import check_length, check_range, thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.files import pack_tensors, require
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.scan import Scan
 
@@ -143,20 +143,12 @@ class BGKMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> BGKMap:
         """Read a map that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            options = dict(facts)
-            dim = {2: 2, 3: 3}[options.pop("dim")]
-            made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        made._start(dim, torch.device("cpu"))
+        made, tensors = cls._opened(path, _FILE_KIND, _FILE_VERSION)
         made._table.fill(tensors, path)
         sums = require(tensors, "sums", (made._table.keys.shape[0], 2), torch.float32, path)
         if bool((sums < 0).any()):
             raise DataError(f"{path}: sums holds negative numbers; the file is damaged.")
         made._table.values = sums
-        made.dim = dim
         return made
 
 

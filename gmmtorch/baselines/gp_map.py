@@ -14,7 +14,7 @@ from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.thinned_samples import check_length, check_range, thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.scan import Scan
@@ -256,18 +256,10 @@ class GPMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> GPMap:
         """Read a map that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            options = dict(facts)
-            dim = {2: 2, 3: 3}[options.pop("dim")]
-            made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        made._start(dim, torch.device("cpu"))
+        made, tensors = cls._opened(path, _FILE_KIND, _FILE_VERSION)
         made._table.fill(tensors, path)
         fused = require(tensors, "fused", (made._table.keys.shape[0], 2), torch.float32, path)
         if bool((fused[:, 1] < 0).any()):
             raise DataError(f"{path}: fused holds negative precisions; the file is damaged.")
         made._table.values = fused
-        made.dim = dim
         return made

@@ -20,8 +20,8 @@ from gmmtorch.baselines.hilbert_features import (
     check_lattice,
 )
 from gmmtorch.baselines.thinned_samples import check_length
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.files import pack_tensors, require
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.hilbert_map", 1
@@ -270,15 +270,7 @@ class HilbertMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> HilbertMap:
         """Read a map that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            options = dict(facts)
-            dim = {2: 2, 3: 3}[options.pop("dim")]
-            made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        made._start(dim, torch.device("cpu"))
-        made.dim = dim
+        made, tensors = cls._opened(path, _FILE_KIND, _FILE_VERSION)
         if tensors:
             features = made._read_features(tensors, path)
             made._before = features, require(tensors, "weights", (features.count,), torch.float32, path)

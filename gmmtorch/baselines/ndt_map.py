@@ -12,7 +12,7 @@ from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.thinned_samples import check_length, check_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.occupancy.raycast import traverse
@@ -288,17 +288,10 @@ class NDTMap(BaselineMap):
     @classmethod
     def load(cls, path: str | Path) -> NDTMap:
         """Read a map that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            options = dict(facts)
-            dim = {2: 2, 3: 3}[options.pop("dim")]
-            made = cls(**options)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        made._start(dim, torch.device("cpu"))
+        made, tensors = cls._opened(path, _FILE_KIND, _FILE_VERSION)
         table = made._table
         table.fill(tensors, path)
-        reached = CellTable(made.resolution, dim, 0)
+        reached = CellTable(made.resolution, made._table.dim, 0)
         reached.fill(tensors, path, "gaussian_")
         rows = torch.searchsorted(table.keys, reached.keys).clamp_max(max(0, table.keys.shape[0] - 1))
         if reached.keys.numel() and (
@@ -311,7 +304,6 @@ class NDTMap(BaselineMap):
         if bool((gaussians[:, 0] <= 0).any()):
             raise DataError(f"{path}: gaussians of no points; the file is damaged.")
         table.values[rows, 1:] = gaussians
-        made.dim = dim
         return made
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -52,7 +53,7 @@ class Rule(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Patches:
+class Patches(ABC):
     """An integrand on each of P affine patches f ↦ centre + Σ f_i edge_i, all in one tensor.
 
     f runs over [−½, ½]^{D−1}, or over the triangle {f ≥ 0, Σf ≤ 1} where `triangular`. What lies
@@ -62,33 +63,34 @@ class Patches:
     cutoff: float
     triangular: bool = field(default=False, kw_only=True)
 
+    @abstractmethod
     def __len__(self) -> int:
-        raise NotImplementedError
+        """How many."""
 
     def take(self, index: Tensor) -> Self:
         """The patches of an index (Q,): every tensor has them last."""
         tensors = (f.name for f in fields(self) if isinstance(getattr(self, f.name), Tensor))
         return replace(self, **{name: getattr(self, name).index_select(-1, index) for name in tensors})
 
+    @abstractmethod
     def cut(self, base: Tensor, scale: Tensor) -> Self:
         """Of each patch the part f ↦ centre + Σ (base_i + scale_i f_i) edge_i; (D−1, P) each."""
-        raise NotImplementedError
 
+    @abstractmethod
     def simple(self) -> Tensor:
         """Patches (P,) on which a cheaper form of the integrand holds."""
-        raise NotImplementedError
 
+    @abstractmethod
     def variation(self, simple: Tensor) -> Tensor:
         """By how many standard deviations the integrand changes along each edge: (D−1, P)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outside(self) -> Tensor:
         """Patches (P,) on which the integrand certainly is zero."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sums(self, rule: Rule, simple: bool) -> Tensor:
         """Integral over each patch (P,) by a rule; `simple` says that the cheaper form holds on all."""
-        raise NotImplementedError
 
 
 class _Panels(NamedTuple):
