@@ -22,6 +22,8 @@ ROOMS = [
     "mapping",
     "baselines",
     "evaluation",
+    "sharing",
+    "exploration",
     "report",
     "cli",
 ]

@@ -1,0 +1,1 @@
+"""Robots that choose where to look next: information, planning, teams, missions."""

@@ -1,0 +1,1 @@
+"""What robots tell one another, as bytes, and the networks that carry it."""
