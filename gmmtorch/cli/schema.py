@@ -298,12 +298,169 @@ class Export:
     runtime: ExportRuntime = field(default_factory=ExportRuntime)
 
 
+@dataclass
+class GeneratedWorld:
+    name: str = MISSING
+    size: list[float] = field(default_factory=lambda: [50.0, 40.0, 8.0])
+    seed: int = 0
+    resolution: float = 0.2
+
+
+@dataclass
+class MeshWorldOptions:
+    name: str = MISSING
+    path: str = MISSING
+    bounds: list[float] | None = None
+    resolution: float = 0.2
+
+
+@dataclass
+class Team:
+    name: str = MISSING
+    size: int = 3
+    start: Any = None  # a pose for each robot
+
+
+@dataclass
+class PlannerOptions:
+    name: str = MISSING
+    prior: float = 0.125  # occupancy that the planner expects of what nobody has seen
+
+
+@dataclass
+class TreePlannerOptions(PlannerOptions):
+    beams: int = 160  # of a view
+
+
+@dataclass
+class DepthSensor:
+    width: int = 160
+    height: int = 120
+    rate: float = 1.0
+    horizontal_fov: float = 1.5184
+    vertical_fov: float = 1.0123
+    max_range: float = 6.0
+    noise: float = 0.0015
+    dropout: float = 0.01
+
+
+@dataclass
+class RobotBody:
+    radius: float = 0.3
+    speed: float = 1.5
+    climb: float = 0.75
+    yaw_rate: float = 1.2
+    acceleration: float = 1.5
+    yaw_acceleration: float = 3.0
+    duration: float = 2.0
+    step: float = 0.2
+
+
+@dataclass
+class Belief:
+    prior: float = 1.0
+    clamp: float = 0.05
+    free: float = 0.2
+    occupied: float = 0.65
+
+
+@dataclass
+class TeamMap:
+    window: list[int] = field(default_factory=lambda: [96, 96, 40])
+    threshold: float = 1.0
+    observed: float = 0.5
+    distance: float = 0.5
+    noise: float = 0.05
+    length: float = 0.5
+    cell: float = 0.15
+    components: int = 200
+    iterations: int = 4
+    update_at: float = 2.0
+    update_stride: int = 4
+
+
+@dataclass
+class NetworkOptions:
+    delay: float = 0.05
+    bandwidth: float | None = None
+    loss: float = 0.0
+
+
+@dataclass
+class ExploreEvaluation:
+    every: float = 10.0
+    codecs: list[str] = field(default_factory=list)
+
+
+@dataclass
+class CheckpointOptions:
+    every: float = 60.0
+    folder: str | None = None
+
+
+@dataclass
+class ExploreReport:
+    progress: bool = True
+    figures: bool = True
+    tensorboard: bool = True
+    recording: bool = False
+
+
+@dataclass
+class ExploreRuntime:
+    device: str = "cpu"
+    threads: int | None = 1
+    workers: int = 2
+    cache: bool = True
+    memory_limit: int = 4 << 30
+
+
+@dataclass
+class TrialsStudy:
+    """Missions that differ in some options, each with every seed."""
+
+    name: str = "trials"
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4])
+    variants: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass
+class Explore:
+    world: Any = MISSING
+    team: Any = MISSING
+    planner: Any = MISSING
+    duration: float = 1600.0
+    seed: int = 0
+    information: str = "csqmi"
+    coordination: str = "greedy"
+    rounds: int = 3
+    codec: str = "quantized"
+    transport: str = "in_process"
+    study: Any = None
+    sensor: DepthSensor = field(default_factory=DepthSensor)
+    robot: RobotBody = field(default_factory=RobotBody)
+    belief: Belief = field(default_factory=Belief)
+    map: TeamMap = field(default_factory=TeamMap)
+    network: NetworkOptions = field(default_factory=NetworkOptions)
+    evaluation: ExploreEvaluation = field(default_factory=ExploreEvaluation)
+    checkpoint: CheckpointOptions = field(default_factory=CheckpointOptions)
+    report: ExploreReport = field(default_factory=ExploreReport)
+    runtime: ExploreRuntime = field(default_factory=ExploreRuntime)
+
+
 def register() -> None:
     """Make the schemas known to Hydra, under the names that the files in conf/ use."""
     store = ConfigStore.instance()
     store.store(name="occupancy_schema", node=Occupancy)
     store.store(name="fit_schema", node=Fit)
     store.store(name="export_schema", node=Export)
+    store.store(name="explore_schema", node=Explore)
+    store.store(group="schema/world", name="generated", node=GeneratedWorld)
+    store.store(group="schema/world", name="mesh", node=MeshWorldOptions)
+    store.store(group="schema/team", name="team", node=Team)
+    store.store(group="schema/planner", name="planner", node=PlannerOptions)
+    store.store(group="schema/planner", name="tree", node=TreePlannerOptions)
+    store.store(group="schema/study", name="trials", node=TrialsStudy)
     store.store(group="schema/map", name="windowed", node=WindowedMap)
     store.store(group="schema/map", name="incremental", node=IncrementalMap)
     store.store(group="schema/study", name="approximation_error", node=ApproximationErrorStudy)

@@ -14,6 +14,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import ArrayLike
+from gmmtorch.sorting import argsort
 
 UNNUMBERED = -1
 """The sequence, in `ids`, of a component that is new, or not as it was: who owns the map numbers it."""
@@ -94,6 +95,21 @@ class Components:
         rows = ("means", "covariances", "support", "max_range", "ids")
         moved = {name: getattr(self, name)[order] for name in rows}
         return replace(self, **moved, seen_by=rank[self.seen_by])
+
+    def selected(self, rows: Tensor) -> Components:
+        """The components of distinct rows (J,), in that order; every origin stays."""
+        place = torch.full_like(self.max_range, -1, dtype=torch.int64)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        kept = (place[self.seen_by] >= 0).nonzero().squeeze(1)
+        kept = kept[argsort(place[self.seen_by[kept]])]
+        per_component = (self.means, self.covariances, self.support, self.max_range, self.ids)
+        return Components(
+            *(values[rows] for values in per_component),
+            self.origins,
+            place[self.seen_by[kept]],
+            self.seen_from[kept],
+            self.seen_count[kept],
+        )
 
     def transformed(self, transform: Tensor, chosen: Tensor) -> Components:
         """The components marked in `chosen` (K,) moved by a rigid motion (D+1, D+1), origins with them."""

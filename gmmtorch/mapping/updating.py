@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import whitening
+from gmmtorch.sorting import number_distinct
 
 _LEAST_DISTANCE = 1e-6  # squared Mahalanobis: at a mean itself the thesis's shares are undefined
 _PAIRS_AT_ONCE = 1 << 20
@@ -61,6 +62,20 @@ def count_explained(
     gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
     counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
     return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
+
+
+def summed(components: Components) -> Components:
+    """Each id once, in order, with the sum of the counts of all its rows.
+
+    For components that were each seen from one place, of which some rows add counts to others.
+    """
+    robot, sequence = components.ids.unbind(1)
+    row, n_ids = number_distinct(robot * (int(sequence.max()) + 1 if len(robot) else 1) + sequence)
+    order = torch.arange(len(components), device=row.device)
+    first = torch.full_like(order[:n_ids], len(components)).scatter_reduce_(0, row, order, "amin")
+    support = components.support.new_zeros(n_ids).index_add_(0, row, components.support)
+    kept = components.selected(first)
+    return replace(kept, support=support, seen_count=support[kept.seen_by])
 
 
 def _nearest_sightings(components: Components, origin: Tensor, distance: float) -> tuple[Tensor, Tensor]:

@@ -1,17 +1,21 @@
-"""CellEvidence: hits and misses of a few cells of an unbounded lattice, as one frame or message yields them."""
+"""CellEvidence: hits and misses of a few cells of an unbounded lattice, as one frame or message brings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.raycast import row_major_strides, traverse
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT, check_resolution
+from gmmtorch.occupancy.raycast import Visits, row_major_strides, traverse
+
+_FARTHEST = 2.0**32  # cells from the world's origin: within, the ray casting's sums are exact
+
+_CHUNK_VISITS = 1 << 16  # fastest where cores share a cache
 
 
 class CellEvidence(NamedTuple):
@@ -39,6 +43,21 @@ class Box(NamedTuple):
         return tuple((self.high - self.low).tolist())
 
 
+def in_cells(points: Tensor, resolution: float, name: str = "points") -> Tensor:
+    """World points (…, 3), metres, in units of the lattice, float64.
+
+    Raises `InvalidArgumentError` where they are not finite, or too far to tell the cells apart.
+    """
+    units = points.double() / check_resolution(resolution)
+    # Not `>=`: NaN must fail, too.
+    if units.numel() and not bool(units.abs().max() < _FARTHEST):
+        raise InvalidArgumentError(
+            f"{name} must be finite and less than 2**32 cells of resolution={resolution} m from the world's "
+            "origin; drop such points, or take coarser cells."
+        )
+    return units
+
+
 def cast_evidence(
     origins: Tensor,
     ends: Tensor,
@@ -55,32 +74,89 @@ def cast_evidence(
     Args:
         origins: (R, 3) or (3,), metres. ends: (R, 3). is_hit: (R,) bool. weights: (R,); ones if not given.
         resolution: side (m) of the cells.
+
+    Raises:
+        InvalidArgumentError: rays that are not finite, or end 2³² cells or more from the world's origin.
+        MemoryLimitError: rays that span too many cells of the box.
     """
-    check_resolution(resolution)
-    starts, stops = origins.double() / resolution, ends.double() / resolution
+    starts, stops = in_cells(origins, resolution, "origins"), in_cells(ends, resolution, "ends")
     starts = starts.expand_as(stops)
-    window = _common(starts, stops, box)
-    if window is None:
+    passage = passage_of(starts, stops, box)
+    if passage is None:
         return CellEvidence.empty(ends.device)
-    low, shape = window.low, window.shape
-    n_cells, strides = math.prod(shape), row_major_strides(shape)
+    window, block = passage.window, passage.block
+    n_bytes = math.prod(block.shape) * BYTES_PER_CELL
+    if n_bytes > MEMORY_LIMIT:
+        raise MemoryLimitError(
+            f"resolution={resolution} m over rays that span {' × '.join(map(str, window.shape))} cells takes "
+            f"{n_bytes:,} bytes, above the limit of {MEMORY_LIMIT:,}; take coarser cells or a smaller box."
+        )
     weight = torch.ones_like(stops[:, 0]) if weights is None else weights.double()
-    misses = torch.zeros(n_cells, dtype=torch.float64, device=ends.device)
-    for visit in traverse(starts, stops, shape, low=low):
-        misses.index_add_(0, visit.voxel, weight.index_select(0, visit.ray))
-    last = stops.floor().long() - low
-    size = torch.tensor(shape, device=ends.device)
-    struck = is_hit & ((last >= 0) & (last < size)).all(1)
-    flat = (last[struck] * torch.tensor(strides, device=ends.device)).sum(1)
-    hits = torch.zeros_like(misses).index_add_(0, flat, weight[struck])
-    return from_dense(low, hits.view(shape), misses.view(shape))
+    misses = torch.zeros(math.prod(block.shape), dtype=torch.float64, device=ends.device)
+    for visit in passage.visits:
+        misses.scatter_add_(0, visit.voxel, weight.index_select(0, visit.ray))
+    misses = misses.view(block.shape)
+    if block is not window:
+        misses = misses[1:-1, 1:-1, 1:-1]
+    flat, inside = flat_index(stops.floor().long() - window.low, window.shape)
+    struck = is_hit & inside
+    hits = weight.new_zeros(math.prod(window.shape)).index_add_(0, flat[struck], weight[struck])
+    return from_dense(window.low, hits.view(window.shape), misses)
+
+
+class Passage(NamedTuple):
+    """Rays through a box. window: the cells of the box among which they go; block: the cells that
+    `visits` number row-major, which is the window, or that with one more cell on each side."""
+
+    window: Box
+    block: Box
+    visits: Iterator[Visits]
+
+
+def passage_of(starts: Tensor, stops: Tensor, box: Box) -> Passage | None:
+    """The cells of a box that rays (R, 3), in grid units, leave; None if they do not come to it.
+
+    Rays that leave the box are cut half a cell outside it. So no cell of the box is cut, and none is
+    entered or left elsewhere than without a box, but for rounding: that stays far below what the
+    traversal takes for one point, as places are taken from the corner of the window.
+    """
+    if len(stops) == 0:
+        return None
+    both = torch.stack([starts.amin(0), starts.amax(0), stops.amin(0), stops.amax(0)]).floor().long()
+    lowest, highest = both.amin(0), both.amax(0) + 1
+    window = Box(torch.maximum(lowest, box.low), torch.minimum(highest, box.high))
+    if bool((window.low >= window.high).any()):
+        return None
+    if torch.equal(window.low, lowest) and torch.equal(window.high, highest):
+        visits = traverse(starts, stops, window.shape, _CHUNK_VISITS, low=window.low)
+        return Passage(window, window, visits)
+    block = Box(window.low - 1, window.high + 1)
+    first, last = shares_near(starts, stops, stops, window)
+    near = (first <= last).nonzero().squeeze(1)
+    start, stop = _relative(starts[near], block.low), _relative(stops[near], block.low)
+    way, first, last = stop - start, first[near, None], last[near, None]
+    cut_start = torch.where(first > 0, start + first * way, start)
+    cut_stop = torch.where(last < 1, start + last * way, stop)
+    cut = traverse(cut_start, cut_stop, block.shape, _CHUNK_VISITS)
+    return Passage(window, block, (Visits(visit.voxel, near[visit.ray]) for visit in cut))
+
+
+def _relative(units: Tensor, low: Tensor) -> Tensor:
+    """units − low, in the same cell even where rounding would put it on the next plane."""
+    return torch.minimum(units - low, (units.floor() - low + 1) * (1 - 2.0**-53))
 
 
 def from_dense(low: Tensor, hits: Tensor, misses: Tensor) -> CellEvidence:
     """The cells of a dense block (nx, ny, nz) with lowest cell `low` (3,) that have any evidence."""
-    cells = ((hits > 0) | (misses > 0)).nonzero()
-    index = cells.unbind(1)
-    return CellEvidence(cells + low, hits[index].float(), misses[index].float())
+    _, ny, nz = hits.shape
+    flat = ((hits > 0) | (misses > 0)).flatten().nonzero().squeeze(1)
+    column = flat // nz
+    cells = torch.stack([column // ny, column % ny, flat % nz], 1)
+    return CellEvidence(
+        cells + low,
+        hits.flatten().index_select(0, flat).float(),
+        misses.flatten().index_select(0, flat).float(),
+    )
 
 
 def united(parts: Iterable[CellEvidence]) -> CellEvidence:
@@ -105,11 +181,30 @@ def united(parts: Iterable[CellEvidence]) -> CellEvidence:
     return CellEvidence(key[:, None] // strides % size + low, *sums)
 
 
-def _common(starts: Tensor, stops: Tensor, box: Box) -> Box | None:
-    """The part of a box that rays, in grid units, can reach; None if they cannot."""
-    if len(stops) == 0:
-        return None
-    both = torch.stack([starts.amin(0), starts.amax(0), stops.amin(0), stops.amax(0)]).floor().long()
-    low = torch.maximum(both.amin(0), box.low.to(both))
-    high = torch.minimum(both.amax(0) + 1, box.high.to(both))
-    return Box(low, high) if bool((low < high).all()) else None
+def flat_index(local: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Row-major index (C,) of cells (C, 3) of a block of `shape`, 0 where outside, and which are inside."""
+    nx, ny, nz = shape
+    x, y, z = local.unbind(1)
+    # Axis by axis: reductions over a dimension of three are slow.
+    inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
+    return torch.where(inside, (x * ny + y) * nz + z, 0), inside
+
+
+def shares_near(apex: Tensor, low: Tensor, high: Tensor, box: Box) -> tuple[Tensor, Tensor]:
+    """Between which shares (R,) of the way the hulls of a point (R, 3) and of a block [low, high], (R, 3)
+    each, are within half a cell of a box: the first is above the last of those that never are.
+
+    All in grid units. At a share t the hull is [a + t(low − a), a + t(high − a)], so that each side of
+    the box bounds t. A ray is the hull of its start and its end.
+    """
+    first, last = torch.zeros_like(apex[:, 0]), torch.ones_like(apex[:, 0])
+    for axis in range(3):
+        start = apex[:, axis]
+        for bound, side, sign in ((box.high, low, 1.0), (box.low, high, -1.0)):
+            room = sign * (float(bound[axis]) - start) + 0.5
+            slope = sign * (side[:, axis] - start)  # t · slope ≤ room
+            share = room / slope
+            last = torch.where(slope > 0, torch.minimum(last, share), last)
+            first = torch.where(slope < 0, torch.maximum(first, share), first)
+            last = torch.where((slope == 0) & (room < 0), -1.0, last)
+    return first, last

@@ -38,6 +38,11 @@ class ProgressBars:
         if total is not None and done >= total:
             self._bars.pop(stage).close()
 
+    def note(self, stage: str, text: str) -> None:
+        """Text beside the bar of a stage that is open."""
+        if stage in self._bars:
+            self._bars[stage].set_postfix_str(text)
+
     @property
     def stages(self) -> tuple[str, ...]:
         """Stages whose bars are open."""

@@ -4,6 +4,8 @@ World frame: metres, z up. Sensor frame: x forward, y left, z up. Nothing is rea
 randomness comes from the `torch.Generator` that the caller hands in.
 """
 
+# The module comes before the function of the same name in `sensors`, which is what the package offers.
+from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.raycast_mesh import ray_segments, ray_triangles
 from gmmtorch.simulation.sensors import (
     RangeSensor,
@@ -19,6 +21,8 @@ from gmmtorch.simulation.world_2d import World2D, building_2d
 from gmmtorch.simulation.world_3d import World3D, building_3d
 
 __all__ = [
+    "DepthCamera",
+    "DepthFrame",
     "RangeSensor",
     "World",
     "World2D",

@@ -41,11 +41,15 @@ class MeshWorld:
         faces = np.arange(corners.shape[0], dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(self._tensor((corners - self._middle).float().numpy()), self._tensor(faces))
 
-    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
-        """Metres (N,) from the origin (D,) or origins (N, D) along unit directions (N, D), or inf."""
+    def distances(self, origin: Tensor, directions: Tensor, threads: int = 0) -> Tensor:
+        """Metres (N,) from the origin (D,) or origins (N, D) along unit directions (N, D), or inf.
+
+        `threads`: how many cast rays; 0 for as many as there are cores.
+        """
         starts = (origin - self._middle).expand_as(directions)
         rays = torch.cat([starts, directions], 1).float().contiguous()
-        return torch.from_numpy(self._scene.cast_rays(self._tensor(rays.numpy()))["t_hit"].numpy()).double()
+        cast = self._scene.cast_rays(self._tensor(rays.numpy()), nthreads=threads)
+        return torch.from_numpy(cast["t_hit"].numpy()).double()
 
     def clearance(self, points: Tensor) -> Tensor:
         """Metres (N,) from each point (N, 3) to the nearest surface."""

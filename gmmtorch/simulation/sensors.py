@@ -103,13 +103,16 @@ def depth_camera(
     _at_least_one(width=width, height=height)
     _angle(field_of_view=field_of_view, limit=math.radians(179))
     focal = width / 2 / math.tan(field_of_view / 2)
-    left = (width / 2 - 0.5 - torch.arange(width, dtype=torch.float64)) / focal
-    up = (height / 2 - 0.5 - torch.arange(height, dtype=torch.float64)) / focal
+    return RangeSensor(pixel_rays(width, height, (focal, focal)), max_range, range_noise, dropout)
+
+
+def pixel_rays(width: int, height: int, focal: tuple[float, float]) -> Tensor:
+    """Unit vectors (height · width, 3) through the centres of a pinhole camera's pixels, row by row from
+    the top left. `focal`: focal lengths in widths and in heights of a pixel."""
+    left = (width / 2 - 0.5 - torch.arange(width, dtype=torch.float64)) / focal[0]
+    up = (height / 2 - 0.5 - torch.arange(height, dtype=torch.float64)) / focal[1]
     z, y = torch.meshgrid(up, left, indexing="ij")
-    directions = torch.nn.functional.normalize(
-        torch.stack([torch.ones_like(y), y, z], -1).flatten(0, 1), dim=1
-    )
-    return RangeSensor(directions, max_range, range_noise, dropout)
+    return torch.nn.functional.normalize(torch.stack([torch.ones_like(y), y, z], -1).flatten(0, 1), dim=1)
 
 
 def sense(

@@ -44,6 +44,22 @@ def ball(centre: tuple[float, float, float], radius: float, n_sides: int = 12) -
     return torch.cat([lower.flatten(0, 1), upper.flatten(0, 1)])
 
 
+def copies(template: Tensor, center: Tensor, size: Tensor, heading: Tensor | None = None) -> Tensor:
+    """Copies (N·T, 3, 3) of a solid (T, 3, 3) that fits the cube of side 1 about the origin.
+
+    Args:
+        center: (N, 3), metres.
+        size: (N, 3) or (3,), metres along the copy's own axes.
+        heading: (N,) angles (rad) about the vertical; 0 if not given.
+    """
+    shapes = template * size.expand_as(center)[:, None, None]
+    if heading is not None:
+        cos, sin = heading.cos()[:, None, None], heading.sin()[:, None, None]
+        x, y, z = shapes.unbind(-1)
+        shapes = torch.stack([cos * x - sin * y, sin * x + cos * y, z], -1)
+    return (shapes + center[:, None, None]).flatten(0, 1)
+
+
 def _fan(corners: Tensor) -> Tensor:
     """Triangles (C − 2, 3, 3) that fill a convex polygon (C, 3)."""
     first = corners[:1].expand(corners.shape[0] - 2, 3)

@@ -1,0 +1,206 @@
+"""gmmtorch-explore: a team of robots explores a simulated world and maps it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch.cli import common, schema
+
+if TYPE_CHECKING:
+    from gmmtorch.exploration.mission import Mission
+    from gmmtorch.exploration.options import TeamOptions
+    from gmmtorch.exploration.trials import Trial, WorldOptions
+    from gmmtorch.report.progress import ProgressBars
+
+_TABLE = (
+    "framework seed planner t50 t90 entropy_reduction_bits bytes_sent bytes_raw_points auc "
+    "cross_entropy_bits map_disagreement coverage_per_metre path_length collisions wall_seconds"
+)
+
+_STAGE = "simulated seconds"
+
+
+def main() -> None:
+    """Entry point of the command."""
+    schema.register()
+    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="explore")(_guarded)()
+
+
+def _guarded(config: DictConfig) -> float | None:
+    return common.run_guarded(run, config)
+
+
+def run(config: DictConfig) -> float | None:
+    """One run; returns the entropy reduction (bits) of the last mission, to be optimised over."""
+    from gmmtorch.report.progress import ProgressBars
+
+    common.set_up(config)
+    folder = common.run_dir()
+    with ProgressBars(enabled=config.report.progress) as bars:
+        work = _explore if config.study is None else _compare
+        rows = work(config, folder, bars)
+    common.print_table(rows, _TABLE.split(), f"{rows[0]['world']}: {rows[0]['n_robots']} robots")
+    common.print_files(folder, folder / "results.json")
+    return float(rows[-1]["entropy_reduction_bits"])
+
+
+def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
+    """One mission, shown as it goes."""
+    from gmmtorch.cli.explore_pictures import MissionRecorder
+    from gmmtorch.exploration.outcome import with_times
+    from gmmtorch.exploration.trials import run_mission
+
+    trial = _trial(config, folder)
+    world = trial.world.open(trial.team, bars)
+    recorder = MissionRecorder(config, folder, world)
+
+    def on_sample(mission: Mission) -> None:
+        bars.note(_STAGE, _status(mission))
+        bars(_STAGE, round(mission.now), round(trial.team.duration))
+        recorder.sample(mission)
+
+    mission, row = run_mission(trial, world, on_sample)
+    rows = with_times([row])
+    common.write_results("explore", config, rows, folder)
+    recorder.finish(mission, rows[0])
+    return rows
+
+
+def _status(mission: Mission) -> str:
+    """Entropy left, bytes sent and the pace, for the progress bar."""
+    left = mission.union.entropy_bits / max(1.0, mission.union.observable_bits)
+    seconds = sum(mission.stages.values())
+    pace = f", {mission.now / seconds:.1f}x real time" if seconds > 0 else ""
+    return f"{left:.1%} of the entropy left, {mission.network.n_bytes / 1e3:,.0f} kB sent{pace}"
+
+
+def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
+    """Every variant of a study with every seed."""
+    from gmmtorch.cli.explore_pictures import save_comparison
+    from gmmtorch.exploration.outcome import with_times
+    from gmmtorch.exploration.trials import run_trials
+
+    trials = [
+        _trial(config, folder, variant, seed) for seed in config.study.seeds for variant in _variants(config)
+    ]
+    trials[0].world.open(trials[0].team, bars)  # into the cache, before several ask for it at once
+    done: list[dict[str, Any]] = []
+
+    def keep(row: dict[str, Any]) -> None:
+        done.append(row)
+        common.write_results("explore", config, with_times(done), folder)
+
+    rows = with_times(run_trials(trials, config.runtime.workers, keep, bars))
+    common.write_results("explore", config, rows, folder)
+    save_comparison(config, rows, folder)
+    return rows
+
+
+def _variants(config: DictConfig) -> list[dict[str, Any]]:
+    from gmmtorch.errors import InvalidArgumentError
+
+    variants: list[dict[str, Any]] = [dict(variant) for variant in config.study.variants]
+    known = {"team", "planner", "information", "coordination", "planning_prior", "codec", "loss"}
+    for variant in variants:
+        if not set(variant) <= known:
+            raise InvalidArgumentError(
+                f"study.variants has {sorted(set(variant) - known)}; a variant may set "
+                f"{', '.join(sorted(known))}."
+            )
+    if not variants or not config.study.seeds:
+        raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
+    return variants
+
+
+def _trial(
+    config: DictConfig, folder: Path, variant: dict[str, Any] | None = None, seed: int | None = None
+) -> Trial:
+    """The mission that the options describe, but for what a variant sets."""
+    from gmmtorch.exploration.trials import Trial
+
+    home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
+    seed = config.seed if seed is None else seed
+    if variant is not None:
+        about = "_".join(str(value) for value in variant.values()) or "default"
+        home = home / "trials" / f"{about}_{seed}"
+    return Trial(
+        world=_world(config),
+        team=_team(config, seed, variant or {}),
+        folder=home,
+        checkpoint_every=config.checkpoint.every,
+    )
+
+
+def _world(config: DictConfig) -> WorldOptions:
+    from gmmtorch.exploration.trials import WorldOptions
+
+    options = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in common.as_options(config.world).items()
+    }
+    return WorldOptions(**options, cache=config.runtime.cache)
+
+
+def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.exploration.mixture_mapper import FrameRule
+    from gmmtorch.exploration.options import TeamOptions
+    from gmmtorch.exploration.primitives import Dynamics
+    from gmmtorch.exploration.scoring import BeliefRule
+    from gmmtorch.mapping.novelty import NoveltyRule
+    from gmmtorch.simulation.depth_camera import DepthCamera
+
+    if config.transport != "in_process":
+        raise InvalidArgumentError(f"transport={config.transport!r} is not one of in_process.")
+    sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
+    rate, window = sensor.pop("rate"), mapping.pop("window")
+    threshold, observed, distance = (mapping.pop(name) for name in ("threshold", "observed", "distance"))
+    start = OmegaConf.to_container(config.team.start) if config.team.start is not None else None
+    return TeamOptions(
+        framework=variant.get("team", config.team.name),
+        size=config.team.size,
+        duration=config.duration,
+        seed=seed,
+        rate=rate,
+        camera=DepthCamera(**sensor),
+        dynamics=Dynamics(**common.as_options(config.robot)),
+        belief=BeliefRule(**common.as_options(config.belief)),
+        novelty=NoveltyRule(
+            resolution=config.world.resolution,
+            threshold=threshold,
+            observed=observed,
+            prior=config.belief.prior,
+            distance=distance,
+        ),
+        frame=FrameRule(**mapping),
+        window=_three("map.window", window),
+        planner=variant.get("planner", config.planner.name),
+        information=variant.get("information", config.information),
+        n_beams=config.planner.get("beams", 160),
+        coordination=variant.get("coordination", config.coordination),
+        n_rounds=config.rounds,
+        planning_prior=variant.get("planning_prior", config.planner.prior),
+        codec=variant.get("codec", config.codec),
+        latency=config.network.delay,
+        bandwidth=config.network.bandwidth,
+        loss=variant.get("loss", config.network.loss),
+        sample_every=config.evaluation.every,
+        codecs=tuple(config.evaluation.codecs),
+        start=None if start is None else tuple(tuple(float(x) for x in pose) for pose in start),
+    )
+
+
+def _three(name: str, values: list[int]) -> tuple[int, int, int]:
+    from gmmtorch.errors import InvalidArgumentError
+
+    if len(values) != 3:
+        raise InvalidArgumentError(f"{name}={values} must have three entries: cells along x, y and z.")
+    return values[0], values[1], values[2]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""What gmmtorch-explore shows: a mission as it goes, and at its end, and several side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import common
+
+if TYPE_CHECKING:
+    from gmmtorch.exploration.mission import Mission
+    from gmmtorch.exploration.world import World
+    from gmmtorch.mapping.components import Components
+    from gmmtorch.report import TeamSnapshot, TopView
+    from gmmtorch.report.exploration_recording import RecordedMap
+
+_SHOWN_AT = (0.05, 0.2, 0.5, 1.0)  # shares of the duration at which the team's map is drawn
+_HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
+_OCCUPIED = 0.65
+
+
+class MissionRecorder:
+    """Notes what the pictures of one mission need while it runs, and draws them at its end.
+
+    Numbers go to TensorBoard as they come. The map is noted at a few times; where a mission went on from a
+    checkpoint, at those that were still to come.
+    """
+
+    def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
+        from gmmtorch.report import Board, MissionBoard
+
+        self._config, self._folder, self._world = config, folder, world
+        self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
+        self._live = MissionBoard(self._board) if self._board is not None else None
+        self._snapshots: list[TeamSnapshot] = []
+        self._maps: list[RecordedMap] = []
+
+    def sample(self, mission: Mission) -> None:
+        """Take note of a mission that has just noted its own numbers."""
+        if self._live is not None:
+            numbers = {
+                name: curve[-1] for name, curve in mission.samples.items() if name != "times" and curve
+            }
+            robots = numbers.pop("entropy_bits_per_robot")
+            numbers |= {f"robot_{n}/entropy_bits": curve[-1] for n, curve in enumerate(robots, 1)}
+            numbers |= {
+                f"robot_{robot.number + 1}/path_length": robot.path_length for robot in mission.robots
+            }
+            self._live.step(mission.now, numbers)
+        reached = mission.now / mission.options.duration
+        due = sum(reached >= share - 1e-9 for share in _SHOWN_AT)
+        if due > len(self._snapshots):
+            self._note(mission)
+
+    def finish(self, mission: Mission, row: dict[str, Any]) -> None:
+        """Draw everything, save the mixture, and close TensorBoard."""
+        import torch
+
+        from gmmtorch.exploration.trials import TRAJECTORIES, save_trajectories
+        from gmmtorch.report import write_exploration_board
+
+        paths = [torch.stack(path).numpy() for path in mission.trajectories]
+
+        save_trajectories(mission, self._folder / TRAJECTORIES)
+        components = mission.robots[0].mapper.components()
+        if components is not None and len(components):
+            _save_mixture(components, self._world.resolution, self._folder / "map.safetensors")
+        figures = self._figures(mission, row, paths, components)
+        common.save_figures(self._config, figures, self._folder)
+        if self._board is not None:
+            write_exploration_board(self._board, [row], figures, _surfaces(components), paths)
+            self._board.close()
+        if self._config.report.recording:
+            from gmmtorch.report.exploration_recording import record_rerun
+
+            record_rerun(
+                self._folder / "mission.rrd",
+                paths,
+                period=mission.options.tick_seconds,
+                maps=self._maps,
+                resolution=self._world.resolution,
+                row=row,
+            )
+
+    def _note(self, mission: Mission) -> None:
+        """The team's map, from above and, for the recording, as cells and components."""
+        import torch
+
+        from gmmtorch.report import TeamSnapshot
+        from gmmtorch.report.exploration_recording import RecordedMap
+
+        surfaces = _surfaces(mission.robots[0].mapper.components())
+        mixture: dict[str, Any] = {}
+        shown: dict[str, Any] = {}
+        if surfaces is not None:
+            mixture = {"means": surfaces.means, "covariances": surfaces.covariances}
+            low, high = _band(mission)
+            within = (surfaces.means[:, 2] > low) & (surfaces.means[:, 2] < high)
+            shown = {name: value[within] for name, value in mixture.items()}
+            shown["owners"] = surfaces.ids[within, 0]
+        gone = 1 - mission.union.entropy_bits / mission.union.observable_bits
+        self._snapshots.append(
+            TeamSnapshot(
+                mission.now,
+                _team_view(mission),
+                [torch.stack(path) for path in mission.trajectories],
+                caption=f"{gone:.0%} of the entropy gone",
+                **shown,
+            )
+        )
+        if self._config.report.recording:
+            stored = mission.union.grid.cells()
+            occupied = mission.union.rule.probability(stored.hits, stored.misses) > _OCCUPIED
+            self._maps.append(RecordedMap(mission.now, stored.cells[occupied], **mixture))
+
+    def _figures(
+        self, mission: Mission, row: dict[str, Any], paths: list[Any], components: Components | None
+    ) -> dict[str, Any]:
+        from gmmtorch.report import (
+            bandwidth_figure,
+            entropy_figure,
+            mixture_scene_figure,
+            profile_figure,
+            stage_means,
+            team_map_figure,
+            trajectories_figure,
+        )
+
+        if not (self._config.report.figures or self._config.report.tensorboard):
+            return {}
+        figures = {
+            "entropy": entropy_figure([row]),
+            "trajectories": trajectories_figure(_world_view(mission), paths, _coverage(mission)),
+            "team_map": team_map_figure(self._snapshots),
+            "profile": profile_figure(*stage_means([row])),
+        }
+        if row["bytes_sent"]:
+            figures["bandwidth"] = bandwidth_figure([row])
+        surfaces = _surfaces(components)
+        if surfaces is not None:
+            first = surfaces.seen_from.new_zeros(len(surfaces))
+            first[surfaces.seen_by.flip(0)] = surfaces.seen_from.flip(0)
+            figures["mixture"] = mixture_scene_figure(
+                surfaces.means,
+                surfaces.covariances,
+                seen_from=surfaces.origins[first],
+                trajectories=paths,
+            )
+        return figures
+
+
+def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
+    """The pictures of a study: curves with bands over seeds, and bars."""
+    from gmmtorch.report import (
+        Board,
+        bandwidth_figure,
+        entropy_figure,
+        planner_comparison_figure,
+        profile_figure,
+        stage_means,
+        summary_bars,
+        write_exploration_board,
+    )
+
+    frameworks = {row["framework"] for row in rows}
+    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(rows))}
+    if len(frameworks) > 1:
+        figures |= {
+            "entropy": entropy_figure(rows),
+            "bandwidth": bandwidth_figure(rows),
+            "summary": summary_bars(rows),
+        }
+    else:
+        figures["planners"] = planner_comparison_figure(rows)
+    common.save_figures(config, figures, folder)
+    if config.report.tensorboard:
+        with Board(folder / "tensorboard") as board:
+            write_exploration_board(board, rows, figures)
+
+
+def _surfaces(components: Components | None) -> Components | None:
+    """The components that stand for surfaces; None if there are none."""
+    if components is None or not bool((~components.max_range).any()):
+        return None
+    return components.selected((~components.max_range).nonzero().squeeze(1))
+
+
+def _save_mixture(components: Components, resolution: float, path: Path) -> None:
+    """The mixture as a map that the other commands read."""
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    first = components.seen_from.new_zeros(len(components))
+    first[components.seen_by] = components.seen_from  # each was seen from one place
+    GaussianMap.from_components(
+        components.means,
+        components.covariances,
+        components.support,
+        components.origins[first],
+        components.max_range,
+        resolution=resolution,
+        codec="quantized",
+    ).save(path)
+
+
+def _band(mission: Mission) -> tuple[float, float]:
+    """Heights (m) that maps from above show: around that at which the robots began."""
+    height = float(mission.trajectories[0][0][2])
+    return height - _HALF_BAND, height + _HALF_BAND
+
+
+def _layers(mission: Mission) -> tuple[int, int]:
+    """The same as layers of the world's box, from the first up to but without the last."""
+    world = mission.world
+    first, last = (round(z / world.resolution - float(world.box.low[2])) for z in _band(mission))
+    return max(0, first), min(world.box.shape[2], max(first + 1, last))
+
+
+def _view(mission: Mission, probability: Any) -> TopView:
+    from gmmtorch.report import top_view
+
+    low = mission.world.box.low.clone()
+    low[2] += _layers(mission)[0]
+    return top_view(probability, low.double() * mission.world.resolution, mission.world.resolution)
+
+
+def _team_view(mission: Mission) -> TopView:
+    """The team's map from above, in the band of heights that the robots began in."""
+    from gmmtorch.occupancy.cell_evidence import Box
+
+    box, (first, last) = mission.world.box, _layers(mission)
+    low, high = box.low.clone(), box.high.clone()
+    low[2], high[2] = box.low[2] + first, box.low[2] + last
+    hits, misses = mission.union.grid.dense(Box(low, high))
+    return _view(mission, mission.union.rule.probability(hits, misses))
+
+
+def _world_view(mission: Mission) -> TopView:
+    """The true world from above, in the same band: occupied, free, or unseen by anybody ever."""
+    first, last = _layers(mission)
+    world = mission.world
+    truth = world.occupied[:, :, first:last].float()
+    return _view(mission, truth.masked_fill(~world.observable[:, :, first:last], 0.5))
+
+
+def _coverage(mission: Mission) -> Any:
+    """How many robots saw each column (nx, ny) in the band."""
+    import torch
+
+    first, last = _layers(mission)
+    seen = mission.seen_by.view(mission.world.box.shape)[:, :, first:last]
+    bits = torch.zeros(seen.shape[:2], dtype=torch.int64)
+    for robot in mission.robots:
+        bits += ((seen >> robot.number) & 1).any(2)
+    return bits

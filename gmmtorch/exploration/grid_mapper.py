@@ -1,0 +1,104 @@
+"""E1 and E2: maps of voxels; the novel points of each frame are shared as they are, or nothing is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.mapper import Heard, Memo, Sensed, novel_beams
+from gmmtorch.exploration.scoring import BeliefMap
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.sharing.messages import PointsMessage, decode, encode_points
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+
+class GridMapper:
+    """The map of one robot of a team with voxel grids.
+
+    Its own frames count in full; `shared`: teammates are sent, and count, the beams that were novel to
+    the sender. The grid behind the window is `belief.grid`.
+    """
+
+    def __init__(
+        self,
+        robot: int,
+        local: SlidingVoxelMap,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        memo: Memo,
+        shared: bool,
+    ) -> None:
+        self.local, self.belief = local, belief
+        self._robot, self._width, self._novelty = robot, width, novelty
+        self._memo, self._shared = memo, shared
+        self._n_frames = 0
+
+    def center_on(self, position: Tensor) -> None:
+        for box in self.local.center_on(position):
+            self.local.add_dense(box, *self.belief.grid.dense(box))
+
+    def sense(self, frame: DepthFrame) -> Sensed:
+        novel = novel_beams(self.local, frame, self._width, self._novelty)
+        parts, datagrams = [], []
+        if self._shared and bool(novel.any()):
+            datagrams = encode_points(
+                self._robot, self._n_frames, frame.origin, frame.ends[novel], frame.is_hit[novel]
+            )
+            parts.append(self._said(datagrams))  # from the points as they are sent
+            rest = ~novel
+        else:
+            rest = torch.ones_like(novel)
+        self._n_frames += 1
+        grid = self.belief.grid
+        parts.append(
+            cast_evidence(frame.origin, frame.ends[rest], frame.is_hit[rest], grid.resolution, grid.box)
+        )
+        for part in parts:
+            self._add(part)
+        return Sensed({"points": datagrams}, parts, novel)
+
+    def receive(self, heard: Sequence[Heard]) -> None:
+        frames: dict[tuple[int, int], list[bytes]] = {}
+        for item in heard:
+            if isinstance(item.message, PointsMessage):
+                frames.setdefault((item.message.sender, item.message.frame), []).append(item.datagram)
+        for datagrams in frames.values():
+            self._add(self._said(datagrams))
+
+    def _said(self, datagrams: list[bytes]) -> CellEvidence:
+        """The evidence of the points of a frame that have arrived."""
+
+        def make() -> CellEvidence:
+            said = [decode(datagram) for datagram in datagrams]
+            points = [message for message in said if isinstance(message, PointsMessage)]
+            ends = torch.cat([message.ends for message in points]).double()
+            is_hit = torch.cat([message.is_hit for message in points])
+            grid = self.belief.grid
+            return cast_evidence(points[0].origin.double(), ends, is_hit, grid.resolution, grid.box)
+
+        return self._memo(tuple(datagrams), make)
+
+    def _add(self, evidence: CellEvidence) -> None:
+        self.local.add(evidence)
+        self.belief.add(evidence)
+
+    def components(self) -> None:
+        """A grid has none."""
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "local": self.local.state(),
+            "belief": self.belief.state(),
+            "n_frames": self._n_frames,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.local.restore(state["local"])
+        self.belief.restore(state["belief"])
+        self._n_frames = int(state["n_frames"])

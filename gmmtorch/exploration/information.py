@@ -1,0 +1,216 @@
+"""What a range beam is expected to tell about the cells it meets: CSQMI and Shannon information.
+
+A beam meets cells 1 … C in order, cell i occupied with probability o_i independently of the others, and
+reads the depth of the first occupied one, or that there was none. That reading without a return is
+told apart from every depth. A cell of occupancy 0 changes nothing, wherever it stands: beams of
+different lengths are padded with it, or their `lengths` given. All information is in nats.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+BITS_PER_NAT = 1 / math.log(2)
+
+_NEGLIGIBLE = 1e-5
+"""Of the kernel: readings less alike than this count as unlike."""
+
+
+def first_hit(occupancy: Tensor, lengths: Tensor | None = None) -> Tensor:
+    """Probability of each cell to be the first occupied one, and of none to be.
+
+    Args:
+        occupancy: (..., C) in [0, 1], cells in order along each beam.
+        lengths: (...,) cells that a beam has; all C if not given. Later ones do not exist.
+
+    Returns:
+        (..., C + 1), o_i Π_{j<i} (1 − o_j), and last Π_j (1 − o_j); rows sum to one.
+    """
+    return first_block(_ended(check_occupancy(occupancy), lengths))
+
+
+def first_block(occupancy: Tensor) -> Tensor:
+    """Probability (..., C) of each cell to be the first occupied one; the last must be occupied surely."""
+    return _reach(occupancy).mul_(occupancy)
+
+
+def _reach(occupancy: Tensor) -> Tensor:
+    """Probability (..., C) that all cells before each are free."""
+    clear = torch.empty_like(occupancy)
+    torch.sub(1, occupancy[..., :-1], out=clear[..., 1:])
+    clear[..., 0] = 1
+    return torch.cumprod(clear, -1)
+
+
+def sharpened(occupancy: Tensor) -> Tensor:
+    """o²/(o² + (1 − o)²): cells of the maps drawn with the squares of their probabilities."""
+    occupied = occupancy * occupancy
+    clear = (1 - occupancy).square_()
+    return occupied / clear.add_(occupied)
+
+
+def csqmi(
+    occupancy: Tensor,
+    depths: Tensor,
+    sigma: float,
+    *,
+    band: int | None = None,
+    lengths: Tensor | None = None,
+) -> Tensor:
+    """Cauchy–Schwarz quadratic mutual information of each beam's reading and the cells it meets.
+
+    I = log(pᵀKp) − 2 log(pᵀKv), p the first hits of o, v those of `sharpened` o and
+    K_ij = exp(−(d_i − d_j)²/4σ²): Charrow et al., ICRA 2015, without the products of squares of theirs
+    that underflow, so that float32 serves for beams of any length. The reading is normal about the depth
+    of the cell that is hit.
+
+    Args:
+        occupancy: (..., C) in [0, 1].
+        depths: (..., C), metres, where a hit in each cell is expected, not decreasing; broadcast if need be.
+        sigma: standard deviation (m) of a reading, positive.
+        band: how many cells on either side a reading can be mistaken for; if not given as many as have
+            a K_ij above 10⁻⁵.
+        lengths: (...,) cells that a beam has; all C if not given.
+
+    Returns:
+        (...,) nats, never negative.
+    """
+    check_sigma(sigma)
+    ended = _ended(check_occupancy(occupancy), lengths)
+    if not bool(torch.isfinite(depths).all()):
+        raise InvalidArgumentError("depths must be finite, those of cells beyond a beam's end as well.")
+    depths = depths.expand_as(occupancy)
+    if band is None:
+        band = needed_band(depths, sigma)
+    elif band < 0:
+        raise InvalidArgumentError(f"band={band} must be at least 0, or None to have it chosen.")
+    kernel = depth_kernel(depths, sigma, band).to(occupancy.dtype)
+    return banded_csqmi(first_block(ended), first_block(sharpened(ended)), kernel)
+
+
+def needed_band(depths: Tensor, sigma: float, negligible: float = _NEGLIGIBLE) -> int:
+    """Most cells (of depths (..., C), not decreasing) within which K stays above `negligible`."""
+    reach = 2 * sigma * math.sqrt(-math.log(negligible))
+    n_cells = depths.shape[-1]
+    for band in range(1, n_cells):
+        if not bool((depths[..., band:] - depths[..., :-band] < reach).any()):
+            return band - 1
+    return max(n_cells - 1, 0)
+
+
+def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor | None = None) -> Tensor:
+    """K_{i,i+s} for s = 1 … band as (band, ..., C + 1): zero where i + s is beyond the beam's cells.
+
+    Args:
+        depths: (..., C), metres.
+        sigma: metres.
+        lengths: (...,) cells that a beam has; all C if not given.
+    """
+    n_cells = depths.shape[-1]
+    kernel = depths.new_zeros(band, *depths.shape[:-1], n_cells + 1)
+    cell = torch.arange(n_cells, device=depths.device)
+    for s in range(1, min(band, n_cells - 1) + 1):
+        near = ((depths[..., s:] - depths[..., :-s]) / (2 * sigma)).square_().neg_().exp_()
+        if lengths is not None:
+            near = torch.where(cell[s:] < lengths[..., None], near, 0)
+        kernel[s - 1, ..., : n_cells - s] = near
+    return kernel
+
+
+def banded_csqmi(hit: Tensor, hit_sharp: Tensor, kernel: Tensor) -> Tensor:
+    """log(pᵀKp) − 2 log(pᵀKv), nats (...,).
+
+    Args:
+        hit, hit_sharp: p and v (..., C), contiguous: `first_block` of the occupancy and of it `sharpened`.
+        kernel: (band, ..., C) of `depth_kernel`: upper diagonals of K, whose main diagonal is one.
+    """
+    p, v = hit.reshape(-1), hit_sharp.reshape(-1)
+    half_p, half_v = p / 2, v / 2  # the upper half of Kp and of Kv, half the diagonal included
+    # Rows laid end to end: the kernel is zero wherever a shift would run into the next beam.
+    for s, diagonal in enumerate(kernel, start=1):
+        upper = diagonal.reshape(-1)
+        half_p[:-s].addcmul_(upper[:-s], p[s:])
+        half_v[:-s].addcmul_(upper[:-s], v[s:])
+    like = (p * half_p).view(hit.shape).sum(-1).mul_(2)
+    cross = half_v.mul_(p).addcmul_(half_p, v).view(hit.shape).sum(-1)
+    return (like.log_() - cross.log_().mul_(2)).clamp_min_(0)
+
+
+def fsmi(
+    occupancy: Tensor,
+    *,
+    delta_occ: float = 1.5,
+    delta_emp: float = 1 / 1.5,
+    lengths: Tensor | None = None,
+) -> Tensor:
+    """Shannon mutual information of each beam's reading and the cells it meets (FSMI).
+
+    I = Σ_j P(e_j) C_j over the events e_j that cell j is hit first,
+    C_j = f(δ_occ, r_j) + Σ_{i<j} f(δ_emp, r_i), r the odds of a cell and f(δ, r) what multiplying them
+    by δ tells about it (Zhang et al., IJRR 2020, for noise within a cell); without a hit every cell
+    gets δ_emp. With δ_occ → ∞ and δ_emp → 0 this is the exact information of a sensor without noise,
+    the entropy of the first hit.
+
+    Args:
+        occupancy: (..., C) in [0, 1].
+        delta_occ: factor of a cell's odds when it is hit, above 1.
+        delta_emp: the same when it is passed through, in (0, 1).
+        lengths: (...,) cells that a beam has; all C if not given.
+
+    Returns:
+        (...,) nats, never negative.
+    """
+    if not (1 < delta_occ < math.inf and 0 < delta_emp < 1):
+        raise InvalidArgumentError(
+            f"delta_occ={delta_occ} must be above 1 and finite, delta_emp={delta_emp} between 0 and 1."
+        )
+    ended = _ended(check_occupancy(occupancy), lengths)
+    return shannon(first_block(ended), ended, delta_occ, delta_emp)
+
+
+def shannon(hit: Tensor, occupancy: Tensor, delta_occ: float = 1.5, delta_emp: float = 1 / 1.5) -> Tensor:
+    """`fsmi` (...,) by the first hits (..., C) of an occupancy (..., C) whose last cell is occupied surely.
+
+    Cell i is passed through with probability Σ_{j>i} P(e_j) = Π_{j≤i} (1 − o_j): the sum is one over cells.
+    """
+    passed = _reach(occupancy).mul_(1 - occupancy)
+    told = hit * _told(delta_occ, occupancy) + passed * _told(delta_emp, occupancy)
+    return told.sum(-1).clamp_min_(0)
+
+
+def _told(delta: float, occupancy: Tensor) -> Tensor:
+    """f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r): finite at 0 and 1."""
+    clear = 1 - occupancy
+    after = (occupancy + clear / delta).log_()
+    return after.neg_().sub_(math.log(delta) * clear / (occupancy * delta + clear))
+
+
+def check_sigma(sigma: float) -> None:
+    if not 0 < sigma < math.inf:
+        raise InvalidArgumentError(
+            f"sigma={sigma} must be positive and finite: metres of noise of a reading."
+        )
+
+
+def check_occupancy(occupancy: Tensor) -> Tensor:
+    """The occupancy, if it is (..., C) of probabilities."""
+    if occupancy.ndim < 1 or not occupancy.is_floating_point():
+        raise InvalidArgumentError(
+            f"occupancy of shape {tuple(occupancy.shape)} and {occupancy.dtype} must be (..., C) of floats."
+        )
+    if not bool(((occupancy >= 0) & (occupancy <= 1)).all()):
+        raise InvalidArgumentError("occupancy must lie in [0, 1] everywhere; give unknown cells their prior.")
+    return occupancy
+
+
+def _ended(occupancy: Tensor, lengths: Tensor | None) -> Tensor:
+    """(..., C + 1): cells beyond a beam's end cleared, and after all one surely occupied, for no hit."""
+    if lengths is not None:
+        cell = torch.arange(occupancy.shape[-1], device=occupancy.device)
+        occupancy = torch.where(cell < lengths[..., None], occupancy, 0)
+    return torch.cat([occupancy, occupancy.new_ones(*occupancy.shape[:-1], 1)], -1)

@@ -1,0 +1,107 @@
+"""What every robot's map offers to the mission, whatever it is made of."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.scoring import BeliefMap
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.sharing.messages import Message
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+T = TypeVar("T")
+
+
+class Sensed(NamedTuple):
+    """What a frame has brought.
+
+    messages: datagrams for the team by kind. evidence: what it adds to the robot's own map, in parts.
+    novel: (N,) bool, the beams of the frame that the map learned from.
+    """
+
+    messages: dict[str, list[bytes]]
+    evidence: list[CellEvidence]
+    novel: Tensor
+
+
+class Heard(NamedTuple):
+    """A datagram as it arrived, and what it says."""
+
+    sender: int
+    datagram: bytes
+    message: Message
+
+
+class Mapper(Protocol):
+    """One robot's map: a window of voxels to plan in, and behind it all that the robot knows.
+
+    `local` is the window, `belief` the map that the evaluator reads; what `sense` and `receive` return
+    is in both already.
+    """
+
+    local: SlidingVoxelMap
+    belief: BeliefMap
+
+    def center_on(self, position: Tensor) -> None:
+        """Move the window along with the robot at (3,), and fill what it uncovers from what is known."""
+
+    def sense(self, frame: DepthFrame) -> Sensed:
+        """Learn from a frame of the robot's own camera."""
+
+    def receive(self, heard: Sequence[Heard]) -> None:
+        """Learn from what teammates sent."""
+
+    def components(self) -> Components | None:
+        """The mixture, of maps that are one."""
+
+    def state(self) -> dict[str, Any]: ...
+
+    def restore(self, state: dict[str, Any]) -> None: ...
+
+
+class Memo:
+    """Values of a pure function that several robots of a simulation would work out alike: kept a while.
+
+    Robots that hear the same datagram get the same evidence from it, so one of them does the work. The
+    least recently used of more than `size` are forgotten.
+    """
+
+    def __init__(self, size: int = 256) -> None:
+        self._size = size
+        self._values: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def __call__(self, key: Hashable, make: Callable[[], T]) -> T:
+        """The value for `key`, made if it is not known."""
+        if key in self._values:
+            self._values.move_to_end(key)
+        else:
+            self._values[key] = make()
+            if len(self._values) > self._size:
+                self._values.popitem(last=False)
+        value: T = self._values[key]
+        return value
+
+
+def novel_beams(local: SlidingVoxelMap, frame: DepthFrame, width: int, rule: NoveltyRule) -> Tensor:
+    """Which beams (N,) of a frame tell the map something new; `width` of the image, pixels.
+
+    The first beam of every two by two pixels speaks for all four: neighbouring pixels are much closer
+    to one another than the cells are large.
+    """
+    n, across = len(frame.pixel), (width + 1) // 2
+    block = frame.pixel // (2 * width) * across + frame.pixel % width // 2
+    first = block.new_full((int(block.max()) + 1 if n else 0,), n)
+    first.scatter_reduce_(0, block, torch.arange(n, device=block.device), "amin")
+    present = first < n
+    number = torch.cumsum(present, 0) - 1
+    first = first[present]
+    bits, unobserved = local.beam_novelty(frame.origin, frame.ends[first], frame.is_hit[first], rule)
+    return (unobserved | (bits >= rule.threshold))[number[block]]

@@ -1,0 +1,231 @@
+"""E0: a map of Gaussian components, learned from novel beams and shared (thesis Fig 4.1).
+
+Novelty → learn → update → share → sliding map. Components are immutable once they are learned, by
+whoever learned them; points that they explain later are counts that anybody may add. All robots hold
+the components as they were decoded from the datagrams, the owner too, so that all maps are the same.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.mapper import Heard, Memo, Sensed, novel_beams
+from gmmtorch.exploration.scoring import BeliefMap
+from gmmtorch.mapping.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.codec import spatial_order
+from gmmtorch.mapping.component_rays import component_evidence
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.mapping.updating import count_explained, summed
+from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.sharing.messages import (
+    ComponentsMessage,
+    CountsMessage,
+    decode,
+    encode_components,
+    encode_counts,
+)
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+
+@dataclass(frozen=True)
+class FrameRule:
+    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
+
+    update_at: counts of a component are sent once they have grown by this factor.
+    update_stride: every so manieth explained beam is counted, for as many as that leaves out.
+    """
+
+    noise: float = 0.05
+    length: float = 0.5
+    cell: float = 0.15
+    components: int = 200
+    iterations: int = 4
+    update_at: float = 2.0
+    update_stride: int = 4
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length", "cell"):
+            if not getattr(self, name) > 0:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        for name in ("components", "iterations", "update_stride"):
+            check_whole(name, getattr(self, name), 1)
+        if not self.update_at > 1:
+            raise InvalidArgumentError(f"update_at={self.update_at} must be above 1.")
+
+    def cells(self) -> CellRule:
+        return CellRule(self.noise, self.length, self.cell, self.components, self.iterations)
+
+
+class MixtureMapper:
+    """The map of one robot of a team that shares mixtures."""
+
+    def __init__(
+        self,
+        robot: int,
+        local: SlidingVoxelMap,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        rule: FrameRule,
+        memo: Memo,
+        codec: str = "quantized",
+    ) -> None:
+        self.local, self.belief = local, belief
+        self.tiles = MixtureTiles()
+        self._robot, self._width, self._novelty, self._rule = robot, width, novelty, rule
+        self._memo, self._codec = memo, codec
+        self._n_numbered = 0
+        self._batches: dict[int, list[tuple[int, Components]]] = {}  # by robot: first sequence, batch
+        self._gained: dict[tuple[int, int], float] = {}  # counts not sent yet, by id
+        self._keys: list[tuple[Any, ...]] = []
+        self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
+
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def center_on(self, position: Tensor) -> None:
+        regenerate(self.local, self.local.center_on(position), self.tiles)
+
+    def sense(self, frame: DepthFrame) -> Sensed:
+        novel = novel_beams(self.local, frame, self._width, self._novelty)
+        counts = encode_counts(self._robot, self._counted(frame, ~novel), self._codec)
+        datagrams = encode_components(self._learned(frame, novel), self._codec)
+        added = [self._take(datagram) for datagram in (*datagrams, *counts)]
+        return Sensed({"components": datagrams, "counts": counts}, added, novel)
+
+    def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
+        """The components of the novel beams, numbered in an order that takes few bytes."""
+        origin = frame.origin[None]
+        parts = [
+            learn_cells([frame.ends[novel & kind]], origin, self._rule.cells(), max_range=not bool(surface))
+            for kind, surface in ((frame.is_hit, True), (~frame.is_hit, False))
+        ]
+        found = Components.concatenate([part for part in parts if len(part)] or parts[:1])
+        found = found.rearranged(spatial_order(found)) if len(found) else found
+        number = self._n_numbered + torch.arange(len(found))
+        self._n_numbered += len(found)
+        return replace(found, ids=torch.stack([torch.full_like(number, self._robot), number], 1))
+
+    def _counted(self, frame: DepthFrame, known: Tensor) -> dict[tuple[int, int], float]:
+        """Counts that are due to be sent, once the beams (N,) that told nothing new are counted."""
+        nearby = self._seen_from_near(frame.origin)
+        chosen = known.nonzero().squeeze(1)[:: self._rule.update_stride]
+        if nearby is None or len(chosen) == 0:
+            return {}
+        weight = float(self._rule.update_stride)
+        counted = nearby
+        for max_range in (False, True):
+            ends = frame.ends[chosen[frame.is_hit[chosen] != max_range]]
+            counted = count_explained(
+                counted, ends, frame.origin, self._novelty.distance, None, max_range, weight
+            ).components
+        gain = counted.support - nearby.support
+        due = {}
+        for row in (gain > 0).nonzero().squeeze(1).tolist():
+            key = (int(nearby.ids[row, 0]), int(nearby.ids[row, 1]))
+            total = self._gained.pop(key, 0.0) + float(gain[row])
+            if total >= (self._rule.update_at - 1) * float(nearby.support[row]):
+                due[key] = total
+            else:
+                self._gained[key] = total
+        return due
+
+    def _seen_from_near(self, origin: Tensor) -> Components | None:
+        """Components with all their counts, of batches seen from close to a place (3,)."""
+        middle = self._place(origin)
+        near = [
+            batch
+            for offset in itertools.product((-1, 0, 1), repeat=3)
+            for batch in self._places.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
+        ]
+        return summed(Components.concatenate(near)) if near else None
+
+    def _place(self, origin: Tensor) -> tuple[int, ...]:
+        """Which cell of the index of origins a place (3,) is in."""
+        return tuple((origin / self._novelty.distance).floor().long().tolist())
+
+    # -- what datagrams say -----------------------------------------------------------------------
+
+    def receive(self, heard: Sequence[Heard]) -> None:
+        for item in heard:
+            if isinstance(item.message, ComponentsMessage | CountsMessage):
+                self._take(item.datagram)
+
+    def _take(self, datagram: bytes) -> CellEvidence:
+        """Enter what a datagram says, one's own included."""
+        message = self._memo(("message", datagram), lambda: decode(datagram))
+        if isinstance(message, CountsMessage):
+            batch = self._with_counts(message)
+            name: tuple[Any, ...] = ("counts", message.sender, len(self._keys))
+        else:
+            assert isinstance(message, ComponentsMessage)  # `receive` and `sense` pass on no others
+            batch = message.components
+            name = ("components", *(batch.ids[0].tolist() if len(batch) else ()))
+        key = (datagram, *batch.ids[:, 1].tolist())  # counts of unknown components are left out
+        if len(batch) == 0:
+            return CellEvidence.empty()
+        self._enter(name, batch)
+        grid = self.belief.grid
+        evidence = self._memo(key, lambda: component_evidence(batch, grid.resolution, grid.box))
+        self.local.add(evidence)
+        self.belief.add(evidence)
+        return evidence
+
+    def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
+        """Keep a batch of components seen from one place, or of counts that are added to some."""
+        self._keys.append(name)
+        self.tiles.add(name, batch)
+        for place in {self._place(origin) for origin in batch.origins}:
+            self._places.setdefault(place, []).append(batch)
+        if name[0] == "components":
+            batches = self._batches.setdefault(name[1], [])
+            bisect.insort(batches, (name[2], batch), key=lambda entry: entry[0])
+
+    def _with_counts(self, message: CountsMessage) -> Components:
+        """The components that a message adds counts to, with those counts; unknown ones are left out."""
+        rows = []
+        for (robot, number), count in message.counts.items():
+            batches = self._batches.get(robot, [])
+            at = bisect.bisect_right(batches, number, key=lambda entry: entry[0]) - 1
+            if at >= 0 and number - batches[at][0] < len(batches[at][1]):
+                batch = batches[at][1]
+                one = batch.selected(torch.tensor([number - batches[at][0]]))
+                scale = count / float(one.support[0])
+                rows.append(replace(one, support=one.support * scale, seen_count=one.seen_count * scale))
+        return Components.concatenate(rows) if rows else Components.empty(3)
+
+    # -- the whole --------------------------------------------------------------------------------
+
+    def components(self) -> Components:
+        """All components with all their counts, in the order of their ids."""
+        return summed(self.tiles.all()) if self._keys else Components.empty(3)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "local": self.local.state(),
+            "belief": self.belief.state(),
+            "batches": [
+                {"name": list(name), **{f.name: getattr(batch, f.name) for f in fields(batch)}}
+                for name, batch in zip(self._keys, (part for _, part in self.tiles.items()), strict=True)
+            ],
+            "n_numbered": self._n_numbered,
+            "gained": [[*key, count] for key, count in self._gained.items()],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.local.restore(state["local"])
+        self.belief.restore(state["belief"])
+        for entry in state["batches"]:
+            self._enter(tuple(entry["name"]), Components(**{k: v for k, v in entry.items() if k != "name"}))
+        self._n_numbered = int(state["n_numbered"])
+        self._gained = {(int(robot), int(number)): count for robot, number, count in state["gained"]}

@@ -1,0 +1,111 @@
+"""TeamOptions: how a team explores, everything but the world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.mixture_mapper import FrameRule
+from gmmtorch.exploration.primitives import Dynamics
+from gmmtorch.exploration.scoring import BeliefRule
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.simulation.depth_camera import DepthCamera
+
+PLANNERS = ("mcts", "frontier", "random")
+"""Names of planners, see `planners.make_planner`."""
+
+_MOST_ROBOTS = 15  # as many bits as say who saw a cell
+
+FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
+"""What the thesis calls them."""
+
+
+@dataclass(frozen=True)
+class TeamOptions:
+    """How a team explores, everything but the world.
+
+    framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and search.
+    rate: frames a second (Hz); a robot plans each time it has flown a primitive (`dynamics.duration`).
+    window: cells of the sliding map along x, y, z. planner, information, coordination: by
+    name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior: occupancy that the planner
+    expects of unknown cells. codec: of components, see `sharing.messages`. latency (s), bandwidth
+    (bytes/s of each sender; None: no limit), loss: of the network. sample_every: simulated seconds
+    between the numbers kept. codecs: what the novel points are also encoded with, to compare. margin:
+    metres that robots keep between them. start: (size, 4) poses; None: chosen by the world.
+    """
+
+    framework: str = "gmm_shared"
+    size: int = 3
+    duration: float = 1600.0
+    seed: int = 0
+    rate: float = 1.0
+    camera: DepthCamera = field(default_factory=DepthCamera)
+    dynamics: Dynamics = field(default_factory=Dynamics)
+    belief: BeliefRule = field(default_factory=BeliefRule)
+    novelty: NoveltyRule = field(default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5))
+    frame: FrameRule = field(default_factory=FrameRule)
+    window: tuple[int, int, int] = (96, 96, 40)
+    planner: str = "mcts"
+    information: str = "csqmi"
+    n_beams: int = 160
+    coordination: str = "greedy"
+    n_rounds: int = 3
+    planning_prior: float = 0.125
+    codec: str = "quantized"
+    latency: float = 0.05
+    bandwidth: float | None = None
+    loss: float = 0.0
+    sample_every: float = 10.0
+    codecs: tuple[str, ...] = ()
+    margin: float = 0.1
+    start: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.framework not in FRAMEWORKS:
+            raise InvalidArgumentError(f"team={self.framework!r} is not one of {', '.join(FRAMEWORKS)}.")
+        if self.planner not in PLANNERS:
+            raise InvalidArgumentError(f"planner={self.planner!r} is not one of {', '.join(PLANNERS)}.")
+        check_whole("team.size", self.size, 1)
+        if self.size > _MOST_ROBOTS:
+            raise InvalidArgumentError(f"team.size={self.size} is more than the {_MOST_ROBOTS} there may be.")
+        check_whole("seed", self.seed, 0)
+        for name in ("duration", "rate", "sample_every"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero, and finite.")
+        if not 0 < self.planning_prior < 1:
+            raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
+        for name, ratio in (
+            ("the planning period in frames", self.dynamics.duration * self.rate),
+            ("the frame period in steps of the dynamics", 1 / (self.rate * self.dynamics.step)),
+        ):
+            if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
+                raise InvalidArgumentError(
+                    f"sensor.rate={self.rate} Hz with robot.duration={self.dynamics.duration} s and "
+                    f"robot.step={self.dynamics.step} s makes {name} {ratio:g}; it must be a whole number."
+                )
+
+    @property
+    def tick_seconds(self) -> float:
+        return 1 / self.rate
+
+    @property
+    def ticks_per_plan(self) -> int:
+        return round(self.dynamics.duration * self.rate)
+
+    @property
+    def steps_per_tick(self) -> int:
+        return round(self.tick_seconds / self.dynamics.step)
+
+    @property
+    def ticks_per_sample(self) -> int:
+        return max(1, round(self.sample_every * self.rate))
+
+    @property
+    def plan_slack(self) -> float:
+        """Seconds in which a plan reaches the teammates who wait for it before they plan."""
+        return 2 * self.latency + 0.01
+
+    @property
+    def shares(self) -> bool:
+        return self.framework != "grid_isolated"

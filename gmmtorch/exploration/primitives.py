@@ -1,0 +1,154 @@
+"""Motion primitives of a quadrotor: short flights at commanded velocities, and how to stop after them.
+
+A state (7,) is x, y, z, yaw and the velocities v along the heading, v_z up, ω of the yaw; world frame,
+metres, radians, seconds. Yaw runs on beyond ±π, so that it has no jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+_ROUNDING = 1e-9
+
+_QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18))
+"""Gauss–Legendre nodes and weights on [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What the robot can do, in metres, radians and seconds.
+
+    Attributes:
+        speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
+        acceleration: largest change of each of the first two, m/s². yaw_acceleration: of the last, rad/s².
+        duration: of a primitive. step: time between two states of a path, which divides the duration.
+        radius: of a sphere around the body.
+
+    Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
+    """
+
+    speed: float = 1.5
+    climb: float = 0.75
+    yaw_rate: float = 1.2
+    acceleration: float = 1.5
+    yaw_acceleration: float = 3.0
+    duration: float = 2.0
+    step: float = 0.2
+    radius: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidArgumentError(f"{field.name}={value} must be finite, above zero.")
+        if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
+            raise InvalidArgumentError(
+                f"step={self.step} s does not divide duration={self.duration} s; take a fraction of it."
+            )
+
+    @property
+    def n_steps(self) -> int:
+        """States on the path of a primitive."""
+        return round(self.duration / self.step)
+
+    @property
+    def n_braking_steps(self) -> int:
+        """States on the way to rest from the largest velocities."""
+        return int(self._n_ramp_steps(self._limits).max())
+
+    @property
+    def _limits(self) -> Tensor:
+        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
+
+    def _n_ramp_steps(self, change: Tensor) -> Tensor:
+        """Whole steps that changes (..., 3) of the velocities take."""
+        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
+        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
+        return (change.abs() / per_step - _ROUNDING).ceil()
+
+    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
+        """Velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
+
+        Each changes evenly over as many whole steps as the largest acceleration asks for, then stays: so
+        it is linear in time within every step. Raises `InvalidArgumentError` for states beyond the limits.
+        """
+        now = states[..., 4:]
+        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # NaN is not within them, either
+            worst = now.reshape(-1, 3).abs().amax(0).tolist()
+            raise InvalidArgumentError(
+                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
+                f"{self._limits.tolist()}."
+            )
+        change = commands - now
+        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
+        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
+        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
+        return torch.where(time < n_ramp, ramp, commands[..., None, :])
+
+
+class Primitives:
+    """The library: arcs, climbing arcs, slow arcs, turns in place, straight up and down, and to stop.
+
+    commands: (P, 3) float64, the velocities v, v_z, ω that each primitive goes over to. stop: the index of
+    the one that comes to rest.
+    """
+
+    def __init__(self, dynamics: Dynamics) -> None:
+        self.dynamics = dynamics
+        v, c, w = dynamics.speed, dynamics.climb, dynamics.yaw_rate
+        arcs = [(v, up, turn) for up in (0.0, c, -c) for turn in (0.0, w / 2, -w / 2, w, -w)]
+        slow = [(v / 2, 0.0, turn) for turn in (0.0, w, -w)]
+        turns = [(0.0, 0.0, turn) for turn in (w, -w, w / 2, -w / 2)]
+        vertical = [(0.0, c, 0.0), (0.0, -c, 0.0)]
+        library = [*arcs, *slow, *turns, *vertical, (0.0, 0.0, 0.0)]
+        self.commands = torch.tensor(library, dtype=torch.float64)
+        self.stop = len(library) - 1
+
+    def __len__(self) -> int:
+        return len(self.commands)
+
+    def rollout(self, states: Tensor) -> Tensor:
+        """States (N, P, S, 7) after 1, 2, …, S steps of every primitive from states (N, 7).
+
+        With velocities that change evenly within a step h,
+
+            z += h (v_z⁰ + v_z¹)/2,   ψ += h (ω⁰ + ω¹)/2,   (x, y) += ∫₀ʰ v(t) (cos ψ(t), sin ψ(t)) dt
+
+        the integral by three Gauss–Legendre nodes. At constant velocities it is that of the closed form,
+        x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)), to better than 10⁻⁸ m.
+        """
+        return _integrated(states[:, None], self.commands, self.dynamics, self.dynamics.n_steps)
+
+    def braking(self, states: Tensor) -> Tensor:
+        """States (..., B, 7) on the way to rest from states (..., 7); the last is at rest."""
+        at_rest = torch.zeros(3, dtype=torch.float64)
+        return _integrated(states, at_rest, self.dynamics, self.dynamics.n_braking_steps)
+
+
+def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
+    """States (..., n_steps, 7) that follow states (..., 7) as the velocities go over to commands (..., 3)."""
+    h = dynamics.step
+    velocity = dynamics.velocities(states.double(), commands, n_steps)
+    x, y, z, yaw = (states[..., i, None].double() for i in range(4))
+    v, climb, turn = velocity.movedim(-1, 0).contiguous()  # each (..., n_steps + 1)
+    yaw = yaw + _accumulated((turn[..., :-1] + turn[..., 1:]) * (h / 2))
+    z = z + _accumulated((climb[..., :-1] + climb[..., 1:]) * (h / 2))
+    dx, dy = torch.zeros_like(v[..., 1:]), torch.zeros_like(v[..., 1:])
+    for node, weight in _QUADRATURE:
+        heading = torch.lerp(turn[..., :-1], turn[..., 1:], node / 2) * (h * node) + yaw[..., :-1]
+        speed = torch.lerp(v[..., :-1], v[..., 1:], node) * (h * weight)
+        dx += speed * heading.cos()
+        dy += speed * heading.sin()
+    place = [x + dx.cumsum(-1), y + dy.cumsum(-1), z[..., 1:], yaw[..., 1:]]
+    return torch.stack([*place, v[..., 1:], climb[..., 1:], turn[..., 1:]], -1)
+
+
+def _accumulated(steps: Tensor) -> Tensor:
+    """Sums (..., n + 1) of the first 0, 1, …, n of steps (..., n)."""
+    return torch.nn.functional.pad(steps.cumsum(-1), (1, 0))

@@ -1,0 +1,121 @@
+"""Robot: one member of a team, with its map, its planner, and the path it is on."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.mapper import Mapper
+from gmmtorch.exploration.planning import Plan, Planner
+from gmmtorch.exploration.roadmap import Roadmap
+from gmmtorch.exploration.safety import surroundings_of
+from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+_REMEMBERED = 12  # frames whose returns are kept away from, whatever the map makes of them
+
+
+class Robot:
+    """What one robot knows and does.
+
+    state: (7,) x, y, z, yaw and the velocities v, v_z, ω now. path: (S, 7) the states of the plan it
+    follows. braking: (B, 7) how it would come to rest after it. start_radius: metres around the start that
+    are known to be free.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        pose: Tensor,
+        mapper: Mapper,
+        planner: Planner,
+        library: ViewLibrary,
+        roadmap: Roadmap,
+        start_radius: float,
+    ) -> None:
+        self.number = number
+        self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
+        self.state = torch.cat([pose.double(), torch.zeros(3, dtype=torch.float64)])
+        self.path = self.state[None].clone()
+        self.braking = self.state[None].clone()
+        self.path_length = 0.0
+        self.collisions = 0
+        self.plans: dict[int, tuple[float, Tensor]] = {}  # heard of teammates: when, view poses
+        self._start = (pose[:3].double().clone(), start_radius)
+        self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
+
+    @property
+    def position(self) -> Tensor:
+        return self.state[:3]
+
+    def follow(self, plan: Plan) -> None:
+        """Take up a plan that starts at the present state."""
+        self.path, self.braking = plan.path, plan.braking
+
+    def advance(self, begin: int, stop: int) -> Tensor:
+        """Fly on from step `begin` of the path to step `stop`; returns the positions on the way (n, 3)."""
+        flown = self.path[begin:stop]
+        if len(flown):
+            steps = torch.cat([self.state[None], flown])[:, :3]
+            self.path_length += float((steps[1:] - steps[:-1]).norm(dim=1).sum())
+            self.state = flown[-1].clone()
+        return flown[:, :3]
+
+    def remember(self, frame: DepthFrame) -> None:
+        """Keep the cells of a frame's returns, which the planner stays clear of."""
+        resolution = self.mapper.local.resolution
+        cells = (frame.ends[frame.is_hit] / resolution).floor().long()
+        if len(cells) == 0:
+            return
+        low, size = cells.amin(0), cells.amax(0) - cells.amin(0) + 1
+        hit = torch.zeros(size.tolist(), dtype=torch.bool)
+        hit[(cells - low).unbind(1)] = True
+        self._recent.append(hit.nonzero() + low)
+
+    def surroundings(self, planning_prior: float, radius: float) -> Surroundings:
+        """What the planner is given to read."""
+        local, rule = self.mapper.local, self.mapper.belief.rule
+        hits, misses = local.evidence()
+        recent = list(self._recent)
+        return surroundings_of(
+            local.low,
+            local.resolution,
+            hits,
+            misses,
+            prior=rule.prior,
+            planning_prior=planning_prior,
+            free_below=rule.free,
+            radius=radius,
+            known_free=[self._start],
+            obstacles=torch.cat(recent) if recent else torch.zeros(0, 3, dtype=torch.int64),
+        )
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that changes, for a file."""
+        return {
+            "mapper": self.mapper.state(),
+            "planner": self.planner.state(),
+            "library": self.library.state(),
+            "roadmap": self.roadmap.state(),
+            "state": self.state,
+            "path": self.path,
+            "braking": self.braking,
+            "path_length": self.path_length,
+            "collisions": self.collisions,
+            "plans": [[number, when, poses] for number, (when, poses) in self.plans.items()],
+            "recent": list(self._recent),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        for name in ("mapper", "planner", "library", "roadmap"):
+            getattr(self, name).restore(state[name])
+        self.state, self.path, self.braking = state["state"], state["path"], state["braking"]
+        self.path_length = float(state["path_length"])
+        self.collisions = int(state["collisions"])
+        self.plans = {int(number): (float(when), poses) for number, when, poses in state["plans"]}
+        self._recent = deque(state["recent"], maxlen=_REMEMBERED)

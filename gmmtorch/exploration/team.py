@@ -1,0 +1,85 @@
+"""A mission put together: a world, and a team as its options describe it."""
+
+from __future__ import annotations
+
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.coordination import Coordination
+from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.mapper import Mapper, Memo
+from gmmtorch.exploration.mission import Mission
+from gmmtorch.exploration.mixture_mapper import MixtureMapper
+from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.planners import make_planner
+from gmmtorch.exploration.planning import Planner
+from gmmtorch.exploration.primitives import Primitives
+from gmmtorch.exploration.roadmap import Roadmap
+from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.scoring import BeliefMap
+from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.views import ViewEvaluator
+from gmmtorch.exploration.world import World
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.sharing.network import Network
+
+
+def assemble(world: World, options: TeamOptions) -> Mission:
+    """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin."""
+    start = options.start
+    poses = world.start_poses(options.size) if start is None else torch.tensor(start, dtype=torch.float64)
+    if poses.shape != (options.size, 4):
+        raise InvalidArgumentError(
+            f"team.start has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
+            f"{options.size} robots."
+        )
+    world.check_start(poses)
+    evaluator = ViewEvaluator(
+        options.camera.horizontal_fov,
+        options.camera.vertical_fov,
+        options.camera.max_range,
+        world.resolution,
+        information=options.information,
+        n_beams=options.n_beams,
+    )
+    primitives = Primitives(options.dynamics)
+    memo = Memo()
+
+    def belief() -> BeliefMap:
+        return BeliefMap(world.resolution, world.box, world.observable, options.belief)
+
+    robots = [
+        Robot(
+            number,
+            poses[number],
+            _mapper(number, world, options, belief(), memo),
+            _planner(options, primitives, evaluator),
+            ViewLibrary(number),
+            Roadmap(),
+            start_radius=3 * options.dynamics.radius,
+        )
+        for number in range(options.size)
+    ]
+    network = Network(
+        options.size,
+        latency=options.latency,
+        bandwidth=options.bandwidth,
+        loss=options.loss,
+        seed=options.seed,
+    )
+    coordination = Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
+    return Mission(world, robots, belief(), network, evaluator, coordination, options)
+
+
+def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, memo: Memo) -> Mapper:
+    local = SlidingVoxelMap(world.resolution, options.window)
+    width = options.camera.width
+    if options.framework == "gmm_shared":
+        return MixtureMapper(
+            number, local, belief, width, options.novelty, options.frame, memo, options.codec
+        )
+    return GridMapper(number, local, belief, width, options.novelty, memo, shared=options.shares)
+
+
+def _planner(options: TeamOptions, primitives: Primitives, evaluator: ViewEvaluator) -> Planner:
+    return make_planner(options.planner, primitives, evaluator)

@@ -1,0 +1,92 @@
+"""Traffic: where the other robots have committed to be, and which paths keep clear of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+
+@dataclass(frozen=True, eq=False)
+class Traffic:
+    """Committed paths of other robots.
+
+    paths: (M, T, 3) float64, metres, world frame: each robot's position after 1, 2, …, T ≥ 1 steps of the
+    planner's own paths; it rests at the last from then on.
+    separation: least distance (m) between the centres of two robots: two radii and a margin.
+    """
+
+    paths: Tensor
+    separation: float = 0.7
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.paths.shape)
+        if len(shape) != 3 or shape[1] < 1 or shape[2] != 3 or not bool(torch.isfinite(self.paths).all()):
+            raise InvalidArgumentError(
+                f"paths has shape {shape}; expected finite metres (M, T, 3), T of 1 or more."
+            )
+        if not (math.isfinite(self.separation) and self.separation > 0):
+            raise InvalidArgumentError(f"separation={self.separation} must be above zero metres.")
+
+    @classmethod
+    def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> Traffic:
+        """Traffic on paths (T_i, 3) of any lengths, at least one position each."""
+        longest = max((len(path) for path in paths), default=1)
+        padded = [path[torch.arange(longest).clamp_max(len(path) - 1)] for path in paths]
+        return cls(torch.stack(padded) if padded else torch.zeros(0, 1, 3, dtype=torch.float64), separation)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def later(self, steps: int) -> Traffic:
+        """The traffic for a path that begins that many steps from now."""
+        return Traffic(self.paths[:, min(steps, self.paths.shape[1] - 1) :], self.separation)
+
+
+def clear_of(path: Tensor, traffic: Traffic, start: Tensor | None = None) -> Tensor:
+    """Which (...,) of paths (..., L, 3), positions after 1, 2, …, L steps, keep clear of the traffic.
+
+    After step L a robot stays where it is. At step k its distance from another robot must be at least the
+    separation, plus how far that robot is from its place at step k one step earlier and later, plus half
+    of this robot's own longer step before or after: so they are clear in between, too, and if the other
+    robot is up to half a step early or late. With `start` (..., 3), where the path begins, a robot that is
+    too close already may move, as long as it is at no step closer than it would be by staying.
+    """
+    if len(traffic) == 0:
+        return torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
+    n_path, n_traffic = path.shape[-2], traffic.paths.shape[1]
+    # After the shorter of the two ends, one robot rests.
+    n = max(n_path, n_traffic)
+    there = traffic.paths[:, torch.arange(n).clamp_max(n_traffic - 1)]
+    least = traffic.separation + _longer_step(there)
+    own = path if start is None else torch.cat([start[..., None, :], path], -2)
+    sway = _longer_step(own)[..., own.shape[-2] - n_path :] / 2
+    clear = torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
+    for other, needed in zip(there, least, strict=True):
+        ahead, after = other[:n_path], other[n_path:]
+        required = needed[:n_path] + sway
+        if start is not None:
+            required = torch.minimum(required, _distance(start[..., None, :], ahead))
+        clear &= (_distance(path, ahead) >= required).all(-1)
+        if len(after):
+            required = needed[n_path:]
+            if start is not None:
+                required = torch.minimum(required, _distance(start[..., None, :], after))
+            clear &= (_distance(path[..., -1:, :], after) >= required).all(-1)
+    return clear
+
+
+def _longer_step(path: Tensor) -> Tensor:
+    """Metres (..., L) from each position of paths (..., L, 3) to the farther of its neighbours in time."""
+    step = (path[..., 1:, :] - path[..., :-1, :]).norm(dim=-1)
+    pad = torch.nn.functional.pad
+    return torch.maximum(pad(step, (0, 1)), pad(step, (1, 0)))
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).norm(dim=-1)

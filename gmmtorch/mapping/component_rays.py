@@ -1,0 +1,233 @@
+"""Rays of components: the same ones for a component each time, in whatever company it is asked for."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.linalg import safe_cholesky
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence, in_cells, shares_near
+from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy.monte_carlo import RayBundle
+
+_EFFECTIVE_AREA = 4 * math.pi
+_RADII = 4096  # steps of the table of truncated radii
+_FARTHEST_DRAW = 11.0  # a radius, in deviations, beyond every draw: the quantiles end at 6.4 an axis
+
+
+def component_rays(
+    components: Components,
+    resolution: float,
+    *,
+    rays_per_cell: float = 4.0,
+    least: int = 8,
+    most: int = 512,
+    cutoff: float = 2.5,
+) -> RayBundle:
+    """Rays from where components were seen to points that they stand for (thesis 3.2.3).
+
+    A sighting gets about `rays_per_cell` rays for each cell that its component hides from the sensor,
+    where 4π √|Σ₂| is what a Gaussian hides (∫p² of its shadow p, inverted), Σ₂ its covariance across
+    the view; each carries its share of the sighting's count. The points are the first of one Sobol
+    sequence, rotated on the unit cube by a hash of the component's id (Cranley and Patterson 1976), and
+    turned into normal draws whose radius is that of a Gaussian cut off at `cutoff` deviations. So a
+    component's rays depend on nothing but itself: not on its company, nor on the order, nor on what
+    was drawn before, and those of more than one batch can be added or left out one by one.
+
+    Args:
+        components: in three dimensions. Those without a count get no rays.
+        resolution: side (m) of the cells.
+        least, most: bounds on the rays of a sighting.
+
+    Raises `InvalidArgumentError` for components in the plane, or numbers that are out of range.
+    """
+    density = _Density(resolution, rays_per_cell, least, most, cutoff)
+    return _rays(components, _counted(components, resolution), density)
+
+
+def component_evidence(
+    components: Components,
+    resolution: float,
+    box: Box,
+    *,
+    rays_per_cell: float = 4.0,
+    least: int = 8,
+    most: int = 512,
+    cutoff: float = 2.5,
+) -> CellEvidence:
+    """Evidence of components in the cells of a box, by their rays: see `component_rays`.
+
+    Sightings whose rays cannot reach the box are left out before any is drawn, which changes nothing.
+    """
+    density = _Density(resolution, rays_per_cell, least, most, cutoff)
+    seen = _counted(components, resolution)
+    seen = seen[_in_reach(components, seen, box, density)]
+    rays = _rays(components, seen, density)
+    return cast_evidence(rays.origins, rays.ends, rays.is_hit, resolution, box, rays.weights)
+
+
+@dataclass(frozen=True)
+class _Density:
+    """How densely rays are drawn: see `component_rays`."""
+
+    resolution: float
+    rays_per_cell: float
+    least: int
+    most: int
+    cutoff: float
+
+    def __post_init__(self) -> None:
+        check_resolution(self.resolution)
+        for name in ("rays_per_cell", "cutoff"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, above zero.")
+        if check_whole("most", self.most, 1) < check_whole("least", self.least, 1):
+            raise InvalidArgumentError(f"most={self.most} must be at least least={self.least}.")
+
+
+def _counted(components: Components, resolution: float) -> Tensor:
+    """The sightings (C,) of sound components that have a count."""
+    if components.dim != 3:
+        raise InvalidArgumentError(f"components have {components.dim} dimensions; their rays need 3.")
+    in_cells(components.means, resolution, "means")
+    in_cells(components.origins, resolution, "origins")
+    return (components.seen_count > 0).nonzero().squeeze(1)
+
+
+def _in_reach(components: Components, seen: Tensor, box: Box, density: _Density) -> Tensor:
+    """Which sightings (C,), of those `seen` (C,), may have rays that reach the box."""
+    by = components.seen_by[seen]
+    spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
+    low, high = components.means.double() - spread, components.means.double() + spread
+    origins = components.origins.double()[components.seen_from[seen]]
+    scale = 1 / density.resolution
+    # Half a cell more than the box covers the rounding of what is drawn.
+    first, last = shares_near(origins * scale, low[by] * scale, high[by] * scale, box)
+    return first <= last
+
+
+def _rays(components: Components, seen: Tensor, density: _Density) -> RayBundle:
+    """Rays of the sightings `seen` (C,)."""
+    used, by = torch.unique(components.seen_by[seen], return_inverse=True)
+    mean, covariance = components.means[used].double(), components.covariances[used].double()
+    origin, count = (
+        components.origins[components.seen_from[seen]].double(),
+        components.seen_count[seen].double(),
+    )
+    factor = safe_cholesky(covariance)
+    hidden = _hidden_area(mean[by] - origin, covariance[by]) / density.resolution**2
+    number = (density.rays_per_cell * hidden).ceil().clamp(density.least, density.most).long()
+    sighting = torch.repeat_interleave(number)
+    first = torch.cumsum(number, 0) - number
+    draw = torch.arange(len(sighting), device=seen.device) - first[sighting]
+    component = by[sighting]
+    normal = _normals(_shifts(components.ids[used]), component, draw, density)
+    # Row by row, by sums and products alone: a matrix product may round differently in other company.
+    ends = []
+    for row in range(3):
+        place = mean[:, row][component]
+        for column in range(row + 1):
+            place = place + factor[:, row, column][component] * normal[column]
+        ends.append(place)
+    return RayBundle(
+        origin[sighting],
+        torch.stack(ends, 1),
+        (count / number)[sighting],
+        ~components.max_range[used][component],
+    )
+
+
+def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
+    """Area (C,), m², that Gaussians hide of what is behind them; `toward` (C, 3): from sensor to mean.
+
+    The determinant of the covariance across a unit direction d is dᵀ adj(Σ) d.
+    """
+    scale = covariance.diagonal(dim1=1, dim2=2).amax(1).clamp_min(torch.finfo(torch.float64).tiny)
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (
+        row.unbind(1) for row in (covariance / scale[:, None, None]).unbind(1)
+    )
+    largest = toward.abs().amax(1).clamp_min(torch.finfo(torch.float64).tiny)
+    x, y, z = (toward / largest[:, None]).unbind(1)
+    a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    mixed = x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz)
+    length = x * x + y * y + z * z
+    along = (a * x * x + b * y * y + c * z * z + 2 * mixed) / length
+    # Seen from its very mean a component has no direction: as large as it can look.
+    determinant = torch.where(length > 0, along, a + b + c).clamp_min(0)
+    return _EFFECTIVE_AREA * scale * determinant.sqrt()
+
+
+def _shifts(ids: Tensor) -> Tensor:
+    """Points (K, 3) of the unit cube, one for each id (K, 2), that look drawn at random."""
+    key = _scrambled(_scrambled(ids[:, 0]) ^ ids[:, 1])
+    words = torch.stack([_scrambled(key + axis) for axis in range(1, 4)], 1)
+    return ((words >> 11) & (2**53 - 1)).double() * 2.0**-53
+
+
+def _scrambled(word: Tensor) -> Tensor:
+    """Bijective hash of int64 words: the finalizer of SplitMix64 (Steele, Lea and Flood 2014)."""
+    word = word + _signed(0x9E3779B97F4A7C15)
+    word = (word ^ _shifted(word, 30)) * _signed(0xBF58476D1CE4E5B9)
+    word = (word ^ _shifted(word, 27)) * _signed(0x94D049BB133111EB)
+    return word ^ _shifted(word, 31)
+
+
+def _shifted(word: Tensor, bits: int) -> Tensor:
+    """Logical shift to the right: torch's keeps the sign."""
+    return (word >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _signed(word: int) -> int:
+    return word - (1 << 64) if word >= 1 << 63 else word
+
+
+def _normals(shifts: Tensor, component: Tensor, draw: Tensor, density: _Density) -> list[Tensor]:
+    """Coordinates, (R,) each, of draws from a standard normal cut off at a radius: draw (R,) of each
+    component (R,), whose rotations are shifts (K, 3)."""
+    points = _sobol(density.most).to(shifts.device)
+    normal, square = [], torch.zeros((), dtype=torch.float64, device=shifts.device)
+    for axis in range(3):
+        cube = points[axis][draw] + shifts[:, axis][component]
+        cube = torch.where(cube >= 1, cube - 1, cube)
+        normal.append(torch.special.ndtri(cube.clamp(2.0**-33, 1 - 2.0**-33)))
+        square = square + normal[-1] * normal[-1]
+    table = _shrinkage(density.cutoff).to(shifts.device)
+    position = square.sqrt() * (_RADII / _FARTHEST_DRAW)
+    step = position.long()
+    below = table[step]
+    shrunk = below + (position - step) * (table[step + 1] - below)
+    return [coordinate * shrunk for coordinate in normal]
+
+
+@functools.cache
+def _sobol(n: int) -> Tensor:
+    """The first n points of the Sobol sequence, (3, n) float64."""
+    points: Tensor = torch.quasirandom.SobolEngine(3).draw(n, dtype=torch.float64)
+    return points.T.contiguous()
+
+
+@functools.cache
+def _shrinkage(cutoff: float) -> Tensor:
+    """By what a normal draw of radius r, r in even steps from 0, is to be multiplied (_RADII + 2,) so
+    that its radius is that of a normal cut off at `cutoff`: F⁻¹(F(r) F(cutoff))/r, F that of χ₃."""
+    radius = torch.arange(_RADII + 2, dtype=torch.float64) * (_FARTHEST_DRAW / _RADII)
+    target = _chi3(radius) * _chi3(torch.tensor(cutoff, dtype=torch.float64))
+    low, high = torch.zeros_like(radius), radius.clamp_max(cutoff)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = _chi3(middle) > target
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    shrunk = low / radius.clamp_min(1e-9)
+    shrunk[:8] = shrunk[8]  # F loses its digits near 0, where the factor is level
+    return shrunk
+
+
+def _chi3(radius: Tensor) -> Tensor:
+    """Share of a standard normal in three dimensions within a radius."""
+    return torch.erf(radius * math.sqrt(0.5)) - math.sqrt(2 / math.pi) * radius * torch.exp(-0.5 * radius**2)

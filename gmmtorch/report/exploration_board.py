@@ -1,0 +1,105 @@
+"""An exploration in TensorBoard: while it runs, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from matplotlib.colors import to_rgb
+from torch import Tensor
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.report.board import Board
+from gmmtorch.report.style import as_array, colour
+from gmmtorch.scan import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SERIES = (
+    "entropy_bits",
+    "bytes_over_time",
+    "raw_points_bytes_over_time",
+    "octree_bytes_over_time",
+    "draco_bytes_over_time",
+)
+
+
+class MissionBoard:
+    """Numbers of a mission as it runs, by simulated time.
+
+        with Board("outputs/run/tensorboard") as board:
+            live = MissionBoard(board)
+            live.step(12.0, {"entropy_bits": 1.2e6, "bytes_sent": 48_000})
+
+    A mission that resumes from a checkpoint goes back in time; TensorBoard then forgets what it had
+    been told of later times.
+
+    Args:
+        board: the run; who opened it closes it.
+        prefix: of the tags.
+    """
+
+    def __init__(self, board: Board, prefix: str = "mission") -> None:
+        self.board, self.prefix = board, prefix
+
+    def step(self, time: float, scalars: Mapping[str, Any]) -> None:
+        """Write the finite numbers of `scalars`; the step is the whole simulated second (s)."""
+        self.board.scalars(scalars, self.prefix, step=int(time))
+
+
+def write_exploration_board(
+    board: Board,
+    rows: Sequence[Mapping[str, Any]],
+    figures: Mapping[str, Figure],
+    components: Components | None = None,
+    trajectories: Sequence[ArrayLike] = (),
+) -> None:
+    """Trials and their pictures into one TensorBoard run.
+
+    By framework and seed, entropy (bits, and the share left of the observable), the robots' own entropies
+    and cumulative bytes over simulated seconds, and every number of the row at its end.
+
+    Args:
+        board: the run; who opened it closes it.
+        rows: explore rows of `results.json`.
+        figures: by name.
+        components: the final mixture, shown as ellipsoids; beams without return are left out.
+        trajectories: of each robot, poses (T, ≥ 3), world metres, shown as a cloud in their colours.
+    """
+    several = len({_variant(row) for row in rows}) > 1
+    for row in rows:
+        tag = f"{row['framework']}/{_variant(row) + '/' if several else ''}seed_{row['seed']}"
+        _write_series(board, row, tag)
+        board.scalars(row, tag, step=int(row["times"][-1]))
+    for name, figure in figures.items():
+        board.figure(f"figures/{name}", figure)
+    if components is not None:
+        surface = ~components.max_range
+        board.ellipsoids("mixture", components.means[surface], components.covariances[surface])
+    board.cloud("paths", *_path_cloud(trajectories))
+
+
+def _variant(row: Mapping[str, Any]) -> str:
+    return "_".join(str(row.get(key)) for key in ("planner", "information", "coordination", "planning_prior"))
+
+
+def _write_series(board: Board, row: Mapping[str, Any], tag: str) -> None:
+    observable = max(float(row["observable_bits"]), 1.0)
+    for i, time in enumerate(row["times"]):
+        now = {name: row[name][i] for name in _SERIES if row.get(name)}
+        now["entropy_left"] = row["entropy_bits"][i] / observable
+        robots = row.get("entropy_bits_per_robot") or []
+        now |= {f"robot_{n}/entropy_bits": bits[i] for n, bits in enumerate(robots, 1)}
+        board.scalars(now, tag, step=int(time))
+
+
+def _path_cloud(trajectories: Sequence[ArrayLike]) -> tuple[Tensor, Tensor]:
+    """Points (N, 3) of all paths, and the robots' colours (N, 3), 0 to 255."""
+    paths = [as_array(path)[:, :3] for path in trajectories]
+    if not paths:
+        return torch.empty(0, 3), torch.empty(0, 3)
+    hues = [np.tile(255 * np.array(to_rgb(colour(i))), (len(path), 1)) for i, path in enumerate(paths)]
+    return torch.from_numpy(np.concatenate(paths)), torch.from_numpy(np.concatenate(hues))

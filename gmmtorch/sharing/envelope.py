@@ -1,0 +1,94 @@
+"""What every datagram has: a first byte that says what it is, 1200 bytes at most, and a checksum."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from enum import IntEnum
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+VERSION = 1
+MAX_BYTES = 1200
+"""Longest datagram: with its headers it fits the smallest path of IPv6, so it is never fragmented."""
+CODECS = ("quantized", "float", "thesis")
+"""How components and counts are written."""
+_KIND_BITS = 4
+_CHECKSUM_BYTES = 4
+
+
+class Kind(IntEnum):
+    """What a datagram is: the low half of its first byte; the high half is the version."""
+
+    COMPONENTS = 1
+    FLOAT_COMPONENTS = 2
+    THESIS_COMPONENTS = 3
+    COUNTS = 4
+    FLOAT_COUNTS = 5
+    THESIS_COUNTS = 6
+    POINTS = 7
+    VIEWS = 8
+    PLAN = 9
+
+
+OWN_CHECKSUM = frozenset({Kind.COMPONENTS})
+"""Whose body ends with its own checksum, and gets no second one."""
+
+
+def sealed(kind: Kind, body: bytes) -> bytes:
+    """The datagram of a body: first byte, body, CRC-32 of both (4 bytes, little-endian)."""
+    data = bytes([VERSION << _KIND_BITS | kind]) + body
+    if kind in OWN_CHECKSUM:
+        return data
+    return data + zlib.crc32(data).to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def opened(datagram: bytes) -> tuple[Kind, bytes]:
+    """Kind and body of a datagram; `DataError` for what is too long, foreign or damaged."""
+    if len(datagram) > MAX_BYTES:
+        raise DataError(f"The datagram has {len(datagram)} bytes; {MAX_BYTES} are the most: it is foreign.")
+    if not datagram:
+        raise DataError("The datagram is empty.")
+    version, number = datagram[0] >> _KIND_BITS, datagram[0] & ((1 << _KIND_BITS) - 1)
+    if version != VERSION:
+        raise DataError(
+            f"The datagram is version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
+            "damaged, or gmmtorch is to be updated on one of the robots."
+        )
+    if number not in {int(kind) for kind in Kind}:
+        raise DataError(f"The datagram is of kind {number}, which is none: it is foreign or damaged.")
+    kind = Kind(number)
+    if kind in OWN_CHECKSUM:
+        return kind, datagram[1:]
+    data, checksum = datagram[:-_CHECKSUM_BYTES], datagram[-_CHECKSUM_BYTES:]
+    if len(datagram) <= _CHECKSUM_BYTES or zlib.crc32(data) != int.from_bytes(checksum, "little"):
+        raise DataError("The datagram does not match its checksum: it is truncated or damaged.")
+    return kind, data[1:]
+
+
+def split(n: int, encode: Callable[[int, int], bytes], what: str) -> list[bytes]:
+    """Datagrams of n things, halved until each fits; encode(begin, end) writes those from begin to end − 1.
+
+    Raises `InvalidArgumentError` where a single one does not fit.
+    """
+
+    def parts(begin: int, end: int) -> list[bytes]:
+        datagram = encode(begin, end)
+        if len(datagram) <= MAX_BYTES:
+            return [datagram]
+        if end - begin == 1:
+            raise InvalidArgumentError(
+                f"A single {what} takes {len(datagram)} bytes; a datagram has room for {MAX_BYTES}. "
+                "Let it have fewer sensor positions."
+            )
+        middle = (begin + end) // 2
+        return parts(begin, middle) + parts(middle, end)
+
+    return parts(0, n) if n else []
+
+
+def check_codec(codec: str) -> str:
+    """The codec, if it is one of `CODECS`."""
+    if codec not in CODECS:
+        raise InvalidArgumentError(f"codec={codec!r} must be one of {', '.join(CODECS)}.")
+    return codec

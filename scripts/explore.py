@@ -1,0 +1,11 @@
+#!/usr/bin/env python
+"""The command gmmtorch-explore, from a checkout."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from gmmtorch.cli.explore import main
+
+main()

@@ -1,0 +1,150 @@
+"""Geodesic distance, against Dijkstra's algorithm with a heap, and against straight lines."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.distance import DistanceField, coarsened, geodesic
+from gmmtorch.exploration.surroundings import Surroundings
+
+STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
+
+
+def by_dijkstra(open_cells: torch.Tensor, starts: dict[tuple[int, ...], float]) -> torch.Tensor:
+    """Cell widths to the nearest start, one cell at a time."""
+    found = torch.full(open_cells.shape, math.inf)
+    heap = [(width, cell) for cell, width in starts.items()]
+    heapq.heapify(heap)
+    while heap:
+        width, cell = heapq.heappop(heap)
+        if found[cell] <= width:
+            continue
+        found[cell] = width
+        for step in STEPS:
+            other = tuple(c + d for c, d in zip(cell, step, strict=True))
+            inside = all(0 <= c < n for c, n in zip(other, open_cells.shape, strict=True))
+            if inside and open_cells[other]:
+                heapq.heappush(heap, (width + math.hypot(*step), other))
+    return found
+
+
+def surroundings(passable: torch.Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> Surroundings:
+    known = torch.ones_like(passable)
+    return Surroundings(torch.tensor(low), 0.2, known.float(), known, passable, passable)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    share=st.sampled_from([0.3, 0.5, 0.8, 1.0]),
+    shape=st.tuples(*[st.integers(1, 7)] * 3),
+    n=st.integers(0, 3),
+)
+def test_is_what_dijkstra_finds(seed, share, shape, n):
+    generator = torch.Generator().manual_seed(seed)
+    passable = torch.rand(shape, generator=generator) < share
+    sources = (torch.rand(n, 3, generator=generator) * torch.tensor(shape)).long()
+    offsets = torch.rand(n, generator=generator)
+    starts: dict[tuple[int, ...], float] = {}
+    opened = passable.clone()
+    for cell, offset in zip(sources.tolist(), offsets.tolist(), strict=True):
+        opened[tuple(cell)] = True
+        starts[tuple(cell)] = min(offset / 0.5, starts.get(tuple(cell), math.inf))
+    found = geodesic(passable, sources, 0.5, offsets, coarse=1)
+    torch.testing.assert_close(found, 0.5 * by_dijkstra(opened, starts), rtol=1e-5, atol=1e-5)
+
+
+def test_coarse_cells_are_passable_where_half_of_theirs_are():
+    generator = torch.Generator().manual_seed(0)
+    passable = torch.rand(7, 6, 5, generator=generator) < 0.5
+    found = coarsened(passable, 2)
+    assert found.shape == (4, 3, 3)
+    for cell in itertools.product(range(4), range(3), range(3)):
+        part = passable[tuple(slice(2 * c, 2 * c + 2) for c in cell)]
+        assert bool(found[cell]) == (int(part.sum()) >= 4)
+
+
+def test_a_passage_one_cell_wide_is_open_and_a_wall_two_cells_thick_is_closed():
+    passable = torch.zeros(12, 12, 12, dtype=torch.bool)
+    passable[:, 5] = True  # wherever it lies, and however the coarse cells do
+    along = geodesic(passable, torch.tensor([[0, 5, 6]]), 0.2)
+    assert bool(torch.isfinite(along[:, 2]).all())
+    for begin in range(4, 7):
+        wall = torch.ones(12, 12, 12, dtype=torch.bool)
+        wall[begin : begin + 3] = False
+        beyond = geodesic(wall, torch.tensor([[0, 5, 6]]), 0.2)
+        assert bool(torch.isinf(beyond[5]).all())
+
+
+def test_a_detour_is_as_long_as_it_looks():
+    passable = torch.ones(40, 40, 6, dtype=torch.bool)
+    passable[18:22, :30] = False
+    here = surroundings(passable, low=(-20, -20, -3))
+    goal = torch.tensor([[-3.0, -3.0, 0.0]], dtype=torch.float64)
+    field = DistanceField.to(here, goal)
+    start = torch.tensor([3.0, -3.0, 0.0], dtype=torch.float64)
+    corner = [torch.tensor([x, 2.1, 0.0], dtype=torch.float64) for x in (0.5, -0.5)]
+    shortest = float((start - corner[0]).norm() + 1.0 + (corner[1] - goal[0]).norm())
+    assert shortest - 0.5 < float(field.at(start)) < 1.09 * shortest + 0.5
+
+
+@given(seed=st.integers(0, 200))
+def test_never_shorter_than_a_straight_line_nor_much_longer_in_the_open(seed):
+    generator = torch.Generator().manual_seed(seed)
+    here = surroundings(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
+    corner = here.low.double() * 0.2
+    size = torch.tensor([4.0, 3.2, 2.0], dtype=torch.float64)
+    goal, point = corner + torch.rand(2, 3, generator=generator, dtype=torch.float64) * size
+    straight = float((goal - point).norm())
+    found = float(DistanceField.to(here, goal[None]).at(point))
+    assert straight - 0.4 < found < 1.13 * straight + 0.8  # to the goal's cell, by steps of 45°
+
+
+def test_the_way_ahead_comes_closer_cell_by_cell():
+    passable = torch.ones(40, 40, 6, dtype=torch.bool)
+    passable[18:22, :30] = False
+    field = DistanceField.to(surroundings(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
+    point = torch.tensor([[7.0, 1.0, 0.6]], dtype=torch.float64)
+    before = float(field.at(point))
+    for _ in range(60):
+        metres, ahead = field.way(point, 3)
+        assert float(metres) <= before + 1e-6
+        assert float((ahead - point).norm()) < 3.5 * math.sqrt(3) * 0.4
+        if float(metres) < 0.7:
+            break
+        assert float(field.at(ahead)) < float(metres) - 0.4
+        before, point = float(metres), ahead
+    else:
+        pytest.fail("never arrived")
+    assert float((field.way(point, 50)[1] - torch.tensor([1.0, 1.0, 0.6])).norm()) < 0.4
+
+
+def test_where_there_is_no_way():
+    passable = torch.ones(20, 8, 8, dtype=torch.bool)
+    passable[8:12] = False
+    here = surroundings(passable)
+    field = DistanceField.to(here, torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64))
+    points = torch.tensor([[3.5, 0.5, 0.5], [1e9, 0.0, 0.0], [0.7, 0.5, 0.5]], dtype=torch.float64)
+    metres, ahead = field.way(points, 3)
+    assert torch.isinf(metres).tolist() == [True, True, False]
+    torch.testing.assert_close(ahead[:2], points[:2])
+    nowhere = DistanceField.to(here, torch.tensor([[50.0, 0.5, 0.5]], dtype=torch.float64))
+    assert bool(torch.isinf(nowhere.at(points)).all())
+    assert bool(torch.isinf(geodesic(passable, torch.zeros(0, 3).long(), 0.2)).all())
+
+
+def test_bad_input_is_named():
+    passable = torch.ones(4, 4, 4, dtype=torch.bool)
+    with pytest.raises(InvalidArgumentError, match="sources"):
+        geodesic(passable, torch.tensor([[4, 0, 0]]), 0.2)
+    with pytest.raises(InvalidArgumentError, match="passable"):
+        geodesic(passable[0], torch.tensor([[0, 0, 0]]), 0.2)
+    with pytest.raises(InvalidArgumentError, match="coarse"):
+        geodesic(passable, torch.tensor([[0, 0, 0]]), 0.2, coarse=0)

@@ -1,0 +1,103 @@
+"""Frontiers, against a loop over cells; and that its planner explores."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, RESOLUTION, Explorer, corridor, explore, two_rooms
+
+from gmmtorch.exploration.frontier import find_frontiers, frontier_cells
+from gmmtorch.exploration.planners import make_planner
+from gmmtorch.exploration.surroundings import Surroundings
+
+NONE = torch.zeros(0, 3, dtype=torch.float64)
+
+
+def half_known() -> Surroundings:
+    """An open hall of 8 × 4 × 2 m, of which the half at low x has been seen."""
+    observed = torch.zeros(40, 20, 10, dtype=torch.bool)
+    observed[:20] = True
+    inner = torch.zeros_like(observed)
+    inner[1:-1, 1:-1, 1:-1] = True
+    free = observed & inner
+    passable = free.clone()
+    passable[18:], passable[:3], passable[:, :3], passable[:, -3:] = False, False, False, False
+    passable[..., :3], passable[..., -3:] = False, False
+    return Surroundings(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, passable)
+
+
+def test_frontier_cells_are_free_cells_next_to_the_unknown():
+    generator = torch.Generator().manual_seed(0)
+    observed = torch.rand(7, 6, 5, generator=generator) < 0.6
+    free = (torch.rand(7, 6, 5, generator=generator) < 0.5) & observed
+    free[0, 0, 0], observed[0, 0, 0] = True, False  # known to be free without having been seen
+    here = Surroundings(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, free)
+    found = frontier_cells(here)
+    for cell in itertools.product(*(range(n) for n in free.shape)):
+        beside = []
+        for axis, step in itertools.product(range(3), (-1, 1)):
+            other = list(cell)
+            other[axis] += step
+            if all(0 <= c < n for c, n in zip(other, free.shape, strict=True)):
+                beside.append(bool(observed[tuple(other)] or free[tuple(other)]))
+        assert bool(found[cell]) == (bool(free[cell]) and not all(beside))
+
+
+def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
+    here = half_known()
+    start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
+    found = find_frontiers(here, start, NONE, least=20, elevation=0.4)
+    assert len(found.sizes) == 1
+    assert float(found.sizes) == float(frontier_cells(here).sum()) == 18 * 8
+    place, target = found.poses[0, :3], found.targets[0]
+    assert bool(here.is_passable(place))
+    assert abs(float(target[0]) - 3.9) < 0.3
+    bearing = torch.atan2(*(target - place)[[1, 0]])
+    assert abs(float(bearing - found.poses[0, 3])) < 1e-9
+    assert abs(float(found.metres) - float((place - start).norm())) < 0.8
+    assert len(find_frontiers(here, start, NONE, least=145, elevation=0.4).sizes) == 0
+
+
+def test_what_was_given_up_is_no_frontier_again():
+    here = half_known()
+    start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
+    first = find_frontiers(here, start, NONE, least=20, elevation=0.4)
+    given_up = first.targets
+    for _ in range(8):
+        found = find_frontiers(here, start, given_up, least=20, elevation=0.4)
+        if len(found.sizes) == 0:
+            break
+        assert float(torch.cdist(found.targets, given_up).min()) > 0.8
+        given_up = torch.cat([given_up, found.targets])
+    else:
+        raise AssertionError("frontiers never end")
+
+
+def test_nothing_unknown_means_no_frontier():
+    here = half_known()
+    known = torch.ones_like(here.observed)
+    here = Surroundings(here.low, RESOLUTION, here.occupancy, known, here.free, here.passable)
+    found = find_frontiers(here, torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64), NONE, 20, 0.4)
+    assert [len(values) for values in found] == [0, 0, 0, 0]
+
+
+def test_frontiers_lead_through_the_door():
+    explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
+    explore(make_planner("frontier", PRIMITIVES, EVALUATOR), explorer, 30)
+    beyond = ((explorer.hits + explorer.misses) > 0)[30:53, 1:-1, 1:-1].float().mean()
+    assert float(beyond) > 0.6
+    assert explorer.flown > 5
+
+
+def test_plans_are_safe_and_restored_planners_go_on_alike():
+    one, other = (Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi)) for _ in range(2))
+    first = make_planner("frontier", PRIMITIVES, EVALUATOR)
+    for plans in (explore(first, one, 6), explore(make_planner("frontier", PRIMITIVES, EVALUATOR), other, 6)):
+        for plan in plans:
+            assert one.clearance(torch.cat([plan.path, plan.braking])[:, :3]) > 0.3
+    second = make_planner("frontier", PRIMITIVES, EVALUATOR)
+    second.restore(first.state())
+    for a, b in zip(explore(first, one, 4), explore(second, other, 4), strict=True):
+        assert torch.equal(a.path, b.path) and a.kind == b.kind

@@ -1,0 +1,207 @@
+"""Planners in small worlds: they explore, they stay clear of everything, and they never end up stuck."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from exploration.voxel_worlds import (
+    EVALUATOR,
+    PRIMITIVES,
+    Explorer,
+    corridor,
+    explore,
+    hollow,
+    two_rooms,
+)
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.planners import PLANNERS, RandomPlanner, TreePlanner, TreeRule, make_planner
+from gmmtorch.exploration.planning import Plan
+from gmmtorch.exploration.safety import feasible
+from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.travel import Journey
+from gmmtorch.exploration.tree_search import SearchRule
+
+SMALL = TreeRule(search=SearchRule(n_rounds=3, n_leaves=24))
+
+
+def planner_named(name: str):
+    return (
+        TreePlanner(PRIMITIVES, EVALUATOR, SMALL)
+        if name == "mcts"
+        else make_planner(name, PRIMITIVES, EVALUATOR)
+    )
+
+
+def same(one: Plan, other: Plan) -> bool:
+    names = ("path", "braking", "views")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names) and (
+        (one.kind, one.value) == (other.kind, other.value)
+    )
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("world", [two_rooms, corridor])
+def test_paths_are_feasible_and_touch_nothing(name, world):
+    explorer = Explorer.at(world(), (1.2, 1.2, 1.2, math.pi))
+    planner, generator = planner_named(name), torch.Generator().manual_seed(3)
+    for _ in range(8):
+        task = explorer.task(generator)
+        plan = planner.plan(task)
+        assert plan.path.shape == (PRIMITIVES.dynamics.n_steps, 7)
+        assert plan.views.shape[1] == 4 and math.isfinite(plan.value)
+        assert plan.kind in ("explore", "travel", "wait")
+        assert not bool(plan.braking[-1, 4:].any())
+        start, radius = task.state, PRIMITIVES.dynamics.radius
+        assert bool(feasible(plan.path, plan.braking, task.surroundings, start=start, radius=radius))
+        assert explorer.clearance(torch.cat([plan.path, plan.braking])[:, :3]) > 0.3
+        explorer.follow(plan)
+
+
+def test_the_tree_explores_both_rooms_and_more_than_chance():
+    seen = {}
+    for name in ("mcts", "random"):
+        explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
+        explore(planner_named(name), explorer, 14)
+        seen[name] = explorer.seen
+    assert seen["mcts"][-1] > 0.93
+    half = len(seen["mcts"]) // 2
+    assert seen["mcts"][half] > seen["random"][half] + 0.05
+    assert sum(seen["mcts"]) > sum(seen["random"])
+
+
+def test_the_tree_goes_round_the_corner_of_a_corridor():
+    explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi))
+    explore(planner_named("mcts"), explorer, 18)
+    open_cells = ~explorer.solid
+    seen = ((explorer.hits + explorer.misses) > 0)[open_cells].float().mean()
+    assert float(seen) > 0.8
+    assert float(((explorer.hits + explorer.misses) > 0)[51:61, 30:41, 1:12].float().mean()) > 0.5
+
+
+def test_with_nothing_left_around_it_travels_to_a_far_view():
+    """A robot that has seen its room knows of a view beyond the corner, and of the way there."""
+    explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, 0.0))
+    explorer.misses[~explorer.solid] = 9.0
+    explorer.hits[explorer.solid] = 9.0
+    explorer.misses[51:61, 33:41, 1:12] = 0.0  # all but the far end
+    pose = torch.tensor([[11.2, 5.2, 1.2, math.pi / 2]], dtype=torch.float64)
+    planner, generator = planner_named("mcts"), torch.Generator().manual_seed(0)
+    explorer.library.add(pose, torch.tensor([50.0]), 0.0, 0.0)
+    kinds, library_sizes = [], []
+    for _ in range(14):
+        plan = planner.plan(explorer.task(generator))
+        library_sizes.append(len(explorer.library))
+        kinds.append(plan.kind)
+        explorer.follow(plan)
+        if float(((explorer.hits + explorer.misses) > 0)[53:59, 35:39, 3:9].float().mean()) > 0.9:
+            break
+    assert kinds[:3] == ["travel"] * 3
+    assert library_sizes[0] == 0  # it is taken: nobody else goes there
+    assert len(kinds) < 14
+
+
+def test_a_journey_ends_where_it_leads_nowhere():
+    explorer = Explorer.at(hollow(30, 20, 13), (1.2, 1.2, 1.2, 0.0))
+    explorer.misses[~explorer.solid] = 9.0
+    explorer.hits[explorer.solid] = 9.0
+    generator = torch.Generator().manual_seed(0)
+    pose = torch.tensor([50.0, 50.0, 1.2, 0.0], dtype=torch.float64)
+    journey = Journey(pose, 9.0, 60.0, 0.0)
+    assert journey.goal(explorer.task(generator), 1.0) is not None
+    explorer.now = 30.0
+    assert journey.goal(explorer.task(generator), 1.0) is None
+    here = Journey(explorer.state[:4].clone(), 9.0, 0.0, 30.0)
+    assert here.goal(explorer.task(generator), 1.0) is None
+
+
+def test_teammates_plans_send_a_robot_elsewhere():
+    explorer = Explorer.at(hollow(60, 20, 13), (6.0, 2.0, 1.2, math.pi / 2))
+    looks = []
+    for side in (slice(0, 30), slice(30, 60)):
+        task = explorer.task(torch.Generator().manual_seed(0))
+        blocks = torch.ones(15, 5, 4)
+        blocks[side.start // 4 : side.stop // 4] = 0
+        task = type(task)(**{**task.__dict__, "residual": blocks.flatten()})
+        looks.append(planner_named("mcts").plan(task).views)
+    east = [float(views[:, 3].cos().mean()) for views in looks]
+    assert east[0] > east[1]
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_a_robot_that_is_boxed_in_waits_looks_around_and_goes_on(name):
+    explorer = Explorer.at(hollow(30, 20, 13), (2.0, 2.0, 1.2, 0.0))
+    planner, generator = planner_named(name), torch.Generator().manual_seed(0)
+    hits, misses, start = explorer.hits, explorer.misses, explorer.start
+    explorer.hits, explorer.misses = torch.zeros_like(hits), torch.zeros_like(misses)
+    explorer.start = torch.full((3,), -50.0, dtype=torch.float64)  # not even the start is known
+    kinds, turned = [], 0.0
+    for _ in range(6):
+        plan = planner.plan(explorer.task(generator))
+        assert bool((plan.path[:, :3] == explorer.state[:3]).all())
+        kinds.append(plan.kind)
+        turned += float((plan.path[-1, 3] - explorer.state[3]).abs())
+        explorer.state, explorer.now = plan.path[-1].clone(), explorer.now + 2.0
+    assert turned > 1.0
+    explorer.hits, explorer.misses, explorer.start = hits, misses, start
+    explorer.state[4:] = 0
+    plans = explore(planner, explorer, 10)
+    assert any(float((plan.path[-1, :3] - plan.path[0, :3]).norm()) > 0.2 for plan in plans)
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_a_moving_robot_whose_way_is_shut_brakes(name):
+    explorer = Explorer.at(hollow(60, 20, 13), (3.0, 2.0, 1.2, 0.0))
+    explorer.state[4] = 1.5
+    around = torch.tensor([[x, 2.0, 1.2] for x in (1.6, 4.6)], dtype=torch.float64)
+    task = explorer.task(torch.Generator().manual_seed(0), Traffic.of([p[None] for p in around], 3.0))
+    plan = planner_named(name).plan(task)
+    assert plan.kind == "wait"
+    n = len(plan.braking)
+    torch.testing.assert_close(plan.path[:n], PRIMITIVES.braking(task.state)[: len(plan.path)])
+    assert not bool(plan.path[-1, 4:].any())
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_the_same_seed_gives_the_same_plans_and_so_does_a_restored_planner(name):
+    one, other = (Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0)) for _ in range(2))
+    first, second = planner_named(name), planner_named(name)
+    for a, b in zip(explore(first, one, 4), explore(second, other, 4), strict=True):
+        assert same(a, b)
+    third = planner_named(name)
+    third.restore(first.state())
+    library = type(one.library)(0)
+    library.restore(one.library.state())
+    other.library = library
+    for a, b in zip(explore(first, one, 3, seed=5), explore(third, other, 3, seed=5), strict=True):
+        assert same(a, b)
+
+
+def test_asked_twice_at_once_a_planner_does_not_lose_count():
+    explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
+    generator = torch.Generator().manual_seed(0)
+    planner = planner_named("mcts")
+    planner.plan(explorer.task(generator))
+    before = planner.state()["branch"]
+    planner.plan(explorer.task(generator))
+    assert planner.state()["branch"][:1] == before[:1] or planner.state()["branch"] != before[1:]
+
+
+def test_chance_keeps_on_and_changes():
+    explorer = Explorer.at(hollow(80, 60, 13), (6.0, 6.0, 1.2, 0.0))
+    explorer.misses[~explorer.solid] = 9.0
+    explorer.hits[explorer.solid] = 9.0
+    plans = explore(RandomPlanner(PRIMITIVES), explorer, 30)
+    speeds = torch.stack([plan.path[-1, 4:] for plan in plans])
+    kept = (speeds[1:] == speeds[:-1]).all(1).float().mean()
+    assert 0.2 < float(kept) < 0.9
+    assert explorer.flown > 15
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InvalidArgumentError, match="planner='best'"):
+        make_planner("best", PRIMITIVES, EVALUATOR)
+    with pytest.raises(InvalidArgumentError, match="persistence"):
+        make_planner("random", PRIMITIVES, EVALUATOR, persistence=1.0)

@@ -1,0 +1,206 @@
+"""Motion primitives: against closed forms, a differential equation solver, and the limits they promise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.primitives import Dynamics, Primitives
+
+LIBRARY = Primitives(Dynamics())
+LIMITS = torch.tensor([1.5, 0.75, 1.2], dtype=torch.float64)
+
+
+def random_states(n: int, seed: int, dynamics: Dynamics | None = None) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    unit = torch.rand(n, 7, generator=generator, dtype=torch.float64) * 2 - 1
+    limits = LIMITS if dynamics is None else dynamics._limits
+    return torch.cat([unit[:, :4] * torch.tensor([30.0, 30, 5, 4]), unit[:, 4:] * limits], 1)
+
+
+def ramp(now: float, command: float, acceleration: float, step: float, t: float) -> float:
+    """A velocity that changes evenly, over whole steps, as fast as it may."""
+    steps = math.ceil(abs(command - now) / (acceleration * step) - 1e-9)
+    return command if t >= steps * step else now + (command - now) * t / (steps * step)
+
+
+def flown(state: Tensor, command: Tensor, dynamics: Dynamics, duration: float) -> np.ndarray:
+    """x, y, z, yaw after every step, by solve_ivp, restarted at every step."""
+    rates = (dynamics.acceleration, dynamics.acceleration, dynamics.yaw_acceleration)
+
+    def velocity(t: float, axis: int) -> float:
+        return ramp(float(state[4 + axis]), float(command[axis]), rates[axis], dynamics.step, t)
+
+    def slope(t: float, at: np.ndarray) -> list[float]:
+        v = velocity(t, 0)
+        return [v * math.cos(at[3]), v * math.sin(at[3]), velocity(t, 1), velocity(t, 2)]
+
+    here, found = state[:4].numpy(), []
+    for i in range(round(duration / dynamics.step)):
+        span = (i * dynamics.step, (i + 1) * dynamics.step)
+        here = solve_ivp(slope, span, here, rtol=1e-10, atol=1e-11).y[:, -1]
+        found.append(here)
+    return np.stack(found)
+
+
+def test_the_library_holds_what_a_quadrotor_flies():
+    commands = LIBRARY.commands
+    assert commands.shape == (len(LIBRARY), 3)
+    assert len(LIBRARY) == 25
+    assert len(torch.unique(commands, dim=0)) == 25
+    assert bool((commands.abs() <= LIMITS).all())
+    assert torch.equal(commands[LIBRARY.stop], torch.zeros(3, dtype=torch.float64))
+    forward, up, turn = commands.unbind(1)
+    assert int(((forward == 1.5) & (up == 0)).sum()) == 5
+    assert int(((forward == 1.5) & (up != 0)).sum()) == 10
+    assert int((forward == 0.75).sum()) == 3
+    assert int(((forward == 0) & (up == 0) & (turn != 0)).sum()) == 4
+    assert int(((forward == 0) & (up != 0)).sum()) == 2
+    mirrored = commands * torch.tensor([1.0, 1, -1])
+    assert {tuple(row) for row in mirrored.tolist()} == {tuple(row) for row in commands.tolist()}
+
+
+def test_at_the_commanded_velocity_paths_are_the_closed_forms():
+    for index, (v, climb, turn) in enumerate(LIBRARY.commands.tolist()):
+        state = torch.tensor([[2.0, -1.0, 1.5, 0.7, v, climb, turn]], dtype=torch.float64)
+        path = LIBRARY.rollout(state)[0, index]
+        for k, found in enumerate(path.tolist()):
+            t = 0.2 * (k + 1)
+            end = 0.7 + turn * t
+            if turn:
+                x = 2 + v / turn * (math.sin(end) - math.sin(0.7))
+                y = -1 + v / turn * (math.cos(0.7) - math.cos(end))
+            else:
+                x, y = 2 + v * t * math.cos(0.7), -1 + v * t * math.sin(0.7)
+            assert found == pytest.approx([x, y, 1.5 + climb * t, end, v, climb, turn], abs=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ramps_are_those_of_a_differential_equation_solver(seed):
+    dynamics = Dynamics(acceleration=0.9, yaw_acceleration=1.7)
+    library = Primitives(dynamics)
+    states = random_states(2, seed)
+    paths = library.rollout(states)
+    for n in range(2):
+        for p in range(seed, len(library), 5):
+            exact = flown(states[n], library.commands[p], dynamics, 2.0)
+            np.testing.assert_allclose(paths[n, p, :, :4].numpy(), exact, atol=2e-7)
+
+
+def test_braking_is_that_of_a_differential_equation_solver():
+    states = random_states(4, 9)
+    paths = LIBRARY.braking(states)
+    at_rest = torch.zeros(3)
+    for state, path in zip(states, paths, strict=True):
+        exact = flown(state, at_rest, LIBRARY.dynamics, 0.2 * path.shape[0])
+        np.testing.assert_allclose(path[:, :4].numpy(), exact, atol=2e-7)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    speed=st.floats(0.1, 5),
+    acceleration=st.floats(0.2, 6),
+    yaw_acceleration=st.floats(0.3, 9),
+    step=st.sampled_from([0.05, 0.1, 0.2, 0.5, 1.0]),
+)
+def test_limits_hold_at_every_step_and_every_path_can_be_stopped(
+    seed, speed, acceleration, yaw_acceleration, step
+):
+    dynamics = Dynamics(speed=speed, acceleration=acceleration, yaw_acceleration=yaw_acceleration, step=step)
+    library = Primitives(dynamics)
+    limits = torch.tensor([speed, 0.75, 1.2], dtype=torch.float64)
+    states = random_states(3, seed, dynamics)
+    paths = library.rollout(states)
+    braking = library.braking(paths[..., -1, :])
+    assert paths.shape == (3, 25, round(2 / step), 7)
+    begin = states[:, None, None].expand(3, 25, 1, 7)
+    whole = torch.cat([begin, paths, braking], 2)
+    velocity = whole[..., 4:]
+    assert bool((velocity.abs() <= limits * (1 + 1e-9)).all())
+    most = torch.tensor([acceleration, acceleration, yaw_acceleration], dtype=torch.float64) * step
+    assert bool(((velocity[..., 1:, :] - velocity[..., :-1, :]).abs() <= most * (1 + 1e-6)).all())
+    moved = (whole[..., 1:, :3] - whole[..., :-1, :3]).norm(dim=-1)
+    assert float(moved.max()) <= math.hypot(speed, 0.75) * step * (1 + 1e-9)
+    assert torch.equal(braking[..., -1, 4:], torch.zeros(3, 25, 3, dtype=torch.float64))
+    assert bool(torch.isfinite(whole).all())
+
+
+def test_velocities_reach_the_command_and_stay_there():
+    paths = LIBRARY.rollout(random_states(8, 4))
+    # 3 m/s at 1.5 m/s² would take the whole two seconds.
+    assert torch.equal(paths[:, :, -1, 4:], LIBRARY.commands.expand(8, 25, 3))
+
+
+def test_a_command_that_takes_longer_than_the_primitive_is_approached_evenly():
+    library = Primitives(Dynamics(acceleration=0.25))
+    path = library.rollout(torch.zeros(1, 7, dtype=torch.float64))[0, 0]
+    torch.testing.assert_close(path[:, 4], 0.05 * torch.arange(1, 11, dtype=torch.float64))
+    assert library.braking(path[-1]).shape == (30, 7)
+
+
+def test_a_robot_at_rest_that_stops_or_turns_stays_exactly_where_it_is():
+    at_rest = random_states(5, 6)
+    at_rest[:, 4:] = 0
+    paths = LIBRARY.rollout(at_rest)
+    in_place = (LIBRARY.commands[:, :2] == 0).all(1)
+    still = paths[:, in_place, :, :3] == at_rest[:, None, None, :3]
+    assert bool(still.all())
+    assert torch.equal(paths[:, LIBRARY.stop, -1], at_rest)
+    braked = LIBRARY.braking(at_rest)
+    assert torch.equal(braked, at_rest[:, None].expand_as(braked))
+
+
+def test_states_do_not_depend_on_their_company_and_paths_move_with_them():
+    states = random_states(6, 7)
+    together = LIBRARY.rollout(states)
+    alone = torch.cat([LIBRARY.rollout(states[i : i + 1]) for i in range(6)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-12)
+    angle = 0.9
+    turn = torch.tensor(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64
+    )
+    moved = states.clone()
+    moved[:, :2] = states[:, :2] @ turn.T + 5
+    moved[:, 3] += angle
+    expected = together.clone()
+    expected[..., :2] = together[..., :2] @ turn.T + 5
+    expected[..., 3] += angle
+    torch.testing.assert_close(LIBRARY.rollout(moved), expected, rtol=0, atol=1e-12)
+
+
+def test_no_states_have_no_paths():
+    none = torch.zeros(0, 7, dtype=torch.float64)
+    assert LIBRARY.rollout(none).shape == (0, 25, 10, 7)
+    assert LIBRARY.braking(none).shape == (0, 5, 7)
+
+
+@pytest.mark.parametrize("velocity", [(1.6, 0, 0), (0, -0.8, 0), (0, 0, 1.3), (math.nan, 0, 0)])
+def test_states_beyond_the_limits_are_refused(velocity):
+    state = torch.tensor([[0, 0, 0, 0, *velocity]], dtype=torch.float64)
+    for fly in (LIBRARY.rollout, LIBRARY.braking):
+        with pytest.raises(InvalidArgumentError, match="velocities"):
+            fly(state)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"speed": 0.0}, "speed="),
+        ({"acceleration": math.inf}, "acceleration="),
+        ({"yaw_rate": math.nan}, "yaw_rate="),
+        ({"radius": -0.3}, "radius="),
+        ({"step": 0.3}, "does not divide"),
+        ({"step": 5.0}, "does not divide"),
+    ],
+)
+def test_dynamics_that_cannot_be_are_refused(bad, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Dynamics(**bad)

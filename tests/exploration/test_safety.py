@@ -1,0 +1,377 @@
+"""Safety: inflation, free space and feasible paths against brute force over bodies, cells and times."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.primitives import Dynamics, Primitives
+from gmmtorch.exploration.safety import feasible, inflated, surroundings_of
+from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.traffic import Traffic
+
+LIBRARY = Primitives(Dynamics())
+RADIUS, CELL = 0.3, 0.2
+SHAPE = (48, 48, 24)
+LOW = torch.tensor([-24, -24, -12])
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def known(
+    blocked: Tensor, low: Tensor = LOW, resolution: float = CELL, radius: float = RADIUS
+) -> Surroundings:
+    """Surroundings in which all is free but the blocked cells."""
+    return surroundings_of(
+        low,
+        resolution,
+        100.0 * blocked,
+        100.0 * ~blocked,
+        prior=1.0,
+        planning_prior=0.125,
+        free_below=0.25,
+        radius=radius,
+    )
+
+
+def fine_path(states: Tensor, n: int = 40, step: float = 0.2) -> Tensor:
+    """Positions (..., L·n, 3) along states (..., L + 1, 7), by small steps at the velocities in between."""
+    share = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    a, b = states[..., :-1, None, 4:], states[..., 1:, None, 4:]
+    velocity = (a + (b - a) * share[:, None]).flatten(-3, -2)
+    yaw = states[..., :1, 3] + (velocity[..., 2] * (step / n)).cumsum(-1) - velocity[..., 2] * (step / n / 2)
+    v, climb = velocity[..., 0], velocity[..., 1]
+    moved = torch.stack([v * yaw.cos(), v * yaw.sin(), climb], -1) * (step / n)
+    return states[..., :1, :3] + moved.cumsum(-2)
+
+
+def gaps(points: Tensor, cells: Tensor, resolution: float = CELL) -> Tensor:
+    """Metres (N, C) from points (N, 3) to cells (C, 3) of the lattice."""
+    low = cells.double() * resolution
+    nearest = points[:, None].clamp(low, low + resolution)
+    return (points[:, None] - nearest).norm(dim=-1)
+
+
+def with_start(state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rollouts (P, S, 7), braking (P, B, 7), and whole paths (P, L, 7) with the start, from a state (7,)."""
+    rollout = LIBRARY.rollout(state[None])[0]
+    braking = LIBRARY.braking(rollout[:, -1])
+    return rollout, braking, torch.cat([state.expand(len(LIBRARY), 1, 7), rollout, braking], 1)
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    shape=st.tuples(*[st.integers(1, 7)] * 3),
+    radius=st.floats(0.01, 1.0),
+    resolution=st.floats(0.05, 1.5),
+)
+def test_inflation_is_that_of_cells_compared_two_by_two(seed, shape, radius, resolution):
+    if radius / resolution > 6:
+        resolution = radius / 6
+    blocked = torch.rand(shape, generator=seeded(seed)) < 0.05
+    reach = math.ceil(radius / resolution) + 1
+    around = torch.nn.functional.pad(blocked, (reach,) * 6, value=True)
+    apart = (torch.arange(-reach, reach + 1).abs() - 1).clamp_min(0).double() * resolution
+    gap = (apart[:, None, None].square() + apart[:, None].square() + apart.square()).sqrt()
+    ball = (gap < radius - 1e-9).double()[None, None]
+    touched = torch.nn.functional.conv3d(around.double()[None, None], ball)[0, 0] > 0.5
+    assert torch.equal(inflated(blocked, radius, resolution), touched)
+
+
+def test_a_body_anywhere_in_a_cell_that_is_left_touches_nothing():
+    blocked = torch.rand(12, 12, 12, generator=seeded(1)) < 0.004
+    left = (~inflated(blocked, RADIUS, CELL)).nonzero()
+    assert len(left) > 20
+    generator = seeded(2)
+    inside = (
+        left.repeat(200, 1) + torch.rand(200 * len(left), 3, generator=generator, dtype=torch.float64)
+    ) * CELL
+    ray = torch.randn(inside.shape, generator=generator, dtype=torch.float64)
+    body = inside + RADIUS * ray / ray.norm(dim=1, keepdim=True)
+    cell = (body / CELL).floor().long()
+    assert bool(((cell >= 0) & (cell < 12)).all())
+    assert not bool(blocked[cell.unbind(1)].any())
+
+
+def test_inflation_is_not_wider_than_it_must_be():
+    blocked = torch.zeros(15, 15, 15, dtype=torch.bool)
+    blocked[7, 7, 7] = True
+    found = inflated(blocked, RADIUS, CELL)[3:-3, 3:-3, 3:-3]
+    offset = found.nonzero() - 4
+    # Two cells along two axes: a gap of 0.283 m. Along all three: 0.346 m, which is out of reach.
+    assert len(offset) == 5**3 - 8
+    assert int(offset.abs().max()) == 2
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
+def test_a_body_without_size_is_refused(radius):
+    with pytest.raises(InvalidArgumentError, match="radius="):
+        inflated(torch.zeros(2, 2, 2, dtype=torch.bool), radius, CELL)
+
+
+def test_probabilities_are_those_of_pseudo_counts():
+    hits = torch.tensor([0.0, 0, 3, 0.5, 1]).view(5, 1, 1).expand(5, 4, 4)
+    misses = torch.tensor([0.0, 9, 1, 0, 5]).view(5, 1, 1).expand(5, 4, 4)
+    given_hits, given_misses = hits.clone(), misses.clone()
+    found = surroundings_of(
+        torch.tensor([1, 2, 3]), 0.5, given_hits, given_misses,
+        prior=0.5, planning_prior=0.125, free_below=0.25, radius=0.3,
+    )  # fmt: skip
+    expected = [0.125, 0.125 / 10, 3.125 / 5, 0.625 / 1.5, 1.125 / 7]
+    assert found.occupancy[:, 0, 0].tolist() == pytest.approx(expected)
+    assert found.observed[:, 2, 1].tolist() == [False, True, True, True, True]
+    # θ: ½, 0.05, 0.7, 0.667, 0.214
+    assert found.free[:, 3, 3].tolist() == [False, True, False, False, True]
+    assert not bool(found.passable.any())  # at 0.5 m, the body needs more than four cells
+    assert found.occupancy.dtype == torch.float32
+    assert torch.equal(given_hits, hits)
+    assert torch.equal(given_misses, misses)
+
+
+@given(seed=st.integers(0, 10**6), radius=st.floats(0.05, 2.0), far=st.sampled_from([0, 2_500_000]))
+def test_known_free_spheres_free_the_cells_that_lie_wholly_in_them(seed, radius, far):
+    generator = seeded(seed)
+    low = torch.tensor([-4 + far, 3, -6])
+    center = (low + torch.rand(3, generator=generator, dtype=torch.float64) * 9) * CELL
+    nothing = torch.zeros(9, 8, 10)
+    found = surroundings_of(
+        low, CELL, nothing, nothing,
+        prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS, known_free=[(center, radius)],
+    )  # fmt: skip
+    cells = torch.cartesian_prod(*[torch.arange(n) for n in (9, 8, 10)]) + low
+    corner = torch.tensor(list(itertools.product((0, 1), repeat=3)))
+    farthest = ((cells[:, None] + corner).double() * CELL - center).norm(dim=-1).amax(1)
+    sure = (farthest - radius).abs() > 1e-6
+    assert torch.equal(found.free.flatten()[sure], (farthest <= radius)[sure])
+    assert not bool(found.observed.any())
+
+
+def test_a_large_enough_start_sphere_lets_a_robot_leave():
+    nothing = torch.zeros(SHAPE)
+    for radius in (0.2, 0.3, 0.5):
+        for seed in range(5):
+            center = torch.rand(3, generator=seeded(seed), dtype=torch.float64)
+            found = surroundings_of(
+                LOW, CELL, nothing, nothing, prior=1.0, planning_prior=0.125, free_below=0.25,
+                radius=radius, known_free=[(center, math.sqrt(3) * (radius + 2.5 * CELL))],
+            )  # fmt: skip
+            assert bool(found.is_passable(center))
+
+
+def test_cells_of_recent_returns_are_never_free():
+    obstacles = torch.tensor([[-20, -20, -8], [0, 3, 2], [0, 3, 2], [-25, 0, 0], [24, 0, 0], [0, 0, 99]])
+    found = surroundings_of(
+        LOW, CELL, torch.zeros(SHAPE), torch.full(SHAPE, 50.0),
+        prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS, obstacles=obstacles,
+        known_free=[(torch.tensor([0.1, 0.7, 0.5]), 1.0)],
+    )  # fmt: skip
+    assert (~found.free).nonzero().tolist() == [[4, 4, 4], [24, 27, 14]]
+    assert not bool(found.passable[24, 27, 14])
+    assert not bool(found.passable[23, 26, 12])
+
+
+@pytest.mark.parametrize(
+    "bad", [{"prior": 0.0}, {"prior": math.nan}, {"planning_prior": 1.0}, {"free_below": 0.0}]
+)
+def test_probabilities_and_priors_are_checked(bad):
+    (name,) = bad
+    settings = {"prior": 1.0, "planning_prior": 0.125, "free_below": 0.25, **bad}
+    with pytest.raises(InvalidArgumentError, match=f"{name}="):
+        surroundings_of(LOW, CELL, torch.zeros(SHAPE), torch.zeros(SHAPE), radius=RADIUS, **settings)
+
+
+def test_passable_cells_keep_half_a_cell_more_than_the_body():
+    blocked = torch.rand(SHAPE, generator=seeded(8)) < 0.002
+    passable = known(blocked).passable.nonzero()
+    cells = blocked.nonzero()
+    gap = ((passable[:, None] - cells).abs() - 1).clamp_min(0).double().square().sum(-1).sqrt() * CELL
+    nearest = float(gap.amin(1).min())
+    assert len(passable) > 1000
+    assert RADIUS + CELL / 2 - 1e-6 <= nearest < RADIUS + CELL
+
+
+def test_in_the_open_every_primitive_is_feasible():
+    state = torch.tensor([0.05, 0.1, 0.0, 0.3, 1.2, 0.4, -0.8], dtype=torch.float64)
+    state = state.expand(3, 7)
+    surroundings = known(torch.zeros(60, 60, 40, dtype=torch.bool), torch.tensor([-30, -30, -20]))
+    rollout = LIBRARY.rollout(state)
+    braking = LIBRARY.braking(rollout[..., -1, :])
+    assert feasible(rollout, braking, surroundings).shape == (3, 25)
+    assert bool(feasible(rollout, braking, surroundings, start=state[:, None]).all())
+
+
+def test_beyond_what_is_known_nothing_is_feasible_but_to_stay():
+    state = torch.tensor([0.1, 0.1, 0.1, 0.0, 0, 0, 0], dtype=torch.float64)
+    nothing = torch.zeros(SHAPE)
+    unknown = surroundings_of(
+        LOW, CELL, nothing, nothing, prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS
+    )
+    elsewhere = known(torch.zeros(SHAPE, dtype=torch.bool), LOW + 10_000)
+    in_place = (LIBRARY.commands[:, :2] == 0).all(1)
+    rollout, braking, _ = with_start(state)
+    traffic = Traffic.of([state[None, :3] + 0.1])
+    for surroundings in (unknown, elsewhere):
+        for more in ({}, {"start": state}, {"start": state, "radius": RADIUS}):
+            for others in (None, traffic):
+                assert torch.equal(feasible(rollout, braking, surroundings, others, **more), in_place)
+
+
+@given(seed=st.integers(0, 10**6), density=st.floats(0.0005, 0.006))
+def test_the_body_touches_only_free_cells_on_a_feasible_path_to_rest(seed, density):
+    generator = seeded(seed)
+    blocked = torch.rand(SHAPE, generator=generator) < density
+    blocked[20:29, 20:29, 8:17] = False
+    surroundings = known(blocked)
+    limits = torch.tensor([1, 1, 1, 3, 1.5, 0.75, 1.2], dtype=torch.float64)
+    state = (
+        (torch.rand(7, generator=generator, dtype=torch.float64) * 2 - 1)
+        * limits
+        * torch.tensor([0.3, 0.3, 0.3, 1, 1, 1, 1])
+    )
+    state[4] = state[4].abs()
+    rollout, braking, whole = with_start(state)
+    good = feasible(rollout, braking, surroundings, start=state)
+    points = fine_path(whole[good], 10).flatten(0, 1)
+    inside = torch.floor(points / CELL).long() - LOW
+    margin = math.ceil(RADIUS / CELL) - 1
+    assert bool(((inside >= margin) & (inside < torch.tensor(SHAPE) - margin)).all())
+    cells = blocked.nonzero() + LOW
+    if len(points) and len(cells):
+        assert float(gaps(points, cells).min()) > RADIUS
+
+
+def test_among_obstacles_some_paths_are_feasible_and_some_are_not():
+    shares = []
+    for seed in range(8):
+        blocked = torch.rand(SHAPE, generator=seeded(seed)) < 0.003
+        blocked[20:29, 20:29, 8:17] = False
+        state = torch.tensor([0.1, 0.1, 0.1, 0.5 * seed, 0, 0, 0], dtype=torch.float64)
+        rollout, braking, _ = with_start(state)
+        shares.append(float(feasible(rollout, braking, known(blocked), start=state).double().mean()))
+    assert 0.25 < sum(shares) / len(shares) < 0.9
+
+
+def test_a_path_is_checked_between_its_states_and_while_braking():
+    state = torch.tensor([-1.0, 0.1, 0.1, 0, 1.5, 0, 0], dtype=torch.float64)
+    rollout, braking, whole = with_start(state)
+    straight = 0
+    assert LIBRARY.commands[straight].tolist() == [1.5, 0, 0]
+    # Only the cells in x from 0.0 to 0.2 m are forbidden, which lie between two states.
+    xs = whole[straight, :, 0]
+    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
+    between = surroundings.passable.clone()
+    gap = [c for c in range(-4, 10) if not bool(((xs / CELL).floor() == c).any())]
+    between[gap[0] - int(LOW[0])] = False
+    pierced = Surroundings(
+        LOW, CELL, surroundings.occupancy, surroundings.observed, surroundings.free, between
+    )
+    assert bool(feasible(rollout, braking, surroundings, start=state)[straight])
+    assert not bool(feasible(rollout, braking, pierced, start=state)[straight])
+    # A wall that only the way to rest runs into.
+    wall = torch.zeros(SHAPE, dtype=torch.bool)
+    wall[int((float(braking[straight, -1, 0])) // CELL) + 1 - int(LOW[0])] = True
+    assert bool(feasible(rollout, rollout[:, -1:], known(wall), start=state)[straight])
+    assert not bool(feasible(rollout, braking, known(wall), start=state)[straight])
+    # And the way to the first state, if the start is known.
+    first = surroundings.passable.clone()
+    first[int((-1.0 + 0.12) // CELL) - int(LOW[0])] = False
+    assert bool(surroundings.is_passable(state[:3]))
+    ahead = Surroundings(LOW, CELL, surroundings.occupancy, surroundings.observed, surroundings.free, first)
+    assert not bool(feasible(rollout, braking, ahead, start=state)[straight])
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 5))
+def test_a_robot_that_no_longer_fits_comes_no_closer_to_what_it_knows(seed, n):
+    generator = seeded(seed)
+    blocked = torch.zeros(SHAPE, dtype=torch.bool)
+    offset = torch.randint(-3, 4, (n, 3), generator=generator)
+    blocked[(offset + torch.tensor([24, 24, 12])).unbind(1)] = True
+    blocked[24, 24, 12] = False
+    state = torch.zeros(7, dtype=torch.float64)
+    state[:3] = torch.rand(3, generator=generator, dtype=torch.float64) * CELL
+    state[3] = float(torch.rand((), generator=generator)) * 6
+    rollout, braking, whole = with_start(state)
+    good = feasible(rollout, braking, known(blocked), start=state, radius=RADIUS)
+    cells = blocked.nonzero() + LOW
+    if len(cells) == 0:
+        return
+    share = torch.linspace(0, 1, 4, dtype=torch.float64)
+    surface = (cells[:, None] + torch.cartesian_prod(share, share, share)).flatten(0, 1) * CELL
+    points = fine_path(whole[good], 10).flatten(0, 1)
+    now = torch.cdist(points, surface)
+    before = torch.cdist(state[None, :3], surface).clamp_max(RADIUS)
+    assert bool((now >= before - 1e-4).all())
+
+
+def test_a_robot_that_no_longer_fits_leaves_the_way_that_is_open():
+    blocked = torch.zeros(SHAPE, dtype=torch.bool)
+    blocked[22] = True  # a wall at x from −0.4 to −0.2 m; the robot's cell is [0, 0.2)
+    for x, seen in ((0.02, False), (0.19, True)):
+        state = torch.tensor([x, 0.1, 0.1, 0, 0, 0, 0], dtype=torch.float64)
+        surroundings = known(blocked)
+        assert not bool(surroundings.is_passable(state[:3]))
+        forward = LIBRARY.commands[:, 0] > 0
+        for yaw, leaves in ((0.0, True), (math.pi, False), (math.pi / 2, seen)):
+            state[3] = yaw
+            rollout, braking, whole = with_start(state)
+            good = feasible(rollout, braking, surroundings, start=state, radius=RADIUS)
+            straight = int((LIBRARY.commands == torch.tensor([1.5, 0, 0])).all(1).nonzero())
+            assert bool(good[straight]) == leaves
+            if not leaves:
+                assert float(fine_path(whole[good])[..., 0].min()) >= x - 1e-9
+            unaided = feasible(rollout, braking, surroundings, start=state)
+            assert not bool(unaided[forward].any())
+
+
+def test_many_robots_are_answered_as_one_by_one():
+    blocked = torch.rand(SHAPE, generator=seeded(5)) < 0.004
+    surroundings = known(blocked)
+    generator = seeded(6)
+    states = torch.rand(12, 7, generator=generator, dtype=torch.float64) * 2 - 1
+    states[:, 4:] = 0
+    rollout = LIBRARY.rollout(states)
+    braking = LIBRARY.braking(rollout[..., -1, :])
+    traffic = Traffic.of([torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)])
+    together = feasible(rollout, braking, surroundings, traffic, start=states[:, None], radius=RADIUS)
+    stuck = ~surroundings.is_passable(states[:, :3])
+    assert 0 < int(stuck.sum()) < 12
+    for i in range(12):
+        alone = feasible(rollout[i], braking[i], surroundings, traffic, start=states[i], radius=RADIUS)
+        assert torch.equal(together[i], alone)
+
+
+def test_traffic_is_kept_clear_of():
+    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
+    state = torch.zeros(7, dtype=torch.float64)
+    rollout, braking, whole = with_start(state)
+    parked = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64)
+    good = feasible(rollout, braking, surroundings, Traffic.of([parked[None]]), start=state)
+    nearest = (fine_path(whole) - parked).norm(dim=-1).amin(1)
+    assert bool((nearest[good] >= 0.7).all())
+    assert not bool(good[0])
+    assert bool(good[1:].any())
+
+
+def test_cells_much_finer_than_the_steps_are_refused():
+    state = torch.tensor([0, 0, 0, 0, 1.5, 0, 1.2], dtype=torch.float64)
+    rollout, braking, _ = with_start(state)
+    fine = known(torch.zeros(8, 8, 8, dtype=torch.bool), torch.zeros(3, dtype=torch.int64), 0.01, 0.01)
+    with pytest.raises(InvalidArgumentError, match="shorter step"):
+        feasible(rollout, braking, fine)
+
+
+def test_no_paths_are_answered_with_none():
+    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
+    none = torch.zeros(0, 7, dtype=torch.float64)
+    rollout = LIBRARY.rollout(none)
+    braking = LIBRARY.braking(rollout[..., -1, :])
+    assert feasible(rollout, braking, surroundings, start=none[:, None], radius=RADIUS).shape == (0, 25)

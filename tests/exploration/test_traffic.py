@@ -1,0 +1,146 @@
+"""Traffic and collisions: against distances at finely spaced times, and arithmetic."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.collisions import collides, meets_others
+from gmmtorch.exploration.traffic import Traffic, clear_of
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.solids import box
+
+FINE = 20
+
+
+def walk(n: int, generator: torch.Generator) -> Tensor:
+    """A path (n, 3) whose steps change little by little."""
+    push = torch.randn(n, 3, generator=generator, dtype=torch.float64) * 0.05
+    return (push.cumsum(0)).cumsum(0) + torch.randn(3, generator=generator, dtype=torch.float64)
+
+
+def at(path: Tensor, time: Tensor) -> Tensor:
+    """Where paths (..., L, 3), positions at times 1 … L, are at times (T,): (..., T, 3)."""
+    time = (time - 1).clamp(0, path.shape[-2] - 1)
+    before = time.floor().long().clamp_max(max(path.shape[-2] - 2, 0))
+    after = (before + 1).clamp_max(path.shape[-2] - 1)
+    return torch.lerp(path[..., before, :], path[..., after, :], (time - before)[:, None])
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n_path=st.integers(1, 12),
+    lengths=st.lists(st.integers(1, 15), min_size=1, max_size=3),
+    shift=st.floats(-0.5, 0.5),
+)
+def test_clear_paths_are_clear_at_all_times_and_if_the_others_are_early_or_late(seed, n_path, lengths, shift):
+    generator = torch.Generator().manual_seed(seed)
+    others = [walk(n, generator) for n in lengths]
+    paths = torch.stack([walk(n_path, generator) for _ in range(20)])
+    clear = clear_of(paths, Traffic.of(others, 0.7))
+    time = torch.arange(FINE, 16 * FINE, dtype=torch.float64) / FINE
+    for other in others:
+        apart = (at(paths, time) - at(other, time + shift)).norm(dim=-1).amin(1)
+        assert bool((apart[clear] >= 0.7 - 1e-9).all())
+
+
+def test_far_from_all_others_everything_is_clear_and_on_their_paths_nothing():
+    generator = torch.Generator().manual_seed(0)
+    other = walk(10, generator)
+    traffic = Traffic.of([other])
+    paths = torch.stack([other + 30, other, other.flip(0)])
+    assert clear_of(paths, traffic).tolist() == [True, False, False]
+    assert clear_of(paths, Traffic.of([])).tolist() == [True, True, True]
+    assert len(Traffic.of([])) == 0
+
+
+def test_paths_that_cross_at_different_times_are_clear():
+    along = torch.arange(1, 16, dtype=torch.float64)[:, None] * 0.3
+    east = along * torch.tensor([1.0, 0, 0])
+    through = torch.tensor([[3.0, 0, 0]], dtype=torch.float64) + (along - 4.5) * torch.tensor([0, 1.0, 0])
+    late = east - torch.tensor([4.0, 0, 0])
+    assert clear_of(torch.stack([late, through]), Traffic.of([through])).tolist() == [True, False]
+
+
+def test_where_another_comes_to_rest_stays_taken():
+    waiting = torch.zeros(3, 3, dtype=torch.float64)
+    coming = torch.linspace(6, 0.2, 15, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
+    assert not bool(clear_of(waiting[None], Traffic.of([coming])))  # it arrives after the path has ended
+    assert not bool(clear_of(coming[None], Traffic.of([waiting])))  # it arrives where one rests
+    aside = coming + torch.tensor([0, 1.0, 0])
+    assert bool(clear_of(aside[None], Traffic.of([waiting])))
+
+
+def test_a_robot_that_is_too_close_may_stay_or_move_away():
+    other = torch.zeros(1, 3, dtype=torch.float64)
+    start = torch.tensor([0.5, 0, 0], dtype=torch.float64)
+    step = torch.arange(1, 6, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0, 0])
+    paths = torch.stack([start.expand(5, 3), start + step, start - step, start + step.roll(1, 1)])
+    traffic = Traffic.of([other])
+    assert clear_of(paths, traffic, start.expand(4, 3)).tolist() == [True, True, False, True]
+    assert clear_of(paths, traffic).tolist() == [False, False, False, False]
+
+
+def test_moving_robots_keep_farther_apart_than_resting_ones():
+    rest = torch.tensor([[0.75, 0, 0]], dtype=torch.float64).expand(1, 4, 3)
+    other = torch.zeros(1, 3, dtype=torch.float64)
+    assert bool(clear_of(rest, Traffic.of([other])))
+    sweep = torch.arange(4, dtype=torch.float64)[:, None] * torch.tensor([0, 0.3, 0])
+    assert not bool(clear_of(rest, Traffic.of([sweep])))
+    assert not bool(clear_of(rest + sweep, Traffic.of([other])))
+
+
+def test_later_traffic_is_the_same_traffic_from_then_on():
+    generator = torch.Generator().manual_seed(3)
+    other = walk(8, generator)
+    traffic = Traffic.of([other, walk(5, generator)])
+    assert torch.equal(traffic.later(3).paths[0], other[3:])
+    assert torch.equal(traffic.later(50).paths[0], other[-1:])
+    assert traffic.paths.shape == (2, 8, 3)
+    assert torch.equal(traffic.paths[1, 4:], traffic.paths[1, 4:5].expand(4, 3))
+
+
+@pytest.mark.parametrize("paths", [torch.zeros(2, 3), torch.zeros(2, 0, 3), torch.full((1, 1, 3), math.nan)])
+def test_traffic_that_is_nowhere_is_refused(paths):
+    with pytest.raises(InvalidArgumentError, match="paths"):
+        Traffic(paths)
+
+
+def test_separation_must_be_a_distance():
+    with pytest.raises(InvalidArgumentError, match="separation="):
+        Traffic.of([], 0.0)
+
+
+def test_a_robot_collides_where_a_surface_is_within_its_radius():
+    room = MeshWorld(torch.cat([box((0, 0, 0), (8, 6, 3)), box((4, 2, 0), (5, 3, 3))]))
+    generator = torch.Generator().manual_seed(4)
+    size = torch.tensor([8.0, 6, 3], dtype=torch.float64)
+    points = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * size
+    to_walls = torch.minimum(points, size - points).amin(1)
+    pillar = points[:, :2].clamp(torch.tensor([4.0, 2.0]), torch.tensor([5.0, 3.0]))
+    to_pillar = (points[:, :2] - pillar).norm(dim=1)
+    outside = to_pillar > 0
+    expected = torch.minimum(to_walls, to_pillar) < 0.3
+    found = collides(room, points, 0.3)
+    sure = outside & ((torch.minimum(to_walls, to_pillar) - 0.3).abs() > 1e-4)
+    assert torch.equal(found[sure], expected[sure])
+    assert bool(found[sure].any())
+    assert collides(room, points[:0], 0.3).shape == (0,)
+
+
+def test_robots_collide_where_two_bodies_overlap():
+    generator = torch.Generator().manual_seed(5)
+    positions = torch.rand(4, 50, 3, generator=generator, dtype=torch.float64) * 1.5
+    found = meets_others(positions, 0.3)
+    for i in range(4):
+        for s in range(50):
+            near = [math.dist(positions[i, s].tolist(), positions[j, s].tolist()) for j in range(4) if j != i]
+            assert bool(found[i, s]) == (min(near) < 0.6)
+    assert 0 < int(found.sum()) < 200
+    assert not bool(meets_others(positions[:1], 0.3).any())

@@ -1,0 +1,268 @@
+"""Tree search, against all branches written out, with an evaluator whose values are made up."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from exploration.voxel_worlds import EVALUATOR, NOBODY, PRIMITIVES, Explorer, surroundings_from
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.distance import DistanceField
+from gmmtorch.exploration.planning import PlanningTask
+from gmmtorch.exploration.roadmap import Roadmap
+from gmmtorch.exploration.safety import feasible
+from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.tree_search import Goal, Memory, SearchRule, TreeSearch
+from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.views import ViewValues
+
+N_BLOCKS = 6
+
+
+class MadeUp:
+    """Views on a lattice of 0.5 m and eighths of a turn, with gains drawn by their keys."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.calls: list[torch.Tensor] = []
+
+    def keys(self, poses: torch.Tensor) -> torch.Tensor:
+        yaw = (poses[:, 3:] / (math.pi / 4)).round().long() % 8
+        return torch.cat([(poses[:, :3] / 0.5).round().long(), yaw], 1)
+
+    def poses(self, keys: torch.Tensor) -> torch.Tensor:
+        return torch.cat([keys[:, :3] * 0.5, keys[:, 3:] * (math.pi / 4)], 1).double()
+
+    def evaluate(self, surroundings, keys: torch.Tensor) -> ViewValues:
+        self.calls.append(keys)
+        gain, measured = [], []
+        for key in keys.tolist():
+            drawn = torch.Generator().manual_seed(hash((self.seed, *key)) % 2**31)
+            gain.append(torch.rand(N_BLOCKS, generator=drawn) ** 4)
+            measured.append(torch.rand(N_BLOCKS, generator=drawn))
+        return ViewValues(torch.stack(gain).sum(1), torch.stack(gain), torch.stack(measured))
+
+
+def task_in(
+    passable: torch.Tensor, position: tuple[float, float, float], seed: int = 0, **changed
+) -> PlanningTask:
+    values = {
+        "robot": 0,
+        "state": torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64),
+        "surroundings": surroundings_from(passable),
+        "traffic": NOBODY,
+        "residual": torch.ones(N_BLOCKS),
+        "library": ViewLibrary(0),
+        "roadmap": Roadmap(),
+        "now": 0.0,
+        "generator": torch.Generator().manual_seed(seed),
+    }
+    return PlanningTask(**{**values, **changed})
+
+
+def small_room() -> torch.Tensor:
+    passable = torch.zeros(30, 30, 12, dtype=torch.bool)
+    passable[3:27, 3:22, 2:10] = True
+    return passable
+
+
+ROOM, MIDDLE = small_room(), (2.0, 2.5, 1.2)
+
+
+def all_branches(task: PlanningTask, depth: int) -> list[tuple[int, ...]]:
+    """Every feasible sequence of primitives, longest ones included."""
+    found, level = [], [((), task.state)]
+    for step in range(depth):
+        following = []
+        for actions, state in level:
+            paths = PRIMITIVES.rollout(state[None])
+            braking = PRIMITIVES.braking(paths[:, :, -1])
+            traffic = task.traffic.later(10 * step)
+            safe = feasible(paths, braking, task.surroundings, traffic, start=state[None, None])[0]
+            following += [((*actions, a), paths[0, a, -1]) for a in safe.nonzero()[:, 0].tolist()]
+        found += [actions for actions, _ in following]
+        level = following
+    return found
+
+
+def return_of(task: PlanningTask, evaluator: MadeUp, actions: tuple[int, ...], discount: float) -> float:
+    """The return of a branch, one view after the other."""
+    state, residual, total = task.state, task.residual.clone(), 0.0
+    for step, action in enumerate(actions):
+        state = PRIMITIVES.rollout(state[None])[0, action, -1]
+        values = evaluator.evaluate(None, evaluator.keys(state[None, :4]))
+        total += discount**step * float((values.gain[0] * residual).sum())
+        residual = residual * (1 - values.measured[0])
+    return total
+
+
+def test_with_time_enough_it_finds_the_best_of_all_branches():
+    rule = SearchRule(depth=2, n_rounds=20, n_leaves=64, discount=0.8)
+    for seed in range(3):
+        task, evaluator = task_in(ROOM, MIDDLE, seed, residual=torch.rand(N_BLOCKS)), MadeUp(seed)
+        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        assert found is not None
+        branches = all_branches(task, 2)
+        assert len(branches) > 100
+        best = max(return_of(task, evaluator, branch, 0.8) for branch in branches)
+        assert found.value == pytest.approx(best, rel=1e-5)
+        again = return_of(task, evaluator, tuple(found.actions), 0.8)
+        assert again == pytest.approx(found.value, rel=1e-5)
+        assert found.information == pytest.approx(
+            return_of(task, evaluator, tuple(found.actions), 1.0), rel=1e-5
+        )
+
+
+def test_what_is_returned_is_the_branch():
+    task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, evaluator))
+    assert found is not None and 1 <= len(found.actions) <= 4
+    states = [task.state]
+    for action in found.actions:
+        states.append(PRIMITIVES.rollout(states[-1][None])[0, action, -1])
+    torch.testing.assert_close(found.views, torch.stack(states[1:])[:, :4])
+    torch.testing.assert_close(found.path, PRIMITIVES.rollout(task.state[None])[0, found.actions[0]])
+    torch.testing.assert_close(found.braking, PRIMITIVES.braking(found.path[-1]))
+    assert tuple(found.actions) in set(all_branches(task, 1)) or len(found.actions) > 1
+
+
+def test_few_views_are_spent_well():
+    rule = SearchRule(depth=3, n_rounds=4, n_leaves=32)
+    shares = []
+    for seed in range(6):
+        task, evaluator = task_in(ROOM, MIDDLE, seed), MadeUp(100 + seed)
+        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        assert found is not None
+        full = SearchRule(depth=3, n_rounds=60, n_leaves=64, exploration=2.0)
+        better = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
+        drawn = torch.Generator().manual_seed(seed)
+        two = all_branches(task, 2)
+        chance = [
+            return_of(task, evaluator, two[int(torch.randint(len(two), (), generator=drawn))], 0.9)
+            for _ in range(64)
+        ]
+        assert found.value > max(chance) * 0.8
+        shares.append(found.value / better.value)
+    assert sum(shares) / len(shares) > 0.8
+
+
+def test_each_round_asks_once_and_never_for_what_is_known():
+    task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
+    TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, Memory(task, evaluator))
+    assert len(evaluator.calls) <= 4
+    keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
+    assert len(keys) == len(set(keys))
+    assert 40 < len(keys) <= 128
+
+
+def test_what_teammates_will_see_is_worth_nothing():
+    evaluator = MadeUp(0)
+    for seen in range(2):
+        residual = torch.zeros(N_BLOCKS)
+        residual[seen] = 1.0
+        task = task_in(ROOM, MIDDLE, residual=residual)
+        rule = SearchRule(depth=1, n_rounds=1)
+        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        ends = PRIMITIVES.rollout(task.state[None])[0, :, -1, :4]
+        gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen]
+        safe = [branch[0] for branch in all_branches(task, 1)]
+        assert found is not None
+        assert found.value == pytest.approx(float(gains[safe].max()), rel=1e-6)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=5)
+def test_the_same_seed_gives_the_same_branch(seed):
+    runs = []
+    for _ in range(2):
+        task = task_in(ROOM, MIDDLE, seed)
+        runs.append(TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(seed))))
+    assert runs[0].actions == runs[1].actions and runs[0].value == runs[1].value
+
+
+def test_the_rest_of_the_last_branch_is_tried_first():
+    task, evaluator = task_in(ROOM, MIDDLE), MadeUp(7)
+    full = SearchRule(depth=2, n_rounds=20, n_leaves=64)
+    best = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
+    brief = TreeSearch(PRIMITIVES, SearchRule(depth=2, n_rounds=1, n_leaves=1))
+    found = brief.search(task, Memory(task, evaluator), first=best.actions)
+    assert found.actions == best.actions and found.value == pytest.approx(best.value)
+    beyond = brief.search(task, Memory(task, evaluator), first=[0, 0, 0, 0, 0])  # flies into the wall
+    assert beyond is not None and len(beyond.actions) <= 2
+
+
+def test_with_a_goal_it_comes_closer_the_sooner_the_better():
+    task = task_in(ROOM, MIDDLE)
+    goal_at = torch.tensor([[4.6, 3.4, 1.4]], dtype=torch.float64)
+    goal = Goal(DistanceField.to(task.surroundings, goal_at), weight=2.0, yaw=1.5)
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, goal=goal)
+    assert found is not None and found.information == 0
+    assert found.progress > 1.5
+    assert float((found.views[-1, :3] - goal_at).norm()) < 1.0
+    costs = [float(goal.cost(task.state))]
+    state = task.state
+    for action in found.actions:
+        state = PRIMITIVES.rollout(state[None])[0, action, -1]
+        costs.append(float(goal.cost(state)))
+    sooner = sum(2.0 * 0.9**i * (a - b) for i, (a, b) in enumerate(itertools.pairwise(costs)))
+    assert found.value == pytest.approx(sooner, rel=1e-6)
+
+
+def test_the_cost_to_the_goal_counts_the_way_and_the_turns():
+    here = surroundings_from(torch.ones(50, 50, 10, dtype=torch.bool))
+    goal_at = torch.tensor([[8.1, 5.1, 1.1]], dtype=torch.float64)
+    goal = Goal(DistanceField.to(here, goal_at), weight=1.0, yaw=math.pi / 2, turning=2.0)
+
+    def cost(x: float, y: float, z: float, yaw: float) -> float:
+        return float(goal.cost(torch.tensor([x, y, z, yaw, 0, 0, 0], dtype=torch.float64)))
+
+    assert cost(3.1, 5.1, 1.1, 0.0) == pytest.approx(5.0 + math.pi, abs=0.7)  # straight on, then left
+    assert cost(3.1, 5.1, 1.1, math.pi) == pytest.approx(5.0 + 3 * math.pi, abs=0.7)
+    assert cost(8.1, 5.1, 1.1, math.pi / 2) == pytest.approx(0.0, abs=0.5)
+    assert cost(8.1, 5.1, 1.1, -math.pi / 2) == pytest.approx(2 * math.pi, abs=0.5)
+
+
+def test_traffic_is_kept_clear_of_when_it_comes():
+    other = torch.tensor([[2.9, 2.7, 1.2]], dtype=torch.float64)
+    task = task_in(ROOM, MIDDLE, traffic=Traffic.of([other]))
+    free = TreeSearch(PRIMITIVES, SearchRule(depth=1, n_rounds=1)).search(
+        task_in(ROOM, MIDDLE), Memory(task, MadeUp(0))
+    )
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
+    assert free is not None and found is not None
+    apart = (found.path[:, :3] - other).norm(dim=1)
+    assert float(apart.min()) > 0.7
+    assert float((found.views[:, :3] - other).norm(dim=1).min()) > 0.7
+
+
+def test_boxed_in_there_is_no_branch_that_moves():
+    nowhere = torch.zeros(30, 30, 12, dtype=torch.bool)
+    task = task_in(nowhere, MIDDLE)
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
+    assert found is None or bool((found.views[:, :3] == task.state[:3]).all())
+
+
+def test_at_the_start_it_looks_around():
+    """All that is free is the sphere around the start: there is nowhere to go, but much to see."""
+    solid = torch.zeros(40, 40, 20, dtype=torch.bool)
+    explorer = Explorer.at(solid, (4.0, 4.0, 2.0, 0.0))
+    explorer.hits.zero_()
+    explorer.misses.zero_()
+    task = explorer.task(torch.Generator().manual_seed(0))
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, EVALUATOR))
+    assert found is not None and found.information > 0
+    looks = [float(yaw) for yaw in found.views[:, 3]]
+    assert max(looks) - min(0.0, *looks) > 1.5
+    assert len({PRIMITIVES.commands[action, 2].item() for action in found.actions} - {0.0}) >= 1
+
+
+def test_bad_rules_are_named():
+    with pytest.raises(InvalidArgumentError, match="depth=0"):
+        SearchRule(depth=0)
+    with pytest.raises(InvalidArgumentError, match="exploration"):
+        SearchRule(exploration=math.nan)

@@ -1,0 +1,296 @@
+"""Rays of components, against moments, plain Monte Carlo, and themselves in other company."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from mapping.random_components import random_components
+from scipy import stats
+
+from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.mapping.component_rays import component_evidence, component_rays
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence
+
+EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
+
+
+def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:
+    """A component seen from one place."""
+    return Components(
+        means=torch.tensor([mean], dtype=torch.float64),
+        covariances=torch.as_tensor(covariance, dtype=torch.float64)[None],
+        support=torch.tensor([count], dtype=torch.float64),
+        max_range=torch.tensor([False]),
+        ids=torch.tensor([[2, sequence]]),
+        origins=torch.tensor([origin], dtype=torch.float64),
+        seen_by=torch.tensor([0]),
+        seen_from=torch.tensor([0]),
+        seen_count=torch.tensor([count], dtype=torch.float64),
+    )
+
+
+def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tensor:
+    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    return q @ torch.diag(torch.tensor([a, b, thickness], dtype=torch.float64) ** 2) @ q.T
+
+
+def subset(components: Components, rows: torch.Tensor) -> Components:
+    """The components of some rows, in that order, sightings in theirs."""
+    by, whence, count = [], [], []
+    for place, row in enumerate(rows.tolist()):
+        mine = (components.seen_by == row).nonzero().squeeze(1)
+        by += [place] * len(mine)
+        whence.append(components.seen_from[mine])
+        count.append(components.seen_count[mine])
+    picked = {
+        n: getattr(components, n)[rows] for n in ("means", "covariances", "support", "max_range", "ids")
+    }
+    return replace(
+        components,
+        **picked,
+        seen_by=torch.tensor(by),
+        seen_from=torch.cat(whence),
+        seen_count=torch.cat(count),
+    )
+
+
+def rows_of(rays) -> set[tuple[float, ...]]:
+    table = torch.cat([rays.origins, rays.ends, rays.weights[:, None], rays.is_hit[:, None].double()], 1)
+    return set(map(tuple, table.tolist()))
+
+
+# -- what is drawn --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cutoff", [1.5, 2.5, 4.0])
+def test_moments_are_those_of_a_normal_cut_off(cutoff):
+    covariance = sheet(0.05)
+    rays = component_rays(one(covariance), 0.2, least=4096, most=4096, cutoff=cutoff)
+    mean = torch.tensor([4.0, 1.0, 0.5], dtype=torch.float64)
+    white = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(covariance), (rays.ends - mean).T, upper=False
+    ).T
+    # The covariance of a normal cut off at radius c is P(χ²₅ < c²) / P(χ²₃ < c²) times what it was.
+    factor = stats.chi2.cdf(cutoff**2, 5) / stats.chi2.cdf(cutoff**2, 3)
+    assert float(white.mean(0).abs().max()) < 5e-3
+    torch.testing.assert_close(white.T.cov(), factor * torch.eye(3, dtype=torch.float64), rtol=0, atol=0.01)
+    radius = white.norm(dim=1).numpy()
+    assert radius.max() <= cutoff * (1 + 1e-9)
+
+    def share(r):
+        return stats.chi.cdf(r, 3) / stats.chi.cdf(cutoff, 3)
+
+    assert stats.kstest(radius, share).statistic < 0.01  # independent draws: 0.02
+
+
+def test_weights_add_up_to_the_counts():
+    components = random_components(3, k=30, seed=3)
+    rays = component_rays(components, 0.2)
+    assert float(rays.weights.sum()) == pytest.approx(float(components.support.sum()), rel=1e-12)
+    for sighting in range(len(components.seen_by)):
+        origin = components.origins[components.seen_from[sighting]]
+        alone = replace(
+            components,
+            seen_by=components.seen_by[[sighting]],
+            seen_from=components.seen_from[[sighting]],
+            seen_count=components.seen_count[[sighting]],
+        )
+        rays = component_rays(alone, 0.2)
+        assert float(rays.weights.sum()) == pytest.approx(float(components.seen_count[sighting]), rel=1e-12)
+        assert bool((rays.origins == origin).all())
+        assert bool((rays.is_hit != components.max_range[components.seen_by[sighting]]).all())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rays_for_each_cell_that_is_hidden(seed):
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    covariance = 0.2 * root @ root.T + 1e-3 * torch.eye(3, dtype=torch.float64)
+    component = one(covariance, mean=(5.0, -2.0, 1.0))
+    # The shadow on a plane across the view, from an orthonormal basis of it.
+    view = (component.means - component.origins)[0].numpy()
+    basis = np.linalg.svd(view[None])[2][1:]
+    shadow = basis @ covariance.numpy() @ basis.T
+    area = 4 * np.pi * np.sqrt(np.linalg.det(shadow))
+    # ∫p² of a normal p is 1/area.
+    draws = np.random.default_rng(0).multivariate_normal([0, 0], shadow, 200_000)
+    density = stats.multivariate_normal([0, 0], shadow).pdf(draws)
+    assert 1 / density.mean() == pytest.approx(area, rel=0.02)
+    for resolution in (0.2, 0.5):
+        rays = component_rays(component, resolution, rays_per_cell=3.0, least=1, most=100_000)
+        assert len(rays.ends) == pytest.approx(3.0 * area / resolution**2, abs=1.01)
+        assert len(component_rays(component, resolution, least=700, most=700).ends) == 700
+
+
+def test_neighbours_are_drawn_apart():
+    """Rotations of different components are unlike: their draws together are as even as all of them."""
+    parts = [one(torch.eye(3), mean=(0.0, 0.0, 0.0), origin=(50.0, 0.0, 0.0), sequence=k) for k in range(400)]
+    ends = component_rays(Components.concatenate(parts), 0.2, least=1, most=1, cutoff=6.0).ends.numpy()
+    for axis in range(3):
+        assert stats.kstest(ends[:, axis], "norm").pvalue > 1e-3
+        assert abs(np.corrcoef(ends[:-1, axis], ends[1:, axis])[0, 1]) < 0.15
+        assert abs(np.corrcoef(ends[:, axis], ends[:, axis - 1])[0, 1]) < 0.15
+
+
+# -- company --------------------------------------------------------------------------------------
+
+
+def test_rays_do_not_depend_on_the_company():
+    components = random_components(3, k=40, seed=5)
+    together = rows_of(component_rays(components, 0.2))
+    alone = [rows_of(component_rays(subset(components, torch.tensor([k])), 0.2)) for k in range(40)]
+    assert set().union(*alone) == together  # to the last bit
+    assert sum(map(len, alone)) == len(together)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    assert rows_of(component_rays(subset(components, order), 0.2)) == together
+    pairs = Components.concatenate([subset(components, order[:7]), subset(components, order[7:])])
+    assert rows_of(component_rays(pairs, 0.2)) == together
+    renamed = replace(components, ids=components.ids + 1)
+    assert rows_of(component_rays(renamed, 0.2)) != together
+
+
+def test_more_points_are_the_same_rays_of_more_weight():
+    components = random_components(3, k=10, seed=6)
+    twice = replace(components, support=2 * components.support, seen_count=2 * components.seen_count)
+    one_ray, two = component_rays(components, 0.2), component_rays(twice, 0.2)
+    assert torch.equal(one_ray.ends, two.ends)
+    assert torch.equal(2 * one_ray.weights, two.weights)
+
+
+# -- evidence -------------------------------------------------------------------------------------
+
+
+def dense(evidence: CellEvidence, box: Box) -> torch.Tensor:
+    both = torch.zeros(2, *box.shape, dtype=torch.float64)
+    x, y, z = (evidence.cells - box.low).unbind(1)
+    both[0, x, y, z], both[1, x, y, z] = evidence.hits.double(), evidence.misses.double()
+    return both
+
+
+def plain(component: Components, n: int, box: Box, cutoff: float, seed: int) -> torch.Tensor:
+    """Evidence by independent draws, those beyond the cutoff rejected."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(2 * n, 3, generator=generator, dtype=torch.float64)
+    normal = normal[normal.norm(dim=1) <= cutoff][:n]
+    assert len(normal) == n
+    ends = component.means + normal @ torch.linalg.cholesky(component.covariances[0]).T
+    weights = (component.support / n).expand(n)
+    hits = torch.ones(n, dtype=torch.bool)
+    return dense(cast_evidence(component.origins[0], ends, hits, 0.2, box, weights), box)
+
+
+@pytest.mark.parametrize("thickness", [0.001, 0.02, 0.3])
+def test_evidence_is_that_of_plain_monte_carlo(thickness):
+    component = one(sheet(thickness))
+    box = Box(torch.tensor([-2, -2, -8]), torch.tensor([32, 22, 14]))
+    reference = plain(component, 200_000, box, 2.5, 0)
+    fine = dense(component_evidence(component, 0.2, box, least=20_000, most=20_000), box)
+    assert float((fine - reference).abs().sum() / reference.sum()) < 0.02
+    # As few rays as are drawn by themselves do better than as many independent ones.
+    few = component_rays(component, 0.2)
+    drawn = dense(component_evidence(component, 0.2, box), box)
+    error = float((drawn - reference).square().sum().sqrt())
+    independent = [
+        float((plain(component, len(few.ends), box, 2.5, seed) - reference).square().sum().sqrt())
+        for seed in range(1, 9)
+    ]
+    assert error < 0.85 * sum(independent) / len(independent)
+
+
+@pytest.mark.parametrize("low", [(-12, -9, -4), (0, 0, 0), (20, 20, -60), (400, 0, 0)])
+def test_a_box_only_trims(low):
+    components = random_components(3, k=60, seed=8, deviations=(1e-3, 3.0))
+    box = Box(torch.tensor(low), torch.tensor(low) + torch.tensor([9, 30, 20]))
+    rays = component_rays(components, 0.2)
+    expected = cast_evidence(rays.origins, rays.ends, rays.is_hit, 0.2, box, rays.weights)
+    found = component_evidence(components, 0.2, box)
+    assert torch.equal(found.cells, expected.cells)
+    for index in (1, 2):
+        torch.testing.assert_close(found[index], expected[index], rtol=1e-6, atol=0)
+
+
+def test_beams_without_return_hit_nothing():
+    component = replace(one(sheet()), max_range=torch.tensor([True]))
+    evidence = component_evidence(component, 0.2, EVERYTHING)
+    assert float(evidence.hits.sum()) == 0
+    assert float(evidence.misses.sum()) > 100
+
+
+# -- edges ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("covariance", "mean", "origin"),
+    [
+        (1e-16 * torch.eye(3), (4.0, 1.0, 0.5), (0.0, 0.0, 0.0)),  # a point
+        (1e6 * torch.eye(3), (4.0, 1.0, 0.5), (0.0, 0.0, 0.0)),  # larger than the world
+        (1e200 * torch.eye(3, dtype=torch.float64), (4.0, 1.0, 0.5), (0.0, 0.0, 0.0)),
+        (torch.diag(torch.tensor([1.0, 1.0, 1e-9])), (4.0, 0.0, 0.0), (0.0, 0.0, 0.0)),  # on edge
+        (sheet(), (4.0, 1.0, 0.5), (4.0, 1.0, 0.5)),  # seen from its mean
+        (sheet(), (5e5 + 4.0, 5e5, 0.0), (5e5, 5e5, 0.0)),  # 500 km away
+    ],
+)
+def test_any_shape_and_place(covariance, mean, origin):
+    component = one(covariance, mean, origin)
+    for resolution in (0.001, 0.2, 10.0):
+        rays = component_rays(component, resolution)
+        assert 8 <= len(rays.ends) <= 512
+        assert bool(torch.isfinite(rays.ends).all())
+        assert float(rays.weights.sum()) == pytest.approx(100.0)
+    low = (torch.tensor(origin, dtype=torch.float64) / 0.2).floor().long() - 10
+    spread = float(torch.as_tensor(covariance).diagonal().max()) ** 0.5
+    if spread > 1e6:
+        with pytest.raises(InvalidArgumentError, match="ends must be finite and less than"):
+            component_evidence(component, 0.2, EVERYTHING)
+    else:
+        evidence = component_evidence(component, 0.2, Box(low, low + 60))
+        assert bool(torch.isfinite(evidence.misses).all())
+        assert float(evidence.misses.sum() + evidence.hits.sum()) >= 100 * (1 - 1e-6)
+
+
+def test_a_sheet_seen_from_its_mean_looks_as_large_as_it_can():
+    inside = one(sheet(), origin=(4.0, 1.0, 0.5))
+    assert len(component_rays(inside, 0.2).ends) == pytest.approx(4 * 4 * np.pi * 0.3 * 0.2 / 0.2**2, abs=2)
+
+
+def test_no_components_and_none_with_counts():
+    for nothing in (
+        Components.empty(3),
+        replace(one(sheet()), seen_count=torch.zeros(1, dtype=torch.float64)),
+    ):
+        rays = component_rays(nothing, 0.2)
+        assert rays.ends.shape == rays.origins.shape == (0, 3)
+        assert rays.weights.shape == rays.is_hit.shape == (0,)
+        assert len(component_evidence(nothing, 0.2, EVERYTHING).cells) == 0
+
+
+def test_what_cannot_be():
+    component = one(sheet())
+    for options, message in (
+        ({"rays_per_cell": 0.0}, "rays_per_cell=0"),
+        ({"cutoff": float("inf")}, "cutoff=inf"),
+        ({"least": 0}, "least=0"),
+        ({"least": 9, "most": 8}, "most=8"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            component_rays(component, 0.2, **options)
+        with pytest.raises(InvalidArgumentError, match=message):
+            component_evidence(component, 0.2, EVERYTHING, **options)
+    with pytest.raises(InvalidArgumentError, match="resolution=-1"):
+        component_rays(component, -1)
+    for name, kind in (
+        ("means", InvalidArgumentError),
+        ("origins", InvalidArgumentError),
+        ("covariances", NumericalError),
+    ):
+        broken = replace(component, **{name: getattr(component, name) * float("nan")})
+        with pytest.raises(kind, match=name):
+            component_rays(broken, 0.2)
+        with pytest.raises(kind, match=name):
+            component_evidence(broken, 0.2, EVERYTHING)
+    with pytest.raises(InvalidArgumentError, match="2 dimensions"):
+        component_rays(random_components(2), 0.2)

@@ -1,0 +1,139 @@
+"""Batches found by place against a search through all; the window refilled against one made from scratch."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from mapping.random_components import random_components
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.component_rays import component_evidence
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import Box
+
+RESOLUTION, SHAPE = 0.25, (24, 20, 12)
+
+
+def batch(seed: int, center: float = 0.0, extent: float = 6.0, deviations=(5e-3, 0.6)) -> Components:
+    return random_components(
+        3, k=12, seed=seed, center=center, extent=extent, deviations=deviations, n_origins=3, robot=seed
+    )
+
+
+def many(n: int = 30, tile: float = 4.0) -> tuple[MixtureTiles, dict[object, Components]]:
+    """Batches along a diagonal of the world, one of them everywhere."""
+    tiles, batches = MixtureTiles(tile), {}
+    for seed in range(n):
+        key = ("components", seed % 3, seed) if seed % 2 else seed
+        wide = seed == 7
+        batches[key] = batch(seed, center=3.0 * seed - 40, deviations=(50.0, 200.0) if wide else (5e-3, 0.6))
+        tiles.add(key, batches[key])
+    tiles.add("none", Components.empty(3))
+    batches["none"] = Components.empty(3)
+    return tiles, batches
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("tile", [1.0, 4.0, 1000.0])
+def test_nothing_with_evidence_is_overlooked(seed, tile):
+    tiles, batches = many(tile=tile)
+    generator = torch.Generator().manual_seed(seed)
+    middle = torch.full((3,), 12 * seed - 160) + torch.randint(-9, 9, (3,), generator=generator)
+    box = Box(middle, middle + torch.randint(1, 30, (3,), generator=generator))
+    near = tiles.near(box, RESOLUTION)
+    keys = [key for key, _ in near]
+    assert all(found is batches[key] for key, found in near)
+    assert keys == [key for key in batches if key in keys]  # as they came, each once
+    telling = [key for key, each in batches.items() if len(component_evidence(each, RESOLUTION, box).cells)]
+    assert set(telling) <= set(keys)
+    assert 7 in keys or ("components", 1, 7) in keys
+    assert "none" not in keys
+
+
+def test_what_is_far_is_left_out():
+    tiles, _ = many()
+    low = torch.tensor([-160] * 3)
+    assert 1 <= len(tiles.near(Box(low, low + 8), RESOLUTION)) < 8
+    far = torch.tensor([10**6] * 3)
+    assert tiles.near(Box(far, far + 5), RESOLUTION) == []
+    everything = Box(torch.tensor([-(10**7)] * 3), torch.tensor([10**7] * 3))
+    assert len(tiles.near(everything, RESOLUTION)) == len(tiles) - 1  # the empty one is nowhere
+
+
+def test_all_in_the_order_in_which_they_came():
+    tiles, batches = many()
+    assert [key for key, _ in tiles.items()] == list(batches)
+    assert len(tiles) == len(batches)
+    joined, expected = tiles.all(), Components.concatenate(list(batches.values()))
+    for field in fields(Components):
+        assert torch.equal(getattr(joined, field.name), getattr(expected, field.name))
+    assert len(MixtureTiles().all()) == 0
+
+
+def scratch(sliding: SlidingVoxelMap, batches: list[Components]) -> SlidingVoxelMap:
+    """A new window at the same place, with all of the mixture."""
+    made = SlidingVoxelMap(RESOLUTION, SHAPE, sliding.step)
+    made.center_on((sliding.low + torch.tensor(SHAPE) // 2 + 0.5).double() * RESOLUTION)
+    assert torch.equal(made.low, sliding.low)
+    if batches:
+        whole = Components.concatenate(batches)
+        made.add(component_evidence(whole, RESOLUTION, Box(made.low - 400, made.low + 400)))
+    return made
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_regenerated_window_equals_one_made_from_scratch(seed):
+    generator = torch.Generator().manual_seed(seed)
+    sliding, tiles = SlidingVoxelMap(RESOLUTION, SHAPE, 4), MixtureTiles(4.0)
+    robot, batches = torch.zeros(3, dtype=torch.float64), []
+    for number in range(12):
+        robot = robot + torch.randn(3, generator=generator, dtype=torch.float64) * (
+            8.0 if number == 6 else 1.2
+        )
+        regenerate(sliding, sliding.center_on(robot), tiles)
+        learned = batch(100 * seed + number, center=float(robot.mean()), extent=5.0)
+        tiles.add(number, learned)
+        batches.append(learned)
+        sliding.add(component_evidence(learned, RESOLUTION, sliding.box))
+        expected = scratch(sliding, batches)
+        for one, other in zip(sliding.evidence(), expected.evidence(), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+            assert torch.equal(one == 0, other == 0)  # unseen is exactly unseen
+
+
+def test_any_form_of_evidence_can_refill():
+    tiles, batches = many()
+    sliding = SlidingVoxelMap(RESOLUTION, SHAPE, 4)
+    asked = []
+
+    def evidence(components: Components, resolution: float, box: Box):
+        asked.append((len(components), resolution, box.shape))
+        return component_evidence(components, resolution, box, rays_per_cell=1.0)
+
+    regenerate(sliding, sliding.center_on(torch.full((3,), -40.0)), tiles, evidence)
+    near = tiles.near(sliding.box, RESOLUTION)
+    assert asked == [(sum(len(each) for _, each in near), RESOLUTION, SHAPE)]
+    assert float(sliding.evidence()[1].sum()) > 0
+    assert len(near) < len(batches)
+    regenerate(sliding, [], tiles, evidence)
+    assert len(asked) == 1
+
+
+def test_what_cannot_be():
+    with pytest.raises(InvalidArgumentError, match="tile=0"):
+        MixtureTiles(0)
+    tiles = MixtureTiles()
+    tiles.add(1, batch(0))
+    with pytest.raises(InvalidArgumentError, match="key=1"):
+        tiles.add(1, batch(1))
+    with pytest.raises(InvalidArgumentError, match="2 dimensions"):
+        tiles.add(2, random_components(2))
+    broken = batch(2)
+    broken.means[0, 0] = float("nan")
+    with pytest.raises(InvalidArgumentError, match="key=3"):
+        tiles.add(3, broken)
+    assert len(tiles) == 1

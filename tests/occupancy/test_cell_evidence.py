@@ -1,0 +1,241 @@
+"""Evidence of rays in a part of the lattice, against a walk in exact arithmetic."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from occupancy.exact_dda import voxels_left
+
+import gmmtorch.occupancy.cell_evidence as module
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.occupancy.cell_evidence import (
+    Box,
+    CellEvidence,
+    cast_evidence,
+    from_dense,
+    in_cells,
+    shares_near,
+    united,
+)
+
+Counts = dict[tuple[int, ...], tuple[float, float]]
+
+
+def box(low: list[int], high: list[int]) -> Box:
+    return Box(torch.tensor(low), torch.tensor(high))
+
+
+def counts(evidence: CellEvidence) -> Counts:
+    cells = [tuple(cell) for cell in evidence.cells.tolist()]
+    assert len(set(cells)) == len(cells)
+    return dict(zip(cells, zip(evidence.hits.tolist(), evidence.misses.tolist(), strict=True), strict=True))
+
+
+def by_a_walk(starts, stops, is_hit, within: Box, weights=None) -> Counts:
+    """Cells of rays in grid units, one ray and one cell at a time."""
+    found: Counts = {}
+    low, high = within.low.tolist(), within.high.tolist()
+    weights = torch.ones(len(stops)) if weights is None else weights
+    for start, stop, hit, weight in zip(starts, stops, is_hit.tolist(), weights.tolist(), strict=True):
+        ended = [tuple(stop.floor().long().tolist())] if hit else []
+        for index, cells in ((1, voxels_left(start.tolist(), stop.tolist())), (0, ended)):
+            for cell in cells:
+                if all(a <= x < b for a, x, b in zip(low, cell, high, strict=True)):
+                    both = list(found.get(cell, (0.0, 0.0)))
+                    both[index] += weight
+                    found[cell] = (both[0], both[1])
+    return found
+
+
+def random_rays(n: int, seed: int, spread: float = 6.0):
+    generator = torch.Generator().manual_seed(seed)
+    rays = spread * torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
+    return rays[0], rays[1], torch.rand(n, generator=generator) < 0.7
+
+
+SMALL, LARGE = box([-3, -2, 0], [4, 5, 3]), box([-60, -60, -60], [60, 60, 60])
+
+
+@pytest.mark.parametrize("within", [SMALL, LARGE])
+@pytest.mark.parametrize("seed", range(4))
+def test_counts_are_those_of_a_walk(within, seed):
+    starts, stops, is_hit = random_rays(30, seed)
+    for resolution in (0.25, 1.0, 8.0):
+        evidence = cast_evidence(starts * resolution, stops * resolution, is_hit, resolution, within)
+        assert counts(evidence) == by_a_walk(starts, stops, is_hit, within)
+        assert evidence.hits.dtype == evidence.misses.dtype == torch.float32
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    rays=st.lists(st.tuples(*[st.integers(-12, 12)] * 6), min_size=1, max_size=8),
+    corner=st.tuples(*[st.integers(-4, 4)] * 3),
+    shift=st.sampled_from([0, 1 << 21]),
+)
+def test_rays_on_planes_edges_and_corners(rays, corner, shift):
+    # Halves: many start, end or run on planes, and many cross two or three at once.
+    ends = torch.tensor(rays, dtype=torch.float64).view(-1, 2, 3) / 2 + shift
+    low = torch.tensor(corner) + shift
+    within, is_hit = Box(low, low + 3), torch.arange(len(ends)) % 3 > 0
+    evidence = cast_evidence(ends[:, 0], ends[:, 1], is_hit, 1.0, within)
+    assert counts(evidence) == by_a_walk(ends[:, 0], ends[:, 1], is_hit, within)
+
+
+def test_a_cell_is_named_before_rounding():
+    # -1e-20 lies in cell -1, although -1e-20 + 5 is 5.
+    start = torch.tensor([[-1e-20, 0.5, 0.5], [2.5, 0.5, 0.5]], dtype=torch.float64)
+    stop = torch.tensor([[1.5, 0.5, 0.5], [-1e-20, 0.5, 0.5]], dtype=torch.float64)
+    is_hit = torch.tensor([True, True])
+    for within in (LARGE, box([-5, 0, 0], [2, 1, 1])):
+        assert counts(cast_evidence(start, stop, is_hit, 1.0, within)) == by_a_walk(
+            start, stop, is_hit, within
+        )
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_disjoint_boxes_add_up(seed, axis):
+    starts, stops, is_hit = random_rays(200, seed)
+    is_hit[:] = True
+    weights = torch.rand(200, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    whole = box([-6, -6, -6], [6, 6, 6])
+    first, second = box([-6, -6, -6], [6, 6, 6]), box([-6, -6, -6], [6, 6, 6])
+    first.high[axis] = second.low[axis] = seed - 2
+    parts = [cast_evidence(starts, stops, is_hit, 1.0, part, weights) for part in (first, second)]
+    expected = cast_evidence(starts, stops, is_hit, 1.0, whole, weights)
+    found = counts(united(parts))
+    assert found.keys() == counts(expected).keys()
+    for cell, both in counts(expected).items():
+        assert found[cell] == pytest.approx(both, rel=1e-6)
+
+
+def test_order_and_chunks_do_not_matter(monkeypatch):
+    starts, stops, is_hit = random_rays(300, 1)
+    expected = {b: counts(cast_evidence(starts, stops, is_hit, 1.0, w)) for b, w in enumerate((SMALL, LARGE))}
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(module, "_CHUNK_VISITS", 7)
+    for b, within in enumerate((SMALL, LARGE)):
+        shuffled = cast_evidence(starts[order], stops[order], is_hit[order], 1.0, within)
+        assert counts(shuffled) == expected[b]
+
+
+def test_weights_count():
+    starts, stops, is_hit = random_rays(40, 2)
+    weights = 0.1 + torch.rand(40, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = counts(cast_evidence(starts, stops, is_hit, 1.0, SMALL, weights))
+    expected = by_a_walk(starts, stops, is_hit, SMALL, weights)
+    assert found.keys() == expected.keys()
+    for cell, both in expected.items():
+        assert found[cell] == pytest.approx(both, rel=1e-6)
+
+
+def test_one_origin_for_all():
+    _, stops, is_hit = random_rays(20, 4)
+    origin = torch.tensor([0.3, -0.2, 1.1], dtype=torch.float64)
+    found = cast_evidence(origin, stops, is_hit, 1.0, SMALL)
+    assert counts(found) == by_a_walk(origin.expand(20, 3), stops, is_hit, SMALL)
+
+
+def test_far_ends_are_trimmed_and_far_worlds_are_exact():
+    start = torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64)
+    far = torch.tensor([[4e9, 0.5, 0.5]], dtype=torch.float64)
+    row = cast_evidence(start, far, torch.tensor([True]), 1.0, box([0, 0, 0], [50, 1, 1]))
+    assert row.misses.tolist() == [1.0] * 50
+    assert row.hits.sum() == 0
+    starts, stops, is_hit = random_rays(20, 5)
+    shift = 5e5 * torch.ones(3, dtype=torch.float64)  # 500 km; 4e6 cells of 1/8 m
+    starts, stops = starts + 8 * shift, stops + 8 * shift
+    low = (8 * shift).long() - 4
+    within = Box(low, low + 8)
+    assert counts(cast_evidence(starts / 8, stops / 8, is_hit, 0.125, within)) == by_a_walk(
+        starts, stops, is_hit, within
+    )
+
+
+def test_nothing_gives_nothing():
+    starts, stops, is_hit = random_rays(5, 0)
+    for within in (box([100, 0, 0], [110, 9, 9]), box([0, 0, 0], [0, 5, 5]), box([2, 2, 2], [1, 1, 1])):
+        assert len(cast_evidence(starts, stops, is_hit, 1.0, within).cells) == 0
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    found = cast_evidence(none, none, is_hit[:0], 1.0, SMALL)
+    assert found.cells.shape == (0, 3)
+    assert found.hits.shape == found.misses.shape == (0,)
+
+
+def test_a_ray_that_passes_by_the_box_leaves_it_alone():
+    # The box around the ray holds the box, the ray does not come near it.
+    start = torch.tensor([[-10.0, 10.0, 0.5]], dtype=torch.float64)
+    stop = torch.tensor([[10.0, 30.0, 0.5]], dtype=torch.float64)
+    assert len(cast_evidence(start, stop, torch.tensor([True]), 1.0, box([5, 11, 0], [9, 14, 1])).cells) == 0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("which", ["origins", "ends"])
+def test_rays_that_are_nowhere_are_refused(value, which):
+    rays = {"origins": torch.zeros(2, 3, dtype=torch.float64), "ends": torch.ones(2, 3, dtype=torch.float64)}
+    rays[which][1, 2] = value
+    with pytest.raises(InvalidArgumentError, match=f"{which} must be finite"):
+        cast_evidence(rays["origins"], rays["ends"], torch.tensor([True, True]), 0.2, SMALL)
+
+
+def test_too_many_cells_are_refused():
+    starts, stops = torch.zeros(1, 3, dtype=torch.float64), torch.full((1, 3), 10.0, dtype=torch.float64)
+    with pytest.raises(MemoryLimitError, match=r"resolution=0\.001 m"):
+        cast_evidence(starts, stops, torch.tensor([True]), 0.001, box([0] * 3, [10_000] * 3))
+    with pytest.raises(InvalidArgumentError, match="resolution=0"):
+        in_cells(starts, 0.0)
+
+
+def test_dense_and_back():
+    generator = torch.Generator().manual_seed(0)
+    hits, misses = (torch.rand(2, 4, 5, 3, generator=generator) - 0.6).clamp_min(0)
+    evidence = from_dense(torch.tensor([-7, 2, 9]), hits, misses)
+    expected = {
+        (x - 7, y + 2, z + 9): (float(hits[x, y, z]), float(misses[x, y, z]))
+        for x in range(4)
+        for y in range(5)
+        for z in range(3)
+        if hits[x, y, z] + misses[x, y, z] > 0
+    }
+    assert counts(evidence) == expected
+
+
+def test_united_adds_cell_by_cell():
+    parts = [
+        cast_evidence(*random_rays(50, seed)[:2], torch.ones(50, dtype=torch.bool), 1.0, SMALL)
+        for seed in range(3)
+    ]
+    expected: dict[tuple[int, ...], list[float]] = {}
+    for part in parts:
+        for cell, (h, m) in counts(part).items():
+            both = expected.setdefault(cell, [0.0, 0.0])
+            both[0], both[1] = both[0] + h, both[1] + m
+    assert counts(united(parts)) == {cell: tuple(both) for cell, both in expected.items()}
+    assert counts(united(reversed(parts))) == counts(united(parts))
+    assert len(united([]).cells) == 0
+    assert len(united([CellEvidence.empty(), CellEvidence.empty()]).cells) == 0
+    one = torch.ones(1)
+    ends = [CellEvidence(torch.full((1, 3), x), one, one) for x in (-(2**31), 2**31)]
+    with pytest.raises(InvalidArgumentError, match="cannot be united"):
+        united(ends)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_hull_that_meets_the_box_is_missed(seed):
+    generator = torch.Generator().manual_seed(seed)
+    apex = 8 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
+    middle = 8 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
+    half = 2 * torch.rand(300, 3, generator=generator, dtype=torch.float64)
+    within = box([0, -2, 1], [3, 1, 5])
+    first, last = shares_near(apex, middle - half, middle + half, within)
+    draws = 4000
+    place = middle + half * (2 * torch.rand(draws, 300, 3, generator=generator, dtype=torch.float64) - 1)
+    point = apex + torch.rand(draws, 300, 1, generator=generator, dtype=torch.float64) * (place - apex)
+    met = ((point >= within.low) & (point <= within.high)).all(2).any(0)
+    assert bool((first <= last)[met].all())
+    assert 0 < int(met.sum()) <= int((first <= last).sum()) < 300
+    # What is near comes within half a cell: a box larger by more than that is met by a draw.
+    wide = ((point >= within.low - 1.5) & (point <= within.high + 1.5)).all(2).any(0)
+    assert float((first <= last)[~wide].double().mean()) < 0.05

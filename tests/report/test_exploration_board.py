@@ -1,0 +1,84 @@
+"""What is written of an exploration, TensorBoard's own reader finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from exploration_rows import OBSERVABLE_BITS, flights, trial
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.util.tensor_util import make_ndarray
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.report import Board, MissionBoard, entropy_figure, write_exploration_board
+
+
+def read(directory) -> EventAccumulator:
+    events = EventAccumulator(str(directory), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
+    return events.Reload()
+
+
+def mixture() -> Components:
+    empty = Components.empty(3)
+    means = torch.tensor([[0.0, 0.0, 1.0], [5.0, 0.0, 2.0]], dtype=torch.float64)
+    flags = torch.tensor([False, True])
+    covariances = 0.1 * torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    return Components(
+        means,
+        covariances,
+        torch.ones(2, dtype=torch.float64),
+        flags,
+        torch.zeros(2, 2, dtype=torch.int64),
+        empty.origins,
+        empty.seen_by,
+        empty.seen_from,
+        empty.seen_count,
+    )
+
+
+def test_trials_figures_mixture_and_paths(tmp_path):
+    rows = [trial("gmm_shared", 0, duration=50), trial("grid_isolated", 1, duration=50)]
+    paths = flights(2, 30)
+    with Board(tmp_path) as board:
+        write_exploration_board(board, rows, {"entropy": entropy_figure(rows)}, mixture(), paths)
+    events = read(tmp_path)
+    left = events.Scalars("gmm_shared/seed_0/entropy_left")
+    assert [event.step for event in left] == [0, 10, 20, 30, 40, 50]
+    np.testing.assert_allclose(
+        [event.value for event in left], np.array(rows[0]["entropy_bits"]) / OBSERVABLE_BITS, rtol=1e-6
+    )
+    tags = events.Tags()["scalars"]
+    assert "gmm_shared/seed_0/robot_3/entropy_bits" in tags
+    assert "gmm_shared/seed_0/octree_bytes_over_time" in tags
+    assert "grid_isolated/seed_1/octree_bytes_over_time" not in tags
+    assert events.Scalars("grid_isolated/seed_1/auc")[0].step == 50
+    assert events.Tags()["images"] == ["figures/entropy"]
+    cloud = make_ndarray(events.Tensors("paths_VERTEX")[0].tensor_proto)
+    np.testing.assert_allclose(cloud[0], np.concatenate(paths)[:, :3], rtol=1e-6)
+    ellipsoids = make_ndarray(events.Tensors("mixture_VERTEX")[0].tensor_proto)
+    assert ellipsoids[0, :, 0].max() < 1  # the beams without return, at x = 5, are no surface
+
+
+def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
+    rows = [trial("gmm_shared", 0, duration=20, planner=name) for name in ("mcts", "random")]
+    with Board(tmp_path) as board:
+        write_exploration_board(board, rows, {})
+    tags = read(tmp_path).Tags()["scalars"]
+    assert sum(tag.endswith("/entropy_left") for tag in tags) == 2
+
+
+def test_a_running_mission_by_its_simulated_seconds(tmp_path):
+    with Board(tmp_path) as board:
+        live = MissionBoard(board)
+        live.step(0.0, {"entropy_bits": 10.0})
+        live.step(12.9, {"entropy_bits": 5.0, "nothing": None})
+    events = read(tmp_path)
+    assert events.Tags()["scalars"] == ["mission/entropy_bits"]
+    found = events.Scalars("mission/entropy_bits")
+    assert [(event.step, event.value) for event in found] == [(0, 10.0), (12, 5.0)]
+
+
+def test_nothing_to_show(tmp_path):
+    with Board(tmp_path) as board:
+        write_exploration_board(board, [], {}, Components.empty(3))
+    assert read(tmp_path).Tags()["scalars"] == []
+    assert read(tmp_path).Tags()["tensors"] == []

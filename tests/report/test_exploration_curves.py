@@ -1,0 +1,224 @@
+"""Curves and bars of explorations show what the rows say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from exploration_rows import OBSERVABLE_BITS, planner_variants, protocol, trial
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.trials import mean_band
+from gmmtorch.report import (
+    bandwidth_figure,
+    entropy_figure,
+    planner_comparison_figure,
+    profile_figure,
+    stage_means,
+    summary_bars,
+)
+from gmmtorch.report.exploration_style import (
+    FRAMEWORKS,
+    byte_text,
+    framework_colour,
+    framework_name,
+    label_ends,
+    ratio_text,
+)
+from gmmtorch.report.style import PALETTE, new_figure
+
+
+def texts(axes: Axes) -> str:
+    return "\n".join(text.get_text() for text in axes.texts)
+
+
+def lines(axes: Axes, colour: str, n_points: int) -> list[np.ndarray]:
+    """Heights of the lines of a colour that have so many points."""
+    return [
+        np.asarray(line.get_ydata())
+        for line in axes.lines
+        if to_hex(line.get_color()) == to_hex(colour) and len(line.get_ydata()) == n_points
+    ]
+
+
+def test_entropy_is_the_mean_over_seeds_in_its_band():
+    rows = protocol(n_seeds=4)
+    figure = entropy_figure(rows)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    for place, framework in enumerate(FRAMEWORKS):
+        left = [
+            100 * np.array(r["entropy_bits"]) / OBSERVABLE_BITS for r in rows if r["framework"] == framework
+        ]
+        mean, low, high = mean_band(np.stack(left))
+        (drawn,) = lines(axes, framework_colour(framework), len(mean))
+        np.testing.assert_allclose(drawn, mean)
+        corners = axes.collections[place].get_paths()[0].vertices
+        np.testing.assert_allclose(corners[:, 1].max(), high.max())
+        np.testing.assert_allclose(corners[:, 1].min(), low.min())
+        assert framework_name(framework) in texts(axes)
+    assert "90 % of E1's final reduction" in texts(axes)
+    assert "mean of 4 seeds" in figure.get_suptitle()
+
+
+def test_marks_are_at_the_mean_times_where_every_seed_has_one():
+    rows = [trial("grid_shared", seed) for seed in range(3)]
+    rows[0] |= {"t50": 100.0, "t90": None}
+    rows[1] |= {"t50": 200.0, "t90": 700.0}
+    rows[2] |= {"t50": 600.0, "t90": 800.0}
+    axes = entropy_figure(rows).axes[0]
+    marks = [line for line in axes.lines if line.get_marker() in ("o", "s")]
+    assert [float(mark.get_xdata()[0]) for mark in marks] == [300.0]
+    assert "t50 300 s, t90 in 2 of 3" in texts(axes)
+
+
+def test_a_single_trial_has_no_band_and_its_robots_lines():
+    row = trial("grid_isolated", 0, n_robots=2)
+    axes = entropy_figure([row]).axes[0]
+    assert len(axes.collections) == 0
+    drawn = lines(axes, framework_colour("grid_isolated"), len(row["times"]))
+    assert len(drawn) == 3
+    for bits in row["entropy_bits_per_robot"]:
+        assert any(np.allclose(line, 100 * np.array(bits) / OBSERVABLE_BITS) for line in drawn)
+
+
+def test_bytes_are_labelled_with_their_total_and_their_ratio():
+    row = trial("gmm_shared", 0)
+    final = {"bytes_over_time": 50e3, "raw_points_bytes_over_time": 2e6, "octree_bytes_over_time": 150e3}
+    for field, total in final.items():
+        row[field] = np.linspace(0, total, len(row["times"])).tolist()
+    row["draco_bytes_over_time"] = None
+    alone = trial("grid_isolated", 0)
+    figure = bandwidth_figure([row, alone])
+    figure.canvas.draw()
+    said = texts(figure.axes[0])
+    assert "E0 as sent\n50.0 kB" in said
+    assert "raw novel points\n2.00 MB, 40.0× E0" in said
+    assert "zstd octree\n150 kB, 3.00× E0" in said
+    assert "Draco" not in said
+    assert "E2" not in said
+    assert figure.axes[0].get_yscale() == "log"
+
+
+def test_a_band_below_zero_is_drawn_on_the_logarithmic_axis():
+    rows = [trial("gmm_shared", seed) for seed in range(2)]
+    rows[0]["bytes_over_time"] = [0] * len(rows[0]["times"])
+    figure = bandwidth_figure(rows)
+    figure.canvas.draw()
+    for band in figure.axes[0].collections:
+        heights = band.get_paths()[0].vertices[:, 1]
+        assert (heights[np.isfinite(heights)] > 0).all()
+
+
+def test_planners_are_measured_by_one_reference():
+    rows = planner_variants(n_seeds=2)
+    for row in rows:  # by its own reduction even a poor planner reaches 90 %
+        row["reference_bits"], row["t90"] = row["entropy_reduction_bits"], 1.0
+    axes = planner_comparison_figure(rows).axes[0]
+    said = texts(axes)
+    assert "random, CSQMI, prior 0.125\nt50" in said
+    assert "t90 not reached" in said
+    assert "MCTS, CSQMI, prior 0.5\n" in said
+    assert "t90 1 s" not in said
+
+
+def test_variants_that_differ_by_planner_alone_are_named_by_it():
+    rows = [trial("gmm_shared", 0, planner=name) for name in ("mcts", "frontier")]
+    said = texts(planner_comparison_figure(rows).axes[0])
+    assert "MCTS\n" in said
+    assert "frontier\n" in said
+    assert "CSQMI" not in said
+
+
+def test_summary_has_a_dot_a_seed_and_paired_differences():
+    rows = protocol(n_seeds=3)
+    figure = summary_bars(rows)
+    figure.canvas.draw()
+    assert [axes.get_title() for axes in figure.axes[:4]] == [
+        "bytes sent",
+        "t90",
+        "AUC",
+        "coverage per metre flown",
+    ]
+    auc, difference = figure.axes[2], figure.axes[6]
+    dots = [line for line in auc.lines if line.get_marker() == "o"]
+    assert [len(line.get_ydata()) for line in dots] == [3, 3, 3]
+    by = {f: np.array([r["auc"] for r in rows if r["framework"] == f]) for f in FRAMEWORKS}
+    means = [float(line.get_ydata()[0]) for line in difference.lines if len(line.get_ydata()) == 2][1:]
+    expected = [by["gmm_shared"] - by["grid_shared"], by["gmm_shared"] - by["grid_isolated"]]
+    for value in expected:
+        assert any(np.isclose(mean, value.mean()) for mean in means)
+    ratio = [float(line.get_ydata()[0]) for line in figure.axes[4].lines if len(line.get_ydata()) == 2][1]
+    sent = {f: np.array([r["bytes_sent"] for r in rows if r["framework"] == f]) for f in FRAMEWORKS}
+    assert ratio == pytest.approx(np.exp(np.log(sent["gmm_shared"] / sent["grid_shared"]).mean()))
+    summary_bars([trial("grid_isolated", 0)]).canvas.draw()
+
+
+def test_summary_has_no_mean_of_the_lucky_seeds_alone():
+    rows = [trial(framework, seed) for framework in ("gmm_shared", "grid_shared") for seed in range(3)]
+    rows[0]["t90"] = None
+    above, beneath = (summary_bars(rows).axes[i] for i in (1, 5))
+    assert "2 of 3" in texts(above)
+    assert [len(line.get_ydata()) for line in above.lines if line.get_marker() == "o"] == [2, 3]
+    assert len(beneath.lines) == 1  # the line at zero
+
+
+def test_profile_is_in_milliseconds_a_simulated_second():
+    stages = {"gmm_shared": {"sensing": 1.0, "mapping": 3.0}, "grid_shared": {"mapping": 2.0}}
+    figure = profile_figure(stages, {"gmm_shared": 40.0, "grid_shared": 10.0})
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    widths = [patch.get_width() for patch in axes.patches if patch.get_width() > 0]
+    assert widths == pytest.approx([25, 75, 200])
+    assert "100 ms, 10.0× real time" in texts(axes)
+    assert "200 ms, 5.0× real time" in texts(axes)
+    rows = [trial("gmm_shared", seed) for seed in range(2)]
+    means, simulated = stage_means(rows)
+    assert simulated == {"gmm_shared": 1600.0}
+    assert means["gmm_shared"]["mapping"] == pytest.approx(
+        np.mean([row["stage_seconds"]["mapping"] for row in rows])
+    )
+
+
+def test_labels_keep_apart_in_their_order_and_inside():
+    figure = new_figure(6, 4)
+    axes = figure.subplots()
+    axes.set(xlim=(0, 1), ylim=(0, 100))
+    label_ends(axes, [(50, "b", "k"), (50, "c", "k"), (49, "a", "k"), (90, "alone", "k"), (0, "low", "k")])
+    heights = {text.get_text(): text.get_position()[1] for text in axes.texts}
+    assert heights["a"] < heights["b"] < heights["c"]
+    assert heights["alone"] == pytest.approx(0.9)
+    assert heights["low"] > 0
+    assert heights["a"] + heights["b"] + heights["c"] == pytest.approx(3 * 0.4966, abs=1e-2)
+
+
+def test_text_of_bytes_and_ratios():
+    values = [0, 999, 1000, 12_345, 999_499, 999_600, 41e6, 2.5e9]
+    assert [byte_text(v) for v in values] == [
+        *("0 B", "999 B", "1.00 kB", "12.3 kB", "999 kB", "1.00 MB", "41.0 MB", "2.50 GB")
+    ]
+    assert [byte_text(v, digits=1) for v in (1e4, 1e6, 1e8)] == ["10 kB", "1 MB", "100 MB"]
+    assert [ratio_text(v) for v in (58.04, 3.0, 123.4, 0.5)] == ["58.0×", "3.00×", "123×", "0.500×"]
+
+
+def test_frameworks_have_one_name_and_colour():
+    assert [framework_colour(name) for name in FRAMEWORKS] == list(PALETTE[:3])
+    assert framework_name("gmm_shared") == "E0 mixtures shared"
+    assert framework_name("another_one") == "another one"
+    rows = [trial("gmm_shared", 0), {**trial("gmm_shared", 0), "framework": "another_one"}]
+    entropy_figure(rows).canvas.draw()
+
+
+def test_says_what_is_wrong():
+    for draw in (entropy_figure, bandwidth_figure, planner_comparison_figure, summary_bars, stage_means):
+        with pytest.raises(InvalidArgumentError, match="rows is empty"):
+            draw([])
+    with pytest.raises(InvalidArgumentError, match="observable_bits=0"):
+        entropy_figure([trial("gmm_shared", 0, observable_bits=0.0)])
+    with pytest.raises(InvalidArgumentError, match="no byte that was sent"):
+        bandwidth_figure([trial("grid_isolated", 0)])
+    with pytest.raises(InvalidArgumentError, match="stages is empty"):
+        profile_figure({}, 1.0)
+    with pytest.raises(InvalidArgumentError, match="simulated_seconds=0"):
+        profile_figure({"gmm_shared": {"mapping": 1.0}}, 0.0)

@@ -1,0 +1,243 @@
+"""Explorations from above and in space: pixels are cells, and ellipsoids are where rays meet them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from exploration_rows import flights
+from matplotlib.colors import to_rgb
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import (
+    TeamSnapshot,
+    TopView,
+    mixture_scene_figure,
+    team_map_figure,
+    top_view,
+    trajectories_figure,
+)
+from gmmtorch.report.exploration_render import Camera, Canvas, render
+from gmmtorch.report.exploration_scene import _uncovered
+from gmmtorch.report.style import UNKNOWN
+
+
+def components(k: int, size: float = 0.5) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    means = 4 * torch.rand(k, 3, dtype=torch.float64, generator=generator)
+    factors = size * torch.randn(k, 3, 3, dtype=torch.float64, generator=generator)
+    return means, factors @ factors.mT + 0.01 * torch.eye(3, dtype=torch.float64)
+
+
+# -- from above -----------------------------------------------------------------------------------
+
+
+def test_top_view_is_the_highest_of_what_is_known_within_the_band():
+    theta = torch.full((2, 2, 4), 0.5)
+    theta[0, 0] = torch.tensor([0.9, 0.1, 0.2, 0.5])
+    theta[0, 1] = torch.tensor([0.5, 0.5, 0.505, 0.8])
+    theta[1, 0] = torch.tensor([0.5, 0.1, 0.7, 0.9])
+    view = top_view(theta, (1.0, 2.0, -0.5), 0.5, band=(0.0, 1.0))  # centres at −0.25, 0.25, 0.75, 1.25
+    np.testing.assert_allclose(view.image, [[0.2, 0.5], [0.7, 0.5]], atol=1e-7)
+    assert view.band == (0.0, 1.0)
+    assert view.extent == (1.0, 2.0, 2.0, 3.0)
+    truth = top_view(theta > 0.5, (0, 0, 0), 0.5)
+    assert truth.image.tolist() == [[1, 1], [1, 0]]
+
+
+def test_coverage_is_shaded_where_it_is():
+    world = TopView(torch.zeros(6, 4, dtype=torch.bool), (-1.0, 0.0), 0.5)
+    world.image[5, 0] = True
+    coverage = torch.zeros(6, 4, dtype=torch.int64)
+    coverage[1, 2], coverage[2, 2], coverage[3, 3] = 1, 1, 2
+    figure = trajectories_figure(world, flights(2, 20), coverage)
+    figure.canvas.draw()
+    image = figure.axes[0].get_images()[0]
+    pixels = np.asarray(image.get_array())
+    assert image.get_extent() == [-1.0, 2.0, 0.0, 2.0]
+    assert pixels.shape[:2] == (4, 6)  # rows are y
+    np.testing.assert_allclose(pixels[2, 1], pixels[2, 2])
+    np.testing.assert_allclose(pixels[0, 1], to_rgb(UNKNOWN))
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) == 4  # not seen, one, two, surface
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "seen by 1 robot: 67 %" in said
+    assert "seen by 2 robots: 33 %" in said
+
+
+@pytest.mark.parametrize(("n_robots", "n_poses"), [(0, 5), (1, 0), (1, 1), (16, 5)])
+def test_any_number_of_robots_and_poses(n_robots, n_poses):
+    world = TopView(torch.rand(5, 9), (0.0, 0.0), 1.0)
+    coverage = torch.randint(0, n_robots + 1, (5, 9))
+    paths = [path[:n_poses] for path in flights(n_robots, max(n_poses, 1))]
+    trajectories_figure(world, paths, coverage).canvas.draw()
+    mixture_scene_figure(*components(3), trajectories=paths, max_pixels=200).canvas.draw()
+
+
+def test_team_map_outlines_the_components_of_the_layer():
+    view = top_view(torch.rand(8, 8, 6), (0, 0, 0), 0.5, (0.5, 2.0))
+    means, covariances = components(40)
+    snapshots = [
+        TeamSnapshot(60.0, view, [p[:5, :2] for p in flights(2, 5)]),
+        TeamSnapshot(120.0, view, flights(2, 9), means, covariances, torch.arange(40) % 2, "half is known"),
+        TeamSnapshot(180.0, view),
+    ]
+    figure = team_map_figure(snapshots)
+    figure.canvas.draw()
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title() for axes in shown] == ["t = 60 s", "t = 120 s, half is known", "t = 180 s"]
+    within = ((means[:, 2] >= 0.5) & (means[:, 2] <= 2.0)).nonzero()[:, 0]
+    outlines = shown[1].collections[0].get_paths()
+    assert len(outlines) == len(within)
+    # A 2σ outline reaches to ±2σ along either axis, but for its corners.
+    reach = 2 * covariances[within].diagonal(dim1=1, dim2=2).sqrt()[:, :2].numpy()
+    for outline, mean, half in zip(outlines, means[within].numpy(), reach, strict=True):
+        np.testing.assert_allclose(outline.vertices.max(0), mean[:2] + half, atol=0.02 * half.max() + 1e-9)
+    assert "between z = 0.5 m and 2 m" in figure.get_suptitle()
+
+
+def test_maps_say_what_is_wrong():
+    world = TopView(torch.zeros(3, 3), (0.0, 0.0), 1.0)
+    with pytest.raises(InvalidArgumentError, match="coverage has shape"):
+        trajectories_figure(world, [], torch.zeros(2, 3))
+    with pytest.raises(InvalidArgumentError, match="snapshots is empty"):
+        team_map_figure([])
+    with pytest.raises(InvalidArgumentError, match="owners has shape"):
+        team_map_figure([TeamSnapshot(0.0, world, [], *components(3), owners=[0])])
+    with pytest.raises(InvalidArgumentError, match="holds no layer"):
+        top_view(torch.zeros(2, 2, 2), (0, 0, 0), 1.0, (5.0, 6.0))
+    with pytest.raises(InvalidArgumentError, match="no layer"):
+        top_view(torch.zeros(2, 2, 0), (0, 0, 0), 1.0)
+    with pytest.raises(InvalidArgumentError, match="probability has shape"):
+        top_view(torch.zeros(2, 2), (0, 0, 0), 1.0)
+
+
+# -- in space -------------------------------------------------------------------------------------
+
+
+def test_camera_axes_are_a_right_handed_frame():
+    for azimuth, elevation in ((-60, 45), (200, 10), (0, 90)):
+        axes = Camera(azimuth, elevation).axes
+        torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
+        assert float(torch.linalg.det(axes)) == pytest.approx(1)
+    assert Camera(0, 45).project(torch.tensor([0.0, 0.0, 1.0]))[1] > 0  # up is up
+
+
+def test_depth_is_where_rays_meet_the_nearest_quadric():
+    means, covariances = components(12)
+    camera = Camera(-70, 35)
+    canvas = Canvas(-6.0, 6.0, -6.0, 6.0, 8.0)
+    depth = render(means, covariances, torch.ones(12, 3), camera, canvas, smoothing=1).depth
+    rows, columns = canvas.shape
+    right = canvas.left + (torch.arange(columns) + 0.5) / canvas.scale
+    up = canvas.top - (torch.arange(rows) + 0.5) / canvas.scale
+    v, u = torch.meshgrid(up.double(), right.double(), indexing="ij")
+    x, y, z = camera.axes
+    start = u[..., None] * x + v[..., None] * y
+    # (s + t z − μ)ᵀ Σ⁻¹ (s + t z − μ) = 4 by the formula for quadratics, the larger root.
+    precision = torch.linalg.inv(covariances)
+    offset = start[:, :, None] - means
+    a = (z @ precision @ z[:, None])[:, 0]
+    b = torch.einsum("rckd,kde,e->rck", offset, precision, z)
+    c = torch.einsum("rckd,kde,rcke->rck", offset, precision, offset) - 4
+    root = (-b + (b**2 - a * c).clamp_min(0).sqrt()) / a
+    nearest = torch.where(b**2 - a * c > 0, root, -math.inf).amax(2)
+    agree = torch.isfinite(depth) == torch.isfinite(nearest)
+    assert agree.double().mean() > 0.97  # outlines are a little blurred
+    both = torch.isfinite(depth) & torch.isfinite(nearest)
+    assert both.double().mean() > 0.1
+    error = (depth - nearest)[both].abs()
+    assert float(error.median()) < 0.01
+    assert float(error.quantile(0.95)) < 0.15  # steep rims
+
+
+def test_the_nearer_one_hides_the_other_and_light_comes_from_above():
+    means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
+    covariances = torch.eye(3).expand(2, 3, 3) * 0.25
+    colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    canvas = Canvas(-2.0, 2.0, -2.0, 2.0, 20.0)
+    from_above = render(means, covariances, colours, Camera(0, 90), canvas)
+    middle = from_above.rgb[40, 40]
+    assert middle[2] > 0.5
+    assert middle[0] == 0
+    assert float(from_above.depth[40, 40]) == pytest.approx(4.0, abs=0.02)
+    aside = render(means[:1], covariances[:1], colours[:1], Camera(0, 0), canvas).rgb[..., 0]
+    assert aside[25, 40] > aside[55, 40]  # rows from the top
+    assert torch.equal(aside[0], torch.ones(80))  # background
+
+
+def test_flat_needle_like_and_point_like_components_are_drawn():
+    means = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [3.0, 3.0, 0.0]])
+    covariances = torch.diag_embed(
+        torch.tensor([[0.2, 0.2, 0.0], [1e-9, 1e-9, 0.3], [0.0, 0.0, 0.0], [0.0, 0.2, 0.2]])
+    )
+    canvas = Canvas(-5.0, 5.0, -5.0, 5.0, 10.0)
+    picture = render(means, covariances, torch.zeros(4, 3), Camera(0, 60), canvas)
+    assert bool(torch.isfinite(picture.rgb).all())
+    for place in Camera(0, 60).project(means)[:, :2].tolist():
+        row, column = int((5 - place[1]) * 10), int((place[0] + 5) * 10)
+        assert bool(torch.isfinite(picture.depth[row - 1 : row + 2, column - 1 : column + 2]).any())
+
+
+def test_what_hides_the_inside_is_left_out():
+    # A room seen from within: floor, ceiling, near and far wall, and a ball that has no side.
+    means = torch.tensor([[0.0, 0, 0], [0, 0, 4], [2, 0, 2], [-2, 0, 2], [0, 0, 2]], dtype=torch.float64)
+    thin = torch.tensor([[1, 1, 0.001], [1, 1, 0.001], [0.001, 1, 1], [0.001, 1, 1], [0.1, 0.1, 0.1]])
+    covariances = torch.diag_embed(thin.double())
+    inside = torch.tensor([[0.0, 0.1, 2.0]], dtype=torch.float64).expand(5, 3)
+    from_front = Camera(0, 40)  # the viewer is at +x
+    assert _uncovered(means, covariances, inside, None, from_front).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
+    assert _uncovered(means, covariances, None, 3.0, from_front).tolist() == [True, False, True, True, True]
+    assert _uncovered(means, covariances, None, None, from_front).tolist() == [True, False, True, True, True]
+    assert _uncovered(means, covariances, inside, 1.0, from_front).tolist() == [True, *[False] * 4]
+    figure = mixture_scene_figure(means, covariances, seen_from=inside, camera=from_front, max_pixels=200)
+    assert "3 of 5 components" in figure.get_suptitle()
+
+
+@pytest.mark.parametrize("k", [0, 1, 30])
+def test_scene_by_height_and_by_robot(k):
+    means, covariances = components(k)
+    figure = mixture_scene_figure(means, covariances, trajectories=flights(2, 20), max_pixels=300)
+    figure.canvas.draw()
+    assert any(axes.get_ylabel() == "height z [m]" for axes in figure.axes)
+    by_robot = mixture_scene_figure(
+        means, covariances, owners=torch.arange(k) % 2, ceiling=10.0, title="mine", max_pixels=300
+    )
+    by_robot.canvas.draw()
+    assert by_robot.get_suptitle() == "mine"
+    assert len(by_robot.axes) == 1
+
+
+def test_scene_is_the_same_every_time_and_far_from_the_origin():
+    means, covariances = components(20)
+    far = means + torch.tensor([500e3, -500e3, 100.0])
+    canvas = Canvas(-3.0, 3.0, -3.0, 3.0, 20.0)
+    camera = Camera()
+    shift = camera.project(torch.tensor([500e3, -500e3, 100.0], dtype=torch.float64))
+    moved = Canvas(
+        -3.0 + float(shift[0]), 3.0 + float(shift[0]), -3.0 + float(shift[1]), 3.0 + float(shift[1]), 20.0
+    )
+    first = render(means, covariances, torch.ones(20, 3), camera, canvas)
+    again = render(means, covariances, torch.ones(20, 3), camera, canvas)
+    assert torch.equal(first.rgb, again.rgb)
+    away = render(far, covariances, torch.ones(20, 3), camera, moved)
+    assert float((away.rgb[:100, :100] - first.rgb[:100, :100]).abs().mean()) < 1e-3
+
+
+def test_scene_says_what_is_wrong():
+    means, covariances = components(3)
+    with pytest.raises(InvalidArgumentError, match=r"a scene needs \(K, 3\)"):
+        mixture_scene_figure(means[:, :2], covariances[:, :2, :2])
+    with pytest.raises(InvalidArgumentError, match="seen_from has shape"):
+        mixture_scene_figure(means, covariances, seen_from=means[:2])
+    with pytest.raises(InvalidArgumentError, match="owners has shape"):
+        mixture_scene_figure(means, covariances, owners=torch.zeros(2))
+    with pytest.raises(InvalidArgumentError, match="n_sigma=0"):
+        render(means, covariances, means, Camera(), Canvas(0, 1, 0, 1, 10), n_sigma=0)

@@ -1,0 +1,68 @@
+"""What a recording says, rerun's own reader finds; without rerun, a clear error."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+import torch
+from exploration_rows import flights, trial
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.report.exploration_recording import RecordedMap, _ellipsoids, record_rerun
+
+needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs rerun-sdk")
+
+
+def test_half_axes_and_quaternions_make_the_covariance():
+    from scipy.spatial.transform import Rotation
+
+    factors = torch.randn(50, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    covariances = factors @ factors.mT
+    sizes, turns = _ellipsoids(covariances)
+    axes = Rotation.from_quat(turns).as_matrix()
+    np.testing.assert_allclose(
+        axes @ ((sizes / 2) ** 2 * np.eye(3)[:, None]).transpose(1, 0, 2) @ axes.transpose(0, 2, 1),
+        covariances,
+    )
+
+
+@needs_rerun
+def test_records_robots_map_mixture_and_curves(tmp_path):
+    from rerun.chunk import RrdReader
+
+    covariances = torch.eye(3).expand(2, 3, 3) * 0.01
+    maps = [
+        RecordedMap(20.0, [[0, 0, 0], [5, -1, 2]], torch.rand(2, 3), covariances),
+        RecordedMap(10.0, [[0, 0, 0]]),
+    ]
+    path = record_rerun(
+        tmp_path / "mission.rrd", flights(2, 30), maps=maps, row=trial("gmm_shared", 0, duration=100)
+    )
+    assert [p.name for p in tmp_path.iterdir()] == ["mission.rrd"]
+    rows: dict[str, int] = {}
+    for chunk in RrdReader(str(path)).stream():
+        rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + chunk.num_rows
+    found = {name: n for name, n in rows.items() if "__" not in name and n}
+    assert found["/world/robots/1"] == found["/world/robots/2"] == 30
+    assert found["/world/cells"] == found["/world/mixture"] == 2
+    assert found["/entropy_left"] == found["/bytes_sent"] == 11
+    assert found["/world/robots/1/path"] == 1
+
+
+@needs_rerun
+def test_nothing_to_record_is_a_recording(tmp_path):
+    assert record_rerun(tmp_path / "empty.rrd", [np.empty((0, 4))]).is_file()
+
+
+def test_says_what_is_wrong(tmp_path, monkeypatch):
+    with pytest.raises(InvalidArgumentError, match=r"must end in \.rrd"):
+        record_rerun(tmp_path / "mission.bag", [])
+    with pytest.raises(InvalidArgumentError, match="period=0"):
+        record_rerun(tmp_path / "mission.rrd", [], period=0.0)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(GmmTorchError, match="pip install 'rerun-sdk"):
+        record_rerun(tmp_path / "mission.rrd", [])
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,552 @@
+"""Messages: what comes out is what went in, to the stated step; whatever else comes in is refused."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mapping.bitstream import BitWriter
+from gmmtorch.mapping.codec import quantized, spatial_order
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.quantization import COUNT_ERROR
+from gmmtorch.sharing.messages import (
+    CODECS,
+    MAX_BYTES,
+    ComponentsMessage,
+    CountsMessage,
+    PlanMessage,
+    PointsMessage,
+    ViewsMessage,
+    decode,
+    encode_components,
+    encode_counts,
+    encode_plan,
+    encode_points,
+    encode_views,
+    quantized_poses,
+)
+from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
+
+codecs = pytest.mark.parametrize("codec", CODECS)
+numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
+places = st.sampled_from([0.0, -37.25, 5e5])
+
+
+def sealed(data: bytes) -> bytes:
+    """A first byte and a body with a checksum that is right."""
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def assert_same(one: object, other: object) -> None:
+    for field in fields(one):  # type: ignore[arg-type]
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, field.name
+
+
+def frame_of_components(k: int, **options) -> Components:
+    """Components of one frame: near one another, seen from one place, numbered in spatial order."""
+    made = random_components(
+        3, k=k, extent=6.0, n_origins=1, max_sightings=1, deviations=(5e-3, 0.5), **options
+    )
+    return replace(made.rearranged(spatial_order(made)), ids=made.ids)
+
+
+def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> ViewsMessage:
+    generator = torch.Generator().manual_seed(seed)
+    poses = torch.rand(n, 4, generator=generator, dtype=torch.float64) * 40 - 20
+    return ViewsMessage(
+        ids=torch.stack([torch.arange(n) % 3, torch.arange(n) * 2], 1),
+        poses=quantized_poses(poses + center),
+        values=(torch.rand(n, generator=generator) * 200).half().double(),
+        stamps=torch.arange(n, dtype=torch.float64) / 8,
+        removed=torch.stack([torch.full((n_removed,), 7), torch.arange(n_removed)], 1),
+        removed_stamps=torch.full((n_removed,), 12.5, dtype=torch.float64),
+    )
+
+
+def examples() -> list[bytes]:
+    """A sound datagram of every kind."""
+    components, counts = frame_of_components(9), {(0, 3): 5.0, (0, 4): 7.5, (2, 900): 0.0}
+    ends = torch.arange(30, dtype=torch.float64).reshape(10, 3)
+    made = [encode_components(components, codec) for codec in CODECS]
+    made += [encode_counts(1, counts, codec) for codec in CODECS]
+    made += [encode_points(1, 2, ends[0], ends, ends[:, 0] > 9), encode_views(views(6, 3))]
+    made += [encode_plan(2, 5, 12.0, 0.2, views(11).poses, views(3).poses)]
+    assert all(len(datagrams) == 1 for datagrams in made)
+    return [datagrams[0] for datagrams in made]
+
+
+# -- components --------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(
+    dim=st.sampled_from([2, 3]),
+    k=st.integers(0, 3) | st.integers(0, 300),
+    seed=st.integers(0, 999),
+    center=places,
+    extent=st.sampled_from([0.0, 6.0, 2e4]),
+    max_sightings=st.integers(1, 3),
+    robot=st.integers(0, 9),
+)
+def test_components_arrive_as_the_codec_quantizes_them(**options):
+    components = random_components(**options)
+    datagrams = encode_components(components)
+    assert all(len(datagram) <= MAX_BYTES for datagram in datagrams)
+    if not len(components):
+        assert datagrams == []
+        return
+    found = Components.concatenate([decode(datagram).components for datagram in datagrams])
+    expected = quantized(components)
+    for name in ("means", "covariances", "support", "max_range", "ids", "seen_by", "seen_count"):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    assert torch.equal(found.origins[found.seen_from], expected.origins[expected.seen_from])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_float_components_arrive_as_they_are(dim):
+    components = random_components(dim, k=40, center=5e5)
+    datagrams = encode_components(components, "float")
+    assert len(datagrams) > 1
+    found = Components.concatenate([decode(datagram).components for datagram in datagrams])
+    for name in ("means", "covariances", "support", "max_range", "ids", "seen_by", "seen_count"):
+        assert torch.equal(getattr(found, name), getattr(components, name)), name
+    assert torch.equal(found.origins[found.seen_from], components.origins[components.seen_from])
+
+
+def test_thesis_components_are_57_bytes_each_and_float32():
+    components = frame_of_components(50)
+    datagrams = encode_components(components, "thesis")
+    assert sum(map(len, datagrams)) == 57 * 50 + 5 * len(datagrams)
+    found = Components.concatenate([decode(datagram).components for datagram in datagrams])
+    for name in ("means", "covariances", "support"):
+        assert torch.equal(getattr(found, name), getattr(components, name).float().double()), name
+    assert torch.equal(found.seen_count, found.support[found.seen_by])
+    assert torch.equal(found.origins[found.seen_from], components.origins.float().double().expand(50, 3))
+    assert torch.equal(found.ids, components.ids)
+    assert torch.equal(found.max_range, components.max_range)
+
+
+@codecs
+def test_encoding_what_was_decoded_changes_nothing(codec):
+    datagrams = encode_components(frame_of_components(20), codec)
+    assert [encode_components(decode(datagram).components, codec) for datagram in datagrams] == [
+        [datagram] for datagram in datagrams
+    ]
+
+
+def test_a_component_of_a_frame_takes_ten_bytes():
+    assert sum(map(len, encode_components(frame_of_components(100)))) <= 10 * 100
+
+
+@codecs
+def test_a_component_seen_from_too_many_places_is_named(codec):
+    one = random_components(3, k=1, n_origins=900, max_sightings=1)
+    many = replace(
+        one,
+        origins=torch.rand(900, 3, dtype=torch.float64) * 1e3,
+        seen_by=torch.zeros(900, dtype=torch.int64),
+        seen_from=torch.arange(900),
+        seen_count=one.support.expand(900) / 900,
+    )
+    with pytest.raises(InvalidArgumentError, match="single component"):
+        encode_components(many, codec)
+
+
+@pytest.mark.parametrize("codec", ["float", "thesis"])
+def test_covariances_that_would_arrive_indefinite_are_not_sent(codec):
+    components = frame_of_components(3)
+    flat = components.covariances.clone()
+    flat[1] = torch.diag(torch.tensor([1.0, 1.0, -1e-12], dtype=torch.float64))
+    with pytest.raises(InvalidArgumentError, match="codec=quantized"):
+        encode_components(replace(components, covariances=flat), codec)
+    assert len(encode_components(replace(components, covariances=flat))) == 1
+
+
+def test_unknown_codecs_are_named():
+    for encode in (
+        lambda: encode_components(Components.empty(3), "zip"),
+        lambda: encode_counts(0, {}, "zip"),
+    ):
+        with pytest.raises(InvalidArgumentError, match="codec='zip'"):
+            encode()
+
+
+# -- counts ------------------------------------------------------------------------------------------------
+
+
+@given(
+    sender=numbers,
+    counts=st.dictionaries(
+        st.tuples(st.integers(0, 3) | numbers, numbers), st.just(0.0) | st.floats(1e-3, 1e12), max_size=60
+    ),
+)
+def test_counts_arrive_within_their_step(sender, counts):
+    found: dict[tuple[int, int], float] = {}
+    for datagram in encode_counts(sender, counts):
+        assert len(datagram) <= MAX_BYTES
+        message = decode(datagram)
+        assert isinstance(message, CountsMessage)
+        assert message.sender == sender
+        assert encode_counts(sender, message.counts) == [datagram]
+        found |= message.counts
+    assert list(found) == sorted(counts)
+    for key, count in counts.items():
+        assert found[key] == pytest.approx(count, rel=COUNT_ERROR + 1e-12, abs=0)
+
+
+def test_counts_in_float_are_exact_and_in_the_thesis_codec_8_bytes():
+    counts = {(robot, number): number + 0.3 for robot in (2, 0) for number in range(0, 900, 3)}
+    exact = [decode(datagram) for datagram in encode_counts(4, counts, "float")]
+    assert {key: count for message in exact for key, count in message.counts.items()} == counts
+    datagrams = encode_counts(4, counts, "thesis")
+    assert sum(map(len, datagrams)) == 8 * 600 + 6 * len(datagrams)
+    rounded = {key: float(np.float32(count)) for key, count in counts.items()}
+    assert {k: c for datagram in datagrams for k, c in decode(datagram).counts.items()} == rounded
+
+
+def test_counts_take_less_than_three_bytes_each():
+    generator = torch.Generator().manual_seed(0)
+    known = torch.randperm(5000, generator=generator)[:200].tolist()
+    counts = {(i % 3, number): 1.0 + number % 97 for i, number in enumerate(known)}
+    assert sum(map(len, encode_counts(0, counts))) <= 3 * 200
+    assert len(encode_counts(0, {(0, number): 8.0 for number in range(1000, 1100)})[0]) <= 40  # a run
+
+
+@pytest.mark.parametrize("count", [-1.0, math.nan, math.inf, 1e13])
+@codecs
+def test_counts_that_are_none_are_named(count, codec):
+    with pytest.raises(InvalidArgumentError, match=r"counts\[\(1, 2\)\]"):
+        encode_counts(0, {(1, 2): count}, codec)
+
+
+# -- points ------------------------------------------------------------------------------------------------
+
+
+@given(
+    n=st.integers(0, 3) | st.integers(0, 400),
+    seed=st.integers(0, 99),
+    center=places,
+    sender=st.integers(0, 65535),
+)
+def test_points_arrive_to_float32_of_their_distance(n, seed, center, sender):
+    generator = torch.Generator().manual_seed(seed)
+    ends = center + torch.rand(n, 3, generator=generator, dtype=torch.float64) * 12 - 6
+    origin = torch.full((3,), center, dtype=torch.float64) + 0.123
+    is_hit = torch.rand(n, generator=generator) < 0.6
+    datagrams = encode_points(sender, 2**32 - 1, origin, ends, is_hit)
+    assert len(datagrams) == math.ceil(n / POINTS_PER_DATAGRAM)
+    found = [decode(datagram) for datagram in datagrams]
+    for part, message in enumerate(found):
+        assert isinstance(message, PointsMessage)
+        assert (message.sender, message.frame, message.part) == (sender, 2**32 - 1, part)
+        assert message.n_parts == len(datagrams)
+        assert torch.equal(message.origin, origin)
+    if found:
+        assert max(map(len, datagrams)) <= MAX_BYTES
+        torch.testing.assert_close(torch.cat([m.ends for m in found]), ends, rtol=1e-15, atol=1e-6)
+        assert torch.equal(torch.cat([m.is_hit for m in found]), is_hit)
+
+
+def test_points_take_12_bytes_a_bit_and_a_header():
+    n = POINTS_PER_DATAGRAM
+    ends = torch.rand(2 * n, 3, dtype=torch.float64)
+    datagrams = encode_points(0, 0, ends[0], ends, torch.ones(2 * n, dtype=torch.bool))
+    assert [len(datagram) for datagram in datagrams] == [41 + 12 * n + math.ceil(n / 8)] * 2
+    assert 41 + 12 * (n + 1) + math.ceil((n + 1) / 8) > MAX_BYTES  # one more would not fit
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"sender": 65536},
+        {"frame": -1},
+        {"frame": 1 << 32},
+        {"ends": torch.full((4, 3), math.nan)},
+        {"ends": torch.full((4, 3), math.inf)},
+        {"ends": torch.full((4, 3), 1e39, dtype=torch.float64)},
+        {"ends": torch.zeros(4, 2)},
+        {"origin": torch.tensor([0.0, math.inf, 0.0])},
+        {"is_hit": torch.ones(3, dtype=torch.bool)},
+    ],
+)
+def test_points_that_cannot_be_sent_are_named(changed):
+    sound = {
+        "sender": 0,
+        "frame": 0,
+        "origin": torch.zeros(3),
+        "ends": torch.zeros(4, 3),
+        "is_hit": torch.ones(4, dtype=torch.bool),
+    }
+    assert len(encode_points(**sound)) == 1
+    with pytest.raises(InvalidArgumentError, match=next(iter(changed))):
+        encode_points(**{**sound, **changed})
+
+
+# -- views and plans ---------------------------------------------------------------------------------------
+
+
+@given(poses=st.lists(st.tuples(*[st.floats(-1e8, 1e8)] * 3, st.floats(-1e3, 1e3)), max_size=20))
+def test_quantized_poses_are_near_and_stay(poses):
+    rows = torch.tensor(poses, dtype=torch.float64).reshape(-1, 4)
+    found = quantized_poses(rows)
+    assert float((found[:, :3] - rows[:, :3]).abs().max() if len(rows) else 0) <= 0.005 + 1e-7
+    turned = torch.remainder(found[:, 3] - rows[:, 3] + math.pi, 2 * math.pi) - math.pi
+    assert float(turned.abs().max() if len(rows) else 0) <= math.pi / 256 + 1e-9
+    assert bool(((found[:, 3] >= -math.pi) & (found[:, 3] < math.pi)).all())
+    assert torch.equal(quantized_poses(found), found)
+
+
+def test_a_pose_in_centimetres_comes_back_to_the_bit():
+    poses = torch.tensor(
+        [[0.29, -1.15, 4.35, math.pi / 2], [500000.07, 0.0, 0.01, -math.pi]], dtype=torch.float64
+    )
+    assert torch.equal(quantized_poses(poses), poses)
+
+
+@given(
+    n=st.integers(0, 3) | st.integers(0, 250),
+    n_removed=st.integers(0, 3) | st.integers(0, 250),
+    seed=st.integers(0, 99),
+    center=places,
+)
+def test_views_arrive(n, n_removed, seed, center):
+    sent = views(n, n_removed, seed, center)
+    datagrams = encode_views(sent)
+    assert bool(datagrams) == bool(n + n_removed)
+    assert all(len(datagram) <= MAX_BYTES for datagram in datagrams)
+    found = [decode(datagram) for datagram in datagrams]
+    order = sorted(range(n), key=lambda row: sent.ids[row].tolist())
+    for name in ("ids", "poses", "values", "stamps") if n else ():
+        assert torch.equal(torch.cat([getattr(m, name) for m in found]), getattr(sent, name)[order]), name
+    for name in ("removed", "removed_stamps") if n_removed else ():
+        assert torch.equal(torch.cat([getattr(m, name) for m in found]), getattr(sent, name)), name
+
+
+def test_a_view_takes_few_bytes():
+    assert len(encode_views(views(50))[0]) <= 11 * 50
+    assert len(encode_views(views(0, 100))[0]) <= 100
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("ids", torch.tensor([[0, 1], [0, 1]])),
+        ("ids", torch.tensor([[0, -1], [0, 1]])),
+        ("ids", torch.tensor([[0, 1 << 60], [0, 1]])),
+        ("ids", torch.tensor([[0.0, 1.0], [0.0, 2.0]])),
+        ("removed", torch.tensor([[5, 5], [5, 5]])),
+        ("poses", torch.full((2, 4), math.nan)),
+        ("poses", torch.full((2, 4), 1e9)),
+        ("poses", torch.zeros(2, 3)),
+        ("values", torch.tensor([1.0, 7e4])),
+        ("values", torch.tensor([1.0, math.nan])),
+        ("stamps", torch.tensor([1.0, math.inf])),
+        ("stamps", torch.zeros(3)),
+    ],
+)
+def test_views_that_cannot_be_sent_are_named(name, value):
+    with pytest.raises(InvalidArgumentError, match=name):
+        encode_views(replace(views(2, 2), **{name: value}))
+
+
+@given(
+    sender=numbers,
+    number=numbers,
+    time=st.integers(0, 10**9),
+    step=st.integers(1, 10**4),
+    n=st.integers(0, 60),
+    n_views=st.integers(0, 20),
+    speed=st.floats(0, 2),
+)
+def test_plans_arrive(sender, number, time, step, n, n_views, speed):
+    along = torch.arange(n, dtype=torch.float64) * 0.2
+    path = torch.stack([speed * along, 3 - along, along * 0 + 1.5, 1.2 * along], 1)
+    (datagram,) = encode_plan(sender, number, time / 1000, step / 1000, path, views(n_views).poses)
+    found = decode(datagram)
+    assert isinstance(found, PlanMessage)
+    assert (found.sender, found.number, found.time, found.step) == (sender, number, time / 1000, step / 1000)
+    assert torch.equal(found.path, quantized_poses(path))
+    assert torch.equal(found.views, views(n_views).poses)
+
+
+def test_a_plan_of_four_seconds_is_short():
+    along = torch.arange(20, dtype=torch.float64) * 0.2
+    path = torch.stack([along.cos() * 3, along.sin() * 3, 1 + 0.1 * along, along + math.pi / 2], 1)
+    assert len(encode_plan(1, 17, 842.0, 0.2, path)[0]) <= 60
+
+
+def test_plans_that_cannot_be_sent_are_named():
+    path = torch.zeros(4, 4)
+    for changed, message in (
+        ({"step": 0.0}, "step=0.0"),
+        ({"step": math.nan}, "step"),
+        ({"time": math.inf}, "time"),
+        ({"number": -1}, "number=-1"),
+        ({"sender": 1 << 60}, "sender"),
+        ({"path": torch.full((2, 4), math.inf)}, "path"),
+        ({"path": torch.zeros(1001, 4)}, "1001 poses"),
+        ({"path": torch.rand(900, 4, dtype=torch.float64) * 1e6}, "room for 1200"),
+        ({"views": torch.zeros(2, 3)}, "views"),
+    ):
+        sound = {"sender": 1, "number": 2, "time": 3.0, "step": 0.2, "path": path, "views": path}
+        with pytest.raises(InvalidArgumentError, match=message):
+            encode_plan(**{**sound, **changed})
+
+
+# -- the format, by hand from docs/messages.md -------------------------------------------------------------
+
+
+def test_counts_by_hand():
+    """Of robot 1: components 3 and 5 of robot 0 have gained a point each."""
+    stream = "00000010" + "00000010" + "00000000" + "00000100" + "00000110"  # sender; robots; 0, two ids, 3
+    stream += "000000" + "01"  # b = 0; a gap of 2, less one
+    stream += "00" + "000000" + "00000000"  # a column of no bits each, all 0: log2 of 1
+    body = int(stream, 2).to_bytes(len(stream) // 8, "big")
+    datagram = sealed(b"\x14" + body)
+    message = decode(datagram)
+    assert (message.sender, message.counts) == (1, {(0, 3): 1.0, (0, 5): 1.0})
+    assert encode_counts(1, {(0, 5): 1.0, (0, 3): 1.0}) == [datagram]
+
+
+def test_a_path_by_hand():
+    """Two poses a metre apart, the second turned right by an eighth, of robot 0; no views."""
+    poses = torch.tensor([[0.0, 0.01, 0.0, 0.0], [1.0, 0.01, 0.0, -math.pi / 4]], dtype=torch.float64)
+    stream = "".join(f"{byte:08b}" for byte in (0, 2, 2, 4, 4))  # robot 0, plan 1, 1 ms, 2 ms, 2 poses
+    fixed = "00" + "000000"  # a column of one number: its base is all
+    stream += "00000000" + fixed + "11001000" + "00000001"  # x: 0, then 100 = 200 zigzag = 72 + 128 · 1
+    stream += "00000010" + fixed + "00000000" + "00000000" + fixed + "00000000"
+    stream += "00000000" + fixed + f"{2 * 32 - 1:08b}"  # yaw: 0, then -32 of 256
+    stream += "00000000"  # no views
+    datagram = sealed(b"\x19" + int(stream, 2).to_bytes(len(stream) // 8, "big"))
+    assert encode_plan(0, 1, 0.001, 0.002, poses) == [datagram]
+    assert torch.equal(decode(datagram).path, poses)
+
+
+def test_points_by_hand():
+    body = struct.pack("<HI3dHHH6fB", 7, 9, 500.0, 0.5, 1.0, 1, 3, 2, 1, 2, 3, -1, -2, -3, 0b01000000)
+    message = decode(sealed(b"\x17" + body))
+    assert (message.sender, message.frame, message.part, message.n_parts) == (7, 9, 1, 3)
+    assert message.ends.tolist() == [[501.0, 2.5, 4.0], [499.0, -1.5, -2.0]]
+    assert message.is_hit.tolist() == [False, True]
+
+
+# -- what is no message ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sound() -> list[bytes]:
+    return examples()
+
+
+def test_every_kind_says_what_it_is(sound):
+    kinds = [type(decode(datagram)) for datagram in sound]
+    assert kinds == [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
+    assert [datagram[0] for datagram in sound] == [0x11, 0x12, 0x13, 0x14, 0x15, 0x16, 0x17, 0x18, 0x19]
+
+
+def test_every_cut_flipped_bit_and_added_byte_is_noticed(sound):
+    for datagram in sound:
+        for length in range(len(datagram)):
+            with pytest.raises(DataError):
+                decode(datagram[:length])
+        for bit in range(8 * len(datagram)):
+            damaged = bytearray(datagram)
+            damaged[bit // 8] ^= 1 << bit % 8
+            with pytest.raises(DataError):
+                decode(bytes(damaged))
+        with pytest.raises(DataError):
+            decode(datagram + b"\0")
+
+
+def test_other_versions_kinds_and_sizes_are_refused_by_name():
+    with pytest.raises(DataError, match="version 2"):
+        decode(sealed(b"\x24" + bytes(9)))
+    with pytest.raises(DataError, match="kind 12"):
+        decode(sealed(b"\x1c" + bytes(9)))
+    with pytest.raises(DataError, match="1201 bytes"):
+        decode(bytes(1201))
+    with pytest.raises(DataError, match="empty"):
+        decode(b"")
+
+
+def assert_sound(message: object) -> None:
+    """No NaN, nothing infinite or indefinite, and no more than a datagram can hold."""
+    for value in vars(message.components if isinstance(message, ComponentsMessage) else message).values():
+        if isinstance(value, torch.Tensor):
+            assert value.numel() <= 1 << 17
+            assert not value.is_floating_point() or bool(torch.isfinite(value).all())
+    if isinstance(message, ComponentsMessage):
+        message.components.checked()
+        assert not torch.linalg.cholesky_ex(message.components.covariances).info.any()
+    if isinstance(message, CountsMessage):
+        assert all(0 <= count <= 2.0**40 for count in message.counts.values())
+
+
+def try_decode(datagram: bytes) -> bool:
+    try:
+        message = decode(datagram)
+    except DataError:
+        return False
+    assert_sound(message)
+    return True
+
+
+@settings(max_examples=300)
+@given(data=st.binary(max_size=1300))
+def test_noise_is_refused(data):
+    assert not try_decode(data)
+
+
+@settings(max_examples=600)
+@given(kind=st.integers(1, 9), body=st.binary(max_size=400))
+def test_noise_with_a_sound_checksum_is_refused_or_sound(kind, body):
+    try_decode(sealed(b"\x11" + sealed(b"\x01" + body)) if kind == 1 else sealed(bytes([0x10 | kind]) + body))
+
+
+def forged(datagram: bytes, body: bytes) -> bytes:
+    """A datagram of the same kind with another body and checksums that are right."""
+    return datagram[:1] + sealed(body) if datagram[0] == 0x11 else sealed(datagram[:1] + body)
+
+
+def test_thousands_of_forged_datagrams_are_refused_or_sound(sound):
+    rng, n_accepted = np.random.default_rng(0), 0
+    for trial in range(3000):
+        datagram = sound[trial % len(sound)]
+        body = bytearray(datagram[1:-4])
+        for place in rng.integers(0, len(body), rng.integers(1, 5)):
+            body[place] = rng.integers(0, 256)
+        n_accepted += try_decode(forged(datagram, bytes(body[: len(body) - rng.choice([0, 0, 0, 1, 7])])))
+    assert n_accepted > 100  # so that what is accepted was looked at
+
+
+@pytest.mark.parametrize("n", [2**20, 2**40, 2**61])
+@pytest.mark.parametrize("kind", [4, 8, 9])
+def test_numbers_that_nothing_backs_take_no_memory(n, kind):
+    """As many ids of one robot, or poses, as the format can announce."""
+    writer = BitWriter()
+    for value in {4: (1, 1, 0, n, 0), 8: (1, 0, n, 0), 9: (1, 1, 1, 1, n)}[kind]:
+        writer.number(value)
+    with pytest.raises(DataError):
+        decode(sealed(bytes([0x10 | kind]) + writer.to_bytes() + bytes(900)))
+
+
+def test_float_components_that_are_none_are_refused(sound):
+    datagram = sound[1]
+    body = datagram[1:-4]
+    for place, value in ((13, math.nan), (13 + 9 * 24, -1.0)):  # the first mean, the first variance
+        changed = body[:place] + struct.pack("<d", value) + body[place + 8 :]
+        with pytest.raises(DataError):
+            decode(forged(datagram, changed))
+    with pytest.raises(DataError, match="0 components"):
+        decode(forged(datagram, struct.pack("<BIII", 3, 0, 1 << 31, 1 << 31)))

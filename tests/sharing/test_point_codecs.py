@@ -1,0 +1,234 @@
+"""Codecs of points: what comes back is what went in, to the error each is allowed."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.sharing.point_codecs import (
+    POINT_CODECS,
+    DepthImage,
+    Draco,
+    Octree,
+    PointCodec,
+    QuantizedPoints,
+    RawPoints,
+    bytes_of_points,
+    point_codec,
+)
+
+pytest.importorskip("zstandard")
+pytest.importorskip("DracoPy")
+
+clouds = st.builds(
+    lambda n, seed, center, extent: cloud(n, seed, center, extent),
+    n=st.integers(0, 300),
+    seed=st.integers(0, 999),
+    center=st.sampled_from([0.0, -41.3, 5e5]),
+    extent=st.sampled_from([0.0, 0.05, 6.0, 300.0]),
+)
+resolutions = st.sampled_from([0.001, 0.05, 0.2, 1.0, 10.0])
+
+
+def cloud(n: int, seed: int = 0, center: float = 0.0, extent: float = 6.0) -> Tensor:
+    """Points on a wall and a floor."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(n, 3, generator=generator, dtype=torch.float64) * extent
+    points[: n // 2, 0] = extent / 3
+    points[n // 2 :, 2] = 0.0
+    return points + center
+
+
+def sorted_rows(rows: np.ndarray) -> np.ndarray:
+    return rows[np.lexsort(rows.T)]
+
+
+def cells_of(points: Tensor, resolution: float) -> np.ndarray:
+    """The codecs' lattice, worked out point by point."""
+    return np.array([[math.floor(x / resolution) for x in row] for row in points.tolist()]).reshape(-1, 3)
+
+
+@given(points=clouds)
+def test_raw_points_are_float32_in_order(points):
+    if points.numel() and float(points.abs().max()) > 16384:
+        with pytest.raises(InvalidArgumentError, match="millimetre"):
+            RawPoints().encode(points)
+        return
+    data = RawPoints().encode(points)
+    assert len(data) == 12 * len(points)
+    assert torch.equal(RawPoints().decode(data), points.float().double())
+
+
+@given(points=clouds, resolution=resolutions)
+def test_every_point_comes_back_as_its_cell(points, resolution):
+    codec = QuantizedPoints(resolution)
+    found = codec.decode(codec.encode(points)).numpy()
+    expected = (cells_of(points, resolution) + 0.5) * resolution
+    np.testing.assert_array_equal(sorted_rows(found), sorted_rows(expected))
+
+
+@given(points=clouds, resolution=resolutions, level=st.sampled_from([3, 22]))
+def test_an_octree_holds_each_cell_once(points, resolution, level):
+    codec = Octree(resolution, level)
+    found = codec.decode(codec.encode(points)).numpy()
+    expected = (np.unique(cells_of(points, resolution), axis=0).reshape(-1, 3) + 0.5) * resolution
+    np.testing.assert_array_equal(sorted_rows(found), sorted_rows(expected))
+
+
+def test_the_occupancy_bytes_of_an_octree_are_those_of_a_recursion():
+    import zstandard
+
+    points = cloud(200)
+    cells = cells_of(points, 0.2)
+    cells -= cells.min(0)
+    depth = int(cells.max()).bit_length()
+    levels: list[list[int]] = [[] for _ in range(depth)]
+
+    def walk(low: np.ndarray, side: int, level: int) -> bool:
+        inside = ((cells >= low) & (cells < low + side)).all(1)
+        if not inside.any() or side == 1:
+            return bool(inside.any())
+        place = len(levels[level])
+        levels[level].append(0)
+        for child, corner in enumerate(itertools.product((0, 1), repeat=3)):
+            levels[level][place] |= walk(low + np.array(corner) * side // 2, side // 2, level + 1) << child
+        return True
+
+    walk(np.zeros(3, int), 1 << depth, 0)
+    data = Octree(0.2).encode(points)
+    reader = zstandard.ZstdDecompressor(format=zstandard.FORMAT_ZSTD1_MAGICLESS)
+    unfolded = reader.decompress(data[4:], max_output_size=1 << 20)  # a byte each of corner and levels
+    assert list(unfolded) == [byte for level in levels for byte in level]
+
+
+@settings(max_examples=60)
+@given(points=clouds, error=st.sampled_from([0.002, 0.01, 0.1, 1.0]))
+def test_draco_stays_within_the_error_it_is_allowed(points, error):
+    codec = Draco(error)
+    found = codec.decode(codec.encode(points))
+    assert len(found) <= len(points)  # equal ones become one
+    if len(points):
+        # Draco gives no order: each point's nearest is at most as far as its own, and the other way round.
+        for one, other in ((points, found), (found, points)):
+            distances = cKDTree(other.numpy()).query(one.numpy())[0]
+            assert math.sqrt(np.square(distances).mean()) <= error * (1 + 1e-3) + 1e-5
+
+
+def test_the_error_that_draco_is_allowed_is_used_up():
+    """Points so far apart that each one's nearest is its own."""
+    points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 60
+    for error in (0.005, 0.1):
+        found = Draco(error).decode(Draco(error).encode(points)).numpy()
+        distance = cKDTree(found).query(points.numpy())[0]
+        assert len(found) == 3000
+        assert 0.95 * error <= math.sqrt(np.square(distance).mean()) <= error * (1 + 1e-4)
+
+
+@given(
+    shape=st.tuples(st.integers(0, 20), st.integers(0, 30)),
+    seed=st.integers(0, 99),
+    share=st.sampled_from([0.0, 0.3, 1.0]),
+    farthest=st.sampled_from([0.01, 6.0, 65.0]),
+)
+def test_depths_come_back_in_millimetres(shape, seed, share, farthest):
+    generator = torch.Generator().manual_seed(seed)
+    depths = 0.001 + torch.rand(shape, generator=generator, dtype=torch.float64) * farthest
+    depths[torch.rand(shape, generator=generator) >= share] = 0.0
+    found = DepthImage().decode(DepthImage().encode(depths))
+    assert torch.equal(found, (depths * 1000).round() / 1000)
+    assert torch.equal(found > 0, depths > 0)
+
+
+def test_the_compressed_are_smaller_than_the_raw_and_the_octree_is_smallest():
+    points = cloud(5000)
+    depths = torch.zeros(120, 160, dtype=torch.float64)
+    depths.view(-1)[:5000] = 2 + torch.arange(5000, dtype=torch.float64) / 1e4
+    sizes = bytes_of_points(points, 0.2, 0.1, depths)
+    assert sizes["raw"] == 60000
+    assert list(sizes) == [*POINT_CODECS, "depth_image"]
+    assert sizes["octree"] < min(sizes["quantized"], sizes["draco"])
+    assert max(sizes["quantized"], sizes["draco"], sizes["depth_image"]) < 0.2 * sizes["raw"]
+    for name in POINT_CODECS:
+        assert sizes[name] == len(point_codec(name, 0.2, 0.1).encode(points))
+
+
+def test_no_points_take_no_bytes():
+    nothing = bytes_of_points(torch.zeros(0, 3), 0.2, 0.1, torch.zeros(4, 4), ["octree", "draco"])
+    assert nothing == {"octree": 0, "draco": 0, "depth_image": 0}
+
+
+# -- what cannot be encoded or decoded ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", POINT_CODECS)
+@pytest.mark.parametrize(
+    "points", [torch.full((3, 3), math.nan), torch.full((3, 3), math.inf), torch.zeros(3, 2), torch.zeros(3)]
+)
+def test_points_that_are_none_are_named(name, points):
+    with pytest.raises(InvalidArgumentError, match="points"):
+        point_codec(name, 0.2, 0.1).encode(points)
+
+
+@pytest.mark.parametrize("codec", [QuantizedPoints(0.001), Octree(0.001), Draco(1e-7)])
+def test_points_too_far_apart_for_the_step_are_named(codec):
+    with pytest.raises(InvalidArgumentError, match=r"coarser|allow more"):
+        codec.encode(torch.tensor([[0.0, 0.0, 0.0], [1e6, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("depth", [math.nan, -1.0, 65.6, math.inf])
+def test_depths_that_are_none_are_named(depth):
+    with pytest.raises(InvalidArgumentError, match="depths"):
+        DepthImage().encode(torch.full((2, 2), depth))
+
+
+def test_codecs_that_cannot_be_are_named():
+    for make, message in (
+        (lambda: Draco(0.0), "error=0.0"),
+        (lambda: Draco(math.nan), "error=nan"),
+        (lambda: Octree(0.0), "resolution"),
+        (lambda: QuantizedPoints(-1.0), "resolution"),
+        (lambda: point_codec("zip", 0.2, 0.1), "'zip' is no codec"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            make()
+
+
+def test_damaged_bytes_are_refused_or_are_points():
+    """Draco's own reader is not put to this: it may end the process."""
+    rng = np.random.default_rng(0)
+    depths = torch.rand(12, 16, dtype=torch.float64)
+    codecs: list[tuple[PointCodec | DepthImage, bytes]] = [
+        (codec, codec.encode(cloud(150))) for codec in (RawPoints(), QuantizedPoints(0.05), Octree(0.05))
+    ]
+    codecs.append((DepthImage(), DepthImage().encode(depths)))
+    n_refused = 0
+    for trial in range(1500):
+        codec, data = codecs[trial % len(codecs)]
+        damaged = bytearray(data[: rng.integers(0, len(data))] if trial % 3 == 0 else data)
+        for place in rng.integers(0, max(len(damaged), 1), 3)[: len(damaged)]:
+            damaged[place] = rng.integers(0, 256)
+        try:
+            assert bool(torch.isfinite(codec.decode(bytes(damaged))).all())
+        except DataError:
+            n_refused += 1
+    assert n_refused > 300
+
+
+@pytest.mark.parametrize(("codec", "library"), [(Octree(0.2), "zstandard"), (Draco(0.1), "DracoPy")])
+def test_a_missing_library_is_named_with_its_remedy(codec, library, monkeypatch):
+    def missing(name: str) -> None:
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(GmmTorchError, match=rf"{library}.*gmmtorch\[baselines\]"):
+        codec.encode(cloud(10))
