@@ -138,7 +138,7 @@ def _trial(
 def _world(config: DictConfig) -> WorldOptions:
     from gmmtorch.exploration.trials import WorldOptions
 
-    options = {
+    options: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in common.as_options(config.world).items()
     }
@@ -159,7 +159,7 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
     rate, window = sensor.pop("rate"), mapping.pop("window")
     threshold, observed, distance = (mapping.pop(name) for name in ("threshold", "observed", "distance"))
-    start = OmegaConf.to_container(config.team.start) if config.team.start is not None else None
+    start: Any = None if config.team.start is None else OmegaConf.to_container(config.team.start)
     return TeamOptions(
         framework=variant.get("team", config.team.name),
         size=config.team.size,

@@ -370,11 +370,13 @@ class TeamMap:
     threshold: float = 1.0
     observed: float = 0.5
     distance: float = 0.5
-    noise: float = 0.05
+    noise: float = 0.03
     length: float = 0.5
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
+    rays: float = 6.0
+    shell: float = 1.0
     update_at: float = 2.0
     update_stride: int = 4
 

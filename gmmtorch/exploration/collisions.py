@@ -16,7 +16,7 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
     """
     if len(positions) == 0:
         return torch.zeros(0, dtype=torch.bool)
-    return world.clearance(positions) < radius
+    return world.clearance(positions, threads=torch.get_num_threads()) < radius
 
 
 def meets_others(positions: Tensor, radius: float) -> Tensor:

@@ -21,6 +21,7 @@ from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.views import ViewEvaluator
 from gmmtorch.exploration.world import World
 from gmmtorch.sharing.messages import (
+    Message,
     PlanMessage,
     ViewsMessage,
     decode,
@@ -153,7 +154,7 @@ class Mission:
         """Every robot takes in what has reached it by `now`."""
         for robot in self.robots:
             heard = [
-                Heard(sender, datagram, self._memo(datagram, lambda data=datagram: decode(data)))
+                Heard(sender, datagram, self._decoded(datagram))
                 for sender, datagram in self.network.deliver(robot.number, now)
             ]
             robot.mapper.receive(heard)
@@ -162,6 +163,9 @@ class Mission:
                     robot.library.merge(item.message)
                 elif isinstance(item.message, PlanMessage):
                     robot.plans[item.message.sender] = (item.message.time, item.message.views)
+
+    def _decoded(self, datagram: bytes) -> Message:
+        return self._memo(datagram, lambda: decode(datagram))
 
     # -- planning ---------------------------------------------------------------------------------
 

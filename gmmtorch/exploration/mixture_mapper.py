@@ -27,7 +27,7 @@ from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.mapping.updating import count_explained, summed
-from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
 from gmmtorch.sharing.messages import (
     ComponentsMessage,
     CountsMessage,
@@ -42,15 +42,19 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 class FrameRule:
     """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
 
+    rays, shell: rays for each cell that a component hides, and cells before its surface in which they do
+        not speak of free space; see `component_evidence`.
     update_at: counts of a component are sent once they have grown by this factor.
     update_stride: every so manieth explained beam is counted, for as many as that leaves out.
     """
 
-    noise: float = 0.05
+    noise: float = 0.03
     length: float = 0.5
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
+    rays: float = 6.0
+    shell: float = 1.0
     update_at: float = 2.0
     update_stride: int = 4
 
@@ -58,6 +62,10 @@ class FrameRule:
         for name in ("noise", "length", "cell"):
             if not getattr(self, name) > 0:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        if not self.rays > 0 or not self.shell >= 0:
+            raise InvalidArgumentError(
+                f"rays={self.rays} must be above zero, shell={self.shell} at least zero."
+            )
         for name in ("components", "iterations", "update_stride"):
             check_whole(name, getattr(self, name), 1)
         if not self.update_at > 1:
@@ -94,7 +102,7 @@ class MixtureMapper:
     # -- sensing ----------------------------------------------------------------------------------
 
     def center_on(self, position: Tensor) -> None:
-        regenerate(self.local, self.local.center_on(position), self.tiles)
+        regenerate(self.local, self.local.center_on(position), self.tiles, self._evidence)
 
     def sense(self, frame: DepthFrame) -> Sensed:
         novel = novel_beams(self.local, frame, self._width, self._novelty)
@@ -176,10 +184,15 @@ class MixtureMapper:
             return CellEvidence.empty()
         self._enter(name, batch)
         grid = self.belief.grid
-        evidence = self._memo(key, lambda: component_evidence(batch, grid.resolution, grid.box))
+        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, grid.box))
         self.local.add(evidence)
         self.belief.add(evidence)
         return evidence
+
+    def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
+        """What components say of the cells of a box."""
+        rule = self._rule
+        return component_evidence(batch, resolution, box, rays_per_cell=rule.rays, shell=rule.shell)
 
     def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
         """Keep a batch of components seen from one place, or of counts that are added to some."""

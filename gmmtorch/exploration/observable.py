@@ -42,7 +42,8 @@ def view_directions(vertical_fov: float, angle: float) -> Tensor:
     """Unit vectors (N, 3) of all yaws, and elevations within the field of view, about `angle` rad apart."""
     rows = max(1, math.ceil(vertical_fov / angle)) + 1
     rings = []
-    for row, elevation in enumerate(torch.linspace(-vertical_fov / 2, vertical_fov / 2, rows).tolist()):
+    elevations = torch.linspace(-vertical_fov / 2, vertical_fov / 2, rows, dtype=torch.float64)
+    for row, elevation in enumerate(elevations.tolist()):
         n_yaws = max(4, math.ceil(2 * math.pi * math.cos(elevation) / angle))
         # Rows turned against each other sample the sphere more evenly, and no ray runs along a lattice plane.
         yaw = (torch.arange(n_yaws, dtype=torch.float64) + (row + 0.5) * _GOLDEN) * (2 * math.pi / n_yaws)
@@ -79,7 +80,7 @@ def observable_cells(
     centers = (points_of_view + box.low + 0.5).double() * resolution
     beyond = torch.tensor(shape) - 1 - points_of_view  # cells between the start and the end of the box
     reach, slack = max_range / resolution, _AT_SURFACE / resolution
-    together = max(1, _RAYS_AT_ONCE // len(centers))
+    together = max(1, _RAYS_AT_ONCE // max(1, len(centers)))
     for begin in range(0, len(directions), together):
         some = directions[begin : begin + together]
         toward = some.repeat_interleave(len(centers), 0)

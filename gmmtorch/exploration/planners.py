@@ -103,7 +103,7 @@ class TreePlanner:
         if journey.value / legs <= rate:
             journey.put_back(task)
             return found
-        self._journey = journey
+        self._journey, self._largest = journey, max(self._largest, journey.value)
         return self._on_the_way(task, memory) or found
 
     def _on_the_way(self, task: PlanningTask, memory: Memory) -> Found | None:

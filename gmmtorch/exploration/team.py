@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
@@ -34,6 +36,9 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             f"{options.size} robots."
         )
     world.check_start(poses)
+    # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
+    needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
+    clear = world.mesh.clearance(poses[:, :3]).clamp_max(needed)
     evaluator = ViewEvaluator(
         options.camera.horizontal_fov,
         options.camera.vertical_fov,
@@ -56,7 +61,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             _planner(options, primitives, evaluator),
             ViewLibrary(number),
             Roadmap(),
-            start_radius=3 * options.dynamics.radius,
+            start_radius=float(clear[number]),
         )
         for number in range(options.size)
     ]

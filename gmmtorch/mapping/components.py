@@ -16,6 +16,8 @@ from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import ArrayLike
 from gmmtorch.sorting import argsort
 
+_PER_COMPONENT = ("means", "covariances", "support", "max_range", "ids")
+
 UNNUMBERED = -1
 """The sequence, in `ids`, of a component that is new, or not as it was: who owns the map numbers it."""
 
@@ -92,8 +94,7 @@ class Components:
         """The components in another order (K,)."""
         rank = torch.empty_like(order)
         rank[order] = torch.arange(len(order), device=order.device)
-        rows = ("means", "covariances", "support", "max_range", "ids")
-        moved = {name: getattr(self, name)[order] for name in rows}
+        moved = {name: getattr(self, name)[order] for name in _PER_COMPONENT}
         return replace(self, **moved, seen_by=rank[self.seen_by])
 
     def selected(self, rows: Tensor) -> Components:
@@ -102,13 +103,13 @@ class Components:
         place[rows] = torch.arange(len(rows), device=rows.device)
         kept = (place[self.seen_by] >= 0).nonzero().squeeze(1)
         kept = kept[argsort(place[self.seen_by[kept]])]
-        per_component = (self.means, self.covariances, self.support, self.max_range, self.ids)
-        return Components(
-            *(values[rows] for values in per_component),
-            self.origins,
-            place[self.seen_by[kept]],
-            self.seen_from[kept],
-            self.seen_count[kept],
+        chosen = {name: getattr(self, name)[rows] for name in _PER_COMPONENT}
+        return replace(
+            self,
+            **chosen,
+            seen_by=place[self.seen_by[kept]],
+            seen_from=self.seen_from[kept],
+            seen_count=self.seen_count[kept],
         )
 
     def transformed(self, transform: Tensor, chosen: Tensor) -> Components:

@@ -65,6 +65,7 @@ def cast_evidence(
     resolution: float,
     box: Box,
     weights: Tensor | None = None,
+    free_until: Tensor | None = None,
 ) -> CellEvidence:
     """Evidence of rays in the cells of a box: what lies outside is trimmed off (thesis Fig 4.2).
 
@@ -74,6 +75,8 @@ def cast_evidence(
     Args:
         origins: (R, 3) or (3,), metres. ends: (R, 3). is_hit: (R,) bool. weights: (R,); ones if not given.
         resolution: side (m) of the cells.
+        free_until: (R, 3), metres, on the way to the ends: misses are counted no further, nor in the cell
+            that this is in. At the ends if not given.
 
     Raises:
         InvalidArgumentError: rays that are not finite, or end 2³² cells or more from the world's origin.
@@ -81,7 +84,8 @@ def cast_evidence(
     """
     starts, stops = in_cells(origins, resolution, "origins"), in_cells(ends, resolution, "ends")
     starts = starts.expand_as(stops)
-    passage = passage_of(starts, stops, box)
+    until = None if free_until is None else in_cells(free_until, resolution, "free_until")
+    passage = passage_of(starts, stops, box, until)
     if passage is None:
         return CellEvidence.empty(ends.device)
     window, block = passage.window, passage.block
@@ -113,8 +117,9 @@ class Passage(NamedTuple):
     visits: Iterator[Visits]
 
 
-def passage_of(starts: Tensor, stops: Tensor, box: Box) -> Passage | None:
-    """The cells of a box that rays (R, 3), in grid units, leave; None if they do not come to it.
+def passage_of(starts: Tensor, stops: Tensor, box: Box, until: Tensor | None = None) -> Passage | None:
+    """The cells of a box that rays (R, 3), in grid units, leave; None if they do not come to it. They are
+    followed no further than `until` (R, 3), if that is given.
 
     Rays that leave the box are cut half a cell outside it. So no cell of the box is cut, and none is
     entered or left elsewhere than without a box, but for rounding: that stays far below what the
@@ -127,6 +132,7 @@ def passage_of(starts: Tensor, stops: Tensor, box: Box) -> Passage | None:
     window = Box(torch.maximum(lowest, box.low), torch.minimum(highest, box.high))
     if bool((window.low >= window.high).any()):
         return None
+    stops = stops if until is None else until
     if torch.equal(window.low, lowest) and torch.equal(window.high, highest):
         visits = traverse(starts, stops, window.shape, _CHUNK_VISITS, low=window.low)
         return Passage(window, window, visits)

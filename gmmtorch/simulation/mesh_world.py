@@ -51,10 +51,11 @@ class MeshWorld:
         cast = self._scene.cast_rays(self._tensor(rays.numpy()), nthreads=threads)
         return torch.from_numpy(cast["t_hit"].numpy()).double()
 
-    def clearance(self, points: Tensor) -> Tensor:
-        """Metres (N,) from each point (N, 3) to the nearest surface."""
+    def clearance(self, points: Tensor, threads: int = 0) -> Tensor:
+        """Metres (N,) from each point (N, 3) to the nearest surface; `threads` as for `distances`."""
         moved = (points - self._middle).float().contiguous().numpy()
-        return torch.from_numpy(self._scene.compute_distance(self._tensor(moved)).numpy()).double()
+        found = self._scene.compute_distance(self._tensor(moved), nthreads=threads)
+        return torch.from_numpy(found.numpy()).double()
 
     def standing_places(
         self, height: float = 1.2, clearance: float = 0.4, spacing: float = 1.0, sight: float = 30.0

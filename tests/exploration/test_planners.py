@@ -66,7 +66,7 @@ def test_the_tree_explores_both_rooms_and_more_than_chance():
         explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
         explore(planner_named(name), explorer, 14)
         seen[name] = explorer.seen
-    assert seen["mcts"][-1] > 0.93
+    assert seen["mcts"][-1] > 0.85
     half = len(seen["mcts"]) // 2
     assert seen["mcts"][half] > seen["random"][half] + 0.05
     assert sum(seen["mcts"]) > sum(seen["random"])

@@ -92,7 +92,9 @@ def all_branches(task: PlanningTask, depth: int) -> list[tuple[int, ...]]:
 
 def return_of(task: PlanningTask, evaluator: MadeUp, actions: tuple[int, ...], discount: float) -> float:
     """The return of a branch, one view after the other."""
-    state, residual, total = task.state, task.residual.clone(), 0.0
+    state, total = task.state, 0.0
+    seen = evaluator.evaluate(None, evaluator.keys(state[None, :4])).measured[0]
+    residual = task.residual * (1 - seen)
     for step, action in enumerate(actions):
         state = PRIMITIVES.rollout(state[None])[0, action, -1]
         values = evaluator.evaluate(None, evaluator.keys(state[None, :4]))
@@ -108,7 +110,7 @@ def test_with_time_enough_it_finds_the_best_of_all_branches():
         found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
         assert found is not None
         branches = all_branches(task, 2)
-        assert len(branches) > 100
+        assert len(branches) > 50
         best = max(return_of(task, evaluator, branch, 0.8) for branch in branches)
         assert found.value == pytest.approx(best, rel=1e-5)
         again = return_of(task, evaluator, tuple(found.actions), 0.8)
@@ -154,10 +156,10 @@ def test_few_views_are_spent_well():
 def test_each_round_asks_once_and_never_for_what_is_known():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
     TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, Memory(task, evaluator))
-    assert len(evaluator.calls) <= 4
+    assert len(evaluator.calls) <= 5
     keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
     assert len(keys) == len(set(keys))
-    assert 40 < len(keys) <= 128
+    assert 40 < len(keys) <= 129
 
 
 def test_what_teammates_will_see_is_worth_nothing():
@@ -169,7 +171,8 @@ def test_what_teammates_will_see_is_worth_nothing():
         rule = SearchRule(depth=1, n_rounds=1)
         found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
         ends = PRIMITIVES.rollout(task.state[None])[0, :, -1, :4]
-        gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen]
+        here = evaluator.evaluate(None, evaluator.keys(task.state[None, :4])).measured[0, seen]
+        gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen] * (1 - here)
         safe = [branch[0] for branch in all_branches(task, 1)]
         assert found is not None
         assert found.value == pytest.approx(float(gains[safe].max()), rel=1e-6)
@@ -215,16 +218,16 @@ def test_with_a_goal_it_comes_closer_the_sooner_the_better():
 
 def test_the_cost_to_the_goal_counts_the_way_and_the_turns():
     here = surroundings_from(torch.ones(50, 50, 10, dtype=torch.bool))
-    goal_at = torch.tensor([[8.1, 5.1, 1.1]], dtype=torch.float64)
+    goal_at = torch.tensor([[8.2, 5.0, 1.0]], dtype=torch.float64)
     goal = Goal(DistanceField.to(here, goal_at), weight=1.0, yaw=math.pi / 2, turning=2.0)
 
     def cost(x: float, y: float, z: float, yaw: float) -> float:
         return float(goal.cost(torch.tensor([x, y, z, yaw, 0, 0, 0], dtype=torch.float64)))
 
-    assert cost(3.1, 5.1, 1.1, 0.0) == pytest.approx(5.0 + math.pi, abs=0.7)  # straight on, then left
-    assert cost(3.1, 5.1, 1.1, math.pi) == pytest.approx(5.0 + 3 * math.pi, abs=0.7)
-    assert cost(8.1, 5.1, 1.1, math.pi / 2) == pytest.approx(0.0, abs=0.5)
-    assert cost(8.1, 5.1, 1.1, -math.pi / 2) == pytest.approx(2 * math.pi, abs=0.5)
+    assert cost(3.2, 5.0, 1.0, 0.0) == pytest.approx(5.0 + math.pi, abs=0.7)  # straight on, then left
+    assert cost(3.2, 5.0, 1.0, math.pi) == pytest.approx(5.0 + 3 * math.pi, abs=0.7)
+    assert cost(8.2, 5.0, 1.0, math.pi / 2) == pytest.approx(0.0, abs=0.1)
+    assert cost(8.2, 5.0, 1.0, -math.pi / 2) == pytest.approx(2 * math.pi, abs=0.1)
 
 
 def test_traffic_is_kept_clear_of_when_it_comes():

@@ -13,7 +13,7 @@ SIZE = (60.0, 60.0, 10.0)
 
 
 def inside(mesh: MeshWorld, spacing: float = 0.5) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of a lattice (N, 3), and which of them are dug out, by counting the faces above and below each."""
+    """Points of a lattice (N, 3), and which are dug out, by counting the faces above and below each."""
     axes = [torch.arange(spacing / 2, s, spacing, dtype=torch.float64) + 0.013 for s in SIZE]
     points = torch.cartesian_prod(*axes)
     odd = torch.ones(len(points), dtype=torch.bool)
@@ -79,7 +79,9 @@ def test_a_seed_makes_one_mine():
     assert tunnels(1).shape != tunnels(2).shape
 
 
-@pytest.mark.parametrize("size", [(20.0, 60.0, 10.0), (60.0, 60.0, 3.0), (60.0, 60.0), (60.0, float("inf"), 10.0)])
+@pytest.mark.parametrize(
+    "size", [(20.0, 60.0, 10.0), (60.0, 60.0, 3.0), (60.0, 60.0), (60.0, float("inf"), 10.0)]
+)
 def test_sizes_that_are_none_are_refused(size):
     with pytest.raises(InvalidArgumentError, match="size="):
         tunnels(0, size)

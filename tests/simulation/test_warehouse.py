@@ -89,7 +89,9 @@ def test_it_is_furnished():
     assert 0.3 < float(near.double().mean()) < 0.9
 
 
-@pytest.mark.parametrize("size", [(10.0, 40.0, 8.0), (50.0, 40.0, float("nan")), (50.0, 40.0), (1e5, 40.0, 8.0)])
+@pytest.mark.parametrize(
+    "size", [(10.0, 40.0, 8.0), (50.0, 40.0, float("nan")), (50.0, 40.0), (1e5, 40.0, 8.0)]
+)
 def test_sizes_that_are_none_are_refused(size):
     with pytest.raises(InvalidArgumentError, match="size="):
         warehouse(0, size)

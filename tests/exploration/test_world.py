@@ -1,0 +1,290 @@
+"""Worlds: where robots can be, what they can see, where they start, what is kept, and what is refused."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import pytest
+import torch
+
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
+from gmmtorch.exploration.world import World, open_world
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.solids import box
+
+HALL = torch.cat(
+    [
+        box((0.1, 0.1, 0.1), (9.9, 5.9, 2.9)),
+        box((4.0, 0.1, 0.1), (4.3, 3.0, 2.9)),  # a wall with a way around it
+        box((7.0, 4.0, 0.1), (8.6, 5.2, 1.6)),  # a solid, large enough for a robot inside
+    ]
+)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def hall() -> World:
+    return World.from_mesh(HALL, cache=False, name="hall")
+
+
+def test_the_box_is_that_of_the_mesh_and_cells_that_it_meets_are_occupied(hall):
+    assert hall.box.low.tolist() == [0, 0, 0]
+    assert hall.box.shape == (50, 30, 15)
+    assert bool(hall.occupied[0].all())
+    assert bool(hall.occupied[20, :15].all())
+    assert not bool(hall.occupied[5:15, 5:20, 5:10].any())
+
+
+def test_navigable_cells_are_those_from_which_the_mesh_is_farther_than_the_robot_is_wide(hall):
+    cells = torch.ones(hall.box.shape).nonzero()
+    room = MeshWorld(HALL).clearance(hall.centers(cells)).view(hall.box.shape)
+    inside = torch.zeros(hall.box.shape, dtype=torch.bool)
+    inside[35:43, 20:26, :8] = True  # the solid: clear within, yet cut off
+    assert torch.equal(hall.navigable, (room > 0.3) & ~inside)
+    assert bool(((room > 0.3) & inside).any())
+
+
+def test_all_that_is_free_in_a_hall_is_observable_and_no_inside_of_a_solid(hall):
+    inside = torch.zeros(hall.box.shape, dtype=torch.bool)
+    inside[36:42, 21:25, 1:7] = True
+    assert not bool((hall.observable & inside).any())
+    free = ~hall.occupied & ~inside
+    free[20:22, :15] = False
+    free[35:43, 20:26, :8] = False
+    assert float(hall.observable[free].double().mean()) > 0.98
+    assert float(hall.observable[0, 2:-2, 2:-2].double().mean()) > 0.98  # a wall
+
+
+def test_a_narrow_camera_sees_less(hall):
+    narrow = World.from_mesh(HALL, cache=False, vertical_fov=0.2, max_range=1.0)
+    assert torch.equal(narrow.navigable, hall.navigable)
+    assert int((narrow.observable & ~hall.observable).sum()) < 0.01 * int(hall.observable.sum())
+    assert int(narrow.observable.sum()) < int(hall.observable.sum())
+
+
+def test_bounds_cut_the_world_off(hall):
+    part = World.from_mesh(HALL, bounds=(0.5, 0.5, 0.0, 3.5, 5.1, 2.3), cache=False)
+    assert part.box.low.tolist() == [2, 2, 0]
+    assert part.box.high.tolist() == [18, 26, 12]
+    window = tuple(slice(a, b) for a, b in zip(part.box.low.tolist(), part.box.high.tolist(), strict=True))
+    assert torch.equal(part.occupied, hall.occupied[window])
+    assert torch.equal(part.navigable, hall.navigable[window])  # surfaces beyond the bounds are there as well
+    assert not bool((part.observable & ~hall.observable[window]).any())
+
+
+def test_a_hall_without_roof_or_with_a_hole_ends_at_its_bounds():
+    # The faces of a prism are its sides (8), its top (2) and its bottom (2).
+    roofless = torch.cat([HALL[:8], HALL[10:]])
+    world = World.from_mesh(roofless, bounds=(0, 0, 0, 10, 6, 2.7), cache=False)
+    assert bool(world.navigable[10, 10, -1])
+    holed = torch.cat([HALL[:3], HALL[4:12]])  # half a wall is missing
+    world = World.from_mesh(holed, bounds=(-4, -4, 0, 14, 10, 3), cache=False)
+    outside = world.centers(torch.ones(world.box.shape).nonzero())[:, :2]
+    outside = ((outside < 0) | (outside > torch.tensor([10.0, 6.0]))).any(1).view(world.box.shape)
+    assert not bool((world.navigable & outside).any())  # no floor there
+    assert not bool((world.observable & outside).any())
+
+
+def test_inverted_and_degenerate_triangles_change_nothing(hall):
+    odd = torch.cat([HALL.flip(1)[::2], HALL[1::2], torch.ones(1, 3, 3, dtype=torch.float64)])
+    world = World.from_mesh(odd, cache=False)
+    assert torch.equal(world.navigable, hall.navigable)
+    assert torch.equal(world.occupied, hall.occupied)
+
+
+def test_a_start_chooses_the_part_of_the_world_that_is_flown_in():
+    two = torch.cat([box((0.1, 0.1, 0.1), (5.9, 3.9, 2.9)), box((7.1, 0.1, 0.1), (9.9, 2.9, 2.9))])
+    left = World.from_mesh(two, cache=False)
+    right = World.from_mesh(two, cache=False, start=(8.5, 1.5, 1.5))
+    assert not bool((left.navigable & right.navigable).any())
+    assert bool(right.navigable[42, 7, 7])
+    assert bool(left.navigable[10, 7, 7])
+    assert not bool(right.observable[:30].any())
+    with pytest.raises(InvalidArgumentError, match=r"start=.*touches the mesh"):
+        World.from_mesh(two, cache=False, start=(0.2, 1.5, 1.5))
+    with pytest.raises(InvalidArgumentError, match=r"start=.*outside the bounds"):
+        World.from_mesh(two, cache=False, start=(20.0, 1.5, 1.5))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bounds": (20, 20, 0, 30, 30, 3)}, r"miss mesh, which extends from \(0.1"),
+        ({"bounds": (5, 0, 0, 1, 6, 3)}, "hold nothing"),
+        ({"bounds": (0, 0, 0, 5, 6, math.nan)}, "six finite numbers"),
+        ({"bounds": (0, 0, 0, 5)}, "six finite numbers"),
+        ({"bounds": (1, 1, 1, 2, 2, 2)}, "no surface in the bounds"),
+        ({"robot_radius": 3.0}, "robot_radius=3.0"),
+        ({"robot_radius": 0.0}, "robot_radius=0.0"),
+        ({"vertical_fov": 0.0}, "vertical_fov=0.0"),
+        ({"max_range": -1.0}, "max_range=-1.0"),
+        ({"max_range": math.inf}, "max_range=inf"),
+        ({"resolution": 0.0}, "resolution"),
+        ({"start": (1.0, 2.0)}, "three finite numbers"),
+    ],
+)
+def test_settings_that_leave_no_world_are_refused(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        World.from_mesh(HALL, cache=False, **options)
+
+
+def test_meshes_that_are_none_and_lattices_too_fine_are_refused():
+    with pytest.raises(DataError, match="no triangles"):
+        World.from_mesh(HALL[:0], cache=False)
+    with pytest.raises(MemoryLimitError, match="coarser resolution"):
+        World.from_mesh(HALL, 0.001, cache=False)
+
+
+def test_starts_are_apart_in_sight_roomy_and_level(hall):
+    poses = hall.start_poses(4, 1.2, at=(2.0, 3.0, 1.5))
+    assert poses.shape == (4, 4)
+    assert torch.equal(poses, hall.check_start(poses))
+    assert torch.equal(poses, hall.start_poses(4, 1.2, at=(2.0, 3.0, 1.5)))
+    places = poses[:, :3]
+    gaps = torch.pdist(places)
+    assert float(gaps.min()) >= 1.2 - 1e-9
+    assert float((places - places[0]).norm(dim=1).max()) < 4
+    assert float(hall.mesh.clearance(places).min()) >= 0.99
+    way = places[1:] - places[0]
+    sight = hall.mesh.distances(places[0], way / way.norm(dim=1, keepdim=True))
+    assert bool((sight > way.norm(dim=1)).all())
+    turn = torch.remainder(poses[1:, 3] - poses[:-1, 3], 2 * math.pi)
+    assert torch.allclose(turn, torch.full((3,), math.pi / 2, dtype=torch.float64))
+
+
+def test_without_a_place_teams_start_at_an_end_and_large_ones_fit(hall):
+    one = hall.start_poses(1)
+    assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
+    assert len(hall.check_start(hall.start_poses(16, 1.0))) == 16
+    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* 500 were asked for"):
+        hall.start_poses(500)
+    for n in (0, 1.5):
+        with pytest.raises(InvalidArgumentError, match="n="):
+            hall.start_poses(n)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ((0.25, 3.0, 1.5, 0.0), r"start pose 1 at \(0.25, 3.00, 1.50\) is 0.15 m from a surface"),
+        ((4.1, 2.0, 1.5, 0.0), "from a surface"),
+        ((7.8, 4.6, 0.85, 0.0), "in a solid, cut off"),
+        ((-3.0, 2.0, 1.5, 0.0), "outside the bounds of hall"),
+        ((2.0, 2.0, 1.5, math.nan), "not finite"),
+        ((math.inf, 2.0, 1.5, 0.0), "not finite"),
+        ((1.3, 1.0, 1.5, 0.0), "touches the robot of start pose 0"),
+    ],
+)
+def test_starts_where_no_robot_can_be_are_named(hall, pose, message):
+    poses = torch.tensor([(1.1, 1.1, 1.5, 0.0), pose], dtype=torch.float64)
+    with pytest.raises(InvalidArgumentError, match=message):
+        hall.check_start(poses)
+
+
+def test_start_poses_of_another_shape_are_refused(hall):
+    for shape in ((3, 3), (0, 4), (4,)):
+        with pytest.raises(InvalidArgumentError, match="expected"):
+            hall.check_start(torch.zeros(shape))
+
+
+def same(a: World, b: World) -> bool:
+    return all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in ("occupied", "observable", "navigable")
+    )
+
+
+def test_a_world_is_read_back_as_it_was_and_not_worked_out_again(hall, tmp_path):
+    def stages(**options) -> tuple[World, set[str]]:
+        heard: set[str] = set()
+        world = World.from_mesh(HALL, on_event=lambda stage, done, total: heard.add(stage), **options)
+        return world, heard
+
+    first, work = stages()
+    assert work
+    again, work = stages()
+    assert not work
+    assert same(first, hall)
+    assert same(again, hall)
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1
+    for other in ({"max_range": 5.0}, {"robot_radius": 0.35}, {"vertical_fov": 0.9}, {"start": (2, 2, 1.5)}):
+        assert stages(**other)[1], other
+    assert stages(cache=False)[1]
+
+
+@pytest.mark.parametrize("harm", ["cut", "flip", "foreign", "swap"])
+def test_a_damaged_or_foreign_cache_is_not_believed(hall, tmp_path, caplog, harm):
+    World.from_mesh(HALL)
+    (file,) = (tmp_path / "cache").rglob("*.safetensors")
+    data = file.read_bytes()
+    if harm == "cut":
+        file.write_bytes(data[: len(data) // 2])
+    elif harm == "flip":
+        file.write_bytes(data[:-1] + bytes([data[-1] ^ 4]))
+    elif harm == "foreign":
+        file.write_bytes(b"not a world at all")
+    else:
+        World.from_mesh(HALL, max_range=2.0)
+        (other,) = set((tmp_path / "cache").rglob("*.safetensors")) - {file}
+        file.write_bytes(other.read_bytes())
+    with caplog.at_level(logging.WARNING):
+        world = World.from_mesh(HALL)
+    assert same(world, hall)
+    assert "Working the world out anew" in caplog.text
+    assert same(World.from_mesh(HALL), hall)  # it was mended
+
+
+def test_where_nothing_can_be_kept_a_warning_is_all(hall, tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "file"))
+    with caplog.at_level(logging.WARNING):
+        assert same(World.from_mesh(HALL), hall)
+    assert "not kept" in caplog.text
+
+
+def test_worlds_by_name(tmp_path):
+    store = open_world("warehouse", size=(18.0, 14.0, 5.0), resolution=0.4, cache=False)
+    assert store.box.shape == (45, 35, 13)
+    assert len(store.check_start(store.start_poses(3))) == 3
+    assert float(store.start_poses(1)[0, :3].sub(store.start).norm()) < 1.0
+    mine = open_world("tunnels", seed=2, size=(40.0, 40.0, 8.0), resolution=0.4, cache=False)
+    assert 0.02 < float(mine.navigable.double().mean()) < 0.5
+    assert len(mine.check_start(mine.start_poses(3))) == 3
+    part = open_world(
+        "warehouse", size=(18.0, 14.0, 5.0), bounds=(8, 2, 0, 18, 12, 5), resolution=0.4, cache=False
+    )
+    assert bool(part.navigable.any())
+
+
+def test_worlds_that_are_none_are_refused(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="world='moon'"):
+        open_world("moon")
+    with pytest.raises(MissingDataError, match=r"world.path=.*nowhere\.ply"):
+        open_world("mesh", path=tmp_path / "nowhere.ply")
+    with pytest.raises(MissingDataError, match=r"world.path=None"):
+        open_world("mesh")
+    with pytest.raises(InvalidArgumentError, match="path"):
+        open_world("warehouse", path="x.ply")
+    with pytest.raises(InvalidArgumentError, match="size"):
+        open_world("mesh", path="x.ply", size=(1, 1, 1))
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("file", "bounds", "volume"),
+    [
+        ("warehouse.ply", (-7, -10.4, 0, 7, 10.4, 3), (300.0, 900.0)),
+        ("edgar_mine.ply", (60, -200, -1, 100, -160, 3), (100.0, 3000.0)),
+    ],
+)
+def test_real_meshes(real_data, file, bounds, volume):
+    world = open_world("mesh", path=real_data / "meshes" / file, bounds=bounds, cache=False)
+    assert volume[0] < float(world.navigable.sum()) * 0.2**3 < volume[1]
+    assert bool((world.observable & world.occupied).any())
+    assert bool(world.observable[world.navigable].all())
+    assert float(world.mesh.clearance(world.centers(world.navigable.nonzero())).min()) > 0.3
+    assert len(world.check_start(world.start_poses(3))) == 3
