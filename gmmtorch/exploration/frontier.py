@@ -20,18 +20,20 @@ from gmmtorch.exploration.views import BLOCK
 
 _COARSE = 2
 _SAMPLES = 24  # of a line of sight
+_TURNING = 1.25  # metres that a radian counts for
 _TRIES = 3  # goals that may turn out to be out of reach in one plan
-_MOST = 12  # clusters looked at in a plan
-_CLOSEST, _FARTHEST = 0.8, 3.0  # metres, level, from which a robot looks at a frontier
+_GLANCE = 6  # coarse cells along the side of a frontier that is seen at one glance
+_MOST = 20  # clusters looked at in a plan
+_CLOSEST, _FARTHEST = 1.0, 4.0  # metres, level, from which a robot looks at a frontier
 _SAME = 1.0  # metres between the targets of a frontier, before and after it was looked at
-_ABOUT = 2.0  # metres around its nearest cell that stand for a frontier
+_ABOUT = 2.0  # metres around a remembered frontier within which one must be left
 
 
 class Frontiers(NamedTuple):
     """K clusters of frontier cells that a robot can look at.
 
-    poses: (K, 4), the nearest place to see at each from, towards it. targets: (K, 3), the middle of the
-    cluster's part that is nearest to the robot. sizes: (K,) cells. metres: (K,) from the robot to the place.
+    poses: (K, 4), the nearest place to see each from, towards it. targets: (K, 3), its cell in the middle.
+    sizes: (K,) cells. metres: (K,) from the robot to the place.
     """
 
     poses: Tensor
@@ -54,7 +56,7 @@ def frontier_cells(surroundings: Surroundings) -> Tensor:
 def find_frontiers(
     surroundings: Surroundings, start: Tensor, exhausted: Tensor, least: int, elevation: float
 ) -> Frontiers:
-    """Clusters of at least so many cells that a robot at `start` (3,) can look at, nearest first.
+    """Clusters of at least so many cells that a robot at `start` (3,) can look at, the most promising first.
 
     Args:
         exhausted: (E, 3), targets that did not go away when looked at; cells within a metre do not count.
@@ -69,31 +71,29 @@ def find_frontiers(
     counts.index_put_(
         (cells // _COARSE).unbind(1), torch.ones(len(cells), dtype=torch.int64), accumulate=True
     )
-    labels, n = ndimage.label(counts.numpy() > 0, structure=np.ones((3, 3, 3)))
-    label = torch.from_numpy(labels[labels > 0]).long() - 1  # cluster of each coarse frontier cell
-    middles = _middles(distances, torch.from_numpy(np.argwhere(labels > 0)))
-    sizes = torch.zeros(n, dtype=torch.int64).index_add_(0, label, counts[torch.from_numpy(labels > 0)])
-    reach = _middles(distances, torch.isfinite(distances.metres).nonzero())
-    metres = distances.metres[torch.isfinite(distances.metres)].double()
+    label, middles = _parts(distances, counts)
+    n = int(label.max()) + 1 if len(label) else 0
+    sizes = torch.zeros(n, dtype=torch.int64).index_add_(0, label, counts[counts > 0])
+    reached = torch.isfinite(distances.metres)
+    places, metres = _middles(distances, reached.nonzero()), distances.metres[reached].double()
     apart = (middles - start).norm(dim=1)
     nearest = torch.full((n,), math.inf, dtype=torch.float64).scatter_reduce_(0, label, apart, "amin")
+    promise = torch.where(sizes >= least, sizes / (1 + nearest), 0.0)
     found: list[tuple[Tensor, Tensor, float, float]] = []
-    for k in nearest.masked_fill(sizes < least, math.inf).argsort(stable=True)[:_MOST].tolist():
-        if sizes[k] < least:
+    for k in promise.argsort(descending=True, stable=True)[:_MOST].tolist():
+        if promise[k] == 0:
             break
-        own = label == k
-        first = middles[own][apart[own].argmin()]
-        about = middles[own][(middles[own] - first).norm(dim=1) <= _ABOUT]
-        target = about[(about - about.mean(0)).norm(dim=1).argmin()]
-        way = target - reach
+        own = middles[label == k]
+        target = own[(own - own.mean(0)).norm(dim=1).argmin()]
+        way = target - places
         level = way[:, :2].norm(dim=1)
         can_look = (
             (level >= _CLOSEST) & (level <= _FARTHEST) & (way[:, 2].abs() <= math.tan(elevation) * level)
         )
-        can_look[can_look.clone()] = _sees(surroundings, reach[can_look], target)
+        can_look[can_look.clone()] = _sees(surroundings, places[can_look], target)
         if bool(can_look.any()):
             row = int(metres.masked_fill(~can_look, math.inf).argmin())
-            pose = torch.cat([reach[row], torch.atan2(way[row, 1], way[row, 0])[None]])
+            pose = torch.cat([places[row], torch.atan2(way[row, 1], way[row, 0])[None]])
             found.append((pose, target, float(sizes[k]), float(metres[row])))
     return Frontiers(
         torch.stack([pose for pose, *_ in found]) if found else torch.zeros(0, 4, dtype=torch.float64),
@@ -101,6 +101,20 @@ def find_frontiers(
         torch.tensor([size for *_, size, _ in found], dtype=torch.float64),
         torch.tensor([away for *_, away in found], dtype=torch.float64),
     )
+
+
+def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Of each coarse frontier cell (n,), by `counts`: which cluster it is of, and its middle (n, 3).
+
+    Connected cells are one frontier, cut by a lattice of cubes small enough to be seen at one glance.
+    """
+    labels, _ = ndimage.label(counts.numpy() > 0, structure=np.ones((3, 3, 3)))
+    cells = (counts > 0).nonzero()
+    cube = cells // _GLANCE
+    rows = torch.cat([torch.from_numpy(labels[labels > 0])[:, None].long(), cube], 1)
+    if len(rows) == 0:
+        return rows[:, 0], _middles(distances, cells)
+    return torch.unique(rows, dim=0, return_inverse=True)[1], _middles(distances, cells)
 
 
 def _sees(surroundings: Surroundings, places: Tensor, target: Tensor) -> Tensor:
@@ -175,7 +189,9 @@ class FrontierPlanner:
         block = (here.cells_of(found.targets) // BLOCK).clamp_min(0)
         counts = [-(-n // BLOCK) for n in here.shape]
         flat = (block[:, 0] * counts[1] + block[:, 1]) * counts[2] + block[:, 2]
-        score = found.sizes.clamp_max(self._largest) * task.residual[flat] / (1 + found.metres)
+        turn = torch.remainder(found.poses[:, 3] - task.state[3] + math.pi, 2 * math.pi) - math.pi
+        turn = _TURNING * turn.abs()
+        score = found.sizes.clamp_max(self._largest) * task.residual[flat] / (1 + found.metres + turn)
         same = (found.targets - self._target).norm(dim=1) < _SAME
         if self._journey is not None:
             score = torch.where(same, self._loyalty * score, score)

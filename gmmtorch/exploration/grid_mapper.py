@@ -75,7 +75,7 @@ class GridMapper:
         """The evidence of the points of a frame that have arrived."""
 
         def make() -> CellEvidence:
-            said = [decode(datagram) for datagram in datagrams]
+            said = [self._memo(("message", data), lambda data=data: decode(data)) for data in datagrams]
             points = [message for message in said if isinstance(message, PointsMessage)]
             ends = torch.cat([message.ends for message in points]).double()
             is_hit = torch.cat([message.is_hit for message in points])

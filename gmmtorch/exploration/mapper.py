@@ -74,7 +74,7 @@ class Memo:
     least recently used of more than `size` are forgotten.
     """
 
-    def __init__(self, size: int = 256) -> None:
+    def __init__(self, size: int) -> None:
         self._size = size
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 

@@ -52,6 +52,7 @@ class Mission:
         evaluator: ViewEvaluator,
         coordination: Coordination,
         options: TeamOptions,
+        memo: Memo,
     ) -> None:
         self.world, self.robots, self.union, self.network = world, robots, union, network
         self.options = options
@@ -70,7 +71,7 @@ class Mission:
         self._evaluator, self._coordination = evaluator, coordination
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)
-        self._memo = Memo(4096)
+        self._memo = memo
         self._sample()
 
     # -- time -------------------------------------------------------------------------------------
@@ -165,7 +166,7 @@ class Mission:
                     robot.plans[item.message.sender] = (item.message.time, item.message.views)
 
     def _decoded(self, datagram: bytes) -> Message:
-        return self._memo(datagram, lambda: decode(datagram))
+        return self._memo(("message", datagram), lambda: decode(datagram))
 
     # -- planning ---------------------------------------------------------------------------------
 

@@ -42,6 +42,7 @@ def row_of(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "wire_bytes": mission.network.n_wire_bytes,
         "bytes_by_kind": mission.network.bytes_by_kind,
         "bytes_raw_points": mission.samples["raw_points_bytes_over_time"][-1],
+        **{f"bytes_{name}": mission.samples[f"{name}_bytes_over_time"][-1] for name in options.codecs},
         "datagrams": mission.network.n_datagrams,
         "n_components": None if components[0] is None else len(components[0]),
         "map_disagreement": disagreement([r.mapper.belief for r in mission.robots], cells),

@@ -29,11 +29,16 @@ __all__ = [
 ]
 
 
+_STUCK = 0.3  # metres that a branch must come closer
+_REMEMBERED = 32  # views that were given up
+
+
 @dataclass(frozen=True)
 class TreeRule:
     """When a robot explores where it is, and when it travels; all values as shares of the largest seen.
 
-    search: of the tree while exploring; travel: while travelling. little: information a primitive below
+    search: of the tree while exploring; travel: while travelling; squeeze: where that comes no closer,
+    for the way alone. little: information a primitive below
     which a robot looks for something better; plenty: from which on a traveller stays. worthwhile: value of
     a view that is kept in the library. metre: what a metre on the way to a goal is worth, against
     information on the way. n_added, n_revalued: views of the library in one plan.
@@ -41,6 +46,7 @@ class TreeRule:
 
     search: SearchRule = field(default_factory=SearchRule)
     travel: SearchRule = field(default_factory=lambda: SearchRule(n_rounds=2, n_leaves=24))
+    squeeze: SearchRule = field(default_factory=lambda: SearchRule(depth=6, n_rounds=6, n_leaves=48))
     little: float = 0.1
     plenty: float = 0.25
     worthwhile: float = 0.15
@@ -64,11 +70,13 @@ class TreePlanner:
         self._evaluator = evaluator
         self._explore = TreeSearch(primitives, self._rule.search)
         self._travel = TreeSearch(primitives, self._rule.travel)
+        self._squeeze = TreeSearch(primitives, self._rule.squeeze)
         self._waiting = Waiting(primitives)
         self._wandering = RandomPlanner(primitives)
         self._speed = primitives.dynamics.speed
         self._duration = primitives.dynamics.duration
         self._journey: Journey | None = None
+        self._given_up = torch.zeros(0, 4, dtype=torch.float64)
         self._largest = 0.0
         self._branch: list[int] = []
         self._when = -math.inf
@@ -96,7 +104,7 @@ class TreePlanner:
         rate = _rate(found)
         if rate > self._rule.little * self._largest:
             return found
-        journey = Journey.chosen(task, self._rule.worthwhile * self._largest)
+        journey = Journey.chosen(task, self._rule.worthwhile * self._largest, self._given_up)
         if journey is None:
             return found
         legs = 1 + journey.metres / (self._speed * self._duration)
@@ -115,17 +123,29 @@ class TreePlanner:
         if bool(task.surroundings.is_passable(journey.pose[:3])):
             row = memory.rows(journey.pose[None])
             value = float(memory.marginal(row, torch.ones_like(task.residual)[None])[0])
-        goal = journey.goal(task, self._rule.metre * self._largest)
-        worthless = value is not None and value < self._rule.worthwhile * self._largest
-        if goal is None or worthless:
+        if value is not None and value < self._rule.worthwhile * self._largest:
             self._journey = None
             return None
+        goal = journey.goal(task, self._rule.metre * self._largest)
+        if goal is None:
+            self._give_up(journey)
+            return None
         found = self._travel.search(task, memory, goal, first=self._rest_of_branch(task))
+        if found is None or found.progress < _STUCK:
+            found = self._squeeze.search(task, goal=goal)
+        if found is None or found.progress < _STUCK:
+            self._give_up(journey)
+            return None
         if _rate(found) >= self._rule.plenty * self._largest:
             journey.put_back(task)
             self._journey = None
             return None
         return found
+
+    def _give_up(self, journey: Journey) -> None:
+        """Do not go there again: the view was looked from, or cannot be got to."""
+        self._given_up = torch.cat([self._given_up, journey.pose[None]])[-_REMEMBERED:]
+        self._journey = None
 
     def _rest_of_branch(self, task: PlanningTask) -> list[int]:
         return self._branch[1:] if task.now > self._when else self._branch
@@ -144,16 +164,17 @@ class TreePlanner:
         self._branch, self._when = ([] if found is None else found.actions), task.now
         poses, values = memory.views()
         self._largest = max(self._largest, _largest(memory))
-        if found is not None and len(poses):
-            rows = memory.rows(found.views)
-            for row in rows.tolist():
-                near = (poses[:, :3] - poses[row, :3]).norm(dim=1) < task.library.spacing
-                values = values.masked_fill(near, 0.0)
+        known = [self._given_up] if found is None else [self._given_up, found.views]
+        if self._journey is not None:
+            known.append(self._journey.pose[None])
+        apart = torch.cdist(poses[:, :3], torch.cat(known)[:, :3])
+        values = values.masked_fill((apart < task.library.spacing).any(1), 0.0)
         task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
 
     def state(self) -> dict[str, Any]:
         return {
             "journey": None if self._journey is None else self._journey.state(),
+            "given_up": self._given_up,
             "largest": self._largest,
             "branch": self._branch,
             "when": self._when if math.isfinite(self._when) else None,
@@ -163,6 +184,7 @@ class TreePlanner:
 
     def restore(self, state: dict[str, Any]) -> None:
         self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
+        self._given_up = state["given_up"]
         self._largest = float(state["largest"])
         self._branch = [int(action) for action in state["branch"]]
         self._when = -math.inf if state["when"] is None else float(state["when"])

@@ -26,6 +26,9 @@ from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.sharing.network import Network
 
 
+_REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
+
+
 def assemble(world: World, options: TeamOptions) -> Mission:
     """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin."""
     start = options.start
@@ -48,7 +51,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
         n_beams=options.n_beams,
     )
     primitives = Primitives(options.dynamics)
-    memo = Memo()
+    memo = Memo(_REMEMBERED)
 
     def belief() -> BeliefMap:
         return BeliefMap(world.resolution, world.box, world.observable, options.belief)
@@ -73,7 +76,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
         seed=options.seed,
     )
     coordination = Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
-    return Mission(world, robots, belief(), network, evaluator, coordination, options)
+    return Mission(world, robots, belief(), network, evaluator, coordination, options, memo)
 
 
 def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, memo: Memo) -> Mapper:

@@ -41,12 +41,18 @@ class Journey:
         self._refreshed = -math.inf
 
     @classmethod
-    def chosen(cls, task: PlanningTask, least: float) -> Journey | None:
-        """To the view of the library with the largest value/(1 + metres), which is taken out of it."""
+    def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
+        """To the view of the library with the largest value/(1 + metres), which is taken out of it.
+
+        None if none worth `least` can be reached; views close to those of `given_up` (N, 4) do not count.
+        """
         known = task.library.candidates()
         if not known.ids:
             return None
         metres = task.roadmap.route(task.state[:3], known.poses[:, :3]).metres
+        if given_up is not None and len(given_up):
+            apart = torch.cdist(known.poses[:, :3], given_up[:, :3]).amin(1)
+            metres = metres.masked_fill(apart < _THERE, math.inf)
         row = task.library.best(metres, least=least)
         if row is None:
             return None

@@ -133,7 +133,7 @@ class ViewLibrary:
             self.remove([known.ids[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
     def covered(self, surroundings: Surroundings, now: float, most: int, age: float = 10.0) -> list[Id]:
-        """Views in the window that were not looked at for `age` seconds, the longest first, `most` at most."""
+        """Views in the window not valued for `age` seconds, the longest first, `most` at most."""
         known = self.candidates()
         if not known.ids:
             return []

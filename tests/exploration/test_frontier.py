@@ -49,15 +49,16 @@ def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
     found = find_frontiers(here, start, NONE, least=20, elevation=0.4)
-    assert len(found.sizes) == 1
-    assert float(found.sizes) == float(frontier_cells(here).sum()) == 18 * 8
-    place, target = found.poses[0, :3], found.targets[0]
-    assert bool(here.is_passable(place))
-    assert abs(float(target[0]) - 3.9) < 0.3
-    bearing = torch.atan2(*(target - place)[[1, 0]])
-    assert abs(float(bearing - found.poses[0, 3])) < 1e-9
-    assert abs(float(found.metres) - float((place - start).norm())) < 0.8
-    assert len(find_frontiers(here, start, NONE, least=145, elevation=0.4).sizes) == 0
+    assert len(found.sizes) == 2  # one wall of unknown, in two glances
+    assert float(found.sizes.sum()) == float(frontier_cells(here).sum()) == 18 * 8
+    for pose, target, metres in zip(found.poses, found.targets, found.metres, strict=True):
+        place, way = pose[:3], target - pose[:3]
+        assert bool(here.is_passable(place))
+        assert abs(float(target[0]) - 3.9) < 0.3
+        assert abs(math.atan2(way[1], way[0]) - float(pose[3])) < 1e-9
+        assert abs(math.atan2(way[2], way[:2].norm())) < 0.4
+        assert abs(float(metres) - float((place - start).norm())) < 0.8
+    assert len(find_frontiers(here, start, NONE, least=89, elevation=0.4).sizes) == 0
 
 
 def test_what_was_given_up_is_no_frontier_again():
@@ -100,4 +101,5 @@ def test_plans_are_safe_and_restored_planners_go_on_alike():
     second = make_planner("frontier", PRIMITIVES, EVALUATOR)
     second.restore(first.state())
     for a, b in zip(explore(first, one, 4), explore(second, other, 4), strict=True):
-        assert torch.equal(a.path, b.path) and a.kind == b.kind
+        assert torch.equal(a.path, b.path)
+        assert a.kind == b.kind

@@ -60,7 +60,8 @@ def test_paths_run_through_passable_space_from_start_to_goal():
     roadmap = seen_through_windows(passable)
     start, goal = torch.tensor([[1.1, 1.3, 1.7], [10.0, 7.3, 1.7]], dtype=torch.float64)
     path = roadmap.route(start, goal[None]).path(0)
-    assert float((path[0] - start).norm()) < 2.0 and float((path[-1] - goal).norm()) < 2.0
+    assert float((path[0] - start).norm()) < 2.0
+    assert float((path[-1] - goal).norm()) < 2.0
     steps = (path[1:] - path[:-1]).norm(dim=1)
     assert float(steps.max()) < 0.8 * math.sqrt(3) + 1e-9
     near = torch.tensor(list(itertools.product(range(-2, 3), repeat=3)))

@@ -123,7 +123,8 @@ def test_with_time_enough_it_finds_the_best_of_all_branches():
 def test_what_is_returned_is_the_branch():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, evaluator))
-    assert found is not None and 1 <= len(found.actions) <= 4
+    assert found is not None
+    assert 1 <= len(found.actions) <= 4
     states = [task.state]
     for action in found.actions:
         states.append(PRIMITIVES.rollout(states[-1][None])[0, action, -1])
@@ -185,7 +186,8 @@ def test_the_same_seed_gives_the_same_branch(seed):
     for _ in range(2):
         task = task_in(ROOM, MIDDLE, seed)
         runs.append(TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(seed))))
-    assert runs[0].actions == runs[1].actions and runs[0].value == runs[1].value
+    assert runs[0].actions == runs[1].actions
+    assert runs[0].value == runs[1].value
 
 
 def test_the_rest_of_the_last_branch_is_tried_first():
@@ -194,9 +196,11 @@ def test_the_rest_of_the_last_branch_is_tried_first():
     best = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
     brief = TreeSearch(PRIMITIVES, SearchRule(depth=2, n_rounds=1, n_leaves=1))
     found = brief.search(task, Memory(task, evaluator), first=best.actions)
-    assert found.actions == best.actions and found.value == pytest.approx(best.value)
+    assert found.actions == best.actions
+    assert found.value == pytest.approx(best.value)
     beyond = brief.search(task, Memory(task, evaluator), first=[0, 0, 0, 0, 0])  # flies into the wall
-    assert beyond is not None and len(beyond.actions) <= 2
+    assert beyond is not None
+    assert len(beyond.actions) <= 2
 
 
 def test_with_a_goal_it_comes_closer_the_sooner_the_better():
@@ -204,7 +208,8 @@ def test_with_a_goal_it_comes_closer_the_sooner_the_better():
     goal_at = torch.tensor([[4.6, 3.4, 1.4]], dtype=torch.float64)
     goal = Goal(DistanceField.to(task.surroundings, goal_at), weight=2.0, yaw=1.5)
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, goal=goal)
-    assert found is not None and found.information == 0
+    assert found is not None
+    assert found.information == 0
     assert found.progress > 1.5
     assert float((found.views[-1, :3] - goal_at).norm()) < 1.0
     costs = [float(goal.cost(task.state))]
@@ -237,7 +242,8 @@ def test_traffic_is_kept_clear_of_when_it_comes():
         task_in(ROOM, MIDDLE), Memory(task, MadeUp(0))
     )
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
-    assert free is not None and found is not None
+    assert free is not None
+    assert found is not None
     apart = (found.path[:, :3] - other).norm(dim=1)
     assert float(apart.min()) > 0.7
     assert float((found.views[:, :3] - other).norm(dim=1).min()) > 0.7
@@ -258,7 +264,8 @@ def test_at_the_start_it_looks_around():
     explorer.misses.zero_()
     task = explorer.task(torch.Generator().manual_seed(0))
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, EVALUATOR))
-    assert found is not None and found.information > 0
+    assert found is not None
+    assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]
     assert max(looks) - min(0.0, *looks) > 1.5
     assert len({PRIMITIVES.commands[action, 2].item() for action in found.actions} - {0.0}) >= 1

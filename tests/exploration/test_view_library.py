@@ -86,7 +86,8 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
     library = ViewLibrary(0)
     library.add(poses, values, 1.0, least=2.0, most=60)
     kept = library.candidates()
-    assert len(kept.ids) > 3 and float(kept.values.min()) >= 1.99
+    assert len(kept.ids) > 3
+    assert float(kept.values.min()) >= 1.99
 
     def near(one: torch.Tensor, other: torch.Tensor) -> bool:
         turn = (float(one[3] - other[3]) + math.pi) % (2 * math.pi) - math.pi
