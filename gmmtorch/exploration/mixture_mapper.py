@@ -38,6 +38,9 @@ from gmmtorch.sharing.messages import (
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 
+_MARGIN = 8  # cells
+
+
 @dataclass(frozen=True)
 class FrameRule:
     """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
@@ -72,7 +75,12 @@ class FrameRule:
             raise InvalidArgumentError(f"update_at={self.update_at} must be above 1.")
 
     def cells(self) -> CellRule:
+        """For the returns of a frame."""
         return CellRule(self.noise, self.length, self.cell, self.components, self.iterations)
+
+    def empty_cells(self) -> CellRule:
+        """For the ends of beams without one: coarser in everything."""
+        return CellRule(2 * self.noise, 2 * self.length, 2 * self.cell, self.components, 1)
 
 
 class MixtureMapper:
@@ -113,11 +121,11 @@ class MixtureMapper:
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams, numbered in an order that takes few bytes."""
-        origin = frame.origin[None]
-        parts = [
-            learn_cells([frame.ends[novel & kind]], origin, self._rule.cells(), max_range=not bool(surface))
-            for kind, surface in ((frame.is_hit, True), (~frame.is_hit, False))
-        ]
+        origin, rule = frame.origin[None], self._rule
+        surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
+        # Where beams ended without a return there is no surface to be true to.
+        empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
+        parts = [surfaces, empty]
         found = Components.concatenate([part for part in parts if len(part)] or parts[:1])
         found = found.rearranged(spatial_order(found)) if len(found) else found
         number = self._n_numbered + torch.arange(len(found))
@@ -184,7 +192,9 @@ class MixtureMapper:
             return CellEvidence.empty()
         self._enter(name, batch)
         grid = self.belief.grid
-        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, grid.box))
+        # A little more than the world: rays that are cut off at its bounds take longer.
+        box = Box(grid.box.low - _MARGIN, grid.box.high + _MARGIN)
+        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, box))
         self.local.add(evidence)
         self.belief.add(evidence)
         return evidence
