@@ -20,11 +20,11 @@ from gmmtorch.exploration.views import BLOCK
 
 _COARSE = 2
 _SAMPLES = 24  # of a line of sight
-_TURNING = 1.25  # metres that a radian counts for
+_TURNING = 0.3  # metres that a radian counts for
 _TRIES = 3  # goals that may turn out to be out of reach in one plan
-_GLANCE = 6  # coarse cells along the side of a frontier that is seen at one glance
+_GLANCE = 9  # coarse cells along the side of a frontier that is seen at one glance
 _MOST = 20  # clusters looked at in a plan
-_CLOSEST, _FARTHEST = 1.0, 4.0  # metres, level, from which a robot looks at a frontier
+_CLOSEST, _FARTHEST = 1.5, 3.0  # metres, level, from which a robot looks at a frontier
 _SAME = 1.0  # metres between the targets of a frontier, before and after it was looked at
 _ABOUT = 2.0  # metres around a remembered frontier within which one must be left
 

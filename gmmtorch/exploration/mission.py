@@ -100,6 +100,8 @@ class Mission:
             self._plan()
         self._fly()
         self.tick += 1
+        if self.is_over:
+            self._exchange(self.now)  # what was sent in the last tick
         if self.sampled_now:
             self._sample()
 

@@ -10,6 +10,8 @@ from gmmtorch.exploration.mixture_mapper import FrameRule
 from gmmtorch.exploration.primitives import Dynamics
 from gmmtorch.exploration.scoring import BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.sharing.envelope import check_codec
+from gmmtorch.sharing.point_codecs import POINT_CODECS
 from gmmtorch.simulation.depth_camera import DepthCamera
 
 PLANNERS = ("mcts", "frontier", "random")
@@ -70,9 +72,15 @@ class TeamOptions:
         if self.size > _MOST_ROBOTS:
             raise InvalidArgumentError(f"team.size={self.size} is more than the {_MOST_ROBOTS} there may be.")
         check_whole("seed", self.seed, 0)
+        check_codec(self.codec)
         for name in ("duration", "rate", "sample_every"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero, and finite.")
+        for name in self.codecs:
+            if name not in POINT_CODECS:
+                raise InvalidArgumentError(
+                    f"evaluation.codecs has {name!r}, which is not one of {', '.join(POINT_CODECS)}."
+                )
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
         for name, ratio in (

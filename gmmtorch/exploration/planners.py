@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.fatigue import Fatigue
 from gmmtorch.exploration.frontier import FrontierPlanner
 from gmmtorch.exploration.planning import Plan, Planner, PlanningTask, Waiting, options
 from gmmtorch.exploration.primitives import Primitives
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 
+_NOTHING = 1e-3  # of the largest value
 _STUCK = 0.3  # metres that a branch must come closer
 _REMEMBERED = 32  # views that were given up
 
@@ -58,7 +60,8 @@ class TreeRule:
 class TreePlanner:
     """Explores by tree search; with little left around, travels to the best view of the library.
 
-    What a view is worth at all is measured by the largest value seen so far. A robot that travels has
+    What a view is worth at all is measured by the largest value seen so far, and what looking in vain has
+    shown not to be there does not count, see `Fatigue`. A robot that travels has
     taken its goal out of the library, so that nobody else goes there; it puts the goal back when it finds
     enough to do on the way.
     """
@@ -77,12 +80,17 @@ class TreePlanner:
         self._duration = primitives.dynamics.duration
         self._journey: Journey | None = None
         self._given_up = torch.zeros(0, 4, dtype=torch.float64)
+        self._fatigue, self._weights = Fatigue(), torch.zeros(0)
         self._largest = 0.0
         self._branch: list[int] = []
         self._when = -math.inf
 
     def plan(self, task: PlanningTask) -> Plan:
         memory = Memory(task, self._evaluator)
+        here = int(memory.rows(task.state[None, :4].double())[0])
+        self._fatigue.note(task.surroundings, memory.measured(here), task.now)
+        self._weights = self._fatigue.weights(task.surroundings)
+        task = replace(task, residual=task.residual * self._weights)
         task.library.visit(task.state[None, :4], task.now)
         self._revalue(task, memory)
         found = self._on_the_way(task, memory) if self._journey is not None else None
@@ -92,7 +100,7 @@ class TreePlanner:
         if found is None:
             return self._waiting.plan(task)
         self._waiting.over()
-        if self._journey is None and found.information <= 1e-3 * self._largest:
+        if self._journey is None and found.information <= _NOTHING * self._largest:
             return self._wandering.plan(task)
         kind = "explore" if self._journey is None else "travel"
         return Plan(found.path, found.braking, found.views, found.value, kind)
@@ -100,7 +108,7 @@ class TreePlanner:
     def _around(self, task: PlanningTask, memory: Memory) -> Found | None:
         """Explore, or set out on a journey where that promises more."""
         found = self._explore.search(task, memory, first=self._rest_of_branch(task))
-        self._largest = max(self._largest, _largest(memory))
+        self._measure(memory)
         rate = _rate(found)
         if rate > self._rule.little * self._largest:
             return found
@@ -122,7 +130,7 @@ class TreePlanner:
         value = None
         if bool(task.surroundings.is_passable(journey.pose[:3])):
             row = memory.rows(journey.pose[None])
-            value = float(memory.marginal(row, torch.ones_like(task.residual)[None])[0])
+            value = float(memory.marginal(row, self._weights[None])[0])
         if value is not None and value < self._rule.worthwhile * self._largest:
             self._journey = None
             return None
@@ -142,6 +150,12 @@ class TreePlanner:
             return None
         return found
 
+    def _measure(self, memory: Memory) -> None:
+        """Hold the largest value up to date."""
+        _, values = memory.views(self._weights)
+        if len(values):
+            self._largest = max(self._largest, float(values.max()))
+
     def _give_up(self, journey: Journey) -> None:
         """Do not go there again: the view was looked from, or cannot be got to."""
         self._given_up = torch.cat([self._given_up, journey.pose[None]])[-_REMEMBERED:]
@@ -156,14 +170,14 @@ class TreePlanner:
             known = task.library.candidates()
             at = {key: row for row, key in enumerate(known.ids)}
             rows = memory.rows(known.poses[[at[key] for key in ids]])
-            values, _ = memory.marginal(rows, torch.ones(1, len(task.residual)))
+            values, _ = memory.marginal(rows, self._weights[None])
             task.library.revalue(ids, values, task.now, self._rule.worthwhile * self._largest)
 
     def _note(self, task: PlanningTask, memory: Memory, found: Found | None) -> None:
         """Remember the branch, and in the library the best of what it leaves."""
         self._branch, self._when = ([] if found is None else found.actions), task.now
-        poses, values = memory.views()
-        self._largest = max(self._largest, _largest(memory))
+        poses, values = memory.views(self._weights)
+        self._measure(memory)
         known = [self._given_up] if found is None else [self._given_up, found.views]
         if self._journey is not None:
             known.append(self._journey.pose[None])
@@ -174,6 +188,7 @@ class TreePlanner:
     def state(self) -> dict[str, Any]:
         return {
             "journey": None if self._journey is None else self._journey.state(),
+            "fatigue": self._fatigue.state(),
             "given_up": self._given_up,
             "largest": self._largest,
             "branch": self._branch,
@@ -184,6 +199,7 @@ class TreePlanner:
 
     def restore(self, state: dict[str, Any]) -> None:
         self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
+        self._fatigue.restore(state["fatigue"])
         self._given_up = state["given_up"]
         self._largest = float(state["largest"])
         self._branch = [int(action) for action in state["branch"]]
@@ -248,8 +264,3 @@ def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator, **
 def _rate(found: Found | None) -> float:
     """Information a primitive of a branch."""
     return 0.0 if found is None else found.information / len(found.actions)
-
-
-def _largest(memory: Memory) -> float:
-    _, values = memory.views()
-    return float(values.max()) if len(values) else 0.0

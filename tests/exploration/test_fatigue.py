@@ -1,0 +1,60 @@
+"""Fatigue, against a dictionary of blocks."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from exploration.voxel_worlds import surroundings_from
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.exploration.fatigue import Fatigue
+
+SHAPE = (12, 9, 8)
+COUNTS = (3, 3, 2)
+
+
+def window(low: tuple[int, int, int]):
+    return surroundings_from(torch.ones(SHAPE, dtype=torch.bool), low)
+
+
+corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
+
+
+@given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
+def test_weights_are_those_of_a_dictionary_wherever_the_window_is(lows, seed):
+    generator = torch.Generator().manual_seed(seed)
+    fatigue, kept = Fatigue(decay=0.3), {}
+    for now, low in enumerate(lows):
+        measured = torch.rand(18, generator=generator) * (torch.rand(18, generator=generator) < 0.5)
+        fatigue.note(window(low), measured, float(now))
+        for share, block in zip(measured.tolist(), itertools.product(*map(range, COUNTS)), strict=True):
+            name = tuple(a // 4 + b for a, b in zip(low, block, strict=True))
+            kept[name] = kept.get(name, 1.0) * (1 - 0.3 * share)
+    for low in lows:
+        expected = [
+            kept.get(tuple(a // 4 + b for a, b in zip(low, block, strict=True)), 1.0)
+            for block in itertools.product(*map(range, COUNTS))
+        ]
+        torch.testing.assert_close(fatigue.weights(window(low)), torch.tensor(expected))
+
+
+def test_a_look_counts_once():
+    fatigue = Fatigue(decay=0.5)
+    assert fatigue.weights(window((0, 0, 0))).tolist() == [1.0] * 18
+    for _ in range(3):
+        fatigue.note(window((0, 0, 0)), torch.ones(18), 2.0)
+    assert fatigue.weights(window((0, 0, 0))).tolist() == [0.5] * 18
+    fatigue.note(window((0, 0, 0)), torch.ones(18), 4.0)
+    assert fatigue.weights(window((0, 0, 0))).tolist() == [0.25] * 18
+
+
+def test_restored_it_answers_as_before():
+    fatigue, other = Fatigue(), Fatigue()
+    fatigue.note(window((0, 4, 8)), torch.linspace(0, 1, 18), 2.0)
+    other.restore(fatigue.state())
+    for one in (fatigue, other):
+        one.note(window((4, 4, 8)), torch.linspace(1, 0, 18), 2.0)  # no news
+        one.note(window((4, 4, 8)), torch.linspace(1, 0, 18), 4.0)
+    assert torch.equal(fatigue.weights(window((0, 0, 0))), other.weights(window((0, 0, 0))))

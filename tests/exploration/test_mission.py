@@ -1,0 +1,318 @@
+"""Small missions from end to end: each team in a furnished room, against its own frames and the truth."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission import Mission
+from gmmtorch.exploration.mixture_mapper import MixtureMapper
+from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.outcome import row_of, with_times
+from gmmtorch.exploration.team import assemble
+from gmmtorch.exploration.trials import CHECKPOINT, ROW, Trial, WorldOptions, run_mission, run_trials
+from gmmtorch.exploration.world import World
+from gmmtorch.mapping.component_rays import component_evidence
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.cell_evidence import cast_evidence
+from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.simulation.solids import box
+
+SMALL = TeamOptions(
+    size=2,
+    duration=20.0,
+    camera=DepthCamera(width=48, height=36, max_range=5.0),
+    window=(64, 64, 24),
+    sample_every=5.0,
+    n_beams=60,
+)
+
+
+CONTRACT = """
+framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits
+entropy_reduction_bits t50 t90 bytes_sent bytes_raw_points datagrams map_disagreement auc
+cross_entropy_bits collisions path_length coverage_per_metre overlap wall_seconds
+"""
+
+
+def room(*pieces: Tensor) -> Tensor:
+    """A hall of 10 by 8 by 3 metres, its walls half a cell off the lattice, with pieces in it."""
+    return torch.cat([box((0.1, 0.1, 0.1), (10.1, 8.1, 3.1)), *pieces])
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    shelf, crate = box((4.5, 2.5, 0.1), (5.1, 8.1, 3.1)), box((7.5, 5.5, 0.1), (8.5, 6.5, 1.0))
+    return World.from_mesh(room(shelf, crate), start=(2.0, 2.0, 1.3), cache=False, name="room")
+
+
+def flown(world: World, options: TeamOptions, to: int | None = None) -> Mission:
+    mission = assemble(world, options)
+    while not mission.is_over and mission.tick != to:
+        mission.step()
+    return mission
+
+
+def without_seconds(row: dict[str, Any]) -> dict[str, Any]:
+    kept = {k: v for k, v in row.items() if not k.endswith("seconds")}
+    return json.loads(json.dumps(kept, allow_nan=False))
+
+
+@pytest.fixture(scope="module", params=list(FRAMEWORKS))
+def mission(request: pytest.FixtureRequest, world: World) -> Mission:
+    return flown(world, replace(SMALL, framework=request.param))
+
+
+def test_a_mission_learns_the_room(mission: Mission) -> None:
+    row = row_of(mission, 1.0)
+    assert row["entropy_reduction_bits"] > 0.25 * row["observable_bits"]
+    assert row["observed_share"] > 0.6
+    assert row["auc"] > 0.7
+    assert row["times"] == [0.0, 5.0, 10.0, 15.0, 20.0]
+    falls = row["entropy_bits"]
+    assert falls[0] == row["observable_bits"]
+    assert all(after <= before + 1 for before, after in itertools.pairwise(falls))
+
+
+def test_nobody_touches_anything(mission: Mission) -> None:
+    radius = mission.options.dynamics.radius
+    for robot, path in zip(mission.robots, mission.trajectories, strict=True):
+        assert robot.collisions == 0
+        assert float(mission.world.mesh.clearance(torch.stack(path)[:, :3]).min()) >= radius
+    one, other = (torch.stack(path)[:, :3] for path in mission.trajectories)
+    assert float((one - other).norm(dim=1).min()) >= 2 * radius
+
+
+def test_the_row_is_whole_and_plain(mission: Mission) -> None:
+    row = with_times([row_of(mission, 2.0)])[0]
+    assert set(CONTRACT.split()) <= set(row)
+    without_seconds(row)  # plain numbers, no NaN
+    assert row["t50"] <= row["t90"] <= row["duration"]
+    assert len(row["entropy_bits_per_robot"]) == 2
+    union = row["entropy_bits"][-1]
+    assert all(curve[-1] >= union - 0.02 * row["observable_bits"] for curve in row["entropy_bits_per_robot"])
+
+
+def test_what_is_sent_is_what_the_framework_shares(mission: Mission) -> None:
+    row = row_of(mission, 1.0)
+    if mission.options.framework == "grid_isolated":
+        assert row["bytes_sent"] == row["datagrams"] == 0
+    elif mission.options.framework == "grid_shared":
+        assert row["bytes_by_kind"]["points"] > row["bytes_raw_points"]
+    else:
+        assert 0 < row["bytes_by_kind"]["components"] < row["bytes_raw_points"] / 30
+        assert row["map_disagreement"] <= 0.02
+
+
+@pytest.mark.parametrize("framework", FRAMEWORKS)
+def test_the_same_seed_gives_the_same_row(world: World, framework: str) -> None:
+    options = replace(SMALL, framework=framework, duration=8.0)
+    one, other = (without_seconds(row_of(flown(world, options), 1.0)) for _ in range(2))
+    assert one == other
+
+
+def test_another_seed_gives_another(world: World) -> None:
+    options = replace(SMALL, duration=6.0)
+    rows = [row_of(flown(world, replace(options, seed=seed)), 1.0) for seed in (0, 1)]
+    assert rows[0]["entropy_bits"] != rows[1]["entropy_bits"]
+
+
+@pytest.mark.parametrize("planner", ["mcts", "frontier", "random"])
+@pytest.mark.parametrize("framework", FRAMEWORKS)
+def test_a_mission_that_was_interrupted_ends_as_one_that_was_not(
+    world: World, tmp_path: Path, framework: str, planner: str
+) -> None:
+    options = replace(
+        SMALL, framework=framework, planner=planner, duration=10.0, loss=0.2, bandwidth=3e4, latency=1.3
+    )
+    whole = flown(world, options)
+    path = save_checkpoint(tmp_path / "half.safetensors", flown(world, options, to=5).state())
+    resumed = assemble(world, options)
+    resumed.restore(load_checkpoint(path))
+    while not resumed.is_over:
+        resumed.step()
+    assert without_seconds(row_of(resumed, 1.0)) == without_seconds(row_of(whole, 1.0))
+    for one, other in zip(whole.trajectories, resumed.trajectories, strict=True):
+        assert torch.equal(torch.stack(one), torch.stack(other))
+
+
+def test_a_lone_grid_is_the_sum_of_its_frames(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames: list[DepthFrame] = []
+    sense = DepthCamera.sense
+
+    def noted(self: DepthCamera, *args: Any, **options: Any) -> DepthFrame:
+        frames.append(sense(self, *args, **options))
+        return frames[-1]
+
+    monkeypatch.setattr(DepthCamera, "sense", noted)
+    mission = flown(world, replace(SMALL, framework="grid_isolated", size=1, duration=6.0))
+    grid = mission.robots[0].mapper.belief.grid
+    hits, misses = torch.zeros(world.box.shape), torch.zeros(world.box.shape)
+    for frame in frames:
+        part = cast_evidence(frame.origin, frame.ends, frame.is_hit, world.resolution, world.box)
+        at = (part.cells - world.box.low).unbind(1)
+        hits[at] += part.hits
+        misses[at] += part.misses
+    found = grid.dense(world.box)
+    torch.testing.assert_close(found[0], hits)
+    torch.testing.assert_close(found[1], misses)
+    assert len(frames) == 6
+
+
+def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
+    mission = flown(world, replace(SMALL, window=(24, 24, 16), duration=14.0))
+    for robot in mission.robots:
+        mapper = robot.mapper
+        assert isinstance(mapper, MixtureMapper)
+        hits, misses = (torch.zeros(mapper.local.shape) for _ in range(2))
+        for _, batch in mapper.tiles.items():
+            part = component_evidence(batch, 0.2, mapper.local.box, rays_per_cell=6.0, shell=1.0)
+            at = (part.cells - mapper.local.low).unbind(1)
+            hits[at] += part.hits
+            misses[at] += part.misses
+        found = mapper.local.evidence()
+        torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found[1], misses, rtol=1e-4, atol=1e-3)
+        assert float(misses.sum()) > 0
+
+
+def test_robots_that_hear_everything_hold_the_same_components(world: World) -> None:
+    mission = flown(world, replace(SMALL, duration=9.0, latency=0.0))
+    for robot in mission.robots:
+        robot.mapper.center_on(robot.position)
+    mission._exchange(1e6)
+    held = [robot.mapper.components() for robot in mission.robots]
+    one, other = (h for h in held if isinstance(h, Components))
+    assert torch.equal(one.ids, other.ids)
+    assert torch.equal(one.means, other.means)
+    torch.testing.assert_close(one.support, other.support)
+
+
+@pytest.mark.parametrize("loss", [0.3, 0.9])
+def test_missions_go_on_where_datagrams_are_lost(world: World, loss: float) -> None:
+    mission = flown(world, replace(SMALL, duration=10.0, loss=loss))
+    assert row_of(mission, 1.0)["collisions"] == 0
+    assert mission.union.entropy_bits < 0.8 * mission.union.observable_bits
+
+
+@pytest.mark.parametrize("coordination", ["myopic", "greedy", "distributed_greedy", "random_partition"])
+def test_every_coordination_flies_without_collisions(world: World, coordination: str) -> None:
+    mission = flown(world, replace(SMALL, size=3, duration=10.0, coordination=coordination))
+    assert sum(robot.collisions for robot in mission.robots) == 0
+    assert mission.union.entropy_bits < 0.8 * mission.union.observable_bits
+
+
+def test_a_robot_that_is_boxed_in_waits_while_the_mission_goes_on() -> None:
+    cage = box((1.1, 1.1, 0.1), (2.7, 2.7, 2.0))
+    world = World.from_mesh(room(cage), start=(6.0, 4.0, 1.3), cache=False, name="cage")
+    caged = World.from_mesh(room(cage), start=(1.9, 1.9, 1.1), cache=False, name="caged")
+    both = replace(world, navigable=world.navigable | caged.navigable)
+    start = ((6.0, 4.0, 1.3, 0.0), (1.9, 1.9, 1.1, 0.0))
+    mission = flown(both, replace(SMALL, duration=12.0, start=start))
+    assert sum(robot.collisions for robot in mission.robots) == 0
+    path = torch.stack(mission.trajectories[1])[:, :3]
+    assert float((path - path[0]).norm(dim=1).max()) < 0.8
+    assert mission.robots[0].path_length > 2
+
+
+START: dict[str, Callable[[], TeamOptions]] = {
+    "inside a wall": lambda: replace(SMALL, start=((2.0, 2.0, 1.3, 0.0), (4.8, 4.0, 1.3, 0.0))),
+    "outside": lambda: replace(SMALL, start=((2.0, 2.0, 1.3, 0.0), (-4.0, 4.0, 1.3, 0.0))),
+    "not a number": lambda: replace(SMALL, start=((2.0, 2.0, 1.3, 0.0), (float("nan"), 4.0, 1.3, 0.0))),
+    "too few": lambda: replace(SMALL, start=((2.0, 2.0, 1.3, 0.0),)),
+    "no robots": lambda: replace(SMALL, size=0),
+    "too many": lambda: replace(SMALL, size=99),
+    "no time": lambda: replace(SMALL, duration=0.0),
+    "unknown team": lambda: replace(SMALL, framework="both"),
+    "unknown planner": lambda: replace(SMALL, planner="best"),
+    "frames out of step": lambda: replace(SMALL, rate=0.7),
+    "prior": lambda: replace(SMALL, planning_prior=1.0),
+    "loss": lambda: replace(SMALL, loss=1.0),
+    "coordination": lambda: replace(SMALL, coordination="none"),
+    "information": lambda: replace(SMALL, information="all"),
+    "codec": lambda: replace(SMALL, codecs=("jpeg",)),
+}
+
+
+@pytest.mark.parametrize("case", START)
+def test_what_cannot_begin_says_so_before_the_first_step(world: World, case: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=r"\w+"):
+        assemble(world, START[case]())
+
+
+# -- trials -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mesh_file(tmp_path: Path) -> str:
+    import open3d
+
+    triangles = room(box((4.5, 2.5, 0.1), (5.1, 8.1, 3.1))).reshape(-1, 3).double().numpy()
+    mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(triangles),
+        open3d.utility.Vector3iVector(torch.arange(len(triangles)).view(-1, 3).numpy()),
+    )
+    path = tmp_path / "room.ply"
+    open3d.io.write_triangle_mesh(str(path), mesh)
+    return str(path)
+
+
+def trial(mesh_file: str, folder: Path, **changes: Any) -> Trial:
+    team = replace(SMALL, duration=6.0, **changes)
+    return Trial(WorldOptions("mesh", path=mesh_file, cache=False), team, folder, checkpoint_every=2.0)
+
+
+def test_a_killed_trial_goes_on_to_the_same_row(
+    mesh_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, whole = run_mission(trial(mesh_file, tmp_path / "whole"))
+    steps = 0
+    step = Mission.step
+
+    def killed(self: Mission) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 4:
+            raise KeyboardInterrupt
+        step(self)
+
+    monkeypatch.setattr(Mission, "step", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_mission(trial(mesh_file, tmp_path / "cut"))
+    assert (tmp_path / "cut" / CHECKPOINT).is_file()
+    _, resumed = run_mission(trial(mesh_file, tmp_path / "cut"))
+    assert steps == 4 + 4  # from the checkpoint after the second on
+    assert without_seconds(resumed) == without_seconds(whole)
+
+
+def test_a_checkpoint_of_other_options_is_refused(mesh_file: str, tmp_path: Path) -> None:
+    run_mission(trial(mesh_file, tmp_path))
+    with pytest.raises(DataError, match="another mission"):
+        run_mission(trial(mesh_file, tmp_path, seed=5))
+
+
+def test_trials_that_are_done_are_not_run_again(
+    mesh_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trials = [trial(mesh_file, tmp_path / str(seed), seed=seed) for seed in range(2)]
+    rows = run_trials(trials)
+    assert (tmp_path / "0" / ROW).is_file()
+    monkeypatch.setattr(Mission, "step", None)
+    assert run_trials(trials) == json.loads(json.dumps(rows))
+
+
+def test_trials_in_two_processes_give_the_rows_of_one(mesh_file: str, tmp_path: Path) -> None:
+    teams = [{"framework": name} for name in ("gmm_shared", "grid_shared")]
+    apart = run_trials([trial(mesh_file, tmp_path / f"a{i}", **t) for i, t in enumerate(teams)], workers=2)
+    alone = run_trials([trial(mesh_file, tmp_path / f"b{i}", **t) for i, t in enumerate(teams)])
+    assert [without_seconds(row) for row in apart] == [without_seconds(row) for row in alone]
