@@ -375,7 +375,7 @@ class TeamMap:
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
-    rays: float = 6.0
+    rays: float = 4.0
     shell: float = 1.0
     update_at: float = 2.0
     update_stride: int = 4

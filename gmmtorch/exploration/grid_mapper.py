@@ -13,7 +13,7 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
-from gmmtorch.sharing.messages import PointsMessage, decode, encode_points
+from gmmtorch.sharing.messages import Message, PointsMessage, decode, encode_points
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 
@@ -75,7 +75,7 @@ class GridMapper:
         """The evidence of the points of a frame that have arrived."""
 
         def make() -> CellEvidence:
-            said = [self._memo(("message", data), lambda data=data: decode(data)) for data in datagrams]
+            said = [self._decoded(data) for data in datagrams]
             points = [message for message in said if isinstance(message, PointsMessage)]
             ends = torch.cat([message.ends for message in points]).double()
             is_hit = torch.cat([message.is_hit for message in points])
@@ -83,6 +83,9 @@ class GridMapper:
             return cast_evidence(points[0].origin.double(), ends, is_hit, grid.resolution, grid.box)
 
         return self._memo(tuple(datagrams), make)
+
+    def _decoded(self, datagram: bytes) -> Message:
+        return self._memo(("message", datagram), lambda: decode(datagram))
 
     def _add(self, evidence: CellEvidence) -> None:
         self.local.add(evidence)

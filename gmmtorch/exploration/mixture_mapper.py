@@ -27,7 +27,7 @@ from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.mapping.updating import count_explained, summed
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, united
 from gmmtorch.sharing.messages import (
     ComponentsMessage,
     CountsMessage,
@@ -37,8 +37,10 @@ from gmmtorch.sharing.messages import (
 )
 from gmmtorch.simulation.depth_camera import DepthFrame
 
-
 _MARGIN = 8  # cells
+_HITS_PER_RAY = 8
+_EMPTY_LENGTH = 0.7
+_EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class FrameRule:
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
-    rays: float = 6.0
+    rays: float = 4.0
     shell: float = 1.0
     update_at: float = 2.0
     update_stride: int = 4
@@ -79,8 +81,9 @@ class FrameRule:
         return CellRule(self.noise, self.length, self.cell, self.components, self.iterations)
 
     def empty_cells(self) -> CellRule:
-        """For the ends of beams without one: coarser in everything."""
-        return CellRule(2 * self.noise, 2 * self.length, 2 * self.cell, self.components, 1)
+        """For the ends of beams without one: finer, as they end at the edges of what is in sight."""
+        length = _EMPTY_LENGTH * self.length
+        return CellRule(self.noise, length, self.cell, self.components, self.iterations)
 
 
 class MixtureMapper:
@@ -123,7 +126,6 @@ class MixtureMapper:
         """The components of the novel beams, numbered in an order that takes few bytes."""
         origin, rule = frame.origin[None], self._rule
         surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
-        # Where beams ended without a return there is no surface to be true to.
         empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
         parts = [surfaces, empty]
         found = Components.concatenate([part for part in parts if len(part)] or parts[:1])
@@ -202,7 +204,21 @@ class MixtureMapper:
     def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
         """What components say of the cells of a box."""
         rule = self._rule
-        return component_evidence(batch, resolution, box, rays_per_cell=rule.rays, shell=rule.shell)
+        surfaces, empty = (
+            batch.selected((batch.max_range == kind).nonzero().squeeze(1)) for kind in (False, True)
+        )
+        parts = [
+            component_evidence(
+                surfaces,
+                resolution,
+                box,
+                rays_per_cell=rule.rays,
+                shell=rule.shell,
+                hits_per_ray=_HITS_PER_RAY,
+            ),
+            component_evidence(empty, resolution, box, rays_per_cell=rule.rays, cutoff=_EMPTY_CUTOFF),
+        ]
+        return united(parts)
 
     def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
         """Keep a batch of components seen from one place, or of counts that are added to some."""

@@ -25,7 +25,6 @@ from gmmtorch.exploration.world import World
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.sharing.network import Network
 
-
 _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -61,6 +61,7 @@ def component_evidence(
     most: int = 512,
     cutoff: float = 2.5,
     shell: float = 0.0,
+    hits_per_ray: int = 1,
 ) -> CellEvidence:
     """Evidence of components in the cells of a box, by their rays: see `component_rays`.
 
@@ -69,28 +70,35 @@ def component_evidence(
     shell: cells. A component knows its surface, as a grid of rays does not: within that distance of it
         a ray says nothing of free space. Without that, rays that come in flat call the very cells free
         that the surface lies in (of a floor most are crossed more often than hit). 0 is the thesis's.
+    hits_per_ray: points drawn for each ray that is followed. To draw one costs little beside following
+        its ray, and it is hits, few to a cell, that are noisy.
     """
+    check_whole("hits_per_ray", hits_per_ray, 1)
     if not 0 <= shell < math.inf:
         raise InvalidArgumentError(f"shell={shell} must be finite, at least zero cells.")
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
     seen = seen[_in_reach(components, seen, box, density)]
-    rays, sighting = _rays(components, seen, density)
+    drawn, sighting, followed = _rays(components, seen, density, hits_per_ray)
+    struck = None
+    if hits_per_ray > 1:
+        struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
+    rays = RayBundle(*(field[followed] for field in drawn)) if hits_per_ray > 1 else drawn
     until = None
     if shell > 0:
-        until = _before_surface(components, components.seen_by[seen], rays, sighting, shell * resolution)
-    return cast_evidence(rays.origins, rays.ends, rays.is_hit, resolution, box, rays.weights, until)
+        row = components.seen_by[seen][sighting[followed] if hits_per_ray > 1 else sighting]
+        until = _before_surface(components, row, rays, shell * resolution)
+    weights = rays.weights * hits_per_ray
+    return cast_evidence(rays.origins, rays.ends, rays.is_hit, resolution, box, weights, until, struck)
 
 
-def _before_surface(
-    components: Components, seen_by: Tensor, rays: RayBundle, sighting: Tensor, distance: float
-) -> Tensor:
-    """Where rays (R,) of sightings (R,) come within `distance` (m) of the surface that they end on, (R, 3):
-    the plane through their end across the direction in which their component, `seen_by` (C,), is thinnest."""
-    used, row = torch.unique(seen_by, return_inverse=True)
+def _before_surface(components: Components, of: Tensor, rays: RayBundle, distance: float) -> Tensor:
+    """Where rays of components (R,) come within `distance` (m) of the surface that they end on, (R, 3):
+    the plane through their end across the direction in which their component is thinnest."""
+    used, row = torch.unique(of, return_inverse=True)
     thinnest = torch.linalg.eigh(components.covariances[used].double()).eigenvectors[:, :, 0]
     way = rays.ends - rays.origins
-    closing = (thinnest[row[sighting]] * way).sum(1).abs()
+    closing = (thinnest[row] * way).sum(1).abs()
     share = (distance / closing.clamp_min(torch.finfo(closing.dtype).tiny)).clamp_max(1)
     return rays.ends - torch.where(rays.is_hit, share, 0.0)[:, None] * way
 
@@ -135,8 +143,11 @@ def _in_reach(components: Components, seen: Tensor, box: Box, density: _Density)
     return first <= last
 
 
-def _rays(components: Components, seen: Tensor, density: _Density) -> tuple[RayBundle, Tensor]:
-    """Rays of the sightings `seen` (C,), and which of those each ray (R,) is of."""
+def _rays(
+    components: Components, seen: Tensor, density: _Density, times: int = 1
+) -> tuple[RayBundle, Tensor, Tensor]:
+    """Rays of the sightings `seen` (C,), `times` as many as the density asks for; which of the sightings
+    each ray (R,) is of; and which rays (F,) would be all of them once."""
     used, by = torch.unique(components.seen_by[seen], return_inverse=True)
     mean, covariance = components.means[used].double(), components.covariances[used].double()
     origin, count = (
@@ -146,11 +157,13 @@ def _rays(components: Components, seen: Tensor, density: _Density) -> tuple[RayB
     factor = safe_cholesky(covariance)
     hidden = _hidden_area(mean[by] - origin, covariance[by]) / density.resolution**2
     number = (density.rays_per_cell * hidden).ceil().clamp(density.least, density.most).long()
+    once, number = number, number * times
     sighting = torch.repeat_interleave(number)
     first = torch.cumsum(number, 0) - number
     draw = torch.arange(len(sighting), device=seen.device) - first[sighting]
     component = by[sighting]
-    normal = _normals(_shifts(components.ids[used]), component, draw, density)
+    longest = replace(density, most=density.most * times)
+    normal = _normals(_shifts(components.ids[used]), component, draw, longest)
     # Row by row, by sums and products alone: a matrix product may round differently in other company.
     ends = []
     for row in range(3):
@@ -164,7 +177,7 @@ def _rays(components: Components, seen: Tensor, density: _Density) -> tuple[RayB
         (count / number)[sighting],
         ~components.max_range[used][component],
     )
-    return rays, sighting
+    return rays, sighting, (draw < once[sighting]).nonzero().squeeze(1)
 
 
 def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:

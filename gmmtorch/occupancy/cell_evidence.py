@@ -66,6 +66,7 @@ def cast_evidence(
     box: Box,
     weights: Tensor | None = None,
     free_until: Tensor | None = None,
+    struck: tuple[Tensor, Tensor] | None = None,
 ) -> CellEvidence:
     """Evidence of rays in the cells of a box: what lies outside is trimmed off (thesis Fig 4.2).
 
@@ -77,6 +78,8 @@ def cast_evidence(
         resolution: side (m) of the cells.
         free_until: (R, 3), metres, on the way to the ends: misses are counted no further, nor in the cell
             that this is in. At the ends if not given.
+        struck: (H, 3) places, metres, and (H,) weights of the hits, where these are drawn more densely than
+            the rays that are followed. The ends of rays that are hits if not given.
 
     Raises:
         InvalidArgumentError: rays that are not finite, or end 2³² cells or more from the world's origin.
@@ -85,7 +88,8 @@ def cast_evidence(
     starts, stops = in_cells(origins, resolution, "origins"), in_cells(ends, resolution, "ends")
     starts = starts.expand_as(stops)
     until = None if free_until is None else in_cells(free_until, resolution, "free_until")
-    passage = passage_of(starts, stops, box, until)
+    places = None if struck is None else in_cells(struck[0], resolution, "struck")
+    passage = passage_of(starts, stops, box, until, places)
     if passage is None:
         return CellEvidence.empty(ends.device)
     window, block = passage.window, passage.block
@@ -102,9 +106,12 @@ def cast_evidence(
     misses = misses.view(block.shape)
     if block is not window:
         misses = misses[1:-1, 1:-1, 1:-1]
-    flat, inside = flat_index(stops.floor().long() - window.low, window.shape)
-    struck = is_hit & inside
-    hits = weight.new_zeros(math.prod(window.shape)).index_add_(0, flat[struck], weight[struck])
+    if places is None or struck is None:
+        places, counts = stops[is_hit], weight[is_hit]
+    else:
+        counts = struck[1].double()
+    flat, inside = flat_index(places.floor().long() - window.low, window.shape)
+    hits = weight.new_zeros(math.prod(window.shape)).index_add_(0, flat[inside], counts[inside])
     return from_dense(window.low, hits.view(window.shape), misses)
 
 
@@ -117,9 +124,11 @@ class Passage(NamedTuple):
     visits: Iterator[Visits]
 
 
-def passage_of(starts: Tensor, stops: Tensor, box: Box, until: Tensor | None = None) -> Passage | None:
+def passage_of(
+    starts: Tensor, stops: Tensor, box: Box, until: Tensor | None = None, others: Tensor | None = None
+) -> Passage | None:
     """The cells of a box that rays (R, 3), in grid units, leave; None if they do not come to it. They are
-    followed no further than `until` (R, 3), if that is given.
+    followed no further than `until` (R, 3), if that is given. The window has room for `others` (H, 3).
 
     Rays that leave the box are cut half a cell outside it. So no cell of the box is cut, and none is
     entered or left elsewhere than without a box, but for rounding: that stays far below what the
@@ -127,7 +136,8 @@ def passage_of(starts: Tensor, stops: Tensor, box: Box, until: Tensor | None = N
     """
     if len(stops) == 0:
         return None
-    both = torch.stack([starts.amin(0), starts.amax(0), stops.amin(0), stops.amax(0)]).floor().long()
+    places = [x for x in (starts, stops, others) if x is not None and len(x)]
+    both = torch.stack([x.amin(0) for x in places] + [x.amax(0) for x in places]).floor().long()
     lowest, highest = both.amin(0), both.amax(0) + 1
     window = Box(torch.maximum(lowest, box.low), torch.minimum(highest, box.high))
     if bool((window.low >= window.high).any()):
