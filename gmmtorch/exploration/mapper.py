@@ -90,11 +90,13 @@ class Memo:
         return value
 
 
-def novel_beams(local: SlidingVoxelMap, frame: DepthFrame, width: int, rule: NoveltyRule) -> Tensor:
+def novel_beams(
+    local: SlidingVoxelMap, frame: DepthFrame, width: int, rule: NoveltyRule, short: float = 0.0
+) -> Tensor:
     """Which beams (N,) of a frame tell the map something new; `width` of the image, pixels.
 
     The first beam of every two by two pixels speaks for all four: neighbouring pixels are much closer
-    to one another than the cells are large.
+    to one another than the cells are large. `short`: see `SlidingVoxelMap.beam_novelty`.
     """
     n, across = len(frame.pixel), (width + 1) // 2
     block = frame.pixel // (2 * width) * across + frame.pixel % width // 2
@@ -103,5 +105,7 @@ def novel_beams(local: SlidingVoxelMap, frame: DepthFrame, width: int, rule: Nov
     present = first < n
     number = torch.cumsum(present, 0) - 1
     first = first[present]
-    bits, unobserved = local.beam_novelty(frame.origin, frame.ends[first], frame.is_hit[first], rule)
+    bits, unobserved = local.beam_novelty(
+        frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short
+    )
     return (unobserved | (bits >= rule.threshold))[number[block]]

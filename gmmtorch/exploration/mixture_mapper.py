@@ -39,6 +39,7 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 
 _MARGIN = 8  # cells
 _HITS_PER_RAY = 8
+_LEEWAY = 0.5  # cells
 _EMPTY_LENGTH = 0.7
 _EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
 
@@ -116,7 +117,9 @@ class MixtureMapper:
         regenerate(self.local, self.local.center_on(position), self.tiles, self._evidence)
 
     def sense(self, frame: DepthFrame) -> Sensed:
-        novel = novel_beams(self.local, frame, self._width, self._novelty)
+        # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
+        short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
+        novel = novel_beams(self.local, frame, self._width, self._novelty, short)
         counts = encode_counts(self._robot, self._counted(frame, ~novel), self._codec)
         datagrams = encode_components(self._learned(frame, novel), self._codec)
         added = [self._take(datagram) for datagram in (*datagrams, *counts)]

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.mixture_mapper import FrameRule
+from gmmtorch.exploration.planners import PLANNERS
 from gmmtorch.exploration.primitives import Dynamics
 from gmmtorch.exploration.scoring import BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.sharing.envelope import check_codec
 from gmmtorch.sharing.point_codecs import POINT_CODECS
 from gmmtorch.simulation.depth_camera import DepthCamera
-
-PLANNERS = ("mcts", "frontier", "random")
-"""Names of planners, see `planners.make_planner`."""
 
 _MOST_ROBOTS = 15  # as many bits as say who saw a cell
 

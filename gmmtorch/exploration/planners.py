@@ -75,7 +75,6 @@ class TreePlanner:
         self._travel = TreeSearch(primitives, self._rule.travel)
         self._squeeze = TreeSearch(primitives, self._rule.squeeze)
         self._waiting = Waiting(primitives)
-        self._wandering = RandomPlanner(primitives)
         self._speed = primitives.dynamics.speed
         self._duration = primitives.dynamics.duration
         self._journey: Journey | None = None
@@ -101,7 +100,7 @@ class TreePlanner:
             return self._waiting.plan(task)
         self._waiting.over()
         if self._journey is None and found.information <= _NOTHING * self._largest:
-            return self._wandering.plan(task)
+            return self._waiting.rest(task)
         kind = "explore" if self._journey is None else "travel"
         return Plan(found.path, found.braking, found.views, found.value, kind)
 
@@ -194,7 +193,6 @@ class TreePlanner:
             "branch": self._branch,
             "when": self._when if math.isfinite(self._when) else None,
             "waiting": self._waiting.state(),
-            "wandering": self._wandering.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -205,7 +203,6 @@ class TreePlanner:
         self._branch = [int(action) for action in state["branch"]]
         self._when = -math.inf if state["when"] is None else float(state["when"])
         self._waiting.restore(state["waiting"])
-        self._wandering.restore(state["wandering"])
 
 
 _TURNING = 0.1  # metres that a turn in place counts for in a random choice

@@ -113,7 +113,12 @@ class Waiting:
             turn[:, 2] = turn[:, 2].where((turn[:, :2] == 0).all(1), 0)
             path = self._primitives.rollout(task.state[None])[0, int(turn[:, 2].argmax())]
         else:
-            path = self._primitives.rollout(task.state[None])[0, self._primitives.stop]
+            return self.rest(task)
+        return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
+
+    def rest(self, task: PlanningTask) -> Plan:
+        """Come to rest and stay there: there is nothing to do, for now."""
+        path = self._primitives.rollout(task.state[None])[0, self._primitives.stop]
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
 
     def over(self) -> None:

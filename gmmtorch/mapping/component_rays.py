@@ -48,7 +48,8 @@ def component_rays(
     Raises `InvalidArgumentError` for components in the plane, or numbers that are out of range.
     """
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
-    return _rays(components, _counted(components, resolution), density)[0]
+    seen = _counted(components, resolution)
+    return _rays(components, seen, density, torch.ones_like(seen))[0]
 
 
 def component_evidence(
@@ -79,16 +80,19 @@ def component_evidence(
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
     seen = seen[_in_reach(components, seen, box, density)]
-    drawn, sighting, followed = _rays(components, seen, density, hits_per_ray)
-    struck = None
-    if hits_per_ray > 1:
-        struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
-    rays = RayBundle(*(field[followed] for field in drawn)) if hits_per_ray > 1 else drawn
+    # Where a component's own points cannot be in the box, only rays that pass are wanted.
+    ends_here = (
+        _in_reach(components, seen, box, density, ends_only=True)
+        & ~components.max_range[components.seen_by[seen]]
+    )
+    times = torch.where(ends_here, hits_per_ray, 1)
+    drawn, sighting, followed = _rays(components, seen, density, times)
+    rays, sighting = RayBundle(*(field[followed] for field in drawn)), sighting[followed]
     until = None
     if shell > 0:
-        row = components.seen_by[seen][sighting[followed] if hits_per_ray > 1 else sighting]
-        until = _before_surface(components, row, rays, shell * resolution)
-    weights = rays.weights * hits_per_ray
+        until = _before_surface(components, components.seen_by[seen][sighting], rays, shell * resolution)
+    struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
+    weights = rays.weights * times[sighting]
     return cast_evidence(rays.origins, rays.ends, rays.is_hit, resolution, box, weights, until, struck)
 
 
@@ -131,8 +135,10 @@ def _counted(components: Components, resolution: float) -> Tensor:
     return (components.seen_count > 0).nonzero().squeeze(1)
 
 
-def _in_reach(components: Components, seen: Tensor, box: Box, density: _Density) -> Tensor:
-    """Which sightings (C,), of those `seen` (C,), may have rays that reach the box."""
+def _in_reach(
+    components: Components, seen: Tensor, box: Box, density: _Density, ends_only: bool = False
+) -> Tensor:
+    """Which sightings (C,), of those `seen` (C,), may have rays that reach the box, or that end there."""
     by = components.seen_by[seen]
     spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
     low, high = components.means.double() - spread, components.means.double() + spread
@@ -140,14 +146,14 @@ def _in_reach(components: Components, seen: Tensor, box: Box, density: _Density)
     scale = 1 / density.resolution
     # Half a cell more than the box covers the rounding of what is drawn.
     first, last = shares_near(origins * scale, low[by] * scale, high[by] * scale, box)
-    return first <= last
+    return (first <= last) & (last >= 1) if ends_only else first <= last
 
 
 def _rays(
-    components: Components, seen: Tensor, density: _Density, times: int = 1
+    components: Components, seen: Tensor, density: _Density, times: Tensor
 ) -> tuple[RayBundle, Tensor, Tensor]:
-    """Rays of the sightings `seen` (C,), `times` as many as the density asks for; which of the sightings
-    each ray (R,) is of; and which rays (F,) would be all of them once."""
+    """Rays of the sightings `seen` (C,), `times` (C,) as many as the density asks for; which of the
+    sightings each ray (R,) is of; and which rays (F,) would be all of them once."""
     used, by = torch.unique(components.seen_by[seen], return_inverse=True)
     mean, covariance = components.means[used].double(), components.covariances[used].double()
     origin, count = (
@@ -162,7 +168,7 @@ def _rays(
     first = torch.cumsum(number, 0) - number
     draw = torch.arange(len(sighting), device=seen.device) - first[sighting]
     component = by[sighting]
-    longest = replace(density, most=density.most * times)
+    longest = replace(density, most=density.most * int(times.max()) if len(times) else density.most)
     normal = _normals(_shifts(components.ids[used]), component, draw, longest)
     # Row by row, by sums and products alone: a matrix product may round differently in other company.
     ends = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -133,6 +134,7 @@ class SlidingVoxelMap:
         is_hit: Tensor,
         rule: NoveltyRule,
         clamp: tuple[float, float] | None = None,
+        short: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
         """Bits (N,) float64 that each beam would take off the window's entropy, and whether it crosses a
         cell that was not observed, (N,) bool (thesis 4.1.2).
@@ -146,13 +148,20 @@ class SlidingVoxelMap:
             rule: its prior, and from how many rays on a cell counts as observed.
             clamp: lowest and highest occupancy that the map tells apart; a cell that is beyond, and
                 stays there, gives nothing.
+            short: metres before its end over which a beam is not asked about free space, as maps may not
+                speak of it that close to surfaces.
         """
+        if not 0 <= short < math.inf:
+            raise InvalidArgumentError(f"short={short} must be finite metres, at least zero.")
         if clamp is not None and not 0 <= clamp[0] < clamp[1] <= 1:
             raise InvalidArgumentError(f"clamp={clamp} must be two probabilities, the lower one first.")
         stops = in_cells(ends, self.resolution, "ends")
         starts = in_cells(origin, self.resolution, "origin").expand_as(stops)
         told = torch.zeros(len(stops), dtype=torch.float64, device=stops.device)
-        passage = passage_of(starts, stops, self.box)
+        way = stops - starts
+        length = way.norm(dim=1, keepdim=True).clamp_min(torch.finfo(way.dtype).tiny)
+        until = stops - way * (short / self.resolution / length).clamp_max(1) if short else None
+        passage = passage_of(starts, stops, self.box, until)
         if passage is None:
             return told, torch.zeros_like(told, dtype=torch.bool)
         # No beam can tell more bits than it crosses cells: one sum holds the bits, and how many cells

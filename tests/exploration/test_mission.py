@@ -22,7 +22,6 @@ from gmmtorch.exploration.outcome import row_of, with_times
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.trials import CHECKPOINT, ROW, Trial, WorldOptions, run_mission, run_trials
 from gmmtorch.exploration.world import World
-from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cell_evidence import cast_evidence
 from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
@@ -176,7 +175,7 @@ def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
         assert isinstance(mapper, MixtureMapper)
         hits, misses = (torch.zeros(mapper.local.shape) for _ in range(2))
         for _, batch in mapper.tiles.items():
-            part = component_evidence(batch, 0.2, mapper.local.box, rays_per_cell=6.0, shell=1.0)
+            part = mapper._evidence(batch, 0.2, mapper.local.box)
             at = (part.cells - mapper.local.low).unbind(1)
             hits[at] += part.hits
             misses[at] += part.misses
