@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The main job on embedded data: maps of a 2D and of a 3D building, by mixture and by grid, scored
-# on scans that neither was shown. Prints tables, and where the pictures are.
+# The main jobs on embedded data: maps of a 2D and of a 3D building, by mixture and by grid, scored
+# on scans that neither was shown; and three robots that explore a warehouse and share their mixtures.
+# Prints tables, and where the pictures are.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -13,6 +14,8 @@ begin=$(date +%s)
 .venv/bin/gmmtorch-occupancy dataset=synthetic_building evaluation.test_every=5 \
   'evaluation.resolution=[0.1]' 'evaluation.kept=[1.0,0.3,0.1]' hydra.run.dir="$OUT/3d" "$@"
 .venv/bin/gmmtorch-fit mixture.n_components=100 hydra.run.dir="$OUT/fit" "$@"
+.venv/bin/gmmtorch-explore 'world.size=[30,24,6]' duration=100 'evaluation.codecs=[octree,draco]' \
+  hydra.run.dir="$OUT/explore" "$@"
 echo
-echo "demo: done in $(($(date +%s) - begin)) s. Look at $OUT/2d, $OUT/3d and $OUT/fit, or run"
+echo "demo: done in $(($(date +%s) - begin)) s. Look at $OUT/2d, $OUT/3d, $OUT/fit and $OUT/explore, or run"
 echo "  .venv/bin/tensorboard --logdir $OUT"

@@ -40,14 +40,12 @@ class MissionRecorder:
     def sample(self, mission: Mission) -> None:
         """Take note of a mission that has just noted its own numbers."""
         if self._live is not None:
-            numbers = {
-                name: curve[-1] for name, curve in mission.samples.items() if name != "times" and curve
-            }
-            robots = numbers.pop("entropy_bits_per_robot")
-            numbers |= {f"robot_{n}/entropy_bits": curve[-1] for n, curve in enumerate(robots, 1)}
-            numbers |= {
-                f"robot_{robot.number + 1}/path_length": robot.path_length for robot in mission.robots
-            }
+            curves = dict(mission.samples)
+            robots = curves.pop("entropy_bits_per_robot")
+            numbers = {name: curve[-1] for name, curve in curves.items() if name != "times"}
+            for robot, curve in zip(mission.robots, robots, strict=True):
+                numbers[f"robot_{robot.number + 1}/entropy_bits"] = curve[-1]
+                numbers[f"robot_{robot.number + 1}/path_length"] = robot.path_length
             self._live.step(mission.now, numbers)
         reached = mission.now / mission.options.duration
         due = sum(reached >= share - 1e-9 for share in _SHOWN_AT)

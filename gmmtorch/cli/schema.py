@@ -366,7 +366,7 @@ class Belief:
 
 @dataclass
 class TeamMap:
-    window: list[int] = field(default_factory=lambda: [96, 96, 40])
+    window: list[int] = field(default_factory=lambda: [80, 80, 40])
     threshold: float = 1.0
     observed: float = 0.5
     distance: float = 0.5

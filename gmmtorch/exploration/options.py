@@ -45,7 +45,7 @@ class TeamOptions:
     belief: BeliefRule = field(default_factory=BeliefRule)
     novelty: NoveltyRule = field(default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5))
     frame: FrameRule = field(default_factory=FrameRule)
-    window: tuple[int, int, int] = (96, 96, 40)
+    window: tuple[int, int, int] = (80, 80, 40)
     planner: str = "mcts"
     information: str = "csqmi"
     n_beams: int = 160

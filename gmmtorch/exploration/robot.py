@@ -17,6 +17,7 @@ from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _REMEMBERED = 12  # frames whose returns are kept away from, whatever the map makes of them
+_TRAIL = 100  # positions flown through lately
 
 
 class Robot:
@@ -47,6 +48,7 @@ class Robot:
         self.plans: dict[int, tuple[float, Tensor]] = {}  # heard of teammates: when, view poses
         self._start = (pose[:3].double().clone(), start_radius)
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
+        self._trail: deque[Tensor] = deque([pose[:3].double().clone()], maxlen=_TRAIL)
 
     @property
     def position(self) -> Tensor:
@@ -63,6 +65,7 @@ class Robot:
             steps = torch.cat([self.state[None], flown])[:, :3]
             self.path_length += float((steps[1:] - steps[:-1]).norm(dim=1).sum())
             self.state = flown[-1].clone()
+            self._trail.extend(flown[:, :3].unbind())
         return flown[:, :3]
 
     def remember(self, frame: DepthFrame) -> None:
@@ -77,11 +80,15 @@ class Robot:
         self._recent.append(hit.nonzero() + low)
 
     def surroundings(self, planning_prior: float, radius: float) -> Surroundings:
-        """What the planner is given to read."""
+        """What the planner is given to read.
+
+        Where the robot has just been it fits, whatever its map has come to think of that: else a robot could
+        not go back the way it came.
+        """
         local, rule = self.mapper.local, self.mapper.belief.rule
         hits, misses = local.evidence()
         recent = list(self._recent)
-        return surroundings_of(
+        found = surroundings_of(
             local.low,
             local.resolution,
             hits,
@@ -93,6 +100,9 @@ class Robot:
             known_free=[self._start],
             obstacles=torch.cat(recent) if recent else torch.zeros(0, 3, dtype=torch.int64),
         )
+        flat, inside = found.flat_index(torch.stack(list(self._trail)))
+        found.passable.view(-1)[flat[inside]] = True
+        return found
 
     def checkpoint(self) -> dict[str, Any]:
         """Everything that changes, for a file."""
@@ -108,6 +118,7 @@ class Robot:
             "collisions": self.collisions,
             "plans": [[number, when, poses] for number, (when, poses) in self.plans.items()],
             "recent": list(self._recent),
+            "trail": torch.stack(list(self._trail)),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -119,3 +130,4 @@ class Robot:
         self.collisions = int(state["collisions"])
         self.plans = {int(number): (float(when), poses) for number, when, poses in state["plans"]}
         self._recent = deque(state["recent"], maxlen=_REMEMBERED)
+        self._trail = deque(state["trail"].unbind(), maxlen=_TRAIL)
