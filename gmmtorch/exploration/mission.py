@@ -67,7 +67,9 @@ class Mission:
         }
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in robots]
         self.stages: dict[str, float] = {}
-        self.seen_by = torch.zeros(world.observable.numel(), dtype=torch.int16)
+        # A bit for each robot that saw a cell.
+        bits = torch.int16 if len(robots) < 16 else torch.int32
+        self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
         self._evaluator, self._coordination = evaluator, coordination
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)

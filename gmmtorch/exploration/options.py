@@ -15,7 +15,7 @@ from gmmtorch.sharing.envelope import check_codec
 from gmmtorch.sharing.point_codecs import POINT_CODECS
 from gmmtorch.simulation.depth_camera import DepthCamera
 
-_MOST_ROBOTS = 15  # as many bits as say who saw a cell
+_MOST_ROBOTS = 31  # as many bits as say who saw a cell
 
 FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
 """What the thesis calls them."""
