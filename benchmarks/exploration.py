@@ -1,4 +1,4 @@
-"""What a simulated second of exploration costs: by stage, early and late, in worlds of any size, for any team.
+"""What a simulated second of exploration costs: by stage, early and late, in any world, for any team.
 
     python benchmarks/exploration.py                                  # the 50 x 40 m warehouse, 3 robots
     python benchmarks/exploration.py --size 200 160 8                 # 16 times its area
@@ -35,7 +35,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     # The mission's own clock, read as CPU time: other work on the machine then counts less.
-    gmmtorch.exploration.mission.time.perf_counter = time.process_time  # type: ignore[attr-defined]
+    gmmtorch.exploration.mission.time.perf_counter = time.process_time
     world = (
         open_world("mesh", path=options.mesh)
         if options.mesh is not None

@@ -38,7 +38,8 @@ def run(config: DictConfig) -> float | None:
     """One run; returns the entropy reduction (bits) of the last mission, to be optimised over."""
     from gmmtorch.report.progress import ProgressBars
 
-    common.set_up(config)
+    if common.set_up(config) != "cpu":
+        raise _no_device(config.runtime.device)
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
         work = _explore if config.study is None else _compare
@@ -46,6 +47,12 @@ def run(config: DictConfig) -> float | None:
     common.print_table(rows, _TABLE.split(), f"{rows[0]['world']}: {rows[0]['n_robots']} robots")
     common.print_files(folder, folder / "results.json")
     return float(rows[-1]["entropy_reduction_bits"])
+
+
+def _no_device(device: str) -> Exception:
+    from gmmtorch.errors import InvalidArgumentError
+
+    return InvalidArgumentError(f"runtime.device={device} is not for exploring, which runs on the cpu.")
 
 
 def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
@@ -125,8 +132,10 @@ def _trial(
     home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
     if variant is not None:
-        about = "_".join(str(value) for value in variant.values()) or "default"
-        home = home / "trials" / f"{about}_{seed}"
+        about = "_".join(f"{key}-{value}" for key, value in variant.items()) or "default"
+        home = home / "trials" / f"{about}_seed-{seed}"
+    elif config.checkpoint.folder:
+        home = home / f"{config.team.name}_{config.planner.name}_seed-{seed}"  # sweeps share the folder
     return Trial(
         world=_world(config),
         team=_team(config, seed, variant or {}),
@@ -190,8 +199,23 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
         loss=variant.get("loss", config.network.loss),
         sample_every=config.evaluation.every,
         codecs=tuple(config.evaluation.codecs),
-        start=None if start is None else tuple(tuple(float(x) for x in pose) for pose in start),
+        start=None if start is None else _poses(start),
     )
+
+
+def _poses(start: Any) -> tuple[tuple[float, ...], ...]:
+    """Start poses as they are given; raises `InvalidArgumentError` unless they are four numbers each."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    try:
+        poses = tuple(tuple(float(x) for x in pose) for pose in start)
+    except (TypeError, ValueError):
+        poses = ()
+    if not poses or any(len(pose) != 4 for pose in poses):
+        raise InvalidArgumentError(
+            f"team.start={start} must be poses of four numbers each: [[x, y, z, yaw], …], m and rad."
+        )
+    return poses
 
 
 def _three(name: str, values: list[int]) -> tuple[int, int, int]:

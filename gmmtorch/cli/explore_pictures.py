@@ -34,6 +34,7 @@ class MissionRecorder:
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
         self._live = MissionBoard(self._board) if self._board is not None else None
+        self._noted = 0
         self._snapshots: list[TeamSnapshot] = []
         self._maps: list[RecordedMap] = []
 
@@ -49,7 +50,8 @@ class MissionRecorder:
             self._live.step(mission.now, numbers)
         reached = mission.now / mission.options.duration
         due = sum(reached >= share - 1e-9 for share in _SHOWN_AT)
-        if due > len(self._snapshots):
+        if due > self._noted:
+            self._noted = due
             self._note(mission)
 
     def finish(self, mission: Mission, row: dict[str, Any]) -> None:

@@ -44,7 +44,7 @@ class GridMapper:
             self.local.add_dense(box, *self.belief.grid.dense(box))
 
     def sense(self, frame: DepthFrame) -> Sensed:
-        novel = novel_beams(self.local, frame, self._width, self._novelty)
+        novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box)
         parts, datagrams = [], []
         if self._shared and bool(novel.any()):
             datagrams = encode_points(

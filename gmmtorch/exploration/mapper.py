@@ -13,7 +13,7 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
 from gmmtorch.sharing.messages import Message
 from gmmtorch.simulation.depth_camera import DepthFrame
 
@@ -91,12 +91,18 @@ class Memo:
 
 
 def novel_beams(
-    local: SlidingVoxelMap, frame: DepthFrame, width: int, rule: NoveltyRule, short: float = 0.0
+    local: SlidingVoxelMap,
+    frame: DepthFrame,
+    width: int,
+    rule: NoveltyRule,
+    within: Box,
+    short: float = 0.0,
 ) -> Tensor:
     """Which beams (N,) of a frame tell the map something new; `width` of the image, pixels.
 
     The first beam of every two by two pixels speaks for all four: neighbouring pixels are much closer
-    to one another than the cells are large. `short`: see `SlidingVoxelMap.beam_novelty`.
+    to one another than the cells are large. `within`, `short`: see
+    `SlidingVoxelMap.beam_novelty`.
     """
     n, across = len(frame.pixel), (width + 1) // 2
     block = frame.pixel // (2 * width) * across + frame.pixel % width // 2
@@ -106,6 +112,6 @@ def novel_beams(
     number = torch.cumsum(present, 0) - 1
     first = first[present]
     bits, unobserved = local.beam_novelty(
-        frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short
+        frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short, within=within
     )
     return (unobserved | (bits >= rule.threshold))[number[block]]

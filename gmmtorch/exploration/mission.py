@@ -20,6 +20,7 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.views import ViewEvaluator
 from gmmtorch.exploration.world import World
+from gmmtorch.occupancy.cell_evidence import cast_evidence, flat_index
 from gmmtorch.sharing.messages import (
     Message,
     PlanMessage,
@@ -31,6 +32,9 @@ from gmmtorch.sharing.messages import (
 from gmmtorch.sharing.network import Network
 from gmmtorch.sharing.point_codecs import bytes_of_points
 from gmmtorch.simulation.depth_camera import DepthFrame
+
+_SEEN_STRIDE = 4  # pixels
+_CHECKS_PER_STEP = 4  # for collisions
 
 Progress = Callable[["Mission"], None]
 
@@ -70,6 +74,7 @@ class Mission:
         # A bit for each robot that saw a cell.
         bits = torch.int16 if len(robots) < 16 else torch.int32
         self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
+        self.coordination = coordination.name
         self._evaluator, self._coordination = evaluator, coordination
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)
@@ -124,7 +129,9 @@ class Mission:
             sensed = robot.mapper.sense(frame)
             robot.remember(frame)
         with self._timed("scoring"):
-            self._count(robot, sensed)
+            for evidence in sensed.evidence:
+                self.union.add(evidence)
+            self._note_seen(robot, frame)
             self._raw["raw_points"] += 12 * int(sensed.novel.sum())
             for name, size in self._encoded(frame, sensed).items():
                 self._raw[name] += size
@@ -144,16 +151,16 @@ class Mission:
                     sizes[name] += size
         return sizes
 
-    def _count(self, robot: Robot, sensed: Sensed) -> None:
-        """A robot's own evidence, to the team's map and to who saw what."""
-        box, shape = self.world.box, self.world.box.shape
-        bit = 1 << robot.number
-        for evidence in sensed.evidence:
-            self.union.add(evidence)
-            at = evidence.cells - box.low
-            at = at[((at >= 0) & (at < torch.tensor(shape))).all(1)]
-            flat = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
-            self.seen_by[flat] |= bit
+    def _note_seen(self, robot: Robot, frame: DepthFrame) -> None:
+        """Which cells a robot has seen: by the beams of every few pixels, whatever its map makes of them."""
+        width = self.options.camera.width
+        row, column = frame.pixel // width, frame.pixel % width
+        some = (row % _SEEN_STRIDE == 0) & (column % _SEEN_STRIDE == 0)
+        seen = cast_evidence(
+            frame.origin, frame.ends[some], frame.is_hit[some], self.world.resolution, self.world.box
+        )
+        flat, _ = flat_index(seen.cells - self.world.box.low, self.world.box.shape)
+        self.seen_by[flat] |= 1 << robot.number
 
     def _exchange(self, now: float) -> None:
         """Every robot takes in what has reached it by `now`."""
@@ -249,13 +256,17 @@ class Mission:
         options = self.options
         begin = (self.tick % options.ticks_per_plan) * options.steps_per_tick
         with self._timed("flying"):
-            flown = [robot.advance(begin, begin + options.steps_per_tick) for robot in self.robots]
-            for robot, positions in zip(self.robots, flown, strict=True):
-                robot.collisions += int(collides(self.world.mesh, positions, options.dynamics.radius).any())
+            flown = []
+            for robot in self.robots:
+                before = robot.position
+                passed = torch.cat([before[None], robot.advance(begin, begin + options.steps_per_tick)])
+                # Between two states a robot may touch what it touches at neither.
+                flown.append(_finely(passed, _CHECKS_PER_STEP))
                 self.trajectories[robot.number].append(robot.state[:4].clone())
             met = meets_others(torch.stack(flown), options.dynamics.radius).any(1)
-            for robot, has_met in zip(self.robots, met.tolist(), strict=True):
-                robot.collisions += int(has_met)
+            for robot, positions, has_met in zip(self.robots, flown, met.tolist(), strict=True):
+                touched = bool(collides(self.world.mesh, positions, options.dynamics.radius).any())
+                robot.collisions += int(touched) + int(has_met)
 
     # -- score ------------------------------------------------------------------------------------
 
@@ -307,3 +318,10 @@ class Mission:
         self.seen_by = torch.zeros_like(self.seen_by).index_copy_(0, seen, bits.to(self.seen_by.dtype))
         self._generator.set_state(state["generator"])
         self._raw = {name: int(size) for name, size in state["raw"].items()}
+
+
+def _finely(positions: Tensor, n: int) -> Tensor:
+    """Positions (1 + n S, 3) evenly on the way through positions (1 + S, 3)."""
+    share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
+    between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
+    return torch.cat([positions[:1], between.reshape(-1, 3)])

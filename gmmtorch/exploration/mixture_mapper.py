@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -22,22 +22,22 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.component_rays import component_evidence
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.components import Components, packed, unpacked
 from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.mapping.updating import count_explained, summed
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, united
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, common, united
 from gmmtorch.sharing.messages import (
     ComponentsMessage,
     CountsMessage,
+    Message,
     decode,
     encode_components,
     encode_counts,
 )
 from gmmtorch.simulation.depth_camera import DepthFrame
 
-_MARGIN = 8  # cells
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
 _EMPTY_LENGTH = 0.7
@@ -109,20 +109,23 @@ class MixtureMapper:
         self._batches: dict[int, list[tuple[int, Components]]] = {}  # by robot: first sequence, batch
         self._gained: dict[tuple[int, int], float] = {}  # counts not sent yet, by id
         self._keys: list[tuple[Any, ...]] = []
+        self._known: set[tuple[Any, ...]] = set()
         self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
 
     # -- sensing ----------------------------------------------------------------------------------
 
     def center_on(self, position: Tensor) -> None:
-        regenerate(self.local, self.local.center_on(position), self.tiles, self._evidence)
+        uncovered = [common(box, self.belief.grid.box) for box in self.local.center_on(position)]
+        boxes = [box for box in uncovered if box is not None]
+        regenerate(self.local, boxes, self.tiles, self._evidence)
 
     def sense(self, frame: DepthFrame) -> Sensed:
         # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
-        novel = novel_beams(self.local, frame, self._width, self._novelty, short)
+        novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
         counts = encode_counts(self._robot, self._counted(frame, ~novel), self._codec)
         datagrams = encode_components(self._learned(frame, novel), self._codec)
-        added = [self._take(datagram) for datagram in (*datagrams, *counts)]
+        added = [self._take(datagram, self._decoded(datagram)) for datagram in (*datagrams, *counts)]
         return Sensed({"components": datagrams, "counts": counts}, added, novel)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
@@ -180,11 +183,13 @@ class MixtureMapper:
     def receive(self, heard: Sequence[Heard]) -> None:
         for item in heard:
             if isinstance(item.message, ComponentsMessage | CountsMessage):
-                self._take(item.datagram)
+                self._take(item.datagram, item.message)
 
-    def _take(self, datagram: bytes) -> CellEvidence:
+    def _decoded(self, datagram: bytes) -> Message:
+        return self._memo(("message", datagram), lambda: decode(datagram))
+
+    def _take(self, datagram: bytes, message: Message) -> CellEvidence:
         """Enter what a datagram says, one's own included."""
-        message = self._memo(("message", datagram), lambda: decode(datagram))
         if isinstance(message, CountsMessage):
             batch = self._with_counts(message)
             name: tuple[Any, ...] = ("counts", message.sender, len(self._keys))
@@ -193,13 +198,11 @@ class MixtureMapper:
             batch = message.components
             name = ("components", *(batch.ids[0].tolist() if len(batch) else ()))
         key = (datagram, *batch.ids[:, 1].tolist())  # counts of unknown components are left out
-        if len(batch) == 0:
+        if len(batch) == 0 or name in self._known:  # components that came twice count once
             return CellEvidence.empty()
         self._enter(name, batch)
         grid = self.belief.grid
-        # A little more than the world: rays that are cut off at its bounds take longer.
-        box = Box(grid.box.low - _MARGIN, grid.box.high + _MARGIN)
-        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, box))
+        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, grid.box))
         self.local.add(evidence)
         self.belief.add(evidence)
         return evidence
@@ -226,6 +229,7 @@ class MixtureMapper:
     def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
         """Keep a batch of components seen from one place, or of counts that are added to some."""
         self._keys.append(name)
+        self._known.add(name)
         self.tiles.add(name, batch)
         for place in {self._place(origin) for origin in batch.origins}:
             self._places.setdefault(place, []).append(batch)
@@ -256,10 +260,8 @@ class MixtureMapper:
         return {
             "local": self.local.state(),
             "belief": self.belief.state(),
-            "batches": [
-                {"name": list(name), **{f.name: getattr(batch, f.name) for f in fields(batch)}}
-                for name, batch in zip(self._keys, (part for _, part in self.tiles.items()), strict=True)
-            ],
+            "names": [list(name) for name in self._keys],
+            "batches": packed([batch for _, batch in self.tiles.items()]),
             "n_numbered": self._n_numbered,
             "gained": [[*key, count] for key, count in self._gained.items()],
         }
@@ -267,7 +269,7 @@ class MixtureMapper:
     def restore(self, state: dict[str, Any]) -> None:
         self.local.restore(state["local"])
         self.belief.restore(state["belief"])
-        for entry in state["batches"]:
-            self._enter(tuple(entry["name"]), Components(**{k: v for k, v in entry.items() if k != "name"}))
+        for name, batch in zip(state["names"], unpacked(state["batches"]), strict=True):
+            self._enter(tuple(name), batch)
         self._n_numbered = int(state["n_numbered"])
         self._gained = {(int(robot), int(number)): count for robot, number, count in state["gained"]}

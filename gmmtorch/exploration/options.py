@@ -79,6 +79,8 @@ class TeamOptions:
                 raise InvalidArgumentError(
                     f"evaluation.codecs has {name!r}, which is not one of {', '.join(POINT_CODECS)}."
                 )
+        if not 0 <= self.margin < math.inf:
+            raise InvalidArgumentError(f"margin={self.margin} must be finite metres, at least zero.")
         if not 0 < self.planning_prior < 1:
             raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
         for name, ratio in (
@@ -109,8 +111,10 @@ class TeamOptions:
 
     @property
     def plan_slack(self) -> float:
-        """Seconds in which a plan reaches the teammates who wait for it before they plan."""
-        return 2 * self.latency + 0.01
+        """Seconds that robots wait for the plan of the one before them; none where the network is too slow
+        for all to wait for one another."""
+        slack = 2 * self.latency + 0.01
+        return slack if slack * self.size <= self.tick_seconds / 2 else 0.0
 
     @property
     def shares(self) -> bool:

@@ -31,7 +31,10 @@ def row_of(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "duration": options.duration,
         "planner": options.planner,
         "information": options.information,
-        "coordination": options.coordination,
+        "coordination": mission.coordination,
+        "codec": options.codec,
+        "delay": options.latency,
+        "bandwidth": options.bandwidth,
         "planning_prior": options.planning_prior,
         "loss": options.loss,
         "resolution": world.resolution,
@@ -81,7 +84,7 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return timed
 
 
-_VARIANT = ("framework", "planner", "information", "coordination", "planning_prior", "loss")
+_VARIANT = ("framework", "planner", "information", "coordination", "planning_prior", "codec", "loss")
 
 
 def _finite(value: float) -> float | None:

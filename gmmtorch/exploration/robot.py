@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
@@ -17,7 +18,8 @@ from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _REMEMBERED = 12  # frames whose returns are kept away from, whatever the map makes of them
-_TRAIL = 100  # positions flown through lately
+_TRAIL = 50  # positions flown through lately
+_NEARBY = 5.0  # metres within which returns are compared with those
 
 
 class Robot:
@@ -82,8 +84,8 @@ class Robot:
     def surroundings(self, planning_prior: float, radius: float) -> Surroundings:
         """What the planner is given to read.
 
-        Where the robot has just been it fits, whatever its map has come to think of that: else a robot could
-        not go back the way it came.
+        Where the robot has just been it fits, whatever its map has come to think of that, unless a return
+        says otherwise: else it could not go back the way it came.
         """
         local, rule = self.mapper.local, self.mapper.belief.rule
         hits, misses = local.evidence()
@@ -100,7 +102,15 @@ class Robot:
             known_free=[self._start],
             obstacles=torch.cat(recent) if recent else torch.zeros(0, 3, dtype=torch.int64),
         )
-        flat, inside = found.flat_index(torch.stack(list(self._trail)))
+        trail = torch.stack(list(self._trail))
+        if recent:
+            # Anywhere in a cell of the trail, the body must keep off what was struck.
+            struck = (torch.cat(recent) + 0.5) * found.resolution - trail[-1]
+            near = struck[struck.abs().amax(1) < _NEARBY].float()
+            if len(near):
+                apart = torch.cdist((trail - trail[-1]).float(), near).amin(1)
+                trail = trail[apart >= radius + math.sqrt(3) / 2 * found.resolution]
+        flat, inside = found.flat_index(trail)
         found.passable.view(-1)[flat[inside]] = True
         return found
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.block_grid import BlockGrid
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, flat_index
 from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
 from gmmtorch.occupancy.thresholds import Thresholds
 
@@ -50,6 +50,9 @@ class BeliefRule:
         return Thresholds(self.free, self.occupied).classify(probability)
 
 
+_MARGIN = 8  # cells around a world in which evidence is kept, though it is not scored
+
+
 class BeliefMap:
     """Evidence of a bounded world in blocks, and its entropy over the observable cells (MATH: H = Σ h(p)).
 
@@ -61,8 +64,10 @@ class BeliefMap:
     """
 
     def __init__(self, resolution: float, box: Box, observable: Tensor, rule: BeliefRule) -> None:
-        self.grid = BlockGrid(resolution, box)
+        # Noise puts a wall that lies in the bounds on either side of them: that must not count as unseen.
+        self.grid = BlockGrid(resolution, Box(box.low - _MARGIN, box.high + _MARGIN))
         self.rule = rule
+        self._low = box.low
         self._observable = observable.reshape(-1)
         self._shape = box.shape
         self.observable_bits = float(observable.sum())
@@ -80,11 +85,8 @@ class BeliefMap:
         return chosen
 
     def _is_observable(self, cells: Tensor) -> Tensor:
-        at = cells - self.grid.box.low
-        inside = ((at >= 0) & (at < torch.tensor(self._shape))).all(1)
-        _, ny, nz = self._shape
-        flat = (at[:, 0] * ny + at[:, 1]) * nz + at[:, 2]
-        return inside & self._observable[torch.where(inside, flat, 0)]
+        flat, inside = flat_index(cells - self._low, self._shape)
+        return inside & self._observable[flat]
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3)."""

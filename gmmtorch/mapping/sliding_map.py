@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.novelty import NoveltyRule
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, flat_index, in_cells, passage_of
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, common, flat_index, in_cells, passage_of
 from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.grid import check_resolution
 
@@ -135,6 +135,7 @@ class SlidingVoxelMap:
         rule: NoveltyRule,
         clamp: tuple[float, float] | None = None,
         short: float = 0.0,
+        within: Box | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Bits (N,) float64 that each beam would take off the window's entropy, and whether it crosses a
         cell that was not observed, (N,) bool (thesis 4.1.2).
@@ -150,6 +151,7 @@ class SlidingVoxelMap:
                 stays there, gives nothing.
             short: metres before its end over which a beam is not asked about free space, as maps may not
                 speak of it that close to surfaces.
+            within: cells that count at all, where a map takes in no evidence of others; all if not given.
         """
         if not 0 <= short < math.inf:
             raise InvalidArgumentError(f"short={short} must be finite metres, at least zero.")
@@ -161,7 +163,8 @@ class SlidingVoxelMap:
         way = stops - starts
         length = way.norm(dim=1, keepdim=True).clamp_min(torch.finfo(way.dtype).tiny)
         until = stops - way * (short / self.resolution / length).clamp_max(1) if short else None
-        passage = passage_of(starts, stops, self.box, until)
+        box = self.box if within is None else common(self.box, within)
+        passage = None if box is None else passage_of(starts, stops, box, until)
         if passage is None:
             return told, torch.zeros_like(told, dtype=torch.bool)
         # No beam can tell more bits than it crosses cells: one sum holds the bits, and how many cells

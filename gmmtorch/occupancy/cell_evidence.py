@@ -58,6 +58,12 @@ def in_cells(points: Tensor, resolution: float, name: str = "points") -> Tensor:
     return units
 
 
+def common(one: Box, other: Box) -> Box | None:
+    """The cells that are in both boxes; None if there are none."""
+    found = Box(torch.maximum(one.low, other.low), torch.minimum(one.high, other.high))
+    return found if bool((found.low < found.high).all()) else None
+
+
 def cast_evidence(
     origins: Tensor,
     ends: Tensor,

@@ -19,7 +19,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, occupancy_studies, schema, studies
+from gmmtorch.cli import common, explore, occupancy_studies, schema, studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.evaluation import (
     approximation_error,
@@ -31,13 +31,19 @@ from gmmtorch.evaluation import (
 )
 from gmmtorch.evaluation.estimators import METHODS, FitOptions
 from gmmtorch.evaluation.occupancy import Protocol
+from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.planners import PLANNERS
+from gmmtorch.exploration.trials import WorldOptions
 from gmmtorch.mapping.answers import Answering
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.incremental import IncrementalRule
 from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.simulation.tunnels import tunnels
+from gmmtorch.simulation.warehouse import warehouse
 
 CONF = Path(common.conf_dir())
 COMMANDS = ["occupancy", "fit"]
+CONFIGURED = [*COMMANDS, "explore"]  # export has options of its own only: see its tests
 MAPS = {
     "incremental": (schema.IncrementalMap, IncrementalRule()),
     "per_scan": (schema.WindowedMap, WindowedRule(window=1, max_origins=1)),
@@ -141,6 +147,52 @@ def test_every_experiment_composes_and_what_it_asks_for_is_there(command, name):
         composed(command, f"experiment={name}", "study.nonsense=1")
 
 
+@pytest.mark.parametrize("name", listed("explore")["experiment"])
+def test_every_experiment_of_teams_composes_and_its_missions_can_be_flown(name, tmp_path):
+    config = composed("explore", f"experiment={name}", "duration=4")
+    assert config.duration == 4
+    assert not OmegaConf.missing_keys(config)
+    variants = explore._variants(config)
+    assert set(plain(config.study)) == {item.name for item in fields(schema.TrialsStudy)}
+    trials = [explore._trial(config, tmp_path, variant, 7) for variant in variants]
+    assert len({trial.folder for trial in trials}) == len(trials) > 1
+    for trial, variant in zip(trials, variants, strict=True):
+        named = {"team": trial.team.framework, "seed": trial.team.seed, **vars(trial.team)}
+        assert named["seed"] == 7
+        assert {key: named[key] for key in variant} == variant
+    with pytest.raises(ConfigCompositionException, match="nonsense"):
+        composed("explore", f"experiment={name}", "study.nonsense=1")
+
+
+@pytest.mark.parametrize("world", choices("world"))
+@pytest.mark.parametrize("team", choices("team"))
+@pytest.mark.parametrize("planner", choices("planner"))
+def test_any_team_and_planner_go_with_any_world(world, team, planner, tmp_path):
+    path = ["world.path=mine.ply"] if world == "mesh" else []
+    config = composed("explore", f"world={world}", f"team={team}", f"planner={planner}", *path)
+    trial = explore._trial(config, tmp_path)
+    assert (trial.world.name, trial.team.framework, trial.team.planner) == (world, team, planner)
+    assert trial.world.path == ("mine.ply" if path else None)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        "warehouse",
+        pytest.param("tunnels", marks=pytest.mark.xfail(strict=True, reason="6 m high; they need 7")),
+    ],
+)
+def test_a_world_can_be_as_large_as_its_file_says(world):
+    options = composed("explore", f"world={world}").world
+    draw = {"warehouse": warehouse, "tunnels": tunnels}[world]
+    assert draw(options.seed, tuple(options.size)).shape[1:] == (3, 3)
+
+
+def test_every_team_and_planner_has_its_file():
+    assert choices("team") == sorted(FRAMEWORKS)
+    assert choices("planner") == sorted(PLANNERS)
+
+
 def test_every_study_has_an_experiment_that_shows_all_its_options():
     shown = {}
     for command, name in EXPERIMENTS:
@@ -182,12 +234,12 @@ def test_missing_readings_mean_the_same_with_and_without_a_configuration(name, t
     assert config["stride"] == 1
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", CONFIGURED)
 def test_nothing_is_missing_from_the_default_configuration(command):
     assert not OmegaConf.missing_keys(composed(command))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", CONFIGURED)
 def test_results_go_to_outputs_unless_told_otherwise(command):
     schema.register()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
@@ -287,6 +339,36 @@ def test_a_study_takes_what_the_options_offer_with_the_same_defaults(experiment,
     assert ours == {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(options()).items()}
 
 
+def test_a_team_takes_what_the_options_offer_with_the_same_defaults(tmp_path):
+    trial = explore._trial(composed("explore"), tmp_path)
+    assert trial.team == TeamOptions()
+    assert trial.world == WorldOptions(size=(50.0, 40.0, 8.0))
+
+
+@pytest.mark.parametrize(
+    ("choice", "options"),
+    [
+        ("world=warehouse", schema.GeneratedWorld),
+        *((f"team={name}", schema.Team) for name in choices("team")),
+        ("planner=mcts", schema.TreePlannerOptions),
+        ("planner=frontier", schema.PlannerOptions),
+        ("planner=random", schema.PlannerOptions),
+    ],
+)
+def test_the_files_of_a_team_repeat_the_defaults_of_the_schema(choice, options):
+    group, name = choice.split("=")
+    assert plain(composed("explore", choice)[group]) == {**asdict(options()), "name": name}
+
+
+def test_the_file_of_explore_repeats_the_defaults_of_the_schema():
+    config = composed("explore")
+    defaults = asdict(schema.Explore())
+    for group in ("world", "team", "planner"):
+        del defaults[group]
+    for name, value in defaults.items():
+        assert OmegaConf.to_container(OmegaConf.create({name: config[name]}))[name] == value, name
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_files_repeat_the_defaults_of_the_schema(command):
     config = composed(command)
@@ -298,12 +380,18 @@ def test_the_files_repeat_the_defaults_of_the_schema(command):
 # -- documentation --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [schema.Occupancy, schema.Fit])
+_UNSHOWN = pytest.mark.xfail(strict=True, reason="runtime.memory_limit is in the schema alone")
+
+
+@pytest.mark.parametrize(
+    "options", [schema.Occupancy, schema.Fit, pytest.param(schema.Explore, marks=_UNSHOWN)]
+)
 def test_the_configuration_file_shows_every_option(options):
     """So that --help, which prints the composed file, and the file itself say the same."""
     text = (CONF / f"{options.__name__.lower()}.yaml").read_text(encoding="utf-8")
     for name in leaves(options):
-        if not name.startswith(("map.", "dataset")):
+        elsewhere = ("dataset", "world", "team", "planner") + (() if options is schema.Explore else ("map.",))
+        if not name.startswith(elsewhere):
             assert re.search(rf"^ *{name.split('.')[-1]}:", text, re.MULTILINE), name
 
 
@@ -312,6 +400,11 @@ def test_the_configuration_file_shows_every_option(options):
     [
         schema.Occupancy,
         schema.Fit,
+        schema.Explore,
+        schema.GeneratedWorld,
+        schema.MeshWorldOptions,
+        schema.Team,
+        schema.TreePlannerOptions,
         schema.DepthFramesDataset,
         schema.MeshDataset,
         schema.SyntheticBuildingDataset,
@@ -325,11 +418,16 @@ def test_every_option_is_documented(options):
     assert path.is_file(), "the options are to be described in docs/commands.md"
     lines = path.read_text(encoding="utf-8").splitlines()
     prefix = "dataset." if issubclass(options, schema.FileDataset | schema.SyntheticDataset) else ""
+    worlds = schema.GeneratedWorld | schema.MeshWorldOptions
+    prefix = "world." if issubclass(options, worlds) else prefix
+    prefix = "team." if issubclass(options, schema.Team) else prefix
+    prefix = "planner." if issubclass(options, schema.PlannerOptions) else prefix
     prefix = "study." if options.__name__.endswith("Study") else prefix
     prefix = "map." if issubclass(options, schema.Map) else prefix
     if prefix == "study.":  # which are told where the study is
         lines = section_of(experiment_of(options), lines)
-    silent = {"map.name", "dataset.name", "study.name"}  # the choice in the group says it
+    groups = ("map", "dataset", "study", "world", "team", "planner")
+    silent = {f"{group}.name" for group in groups}  # the choice in the group says it
     missing = [name for name in leaves(options, prefix) if not any(map(partial(speaks_of, name), lines))]
     assert not set(missing) - silent
 
@@ -355,7 +453,11 @@ def section_of(experiment: str, lines: list[str]) -> list[str]:
 def speaks_of(name: str, line: str) -> bool:
     """Whether a line names an option, in full or as `.last` after another of its group."""
     group, _, last = name.rpartition(".")
-    return f"`{name}`" in line or bool(group and f"`{group}." in line and f"`.{last}`" in line)
+    return (
+        f"`{name}`" in line
+        or f"`{name}=" in line
+        or bool(group and f"`{group}." in line and f"`.{last}`" in line)
+    )
 
 
 # -- where conf/ is -------------------------------------------------------------------------------
@@ -411,7 +513,7 @@ finally:
 """
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", CONFIGURED)
 @pytest.mark.parametrize("arguments", [["--help"], ["--cfg", "job"]], ids=" ".join)
 def test_help_and_configuration_are_shown_without_loading_anything_heavy(command, arguments, tmp_path):
     code = _THEN_LIST_MODULES.format(command=command, arguments=arguments)
@@ -424,15 +526,15 @@ def test_help_and_configuration_are_shown_without_loading_anything_heavy(command
     if arguments == ["--help"]:
         assert f"gmmtorch-{command}" in done.stdout
         assert "Examples:" in done.stdout
-        for choice in choices("dataset"):
-            assert choice in done.stdout
+        for group in {"dataset", "world", "team", "planner"} & listed(command).keys():
+            assert all(choice in done.stdout for choice in choices(group))
     else:
         shown = OmegaConf.to_container(OmegaConf.create(done.stdout))
         assert shown == OmegaConf.to_container(composed(command))
 
 
 def test_the_examples_of_the_help_compose():
-    for command in COMMANDS:
+    for command in CONFIGURED:
         text = (CONF / f"{command}.yaml").read_text(encoding="utf-8").replace("\\\n", " ")
         examples = re.findall(rf"^ +gmmtorch-{command}\b(.*)$", text, re.MULTILINE)
         assert len(examples) >= 5
@@ -446,16 +548,20 @@ def test_the_examples_of_the_help_compose():
 
 def test_the_commands_are_installed_under_their_names():
     scripts = {point.name: point.value for point in entry_points(group="console_scripts")}
-    for command in COMMANDS:
+    for command in CONFIGURED:
         assert scripts[f"gmmtorch-{command}"] == f"gmmtorch.cli.{command}:main"
 
 
 def test_help_names_every_choice_of_every_group():
     """Each experiment is named by the command that it is for, and by that alone."""
-    of_occupancy, of_fit = listed("occupancy"), listed("fit")
+    of_occupancy, of_fit, of_explore = map(listed, CONFIGURED)
     assert of_occupancy.keys() == {"dataset", "map", "experiment"}
     assert of_fit.keys() == {"dataset", "experiment"}
     for groups in (of_occupancy, of_fit):
         assert sorted(groups["dataset"]) == choices("dataset")
     assert sorted(of_occupancy["map"]) == choices("map")
-    assert sorted([*of_occupancy["experiment"], *of_fit["experiment"]]) == choices("experiment")
+    assert of_explore.keys() == {"world", "team", "planner", "experiment"}
+    for group in ("world", "team", "planner"):
+        assert sorted(of_explore[group]) == choices(group)
+    named = [name for groups in (of_occupancy, of_fit, of_explore) for name in groups["experiment"]]
+    assert sorted(named) == choices("experiment")

@@ -75,7 +75,7 @@ def mission(request: pytest.FixtureRequest, world: World) -> Mission:
 def test_a_mission_learns_the_room(mission: Mission) -> None:
     row = row_of(mission, 1.0)
     assert row["entropy_reduction_bits"] > 0.2 * row["observable_bits"]
-    assert row["observed_share"] > 0.6
+    assert row["observed_share"] > 0.5
     assert row["auc"] > 0.7
     assert row["times"] == [0.0, 5.0, 10.0, 15.0, 20.0]
     falls = row["entropy_bits"]

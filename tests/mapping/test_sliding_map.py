@@ -326,3 +326,61 @@ def test_what_cannot_be():
         sliding.add_dense(sliding.box, torch.zeros(2, 2, 2), torch.zeros(2, 2, 2))
     with pytest.raises(DataError, match="made alike"):
         SlidingVoxelMap(0.5, SHAPE, 3).restore(sliding.state())
+
+
+# -- beams that stop short ------------------------------------------------------------------------
+
+
+def novelty_stopping_short(sliding: SlidingVoxelMap, origin, ends, is_hit, rule, short: float):
+    """Misses of beams cut off before their ends, and hits of those that only end."""
+    far = (ends - origin).norm(dim=1, keepdim=True)
+    until = origin + (ends - origin) / far * (far - short).clamp_min(0)
+    passed, new = novelty_by_a_walk(sliding, origin, until, torch.zeros_like(is_hit), rule)
+    for beam, hit in enumerate(is_hit.tolist()):
+        if hit:  # a beam of no length ends in its cell, and passes through none
+            alone = (ends[beam], ends[[beam]], is_hit[[beam]], rule)
+            bits, unobserved = novelty_by_a_walk(sliding, *alone)
+            passed[beam] += bits[0]
+            new[beam] = new[beam] or unobserved[0]
+    return passed, new
+
+
+@pytest.mark.parametrize("short", [0.0, 0.2, 0.5, 2.0, 1e6])
+@pytest.mark.parametrize(
+    ("origin", "spread"),
+    [((0.13, -0.21, 0.07), 0.5), ((0.13, -0.21, 0.07), 4.0), ((9.0, 1.0, 1.0), 5.0)],
+)
+def test_beams_are_not_asked_about_their_last_stretch(short, origin, spread):
+    sliding = new_map()
+    sliding.center_on(at(0, 0, 0))
+    sliding.add(random_evidence(13_700, 5))
+    generator = torch.Generator().manual_seed(7)
+    place = torch.tensor(origin, dtype=torch.float64)
+    ends = spread * torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    is_hit = torch.rand(60, generator=generator) < 0.6
+    rule = NoveltyRule(observed=3.0, prior=0.25)
+    bits, unobserved = sliding.beam_novelty(place, ends, is_hit, rule, short=short)
+    expected, new = novelty_stopping_short(sliding, place, ends, is_hit, rule, short)
+    torch.testing.assert_close(bits, expected, rtol=1e-9, atol=1e-9)
+    assert unobserved.tolist() == new
+    if origin[0] < 1:  # it makes a difference, where beams end within the window
+        whole, _ = sliding.beam_novelty(place, ends, is_hit, rule)
+        assert torch.equal(bits, whole) == (short == 0)
+
+
+def test_a_beam_that_ends_at_the_sensor_may_stop_short():
+    sliding = new_map()
+    sliding.center_on(at(0, 0, 0))
+    end = at(0, 0, 0)[None]
+    for hit in (False, True):
+        bits, unobserved = sliding.beam_novelty(end[0], end, torch.tensor([hit]), NoveltyRule(), short=0.3)
+        assert unobserved.tolist() == [hit]
+        assert math.isfinite(float(bits[0]))
+
+
+@pytest.mark.parametrize("short", [-0.1, math.nan, math.inf])
+def test_no_stretch_is_negative_or_endless(short):
+    sliding = new_map()
+    sliding.center_on(at(0, 0, 0))
+    with pytest.raises(InvalidArgumentError, match="short="):
+        sliding.beam_novelty(at(0, 0, 0), torch.ones(1, 3), torch.tensor([True]), NoveltyRule(), short=short)

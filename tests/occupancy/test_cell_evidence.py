@@ -239,3 +239,75 @@ def test_no_hull_that_meets_the_box_is_missed(seed):
     # What is near comes within half a cell: a box larger by more than that is met by a draw.
     wide = ((point >= within.low - 1.5) & (point <= within.high + 1.5)).all(2).any(0)
     assert float((first <= last)[~wide].double().mean()) < 0.05
+
+
+# -- rays that are stopped early, and hits apart from them -----------------------------------------
+
+
+def walk_until(starts, until, struck, weights, counts_struck, within: Box) -> Counts:
+    """As `by_a_walk`, misses along one set of rays and hits in places of their own."""
+    missed = by_a_walk(starts, until, torch.zeros(len(starts), dtype=torch.bool), within, weights)
+    hits = by_a_walk(struck, struck, torch.ones(len(struck), dtype=torch.bool), within, counts_struck)
+    return {
+        cell: (hits.get(cell, (0.0, 0.0))[0], missed.get(cell, (0.0, 0.0))[1])
+        for cell in missed.keys() | hits.keys()
+    }
+
+
+def assert_same(found: Counts, expected: Counts) -> None:
+    assert found.keys() == expected.keys()
+    for cell, both in expected.items():
+        assert found[cell] == pytest.approx(both, rel=1e-6)
+
+
+@pytest.mark.parametrize("within", [SMALL, LARGE])
+@pytest.mark.parametrize("seed", range(4))
+def test_misses_stop_where_they_are_told_to(within, seed):
+    starts, stops, is_hit = random_rays(40, seed)
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(40, 1, generator=generator, dtype=torch.float64)
+    share[:4], share[4:8] = 0.0, 1.0
+    weights = 0.1 + torch.rand(40, generator=generator, dtype=torch.float64)
+    until = starts + share * (stops - starts)
+    found = counts(cast_evidence(starts, stops, is_hit, 1.0, within, weights, until))
+    assert_same(found, walk_until(starts, until, stops[is_hit], weights, weights[is_hit], within))
+    at_the_ends = cast_evidence(starts, stops, is_hit, 1.0, within, weights, stops)
+    assert counts(at_the_ends) == counts(cast_evidence(starts, stops, is_hit, 1.0, within, weights))
+
+
+@pytest.mark.parametrize("within", [SMALL, LARGE, box([5, -4, -3], [9, 6, 4])])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("stopped", [False, True])
+def test_hits_may_be_elsewhere_than_ends(within, seed, stopped):
+    starts, stops, is_hit = random_rays(25, seed)
+    generator = torch.Generator().manual_seed(seed + 100)
+    struck = 9 * torch.randn(120, 3, generator=generator, dtype=torch.float64)  # also beyond all rays
+    weight = 0.1 + torch.rand(120, generator=generator, dtype=torch.float64)
+    weights = 0.1 + torch.rand(25, generator=generator, dtype=torch.float64)
+    until = starts + 0.6 * (stops - starts) if stopped else None
+    found = cast_evidence(starts, stops, is_hit, 1.0, within, weights, until, (struck, weight))
+    expected = walk_until(starts, stops if until is None else until, struck, weights, weight, within)
+    assert_same(counts(found), expected)
+
+
+def test_rays_that_are_followed_nowhere_still_hit():
+    start, stop, is_hit = (
+        torch.zeros(1, 3).double() + 0.5,
+        torch.full((1, 3), 3.5).double(),
+        torch.tensor([1]),
+    )
+    assert counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, free_until=start)) == {
+        (3, 3, 3): (1.0, 0.0)
+    }
+    nothing = (torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+    assert (0, 0, 0) in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, struck=nothing))
+    assert (3, 3, 3) not in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, struck=nothing))
+
+
+@pytest.mark.parametrize("name", ["free_until", "struck"])
+def test_other_places_must_be_finite(name):
+    starts, stops, is_hit = random_rays(3, 0)
+    bad = stops * float("nan")
+    options = {"free_until": bad} if name == "free_until" else {"struck": (bad, torch.ones(3))}
+    with pytest.raises(InvalidArgumentError, match=name):
+        cast_evidence(starts, stops, is_hit, 1.0, LARGE, **options)

@@ -1,0 +1,547 @@
+"""gmmtorch-explore: what a mission and a study write, how they go on, and how they fail."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_runs import (
+    CHECKOUT,
+    COMMANDS,
+    QUIET,
+    Finished,
+    environment,
+    refused,
+    run_here,
+    succeeded,
+    timeless,
+)
+
+import gmmtorch
+from gmmtorch.cli import explore, export
+from gmmtorch.exploration.mission import Mission
+from gmmtorch.mapping.gaussian_map import GaussianMap
+
+Run = Callable[..., Finished]
+
+FIELDS = {
+    "framework", "seed", "world", "n_robots", "duration", "times", "entropy_bits", "entropy_bits_per_robot",
+    "observable_bits", "entropy_reduction_bits", "t50", "t90", "bytes_sent", "bytes_raw_points", "datagrams",
+    "map_disagreement", "auc", "cross_entropy_bits", "collisions", "path_length", "coverage_per_metre",
+    "overlap", "wall_seconds",
+}  # fmt: skip
+SMALL = ["team.size=2", "sensor.width=48", "sensor.height=36", "runtime.cache=false", "runtime.workers=1"]
+ROOM = (7.0, 6.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh: the six walls of an empty room, two triangles each."""
+    path = tmp_path_factory.mktemp("mesh") / "room.obj"
+    corners = [f"v {x} {y} {z}" for x, y, z in itertools.product(*((0.0, side) for side in ROOM))]
+    walls = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    faces = [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in walls]
+    path.write_text("\n".join([*corners, *faces, ""]))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def with_these_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(COMMANDS, "explore", explore)
+    monkeypatch.setitem(COMMANDS, "export", export)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: Path) -> Run:
+    """Flies two robots through the room for four seconds, without figures unless told otherwise."""
+
+    def run_command(*options: str, name: str = "run") -> Finished:
+        defaults = [*QUIET, *SMALL, "world=mesh", f"world.path={room}", "duration=4", "evaluation.every=2"]
+        chosen = {option.split("=")[0] for option in options}  # Hydra takes a group only once
+        kept = [option for option in defaults if option.split("=")[0] not in chosen]
+        return run_here(monkeypatch, "explore", tmp_path / name, *kept, *options)
+
+    return run_command
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The ticks that missions of this process step from."""
+    ticks: list[int] = []
+    step = Mission.step
+
+    def noted(mission: Mission) -> None:
+        ticks.append(mission.tick)
+        step(mission)
+
+    monkeypatch.setattr(Mission, "step", noted)
+    return ticks
+
+
+# -- a whole mission ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
+    """Nine seconds in a small warehouse, with everything that is written of them."""
+    folder = tmp_path_factory.mktemp("explore") / "run"
+    options = ["world.size=[15,12,4]", "duration=9", "evaluation.every=2", "checkpoint.every=4"]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setitem(COMMANDS, "explore", explore)
+        yield succeeded(run_here(monkeypatch, "explore", folder, *SMALL, *options, "report.progress=true"))
+
+
+@pytest.fixture(scope="module")
+def row(mission: Finished) -> dict[str, Any]:
+    (only,) = mission.results()["rows"]
+    return dict(only)
+
+
+def test_results_are_as_the_contract_says(mission, row):
+    results = mission.results()
+    assert list(results) == ["command", "version", "seed", "config", "rows"]
+    assert results["command"] == "explore"
+    assert results["version"] == gmmtorch.__version__
+    assert results["seed"] == results["config"]["seed"] == row["seed"] == 0
+    assert results["config"]["sensor"]["width"] == 48
+    assert row.keys() >= FIELDS
+    about = ["framework", "world", "n_robots", "duration", "planner", "information", "coordination"]
+    assert [row[name] for name in about] == ["gmm_shared", "warehouse", 2, 9, "mcts", "csqmi", "greedy"]
+
+
+def test_curves_have_a_value_each_time_and_end_where_the_row_says(row):
+    assert row["times"] == [0, 2, 4, 6, 8, 9]  # the end is noted too
+    for name in ("entropy_bits", "bytes_over_time", "raw_points_bytes_over_time"):
+        assert len(row[name]) == 6
+    assert [len(curve) for curve in row["entropy_bits_per_robot"]] == [6, 6]
+    assert row["entropy_bits"][0] == row["observable_bits"]  # a bit a cell: nothing is known
+    assert row["observable_bits"] - row["entropy_bits"][-1] == row["entropy_reduction_bits"] > 0
+    assert row["bytes_over_time"][-1] == row["bytes_sent"] == sum(row["bytes_by_kind"].values())
+    assert row["raw_points_bytes_over_time"][-1] == row["bytes_raw_points"]
+    assert row["bytes_raw_points"] % 12 == 0
+    assert 0 < row["t50"] < row["t90"] <= 9
+    assert 0 < row["bytes_sent"] < row["wire_bytes"]
+
+
+def test_numbers_of_a_row_are_possible(row):
+    assert 0.5 < row["auc"] <= 1
+    assert 0 <= row["map_disagreement"] < 0.05
+    assert 0 < row["cross_entropy_bits"] < 1  # a map that knows nothing has 1
+    assert 0 < row["observed_share"] <= 1
+    assert 0 <= row["overlap"] <= 1
+    assert row["collisions"] == 0
+    cells = row["observed_share"] * row["observable_bits"]
+    assert row["coverage_per_metre"] == pytest.approx(cells * 0.2**3 / row["path_length"])
+    assert 0 < row["path_length"] <= 2 * 9 * math.hypot(1.5, 0.75)
+
+
+def test_trajectories_are_those_of_the_row(mission, row):
+    with np.load(mission.folder / "trajectories.npz") as kept:
+        paths = [kept[f"robot_{n}"] for n in range(2)]
+        assert set(kept) == {"robot_0", "robot_1"}
+    for path in paths:
+        assert path.shape == (10, 4)  # the start, and each second
+        assert np.isfinite(path).all()
+    chords = sum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).sum() for path in paths)
+    assert 0.7 * row["path_length"] < chords <= row["path_length"] + 1e-9
+    apart = np.linalg.norm(paths[0][:, :3] - paths[1][:, :3], axis=1)
+    assert apart.min() > 0.6
+
+
+def test_the_run_directory_holds_figures_events_map_and_checkpoint(mission):
+    files = mission.files()
+    assert {"results.json", "map.safetensors", "mission.safetensors", ".hydra/overrides.yaml"} <= files
+    pictures = {name for name in files if name.endswith(".png")}
+    names = "bandwidth entropy mixture profile team_map trajectories"
+    assert pictures == {f"{name}.png" for name in names.split()}
+    for name in pictures:
+        assert (mission.folder / name).read_bytes().startswith(b"\x89PNG")
+    assert not [name for name in files if Path(name).name.startswith(".") and "/" not in name]
+
+
+def test_the_event_file_holds_the_curves_and_the_figures(mission, row):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(mission.folder / "tensorboard")).Reload()
+    live = events.Scalars("mission/entropy_bits")
+    assert [event.step for event in live] == row["times"]
+    assert [event.value for event in live] == pytest.approx(row["entropy_bits"], rel=1e-6)
+    flown = sum(events.Scalars(f"mission/robot_{n}/path_length")[-1].value for n in (1, 2))
+    assert flown == pytest.approx(row["path_length"], rel=1e-6)
+    assert {f"figures/{name}" for name in ("entropy", "team_map")} <= set(events.Tags()["images"])
+
+
+def test_the_mixture_is_a_map_that_answers(mission, row):
+    made = GaussianMap.load(mission.folder / "map.safetensors")
+    with np.load(mission.folder / "trajectories.npz") as kept:
+        path = torch.from_numpy(kept["robot_0"][:, :3])
+    inside = made.occupancy(path, resolution=0.2)
+    assert bool((inside[1:] < 0.5).all())  # robots flew there
+    far = made.occupancy(path[:1] + 500, resolution=0.2)
+    assert float(far) == pytest.approx(0.5)
+
+
+def test_the_mixture_can_be_exported(mission, row, monkeypatch, tmp_path):
+    source, target = mission.folder / "map.safetensors", tmp_path / "mixture.npz"
+    options = [f"path={source}", f"output={target}", "format=npz", "report.progress=false"]
+    succeeded(run_here(monkeypatch, "export", tmp_path / "export", *options))
+    with np.load(target) as kept:
+        sizes = {len(kept[name]) for name in kept if kept[name].ndim}
+    assert max(sizes) <= row["n_components"]
+    assert max(sizes) > 10
+
+
+def test_a_table_and_where_to_look_are_printed(mission, row):
+    lines = mission.stdout.splitlines()
+    assert "warehouse: 2 robots" in lines
+    (line,) = (line for line in lines if line.startswith("gmm_shared "))
+    assert line.split()[:3] == ["gmm_shared", "0", "mcts"]
+    assert str(mission.folder / "results.json") in mission.stdout
+    assert f"tensorboard --logdir {mission.folder / 'tensorboard'}" in mission.stdout
+    assert "nan" not in mission.stdout.lower()
+
+
+def test_progress_tells_time_entropy_and_bytes_on_standard_error(mission):
+    assert "simulated seconds" in mission.stderr
+    assert "% of the entropy left" in mission.stderr
+    assert "Traceback" not in mission.stderr
+    assert "Warning" not in mission.stderr
+    assert "%|" not in mission.stdout
+
+
+# -- options --------------------------------------------------------------------------------------
+
+
+def test_runs_repeat_and_another_seed_gives_other_results(run):
+    first, again, other = (
+        succeeded(run(f"seed={seed}", name=name)) for seed, name in ((1, "a"), (1, "b"), (2, "c"))
+    )
+    assert timeless(first.results()) == timeless(again.results())
+    assert timeless(first.results())["rows"] != timeless(other.results())["rows"]
+    assert first.stderr == ""
+    assert not [name for name in first.files() if name.endswith(".png") or "tfevents" in name]
+
+
+@pytest.mark.parametrize("team", ["gmm_shared", "grid_shared", "grid_isolated"])
+def test_every_team_explores_and_shares_as_it_is_named(team, run):
+    done = succeeded(run(f"team={team}"))
+    (row,) = done.results()["rows"]
+    assert row["framework"] == team
+    assert row["entropy_reduction_bits"] > 0
+    learns = team == "gmm_shared"
+    assert (row["n_components"] is not None) == ("map.safetensors" in done.files()) == learns
+    assert {"plans", "views"} <= row["bytes_by_kind"].keys() or team == "grid_isolated"
+    if team == "grid_isolated":
+        assert row["bytes_sent"] == row["datagrams"] == 0
+    elif team == "grid_shared":
+        assert row["bytes_sent"] > row["bytes_raw_points"]  # each novel point in full, and plans
+    else:
+        assert 0 < row["bytes_sent"] < row["bytes_raw_points"] / 5
+
+
+@pytest.mark.parametrize("planner", ["frontier", "random"])
+def test_other_planners_fly(planner, run):
+    (row,) = succeeded(run(f"planner={planner}", "duration=8")).results()["rows"]
+    assert row["planner"] == planner
+    assert row["path_length"] > 0
+    assert row["collisions"] == 0
+
+
+def test_options_reach_the_mission(run):
+    options = ["information=fsmi", "coordination=myopic", "network.loss=0.5", "world.resolution=0.25"]
+    options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]", "planner.prior=0.5"]
+    done = succeeded(run(*options))
+    (row,) = done.results()["rows"]
+    names = ["information", "coordination", "loss", "resolution", "planning_prior"]
+    assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25, 0.5]
+    assert 0 < row["bytes_octree"] < row["bytes_raw_points"]
+    with np.load(done.folder / "trajectories.npz") as kept:
+        assert kept["robot_0"][0].tolist() == [2, 3, 1.5, 0]
+        assert kept["robot_1"][0].tolist() == [5, 3, 1.5, 3]
+
+
+def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
+    done = succeeded(run("-m", "seed=0,1", "duration=2", f"hydra.sweep.dir={tmp_path / 'sweep'}"))
+    for number in (0, 1):
+        job = Finished(0, "", "", tmp_path / "sweep" / str(number))
+        assert job.results()["seed"] == job.results()["rows"][0]["seed"] == number
+    assert not (done.folder / "results.json").exists()
+
+
+# -- studies --------------------------------------------------------------------------------------
+
+
+def test_a_study_has_a_row_for_each_trial_and_none_is_flown_twice(run, steps, tmp_path):
+    options = ["experiment=fig4_4_entropy", "study.seeds=[0,1]", f"checkpoint.folder={tmp_path / 'kept'}"]
+    options += ["study.variants=[{team:grid_shared},{team:grid_isolated}]"]
+    done = succeeded(run(*options, "report.figures=true", "report.tensorboard=true"))
+    rows = done.results()["rows"]
+    assert [(row["framework"], row["seed"]) for row in rows] == [
+        ("grid_shared", 0),
+        ("grid_isolated", 0),
+        ("grid_shared", 1),
+        ("grid_isolated", 1),
+    ]
+    assert all(row.keys() >= FIELDS for row in rows)
+    shared = [row["entropy_reduction_bits"] for row in rows if row["framework"] == "grid_shared"]
+    assert all(row["reference_bits"] == pytest.approx(sum(shared) / 2) for row in rows)
+    pictures = {name for name in done.files() if name.endswith(".png")}
+    assert pictures == {"entropy.png", "bandwidth.png", "summary.png", "profile.png"}
+    assert any("tfevents" in name for name in done.files())
+    assert len(list((tmp_path / "kept").rglob("trajectories.npz"))) == 4
+    assert len(steps) == 4 * 4
+
+    again = succeeded(run(*options, name="again"))
+    assert len(steps) == 4 * 4  # none more
+    assert again.results()["rows"] == rows  # seconds too: the rows were read
+
+    longer = succeeded(run(*options, "study.seeds=[0]", "duration=2", name="other"))
+    assert len(steps) == 4 * 4 + 2 * 2  # not the missions that are kept
+    assert [row["duration"] for row in longer.results()["rows"]] == [2, 2]
+
+
+def test_a_study_of_planners_compares_them(run):
+    variants = "study.variants=[{planner:frontier},{planner:random}]"
+    options = ["experiment=planners", "study.seeds=[0]", variants, "report.figures=true"]
+    done = succeeded(run(*options))
+    assert [row["planner"] for row in done.results()["rows"]] == ["frontier", "random"]
+    assert {name for name in done.files() if name.endswith(".png")} == {"planners.png", "profile.png"}
+
+
+def test_a_trial_of_a_study_is_the_mission_alone(run):
+    """Which it must be for a study that went on to be worth the same."""
+    (alone,) = timeless(succeeded(run("team=grid_shared", "seed=1")).results())["rows"]
+    options = ["experiment=fig4_5_bandwidth", "study.seeds=[1]", "study.variants=[{team:grid_shared}]"]
+    (trial,) = timeless(succeeded(run(*options, name="study")).results())["rows"]
+    added = {name for name in trial if name.removesuffix("_bytes_over_time") in ("octree", "draco")}
+    added |= {"bytes_octree", "bytes_draco"}
+    assert trial.keys() - alone.keys() == added
+    assert {name: value for name, value in trial.items() if name not in added} == alone
+
+
+# -- going on -------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
+def test_a_mission_that_was_killed_goes_on_to_the_same_result(run, room, steps, tmp_path):
+    killed = tmp_path / "killed"
+    options = ["duration=12", "checkpoint.every=1"]
+    arguments = [*QUIET, *SMALL, "world=mesh", f"world.path={room}", "evaluation.every=2", *options]
+    process = subprocess.Popen(
+        [sys.executable, str(CHECKOUT / "scripts" / "explore.py"), f"hydra.run.dir={killed}", *arguments],
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 90
+        while time.monotonic() < deadline and process.poll() is None:
+            if (killed / "mission.safetensors").exists():
+                break
+            time.sleep(0.01)
+    finally:
+        process.kill()
+        process.wait(30)
+    assert process.returncode == -signal.SIGKILL
+    assert not (killed / "results.json").exists()
+
+    went_on = succeeded(run(*options, f"checkpoint.folder={killed}", name="on"))
+    assert 1 <= steps[0] < 12
+    assert steps == list(range(steps[0], 12))  # from where it was, not anew
+    whole = succeeded(run(*options, name="whole"))
+    assert timeless(went_on.results())["rows"] == timeless(whole.results())["rows"]
+    with (
+        np.load(went_on.folder / "trajectories.npz") as ours,
+        np.load(whole.folder / "trajectories.npz") as all,
+    ):
+        for name in all:
+            assert np.array_equal(ours[name], all[name])
+
+
+def test_a_mission_can_be_made_longer(run, steps, tmp_path):
+    kept = f"checkpoint.folder={tmp_path / 'kept'}"
+    succeeded(run("duration=4", kept, name="short"))
+    longer = succeeded(run("duration=6", kept, name="longer"))
+    assert steps == [0, 1, 2, 3, 4, 5]
+    (row,) = longer.results()["rows"]
+    assert row["duration"] == 6
+    assert row["times"] == [0, 2, 4, 6]
+
+
+def test_a_checkpoint_of_another_mission_is_not_taken(run, tmp_path):
+    kept = f"checkpoint.folder={tmp_path / 'kept'}"
+    succeeded(run("duration=2", kept, name="first"))
+    line = refused(run("duration=2", kept, "seed=1", name="other"))
+    assert str(tmp_path / "kept" / "mission.safetensors") in line
+    assert "another mission" in line
+    (tmp_path / "kept" / "mission.safetensors").write_bytes(b"damaged")
+    assert "mission.safetensors" in refused(run("duration=2", kept, name="damaged"))
+
+
+def test_without_checkpoints_none_is_written(run):
+    assert "mission.safetensors" not in succeeded(run("duration=2", "checkpoint.every=0")).files()
+
+
+# -- failing --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("team.size=0", "team.size=0"),
+        ("team.size=99", "team.size=99 31"),
+        ("team.start=[[0,3,1.5,0],[3,3,1.5,0]]", "start pose 0 surface"),
+        ("team.start=[[3,3,1.5,0],[50,3,1.5,0]]", "start pose 1 outside bounds room"),
+        ("team.start=[[3,3,1.5,0],[3,3.2,1.5,0]]", "start pose 1 touches"),
+        ("team.start=[[3,3,1.5,0]]", "team.start 2 robots"),
+        ("team.start=[[nan,3,1.5,0],[2,2,1.5,0]]", "start pose 0 finite"),
+        ("world.path=/no/where.ply", "world.path=/no/where.ply"),
+        ("world.bounds=[20,20,0,30,30,3]", "bounds=[20.0, miss room"),
+        ("world.bounds=[0,0,0,3]", "bounds= six"),
+        ("world.resolution=0", "resolution=0.0"),
+        ("sensor.horizontal_fov=0", "horizontal_fov=0.0"),
+        ("sensor.max_range=0", "max_range=0.0"),
+        ("sensor.rate=0.7", "sensor.rate=0.7 robot.duration"),
+        ("duration=-1", "duration=-1.0"),
+        ("network.loss=1", "loss=1.0"),
+        ("network.bandwidth=0", "bandwidth=0.0"),
+        ("network.delay=-1", "-1.0 time"),
+        ("map.window=[8,8]", "map.window=[8, three"),
+        ("map.window=[8,8,8]", "(8, 8, 8)"),
+        ("map.rays=0", "rays=0.0"),
+        ("planner.prior=0", "planner.prior=0.0"),
+        ("planner.beams=0", "beams=0"),
+        ("information=x", "information='x' csqmi fsmi"),
+        ("coordination=x", "coordination='x' myopic greedy"),
+        ("rounds=0", "rounds=0"),
+        ("codec=zip", "codec='zip' quantized thesis"),
+        ("transport=zenoh", "transport='zenoh' in_process"),
+        ("evaluation.codecs=[jpeg]", "evaluation.codecs 'jpeg' octree draco"),
+        ("evaluation.every=0", "every=0.0"),
+        ("belief.clamp=0.6", "clamp=0.6"),
+        ("robot.radius=5", "robot_radius=5.0 room"),
+        ("runtime.threads=0", "runtime.threads=0"),
+        ("runtime.device=meta", "runtime.device=meta"),
+        ("seed=-1", "seed=-1"),
+        ("checkpoint.folder=/dev/null/kept", "/dev/null/kept"),
+        ("experiment=fig4_4_entropy runtime.workers=0", "workers=0"),
+        ("experiment=fig4_4_entropy study.variants=[]", "study.variants study.seeds"),
+        ("experiment=fig4_4_entropy study.variants=[{colour:1}]", "study.variants colour team planner"),
+        ("experiment=fig4_4_entropy study.variants=[{team:x}]", "team='x' gmm_shared"),
+        ("experiment=fig4_4_entropy study.seeds=[-1]", "seed=-1"),
+    ],
+)
+def test_a_bad_value_is_named_in_one_line(options, words, run):
+    line = refused(run(*options.split()))
+    assert all(word in line for word in words.split()), line
+
+
+def test_a_bad_value_is_found_before_anything_is_flown(run, steps):
+    for options in (["network.loss=1"], ["information=x"], ["map.window=[8,8,8]"], ["sensor.rate=0.7"]):
+        refused(run(*options))
+    assert steps == []
+
+
+@pytest.mark.xfail(strict=True, reason="ends in a traceback")
+@pytest.mark.parametrize(
+    "options",
+    [
+        "team.start=[[3,3,1.5,a],[2,2,1.5,0]]",
+        "team.start=3",
+        "team.start=[3,3]",
+        "checkpoint.every=nan",
+        "experiment=fig4_4_entropy study.seeds=[]",
+        "experiment=fig4_4_entropy study.variants=[{loss:high}]",
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_named_in_one_line(options, run):
+    name = options.split()[-1].split("=")[0].split(".")[-1]
+    assert name in refused(run(*options.split(), "study.seeds=[0]" if "loss" in options else "seed=0"))
+
+
+@pytest.mark.xfail(strict=True, reason="found when its turn comes")
+def test_a_bad_variant_is_found_before_the_first_is_flown(run, steps):
+    variants = "study.variants=[{team:grid_isolated},{loss:1}]"
+    assert "loss=1" in refused(run("experiment=fig4_4_entropy", "study.seeds=[0]", variants))
+    assert steps == []
+
+
+@pytest.mark.xfail(strict=True, reason="their folders have one name")
+def test_variants_that_differ_in_an_option_alone_are_kept_apart(run, steps, tmp_path):
+    variants = "study.variants=[{loss:0.5},{planning_prior:0.5}]"
+    options = ["experiment=fig4_4_entropy", "study.seeds=[0]", variants, "duration=2"]
+    options.append(f"checkpoint.folder={tmp_path / 'kept'}")
+    succeeded(run(*options))
+    succeeded(run(*options, name="again"))
+    assert len(steps) == 2 * 2
+
+
+def test_a_mesh_that_was_not_given_is_asked_for(monkeypatch, tmp_path):
+    line = refused(run_here(monkeypatch, "explore", tmp_path / "run", *QUIET, *SMALL, "world=mesh"))
+    assert "world.path" in line
+
+
+@pytest.mark.parametrize("size", ["[12,10]", "[12,10,3.5]", "[1,1,1]", "[nan,20,4]"])
+@pytest.mark.parametrize("world", ["warehouse", "tunnels"])
+def test_a_world_that_is_too_small_says_what_it_needs(world, size, monkeypatch, tmp_path):
+    options = [*QUIET, *SMALL, f"world={world}", f"world.size={size}"]
+    assert "at least (" in refused(run_here(monkeypatch, "explore", tmp_path / "run", *options))
+
+
+_CRASHES = pytest.mark.xfail(strict=True, reason="open3d raises IndexError, which is not caught")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "truncated.ply",
+        "text.ply",
+        "cloud.xyz",
+        pytest.param("text.obj", marks=_CRASHES),
+        pytest.param("text.stl", marks=_CRASHES),
+    ],
+)
+def test_a_file_that_is_no_mesh_is_named(kind, run, tmp_path, room):
+    path = tmp_path / kind
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    texts = {"truncated.ply": f"{header}0 0 0\n1 0 0\n", "cloud.xyz": "0 0 0\n1 1 1\n"}
+    path.write_text(texts.get(kind, "no mesh at all\n"))
+    assert str(path) in refused(run(f"world.path={path}"))
+
+
+def test_half_a_mesh_is_no_world(run, tmp_path, room):
+    path = tmp_path / "half.obj"
+    path.write_text(room.read_text()[:-60])
+    line = refused(run(f"world.path={path}", "robot.radius=3"))
+    assert "half" in line
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("duration=long", "duration=long could not be converted to Float"),
+        ("team.size=two", "team.size=two could not be converted to Integer"),
+        ("team=gmm", "Could not find 'team/gmm' gmm_shared grid_isolated"),
+        ("world=moon", "Could not find 'world/moon' tunnels warehouse"),
+        ("world.size=[10,10,3]", "Could not override 'world.size'"),
+        ("sensor.widht=3", "Could not override 'sensor.widht'"),
+    ],
+)
+def test_wrong_types_and_unknown_options_are_explained_without_a_traceback(option, words, run):
+    done = run(option)
+    assert done.status == 1
+    assert "Traceback" not in done.stderr
+    assert all(word in done.stderr for word in words.split()), done.stderr
+    assert not done.folder.exists()

@@ -1,0 +1,218 @@
+"""Maps of voxels: what arrives is what is counted, and the window shows what is behind it."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.mapper import Heard, Memo
+from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import Box, cast_evidence
+from gmmtorch.sharing.messages import PointsMessage, decode, encode_counts, encode_points
+from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+WIDTH = 24
+BOX = Box(torch.tensor([-20, -20, -10]), torch.tensor([20, 20, 10]))
+MIDDLE = torch.zeros(3, dtype=torch.float64)
+NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)
+
+
+def mapper(robot: int = 0, shared: bool = True, shape: tuple[int, int, int] = (40, 40, 20)) -> GridMapper:
+    local = SlidingVoxelMap(0.2, shape, 4)
+    belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
+    one = GridMapper(robot, local, belief, WIDTH, NOVELTY, Memo(64), shared)
+    one.center_on(MIDDLE)
+    return one
+
+
+def frame(seed: int, n: int = 400, origin: Tensor = MIDDLE) -> DepthFrame:
+    """Beams all about; where they end is a number of float32, from the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    way = 1.2 * torch.randn(n, 3, generator=generator)
+    return DepthFrame(
+        origin, origin + way.double(), torch.rand(n, generator=generator) < 0.7, torch.arange(n)
+    )
+
+
+def dense_of(parts: list[tuple[Tensor, Tensor, Tensor]], box: Box = BOX) -> Tensor:
+    """Evidence (2, nx, ny, nz) of beams (origin, ends, is_hit), cast part by part."""
+    both = torch.zeros(2, *box.shape)
+    for origin, ends, is_hit in parts:
+        evidence = cast_evidence(origin, ends, is_hit, 0.2, box)
+        at = (evidence.cells - box.low).unbind(1)
+        both[0][at] += evidence.hits
+        both[1][at] += evidence.misses
+    return both
+
+
+def in_window(parts: list[tuple[Tensor, Tensor, Tensor]], one: GridMapper) -> Tensor:
+    """What the window should hold of it: no more than the belief, which ends at its box."""
+    sides = [torch.arange(a, b) for a, b in zip(*map(Tensor.tolist, one.local.box), strict=True)]
+    cells = torch.stack(torch.meshgrid(*sides, indexing="ij"), -1)
+    return dense_of(parts, one.local.box) * ((cells >= BOX.low) & (cells < BOX.high)).all(-1)
+
+
+def beams(*frames: DepthFrame) -> list[tuple[Tensor, Tensor, Tensor]]:
+    return [(f.origin, f.ends, f.is_hit) for f in frames]
+
+
+def believed(one: GridMapper) -> Tensor:
+    return torch.stack(one.belief.grid.dense(BOX))
+
+
+def heard(*datagrams: bytes, sender: int = 1) -> list[Heard]:
+    return [Heard(sender, datagram, decode(datagram)) for datagram in datagrams]
+
+
+def said(view: DepthFrame, sender: int = 1, number: int = 0) -> list[bytes]:
+    return encode_points(sender, number, view.origin, view.ends, view.is_hit)
+
+
+# -- one's own frames ---------------------------------------------------------------------------------
+
+
+def test_own_frames_count_in_full_whether_they_are_shared_or_not() -> None:
+    for shared in (False, True):
+        one = mapper(shared=shared)
+        views = [frame(seed) for seed in range(4)]
+        sensed = [one.sense(view) for view in views]
+        torch.testing.assert_close(believed(one), dense_of(beams(*views)))
+        torch.testing.assert_close(torch.stack(one.local.evidence()), in_window(beams(*views), one))
+        assert bool(sensed[0].novel.all())
+        total = sum(float(p.hits.sum() + p.misses.sum()) for s in sensed for p in s.evidence)
+        assert total == float(believed(one).sum())
+
+
+def test_who_is_isolated_sends_nothing() -> None:
+    alone = mapper(shared=False)
+    assert all(alone.sense(frame(seed)).messages == {"points": []} for seed in range(3))
+
+
+def test_only_novel_beams_are_sent() -> None:
+    one = mapper(robot=5)
+    counts = []
+    for number in range(12):
+        view = frame(number % 2)
+        sensed = one.sense(view)
+        messages = [decode(datagram) for datagram in sensed.messages["points"]]
+        ends = [m.ends for m in messages if isinstance(m, PointsMessage)]
+        assert len(ends) == len(messages)
+        for message in messages:
+            assert isinstance(message, PointsMessage)
+            assert (message.sender, message.frame) == (5, number)
+        found = torch.cat([torch.zeros(0, 3, dtype=torch.float64), *ends])
+        torch.testing.assert_close(found, view.ends[sensed.novel], rtol=0, atol=1e-6)
+        counts.append(len(found))
+    assert counts[0] == 400
+    assert 0 < counts[2] < 400
+    assert counts[-1] < counts[2] / 2
+    torch.testing.assert_close(believed(one), dense_of(beams(*[frame(n % 2) for n in range(12)])))
+
+
+def test_a_frame_without_beams_says_nothing() -> None:
+    for shared in (False, True):
+        one = mapper(shared=shared)
+        sensed = one.sense(frame(0, n=0))
+        assert sensed.messages == {"points": []}
+        assert sensed.novel.shape == (0,)
+        assert float(believed(one).sum()) == 0
+
+
+# -- what others say ------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=12)
+@given(arrived=st.lists(st.integers(0, 9), unique=True, max_size=10), at_once=st.booleans())
+def test_whatever_parts_of_a_frame_arrive_are_counted(arrived: list[int], at_once: bool) -> None:
+    views = [frame(seed, n=5 * POINTS_PER_DATAGRAM - 17) for seed in range(2)]
+    datagrams = [data for number, view in enumerate(views) for data in said(view, number=number)]
+    assert len(datagrams) == 10
+    one = mapper()
+    if at_once:
+        one.receive(heard(*[datagrams[k] for k in arrived]))
+    else:
+        for k in arrived:
+            one.receive(heard(datagrams[k]))
+    parts = []
+    for k in arrived:
+        view, begin = views[k // 5], k % 5 * POINTS_PER_DATAGRAM
+        part = slice(begin, begin + POINTS_PER_DATAGRAM)
+        parts.append((view.origin, view.ends[part], view.is_hit[part]))
+    torch.testing.assert_close(believed(one), dense_of(parts))
+    torch.testing.assert_close(torch.stack(one.local.evidence()), in_window(parts, one))
+    assert (float(believed(one).sum()) > 0) == bool(arrived)
+
+
+def test_frames_of_the_same_number_by_two_robots_are_told_apart() -> None:
+    far = torch.tensor([1.0, -0.6, 0.4], dtype=torch.float64)
+    views = [frame(0, n=200), frame(1, n=200, origin=far)]
+    one = mapper()
+    one.receive(heard(*said(views[0], sender=1), *said(views[1], sender=2)))
+    torch.testing.assert_close(believed(one), dense_of(beams(*views)))
+
+
+def test_who_hears_all_that_is_novel_has_what_was_novel() -> None:
+    speaker, listener = mapper(robot=1), mapper()
+    views = [frame(seed) for seed in range(5)]
+    parts = []
+    for view in views:
+        sensed = speaker.sense(view)
+        listener.receive(heard(*sensed.messages["points"]))
+        parts.append((view.origin, view.ends[sensed.novel], view.is_hit[sensed.novel]))
+    torch.testing.assert_close(believed(listener), dense_of(parts))
+    assert float(believed(listener).sum()) < float(believed(speaker).sum())
+
+
+def test_other_messages_are_ignored() -> None:
+    one = mapper()
+    one.receive(heard(*encode_counts(1, {(1, 0): 5.0})))
+    one.receive([])
+    assert float(believed(one).sum()) == 0
+    assert one.components() is None
+
+
+# -- the window -----------------------------------------------------------------------------------------
+
+
+def test_a_sliding_window_is_that_of_a_cast_from_scratch() -> None:
+    one = mapper(shape=(12, 16, 10))
+    generator = torch.Generator().manual_seed(0)
+    position, views = MIDDLE, []
+    for seed in range(12):
+        step = 0.7 * torch.randn(3, generator=generator, dtype=torch.float64)
+        position = (position + step).clamp(-1.8, 1.8)
+        one.center_on(position)
+        views.append(frame(seed, n=60, origin=position))
+        if seed % 3:
+            one.sense(views[-1])
+        else:
+            one.receive(heard(*said(views[-1], number=seed)))
+        expected = in_window(beams(*views), one)
+        torch.testing.assert_close(torch.stack(one.local.evidence()), expected)
+    assert float(expected.sum()) > 100
+
+
+def test_a_restored_mapper_goes_on_alike() -> None:
+    one, twin = mapper(), mapper()
+    for seed in range(3):
+        one.sense(frame(seed))
+    one.receive(heard(*said(frame(7))))
+    twin.restore(one.state())
+    there = torch.tensor([1.2, 0.0, 0.0], dtype=torch.float64)
+    for seed in range(3, 6):
+        for each in (one, twin):
+            each.center_on(there)
+        view = frame(seed, origin=there)
+        a, b = one.sense(view), twin.sense(view)
+        assert a.messages == b.messages
+        assert torch.equal(a.novel, b.novel)
+    assert torch.equal(believed(one), believed(twin))
+    for a, b in zip(one.local.evidence(), twin.local.evidence(), strict=True):
+        assert torch.equal(a, b)
+    assert one.belief.entropy_bits == twin.belief.entropy_bits

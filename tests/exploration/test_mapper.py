@@ -1,0 +1,160 @@
+"""Novel beams against each beam of a block on its own, and values that are remembered."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.mapper import Memo, novel_beams
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+RULE = NoveltyRule(resolution=0.2, observed=0.5)
+
+
+def known(seed: int) -> SlidingVoxelMap:
+    """A window with random evidence, of which some cells have none."""
+    generator = torch.Generator().manual_seed(seed)
+    local = SlidingVoxelMap(0.2, (24, 24, 16))
+    local.center_on(torch.zeros(3, dtype=torch.float64))
+    hits, misses = 40 * torch.rand(2, *local.shape, generator=generator)
+    blank = torch.rand(local.shape, generator=generator) < 0.03
+    local.add_dense(local.box, hits.masked_fill(blank, 0), misses.masked_fill(blank, 0))
+    return local
+
+
+def frame(width: int, height: int, seed: int, missing: float) -> DepthFrame:
+    generator = torch.Generator().manual_seed(seed)
+    pixel = (torch.rand(width * height, generator=generator) >= missing).nonzero().squeeze(1)
+    ends = 1.5 * torch.randn(len(pixel), 3, generator=generator, dtype=torch.float64)
+    is_hit = torch.rand(len(pixel), generator=generator) < 0.7
+    origin = torch.tensor([0.05, 0.15, -0.1], dtype=torch.float64)
+    return DepthFrame(origin, ends, is_hit, pixel)
+
+
+def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float) -> list[bool]:
+    """Each beam answers as the beam of the lowest pixel of its two by two that there is."""
+    speaker: dict[tuple[int, int], int] = {}
+    for beam, pixel in enumerate(seen.pixel.tolist()):
+        speaker.setdefault((pixel // width // 2, pixel % width // 2), beam)
+    answers = []
+    for pixel in seen.pixel.tolist():
+        beam = speaker[(pixel // width // 2, pixel % width // 2)]
+        bits, unobserved = local.beam_novelty(
+            seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short
+        )
+        answers.append(bool(unobserved[0]) or float(bits[0]) >= RULE.threshold)
+    return answers
+
+
+@pytest.mark.parametrize("short", [0.0, 0.5])
+@pytest.mark.parametrize("missing", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (7, 1), (1, 9), (2, 2)])
+def test_the_first_beam_of_four_pixels_speaks_for_them(
+    width: int, height: int, missing: float, short: float
+) -> None:
+    local, seen = known(width), frame(width, height, height, missing)
+    found = novel_beams(local, seen, width, RULE, short)
+    assert found.dtype == torch.bool
+    assert found.tolist() == by_a_loop(local, seen, width, short)
+
+
+def test_some_beams_are_novel_and_some_are_not() -> None:
+    found = novel_beams(known(0), frame(20, 16, 1, 0.1), 20, RULE)
+    assert 0.1 < float(found.double().mean()) < 0.9
+
+
+def test_a_frame_without_beams_has_none() -> None:
+    empty = frame(8, 6, 0, 1.1)
+    assert len(empty.pixel) == 0
+    found = novel_beams(known(0), empty, 8, RULE)
+    assert found.shape == (0,)
+    assert found.dtype == torch.bool
+
+
+def test_the_map_is_left_as_it_was() -> None:
+    local = known(3)
+    before = local.evidence()
+    novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE)
+    for one, other in zip(before, local.evidence(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_nothing_is_novel_where_everything_is_certain() -> None:
+    local = SlidingVoxelMap(0.2, (48, 48, 48))
+    local.center_on(torch.zeros(3, dtype=torch.float64))
+    sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.low.tolist()], indexing="ij")
+    cells = torch.stack(sides, -1).reshape(-1, 3)
+    assert bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE).all())
+    local.add(CellEvidence(cells, torch.zeros(len(cells)), torch.full((len(cells),), 1e4)))
+    assert not bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE).any())
+
+
+# -- memo -----------------------------------------------------------------------------------------
+
+
+class Maker:
+    """Notes what was made."""
+
+    def __init__(self, memo: Memo) -> None:
+        self.memo, self.made = memo, ""
+
+    def __call__(self, keys: str) -> None:
+        for key in keys:
+
+            def make(key: str = key) -> Tensor:
+                self.made += key
+                return torch.tensor(ord(key))
+
+            assert int(self.memo(key, make)) == ord(key)
+
+
+@pytest.mark.parametrize(
+    ("size", "asked", "made"),
+    [
+        (3, "aaabbbabab", "ab"),  # what is known is not made again
+        (3, "abcabcabc", "abc"),  # as many as there is room for
+        (2, "abcabcabc", "abcabcabc"),  # the least recently used goes
+        (2, "abacab", "abcb"),  # asking counts as use
+        (1, "abba", "aba"),
+        (3, "abcadbacd", "abcdbcd"),
+    ],
+)
+def test_the_least_recently_used_is_forgotten(size: int, asked: str, made: str) -> None:
+    maker = Maker(Memo(size))
+    maker(asked)
+    assert maker.made == made
+
+
+def test_a_memo_does_not_grow() -> None:
+    memo = Memo(5)
+    for number in range(100):
+        assert memo(number, lambda number=number: number) == number
+        assert len(memo._values) <= 5
+
+
+def test_values_may_be_nothing_and_may_need_others() -> None:
+    memo = Memo(2)
+    calls = 0
+
+    def nothing() -> None:
+        nonlocal calls
+        calls += 1
+
+    assert memo("none", nothing) is None
+    assert memo("none", nothing) is None
+    assert calls == 1
+    for size in (1, 2, 3):
+        nested = Memo(size)
+        assert nested("outer", lambda nested=nested: nested("inner", lambda: 4) + 1) == 5
+        assert nested("outer", lambda: 0) == 5
+
+
+def test_what_fails_is_not_remembered() -> None:
+    memo = Memo(2)
+    with pytest.raises(ZeroDivisionError):
+        memo("a", lambda: 1 // 0)
+    assert memo("a", lambda: 7) == 7

@@ -1,0 +1,239 @@
+"""A robot: what it has flown, where it fits, and what a checkpoint keeps of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.mapper import Memo
+from gmmtorch.exploration.planning import Plan
+from gmmtorch.exploration.roadmap import Roadmap
+from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
+from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.simulation.depth_camera import DepthFrame
+
+BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
+START = torch.tensor([3.1, 3.1, 1.5, 0.3], dtype=torch.float64)
+
+
+class Idle:
+    """A planner without anything to remember but a number."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def plan(self, task: Any) -> Plan:
+        raise NotImplementedError
+
+    def state(self) -> dict[str, Any]:
+        return {"number": self.number}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.number = state["number"]
+
+
+def robot(start_radius: float = 0.0) -> Robot:
+    belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
+    mapper = GridMapper(
+        0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True
+    )
+    mapper.center_on(START[:3])
+    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), start_radius)
+
+
+def plan(path: Tensor) -> Plan:
+    return Plan(path, path[-1:].clone(), path[-1:, :4], 1.0, "test")
+
+
+def zigzag(n: int = 10) -> Tensor:
+    """States (n, 7) of a path whose steps are 3, 4, 3, 4 … decimetres, along x and y."""
+    path = torch.zeros(n, 7, dtype=torch.float64)
+    step = torch.arange(1, n + 1)
+    path[:, 0] = START[0] + 0.3 * ((step + 1) // 2)
+    path[:, 1] = START[1] + 0.4 * (step // 2)
+    path[:, 2] = START[2]
+    path[:, 4] = step.double() / n
+    return path
+
+
+def test_it_begins_at_rest_where_it_is_put() -> None:
+    one = robot()
+    assert one.state.tolist() == [*START.tolist(), 0, 0, 0]
+    assert one.position.tolist() == START[:3].tolist()
+    assert one.path_length == 0
+    assert one.collisions == 0
+
+
+def test_the_way_flown_is_the_sum_of_its_steps() -> None:
+    one, path = robot(), zigzag()
+    one.follow(plan(path))
+    assert torch.equal(one.advance(0, 3), path[:3, :3])
+    assert one.path_length == pytest.approx(0.3 + 0.4 + 0.3)
+    assert torch.equal(one.state, path[2])
+    assert torch.equal(one.advance(3, 6), path[3:6, :3])
+    assert one.path_length == pytest.approx(3 * 0.3 + 3 * 0.4)
+    assert torch.equal(one.state, path[5])
+
+
+def test_beyond_the_end_of_its_path_it_stays() -> None:
+    one, path = robot(), zigzag()
+    one.follow(plan(path))
+    one.advance(0, 8)
+    assert one.advance(8, 13).shape == (2, 3)
+    flown = one.path_length
+    assert flown == pytest.approx(5 * 0.3 + 5 * 0.4)
+    for _ in range(3):
+        assert one.advance(13, 18).shape == (0, 3)
+        assert one.path_length == flown
+        assert torch.equal(one.state, path[-1])
+    # The next plan starts there.
+    back = path.flip(0)[1:]
+    one.follow(plan(back))
+    one.advance(0, 9)
+    assert one.path_length == pytest.approx(2 * flown - 0.3)
+
+
+def test_a_robot_without_a_plan_stays() -> None:
+    one = robot()
+    one.advance(0, 5)
+    assert one.path_length == 0
+    assert one.position.tolist() == START[:3].tolist()
+
+
+def test_its_state_is_its_own() -> None:
+    one, path = robot(), zigzag()
+    one.follow(plan(path))
+    one.advance(0, 2)
+    path += 1
+    assert float(one.state[0]) == pytest.approx(float(START[0]) + 0.3)
+
+
+# -- where it fits --------------------------------------------------------------------------------------
+
+
+def everywhere(one: Robot, hits: float, misses: float) -> None:
+    local = one.mapper.local
+    local.add_dense(local.box, torch.full(local.shape, hits), torch.full(local.shape, misses))
+
+
+def test_it_may_go_back_the_way_it_came() -> None:
+    one, path = robot(), zigzag()
+    everywhere(one, 30.0, 0.0)  # the map calls everything occupied
+    surroundings = one.surroundings(0.125, 0.3)
+    assert int(surroundings.passable.sum()) == 1  # where it is
+    one.follow(plan(path))
+    one.advance(0, 6)
+    found = one.surroundings(0.125, 0.3)
+    been = torch.cat([START[None, :3], path[:6, :3]])
+    cells = {tuple(c) for c in (been / 0.2).floor().long().tolist()}
+    marked = {tuple(c) for c in (found.passable.nonzero() + found.low).tolist()}
+    assert marked == cells
+    assert not bool(found.free.any())
+
+
+def test_the_trail_is_forgotten_after_a_while_and_does_not_wrap_round_the_window() -> None:
+    one = robot()
+    everywhere(one, 30.0, 0.0)
+    path = zigzag(1).expand(100, 7)
+    one.follow(plan(torch.cat([zigzag(), path])))
+    one.advance(0, 10)
+    one.advance(10, 110)
+    found = one.surroundings(0.125, 0.3)
+    assert (found.passable.nonzero() + found.low).tolist() == [(path[0, :3] / 0.2).floor().long().tolist()]
+    outside = torch.full((100, 7), 50.0, dtype=torch.float64)
+    one.follow(plan(outside))
+    one.advance(0, 100)
+    assert not bool(one.surroundings(0.125, 0.3).passable.any())
+
+
+def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
+    one = robot()
+    everywhere(one, 0.0, 50.0)
+    free = one.surroundings(0.125, 0.3)
+    wall = torch.tensor([[4.5, 3.1, 1.5], [4.5, 3.3, 1.5]], dtype=torch.float64)
+    thin = torch.tensor([[2.1, 3.1, 1.5]], dtype=torch.float64)  # the end of an empty beam
+    ends, is_hit = torch.cat([wall, thin]), torch.tensor([True, True, False])
+    one.remember(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
+    found = one.surroundings(0.125, 0.3)
+    taken = free.free & ~found.free
+    cells = (wall / 0.2).floor().long()
+    assert (taken.nonzero() + found.low).tolist() == cells.tolist()
+    # Every cell that is no longer passable is near a return, and those at it are not.
+    lost = found.centers((free.passable & ~found.passable).nonzero())
+    assert float(torch.cdist(lost, wall).amin(1).max()) < 0.3 + 2.5 * 0.2 * 3**0.5
+    assert not bool(found.is_passable(wall).any())
+    assert bool(found.is_passable(thin).all())
+    # After twelve frames more it is forgotten; frames without returns do not count.
+    nothing = DepthFrame(START[:3], ends[2:], is_hit[2:], torch.arange(1))
+    for _ in range(20):
+        one.remember(nothing)
+    assert not bool(one.surroundings(0.125, 0.3).is_passable(wall).any())
+    elsewhere = DepthFrame(START[:3], wall[:1] + 1.0, is_hit[:1], torch.arange(1))
+    for _ in range(12):
+        one.remember(elsewhere)
+    assert bool(one.surroundings(0.125, 0.3).is_passable(wall).all())
+
+
+def test_around_the_start_it_is_free_though_nothing_was_seen() -> None:
+    found = robot(start_radius=1.4).surroundings(0.125, 0.3)
+    centers = found.centers(found.free.nonzero())
+    assert len(centers) > 100
+    assert float((centers - START[:3]).norm(dim=1).max()) <= 1.4
+    assert int(found.passable.sum()) > 1
+    assert not bool(found.observed.any())
+
+
+# -- checkpoints ----------------------------------------------------------------------------------------
+
+
+def test_a_restored_robot_goes_on_alike() -> None:
+    one, path = robot(1.4), zigzag()
+    one.planner.number = 7
+    one.mapper.belief.add(CellEvidence(torch.tensor([[1, 2, 3]]), torch.ones(1), torch.ones(1)))
+    everywhere(one, 0.0, 3.0)
+    one.follow(plan(path))
+    one.advance(0, 4)
+    one.collisions = 2
+    one.plans = {3: (1.5, START[None].clone()), 1: (0.5, torch.zeros(0, 4, dtype=torch.float64))}
+    wall = torch.tensor([[4.5, 3.1, 1.5]], dtype=torch.float64)
+    one.remember(DepthFrame(START[:3], wall, torch.tensor([True]), torch.arange(1)))
+    twin = robot(1.4)
+    twin.restore(one.checkpoint())
+    assert twin.planner.number == 7
+    assert twin.collisions == 2
+    assert list(twin.plans) == [3, 1]
+    assert twin.plans[3][0] == 1.5
+    assert torch.equal(twin.plans[3][1], START[None])
+    for each in (one, twin):
+        each.advance(4, 8)
+        each.remember(DepthFrame(START[:3], wall + 0.5, torch.tensor([True]), torch.arange(1)))
+    assert twin.path_length == one.path_length == pytest.approx(4 * 0.3 + 4 * 0.4)
+    assert torch.equal(twin.state, one.state)
+    assert torch.equal(twin.braking, one.braking)
+    a, b = (each.surroundings(0.125, 0.3) for each in (one, twin))
+    for name in ("low", "occupancy", "observed", "free", "passable"):
+        assert torch.equal(getattr(a, name), getattr(b, name))
+    assert torch.equal(one.mapper.belief.grid.dense(BOX)[0], twin.mapper.belief.grid.dense(BOX)[0])
+
+
+def test_what_happens_later_does_not_change_a_checkpoint() -> None:
+    one, path = robot(), zigzag()
+    one.follow(plan(path))
+    one.advance(0, 4)
+    state = one.checkpoint()
+    one.advance(4, 8)
+    one.remember(DepthFrame(START[:3], path[:1, :3], torch.tensor([True]), torch.arange(1)))
+    everywhere(one, 1.0, 0.0)
+    twin = robot()
+    twin.restore(state)
+    assert torch.equal(twin.state, path[3])
+    assert twin.path_length == pytest.approx(2 * 0.3 + 2 * 0.4)
+    assert not bool(twin.surroundings(0.125, 0.3).observed.any())
