@@ -131,11 +131,9 @@ def _trial(
 
     home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
-    if variant is not None:
-        about = "_".join(f"{key}-{value}" for key, value in variant.items()) or "default"
-        home = home / "trials" / f"{about}_seed-{seed}"
-    elif config.checkpoint.folder:
-        home = home / f"{config.team.name}_{config.planner.name}_seed-{seed}"  # sweeps share the folder
+    chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
+    about = "_".join(f"{key}-{value}" for key, value in chosen.items())
+    home = home / "trials" / f"{about}_seed-{seed}"  # sweeps may share a folder
     return Trial(
         world=_world(config),
         team=_team(config, seed, variant or {}),

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import check_whole
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
@@ -75,7 +76,7 @@ class Memo:
     """
 
     def __init__(self, size: int) -> None:
-        self._size = size
+        self._size = check_whole("size", size, 1)
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def __call__(self, key: Hashable, make: Callable[[], T]) -> T:

@@ -197,7 +197,7 @@ class MixtureMapper:
             assert isinstance(message, ComponentsMessage)  # `receive` and `sense` pass on no others
             batch = message.components
             name = ("components", *(batch.ids[0].tolist() if len(batch) else ()))
-        key = (datagram, *batch.ids[:, 1].tolist())  # counts of unknown components are left out
+        key = (datagram, *batch.ids.flatten().tolist())  # counts of unknown components are left out
         if len(batch) == 0 or name in self._known:  # components that came twice count once
             return CellEvidence.empty()
         self._enter(name, batch)
@@ -246,8 +246,8 @@ class MixtureMapper:
             if at >= 0 and number - batches[at][0] < len(batches[at][1]):
                 batch = batches[at][1]
                 one = batch.selected(torch.tensor([number - batches[at][0]]))
-                scale = count / float(one.support[0])
-                rows.append(replace(one, support=one.support * scale, seen_count=one.seen_count * scale))
+                support = torch.full_like(one.support, count)
+                rows.append(replace(one, support=support, seen_count=support[one.seen_by]))
         return Components.concatenate(rows) if rows else Components.empty(3)
 
     # -- the whole --------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     final: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
-        final.setdefault(tuple(row[key] for key in _VARIANT), []).append(row["entropy_reduction_bits"])
+        final.setdefault(tuple(row.get(key) for key in _VARIANT), []).append(row["entropy_reduction_bits"])
     means = {variant: sum(bits) / len(bits) for variant, bits in final.items()}
     of_grids = [bits for variant, bits in means.items() if variant[0] == "grid_shared"]
     reference = max(of_grids or means.values(), default=0.0)

@@ -25,6 +25,7 @@ from gmmtorch.exploration.world import World
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.sharing.network import Network
 
+_STEP = 8  # cells by which windows move
 _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
 
 
@@ -38,6 +39,13 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             f"{options.size} robots."
         )
     world.check_start(poses)
+    sight = (min(options.window[:2]) / 2 - _STEP) * world.resolution
+    if sight < options.camera.max_range:
+        raise InvalidArgumentError(
+            f"map.window={list(options.window)} cells of {world.resolution} m reaches {max(sight, 0):.3g} m "
+            f"around the robot, less than sensor.max_range={options.camera.max_range} m; take a larger "
+            "window."
+        )
     # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
     needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
     clear = world.mesh.clearance(poses[:, :3]).clamp_max(needed)
@@ -79,7 +87,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
 
 
 def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, memo: Memo) -> Mapper:
-    local = SlidingVoxelMap(world.resolution, options.window)
+    local = SlidingVoxelMap(world.resolution, options.window, _STEP)
     width = options.camera.width
     if options.framework == "gmm_shared":
         return MixtureMapper(

@@ -25,7 +25,9 @@ def same(one: object, other: object) -> bool:
     if isinstance(one, torch.Tensor):
         return isinstance(other, torch.Tensor) and one.dtype == other.dtype and torch.equal(one, other)
     if isinstance(one, dict):
-        return isinstance(other, dict) and list(one) == list(other) and all(same(one[k], other[k]) for k in one)
+        return (
+            isinstance(other, dict) and list(one) == list(other) and all(same(one[k], other[k]) for k in one)
+        )
     if isinstance(one, list):
         return isinstance(other, list) and len(one) == len(other) and all(map(same, one, other))
     return type(one) is type(other) and one == other
@@ -34,7 +36,7 @@ def same(one: object, other: object) -> bool:
 def test_states_come_back(tmp_path: Path) -> None:
     path = save_checkpoint(tmp_path / "a.safetensors", STATE, seed=3)
     back = load_checkpoint(path, seed=3)
-    assert {k: True for k in STATE} == {k: same(STATE[k], back[k]) for k in STATE}
+    assert dict.fromkeys(STATE, True) == {k: same(STATE[k], back[k]) for k in STATE}
 
 
 def test_one_tensor_in_two_places(tmp_path: Path) -> None:
@@ -46,7 +48,7 @@ def test_one_tensor_in_two_places(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_another_mission_is_refused(tmp_path: Path) -> None:
     path = save_checkpoint(tmp_path / "a.safetensors", STATE, seed=3, team="x")
-    with pytest.raises(DataError, match="another mission .*seed"):
+    with pytest.raises(DataError, match=r"another mission .*seed"):
         load_checkpoint(path, seed=4, team="x")
     with pytest.raises(DataError, match="team"):
         load_checkpoint(path, seed=3)

@@ -55,7 +55,8 @@ def in_window(parts: list[tuple[Tensor, Tensor, Tensor]], one: GridMapper) -> Te
     """What the window should hold of it: no more than the belief, which ends at its box."""
     sides = [torch.arange(a, b) for a, b in zip(*map(Tensor.tolist, one.local.box), strict=True)]
     cells = torch.stack(torch.meshgrid(*sides, indexing="ij"), -1)
-    return dense_of(parts, one.local.box) * ((cells >= BOX.low) & (cells < BOX.high)).all(-1)
+    bounds = one.belief.grid.box
+    return dense_of(parts, one.local.box) * ((cells >= bounds.low) & (cells < bounds.high)).all(-1)
 
 
 def beams(*frames: DepthFrame) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -86,7 +87,7 @@ def test_own_frames_count_in_full_whether_they_are_shared_or_not() -> None:
         torch.testing.assert_close(torch.stack(one.local.evidence()), in_window(beams(*views), one))
         assert bool(sensed[0].novel.all())
         total = sum(float(p.hits.sum() + p.misses.sum()) for s in sensed for p in s.evidence)
-        assert total == float(believed(one).sum())
+        assert total == float(torch.stack(one.belief.grid.dense(one.belief.grid.box)).sum())
 
 
 def test_who_is_isolated_sends_nothing() -> None:

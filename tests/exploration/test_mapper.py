@@ -9,10 +9,11 @@ from torch import Tensor
 from gmmtorch.exploration.mapper import Memo, novel_beams
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import CellEvidence
+from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)
+WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))
 
 
 def known(seed: int) -> SlidingVoxelMap:
@@ -44,7 +45,7 @@ def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float
     for pixel in seen.pixel.tolist():
         beam = speaker[(pixel // width // 2, pixel % width // 2)]
         bits, unobserved = local.beam_novelty(
-            seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short
+            seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short, within=WITHIN
         )
         answers.append(bool(unobserved[0]) or float(bits[0]) >= RULE.threshold)
     return answers
@@ -57,20 +58,20 @@ def test_the_first_beam_of_four_pixels_speaks_for_them(
     width: int, height: int, missing: float, short: float
 ) -> None:
     local, seen = known(width), frame(width, height, height, missing)
-    found = novel_beams(local, seen, width, RULE, short)
+    found = novel_beams(local, seen, width, RULE, WITHIN, short)
     assert found.dtype == torch.bool
     assert found.tolist() == by_a_loop(local, seen, width, short)
 
 
 def test_some_beams_are_novel_and_some_are_not() -> None:
-    found = novel_beams(known(0), frame(20, 16, 1, 0.1), 20, RULE)
+    found = novel_beams(known(0), frame(20, 16, 1, 0.1), 20, RULE, WITHIN)
     assert 0.1 < float(found.double().mean()) < 0.9
 
 
 def test_a_frame_without_beams_has_none() -> None:
     empty = frame(8, 6, 0, 1.1)
     assert len(empty.pixel) == 0
-    found = novel_beams(known(0), empty, 8, RULE)
+    found = novel_beams(known(0), empty, 8, RULE, WITHIN)
     assert found.shape == (0,)
     assert found.dtype == torch.bool
 
@@ -78,7 +79,7 @@ def test_a_frame_without_beams_has_none() -> None:
 def test_the_map_is_left_as_it_was() -> None:
     local = known(3)
     before = local.evidence()
-    novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE)
+    novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN)
     for one, other in zip(before, local.evidence(), strict=True):
         assert torch.equal(one, other)
 
@@ -88,9 +89,9 @@ def test_nothing_is_novel_where_everything_is_certain() -> None:
     local.center_on(torch.zeros(3, dtype=torch.float64))
     sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.low.tolist()], indexing="ij")
     cells = torch.stack(sides, -1).reshape(-1, 3)
-    assert bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE).all())
+    assert bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN).all())
     local.add(CellEvidence(cells, torch.zeros(len(cells)), torch.full((len(cells),), 1e4)))
-    assert not bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE).any())
+    assert not bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN).any())
 
 
 # -- memo -----------------------------------------------------------------------------------------

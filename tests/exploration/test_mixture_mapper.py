@@ -180,6 +180,15 @@ def test_what_sense_returns_is_what_it_adds(flight: tuple) -> None:
     torch.testing.assert_close(found[1], misses, rtol=1e-5, atol=1e-4)
 
 
+def test_components_that_come_twice_count_once(flight: tuple) -> None:
+    components, _ = said(*flight[1])
+    once, twice = mapper(robot=1), mapper(robot=1)
+    once.receive(heard(*components))
+    twice.receive(heard(*components, *components[::-1]))
+    assert_same_components(once.components(), twice.components())
+    assert_same_evidence(once, twice)
+
+
 def test_two_that_speak_to_each_other_hold_the_same() -> None:
     pair = [mapper(robot) for robot in range(2)]
     for turn, place in enumerate(PLACES * 2):
@@ -302,9 +311,6 @@ def test_counts_where_a_datagram_of_components_was_lost(flight: tuple) -> None:
     assert held.support.tolist() == pytest.approx([total[key] for key in sorted(kept)])
 
 
-@pytest.mark.xfail(
-    strict=True, reason="evidence of counts is remembered by sequence alone, not by whose it is"
-)
 def test_counts_of_two_robots_with_the_same_sequence_are_told_apart() -> None:
     """Two listeners that each know one of two components that a message counts."""
     memo = Memo(64)

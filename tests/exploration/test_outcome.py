@@ -19,6 +19,7 @@ VARIANT = {
     "information": "csqmi",
     "coordination": "greedy",
     "planning_prior": 0.125,
+    "codec": "quantized",
     "loss": 0.0,
 }
 
@@ -118,16 +119,8 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
     mask = torch.zeros(24, dtype=torch.int16)
     mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
     mask[20:] = 7  # not observable: not counted
-    names = [
-        "framework",
-        "seed",
-        "planner",
-        "information",
-        "coordination",
-        "planning_prior",
-        "loss",
-        "duration",
-    ]
+    names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
+    names += ["coordination", "codec", "latency", "bandwidth"]
     options = SimpleNamespace(size=3, codecs=("zip",), **dict.fromkeys(names, "x"))
     robots = [
         SimpleNamespace(
@@ -146,6 +139,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
             name="w",
         ),
         options=options,
+        coordination="myopic",
         union=maps[0],
         seen_by=mask,
         robots=robots,

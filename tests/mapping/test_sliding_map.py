@@ -384,3 +384,28 @@ def test_no_stretch_is_negative_or_endless(short):
     sliding.center_on(at(0, 0, 0))
     with pytest.raises(InvalidArgumentError, match="short="):
         sliding.beam_novelty(at(0, 0, 0), torch.ones(1, 3), torch.tensor([True]), NoveltyRule(), short=short)
+
+
+@pytest.mark.parametrize("corner", [(-3, -5, -2), (0, -40, -4), (-90, -90, -90), (30, 0, 0)])
+def test_cells_that_a_map_does_not_take_in_do_not_count(corner):
+    sliding, seen = new_map(), new_map()
+    for each in (sliding, seen):
+        each.center_on(at(0, 0, 0))
+    low = torch.tensor(corner)
+    within = Box(low, low + torch.tensor([6, 60, 95]))
+    evidence = random_evidence(13_700, 5)
+    sliding.add(evidence)
+    # Cells of which all is known, to the last bit, tell nothing: so do those that do not count.
+    seen.add(evidence)
+    everywhere = torch.tensor(sorted(cells_of(seen.box)))
+    outside = ((everywhere < within.low) | (everywhere >= within.high)).any(1)
+    many = torch.full((int(outside.sum()),), 1e9)
+    seen.add(CellEvidence(everywhere[outside], many, 0 * many))
+    generator = torch.Generator().manual_seed(3)
+    ends = torch.randn(80, 3, generator=generator, dtype=torch.float64)
+    is_hit = torch.rand(80, generator=generator) < 0.6
+    place = torch.tensor([0.13, -0.21, 0.07], dtype=torch.float64)
+    bits, unobserved = sliding.beam_novelty(place, ends, is_hit, NoveltyRule(observed=3.0), within=within)
+    expected, new = novelty_by_a_walk(seen, place, ends, is_hit, NoveltyRule(observed=3.0))
+    torch.testing.assert_close(bits, expected, rtol=0, atol=1e-5)
+    assert unobserved.tolist() == new
