@@ -91,9 +91,8 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
     from gmmtorch.exploration.outcome import with_times
     from gmmtorch.exploration.trials import run_trials
 
-    trials = [
-        _trial(config, folder, variant, seed) for seed in config.study.seeds for variant in _variants(config)
-    ]
+    variants = _variants(config)
+    trials = [_trial(config, folder, variant, seed) for seed in config.study.seeds for variant in variants]
     trials[0].world.open(trials[0].team, bars)  # into the cache, before several ask for it at once
     done: list[dict[str, Any]] = []
 
@@ -118,6 +117,9 @@ def _variants(config: DictConfig) -> list[dict[str, Any]]:
                 f"study.variants has {sorted(set(variant) - known)}; a variant may set "
                 f"{', '.join(sorted(known))}."
             )
+        for key in ("planning_prior", "loss"):
+            if not isinstance(variant.get(key, 0.0), int | float):
+                raise InvalidArgumentError(f"study.variants has {key}={variant[key]!r}, which is no number.")
     if not variants or not config.study.seeds:
         raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
     return variants
@@ -166,7 +168,8 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
     rate, window = sensor.pop("rate"), mapping.pop("window")
     threshold, observed, distance = (mapping.pop(name) for name in ("threshold", "observed", "distance"))
-    start: Any = None if config.team.start is None else OmegaConf.to_container(config.team.start)
+    start: Any = config.team.start
+    start = OmegaConf.to_container(start) if OmegaConf.is_config(start) else start
     return TeamOptions(
         framework=variant.get("team", config.team.name),
         size=config.team.size,

@@ -67,10 +67,12 @@ def read_triangles(path: Path) -> Tensor:
     Raises `DataError` if it is unreadable, truncated, has no triangle, or a corner that is not finite.
     """
     open3d = open3d_for(path)
+    if path.suffix.lower() == ".obj" and b"\0" in path.read_bytes():
+        raise DataError(f"{path} is no OBJ file: those are text.")  # which would crash its reader
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
             mesh = open3d.t.io.read_triangle_mesh(path)
-    except RuntimeError as error:
+    except (RuntimeError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a mesh: {error}") from error
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         raise DataError(

@@ -6,12 +6,15 @@ import math
 from dataclasses import dataclass, field
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.mixture_mapper import FrameRule
 from gmmtorch.exploration.planners import PLANNERS
 from gmmtorch.exploration.primitives import Dynamics
 from gmmtorch.exploration.scoring import BeliefRule
+from gmmtorch.exploration.views import INFORMATION
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.sharing.envelope import check_codec
+from gmmtorch.sharing.network import Network
 from gmmtorch.sharing.point_codecs import POINT_CODECS
 from gmmtorch.simulation.depth_camera import DepthCamera
 
@@ -79,6 +82,12 @@ class TeamOptions:
                 raise InvalidArgumentError(
                     f"evaluation.codecs has {name!r}, which is not one of {', '.join(POINT_CODECS)}."
                 )
+        if self.information not in INFORMATION:
+            raise InvalidArgumentError(
+                f"information={self.information!r} is not one of {', '.join(INFORMATION)}."
+            )
+        Coordination(self.coordination, self.n_rounds)  # they check their own
+        Network(self.size, self.latency, self.bandwidth, self.loss)
         if not 0 <= self.margin < math.inf:
             raise InvalidArgumentError(f"margin={self.margin} must be finite metres, at least zero.")
         if not 0 < self.planning_prior < 1:

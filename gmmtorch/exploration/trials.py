@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import io
 import json
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gmmtorch.errors import DataError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission import Mission
@@ -74,6 +75,12 @@ class Trial:
     team: TeamOptions
     folder: Path | None = None
     checkpoint_every: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.checkpoint_every < math.inf:
+            raise InvalidArgumentError(
+                f"checkpoint.every={self.checkpoint_every} must be finite seconds, at least zero."
+            )
 
     @property
     def name(self) -> str:

@@ -179,7 +179,7 @@ def test_any_team_and_planner_go_with_any_world(world, team, planner, tmp_path):
     "world",
     [
         "warehouse",
-        pytest.param("tunnels", marks=pytest.mark.xfail(strict=True, reason="6 m high; they need 7")),
+        "tunnels",
     ],
 )
 def test_a_world_can_be_as_large_as_its_file_says(world):
@@ -380,12 +380,7 @@ def test_the_files_repeat_the_defaults_of_the_schema(command):
 # -- documentation --------------------------------------------------------------------------------
 
 
-_UNSHOWN = pytest.mark.xfail(strict=True, reason="runtime.memory_limit is in the schema alone")
-
-
-@pytest.mark.parametrize(
-    "options", [schema.Occupancy, schema.Fit, pytest.param(schema.Explore, marks=_UNSHOWN)]
-)
+@pytest.mark.parametrize("options", [schema.Occupancy, schema.Fit, schema.Explore])
 def test_the_configuration_file_shows_every_option(options):
     """So that --help, which prints the composed file, and the file itself say the same."""
     text = (CONF / f"{options.__name__.lower()}.yaml").read_text(encoding="utf-8")
