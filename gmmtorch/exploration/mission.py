@@ -15,6 +15,8 @@ from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.mapper import Heard, Memo, Sensed
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.planning import Plan, PlanningTask
+from gmmtorch.exploration.primitives import Primitives
+from gmmtorch.exploration.retreat import retreat
 from gmmtorch.exploration.robot import Robot
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.exploration.traffic import Traffic
@@ -76,6 +78,7 @@ class Mission:
         self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
         self.coordination = coordination.name
         self._evaluator, self._coordination = evaluator, coordination
+        self._primitives = Primitives(options.dynamics)
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)
         self._memo = memo
@@ -220,8 +223,9 @@ class Mission:
                 roadmap=robot.roadmap,
                 now=self.now,
                 generator=self._generator,
+                trail=robot.trail,
             )
-            plan = robot.planner.plan(task)
+            plan = retreat(self._primitives, task) or robot.planner.plan(task)
             proposed[number] = plan
             return plan
 

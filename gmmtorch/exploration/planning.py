@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -23,7 +23,8 @@ class PlanningTask:
 
     robot: its number. state: (7,), where it will be when the plan begins. traffic: of the others.
     residual: (G,) float32, information that teammates' plans leave in each block of the surroundings.
-    now: (s). generator: of the planner's random choices.
+    now: (s). generator: of the planner's random choices. trail: (N, 3), metres, where the robot flew lately,
+    the latest last.
     """
 
     robot: int
@@ -35,6 +36,7 @@ class PlanningTask:
     roadmap: Roadmap
     now: float
     generator: torch.Generator
+    trail: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ class Plan:
     """path: (S, 7), the states of the next primitive. braking: (B, 7), how the robot comes to rest after it.
 
     views: (n, 4), poses from which it means to look on its way. value: the return that it expects.
-    kind: "explore", "travel" or "wait".
+    kind: "explore", "travel", "wait" or "retreat".
     """
 
     path: Tensor

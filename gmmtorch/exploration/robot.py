@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Any
 
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.mapper import Mapper
 from gmmtorch.exploration.planning import Plan, Planner
+from gmmtorch.exploration.retreat import shortened
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.safety import surroundings_of
 from gmmtorch.exploration.surroundings import Surroundings
@@ -18,8 +18,8 @@ from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _REMEMBERED = 12  # frames whose returns are kept away from, whatever the map makes of them
-_TRAIL = 50  # positions flown through lately
-_NEARBY = 5.0  # metres within which returns are compared with those
+_TRAIL = 200  # positions flown through lately
+_STANDING = 1e-3  # metres in a step
 
 
 class Robot:
@@ -27,7 +27,7 @@ class Robot:
 
     state: (7,) x, y, z, yaw and the velocities v, v_z, ω now. path: (S, 7) the states of the plan it
     follows. braking: (B, 7) how it would come to rest after it. start_radius: metres around the start that
-    are known to be free.
+    are known to be free. trail: (N, 3) where it flew lately, the latest last.
     """
 
     def __init__(
@@ -50,7 +50,8 @@ class Robot:
         self.plans: dict[int, tuple[float, Tensor]] = {}  # heard of teammates: when, view poses
         self._start = (pose[:3].double().clone(), start_radius)
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
-        self._trail: deque[Tensor] = deque([pose[:3].double().clone()], maxlen=_TRAIL)
+        self._retreats = False
+        self.trail = pose[None, :3].double().clone()
 
     @property
     def position(self) -> Tensor:
@@ -59,6 +60,7 @@ class Robot:
     def follow(self, plan: Plan) -> None:
         """Take up a plan that starts at the present state."""
         self.path, self.braking = plan.path, plan.braking
+        self._retreats = plan.kind == "retreat"
 
     def advance(self, begin: int, stop: int) -> Tensor:
         """Fly on from step `begin` of the path to step `stop`; returns the positions on the way (n, 3)."""
@@ -67,8 +69,17 @@ class Robot:
             steps = torch.cat([self.state[None], flown])[:, :3]
             self.path_length += float((steps[1:] - steps[:-1]).norm(dim=1).sum())
             self.state = flown[-1].clone()
-            self._trail.extend(flown[:, :3].unbind())
+            self._remember_way(flown[:, :3])
         return flown[:, :3]
+
+    def _remember_way(self, flown: Tensor) -> None:
+        """The trail, with positions flown through (S, 3); a retreat takes away of it what it went back."""
+        if self._retreats:
+            self.trail = shortened(self.trail, flown)
+            return
+        way = torch.cat([self.trail[-1:], flown])
+        moved = (way[1:] - way[:-1]).norm(dim=1) > _STANDING
+        self.trail = torch.cat([self.trail, flown[moved]])[-_TRAIL:]
 
     def remember(self, frame: DepthFrame) -> None:
         """Keep the cells of a frame's returns, which the planner stays clear of."""
@@ -82,15 +93,11 @@ class Robot:
         self._recent.append(hit.nonzero() + low)
 
     def surroundings(self, planning_prior: float, radius: float) -> Surroundings:
-        """What the planner is given to read.
-
-        Where the robot has just been it fits, whatever its map has come to think of that, unless a return
-        says otherwise: else it could not go back the way it came.
-        """
+        """What the planner is given to read."""
         local, rule = self.mapper.local, self.mapper.belief.rule
         hits, misses = local.evidence()
         recent = list(self._recent)
-        found = surroundings_of(
+        return surroundings_of(
             local.low,
             local.resolution,
             hits,
@@ -102,17 +109,6 @@ class Robot:
             known_free=[self._start],
             obstacles=torch.cat(recent) if recent else torch.zeros(0, 3, dtype=torch.int64),
         )
-        trail = torch.stack(list(self._trail))
-        if recent:
-            # Anywhere in a cell of the trail, the body must keep off what was struck.
-            struck = (torch.cat(recent) + 0.5) * found.resolution - trail[-1]
-            near = struck[struck.abs().amax(1) < _NEARBY].float()
-            if len(near):
-                apart = torch.cdist((trail - trail[-1]).float(), near).amin(1)
-                trail = trail[apart >= radius + math.sqrt(3) / 2 * found.resolution]
-        flat, inside = found.flat_index(trail)
-        found.passable.view(-1)[flat[inside]] = True
-        return found
 
     def checkpoint(self) -> dict[str, Any]:
         """Everything that changes, for a file."""
@@ -128,7 +124,8 @@ class Robot:
             "collisions": self.collisions,
             "plans": [[number, when, poses] for number, (when, poses) in self.plans.items()],
             "recent": list(self._recent),
-            "trail": torch.stack(list(self._trail)),
+            "trail": self.trail,
+            "retreats": self._retreats,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -140,4 +137,4 @@ class Robot:
         self.collisions = int(state["collisions"])
         self.plans = {int(number): (float(when), poses) for number, when, poses in state["plans"]}
         self._recent = deque(state["recent"], maxlen=_REMEMBERED)
-        self._trail = deque(state["trail"].unbind(), maxlen=_TRAIL)
+        self.trail, self._retreats = state["trail"], bool(state["retreats"])

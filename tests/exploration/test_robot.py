@@ -124,34 +124,35 @@ def everywhere(one: Robot, hits: float, misses: float) -> None:
     local.add_dense(local.box, torch.full(local.shape, hits), torch.full(local.shape, misses))
 
 
-def test_it_may_go_back_the_way_it_came() -> None:
+def test_the_trail_is_where_it_flew_and_standing_adds_nothing() -> None:
     one, path = robot(), zigzag()
-    everywhere(one, 30.0, 0.0)  # the map calls everything occupied
-    surroundings = one.surroundings(0.125, 0.3)
-    assert int(surroundings.passable.sum()) == 1  # where it is
-    one.follow(plan(path))
-    one.advance(0, 6)
-    found = one.surroundings(0.125, 0.3)
-    been = torch.cat([START[None, :3], path[:6, :3]])
-    cells = {tuple(c) for c in (been / 0.2).floor().long().tolist()}
-    marked = {tuple(c) for c in (found.passable.nonzero() + found.low).tolist()}
-    assert marked == cells
-    assert not bool(found.free.any())
+    one.follow(plan(torch.cat([path, path[-1:].expand(30, 7)])))
+    one.advance(0, 40)
+    assert torch.equal(one.trail, torch.cat([START[None, :3], path[:, :3]]))
 
 
-def test_the_trail_is_forgotten_after_a_while_and_does_not_wrap_round_the_window() -> None:
+def test_a_long_trail_is_forgotten_from_its_beginning() -> None:
     one = robot()
-    everywhere(one, 30.0, 0.0)
-    path = zigzag(1).expand(100, 7)
-    one.follow(plan(torch.cat([zigzag(), path])))
+    path = torch.zeros(500, 7, dtype=torch.float64)
+    path[:, 0] = torch.arange(500) * 0.1
+    one.follow(plan(path))
+    one.advance(0, 500)
+    assert torch.equal(one.trail, path[-len(one.trail) :, :3])
+    assert len(one.trail) < 500
+
+
+def test_a_retreat_takes_its_way_off_the_trail() -> None:
+    one, path = robot(), zigzag()
+    one.follow(plan(path))
     one.advance(0, 10)
-    one.advance(10, 110)
-    found = one.surroundings(0.125, 0.3)
-    assert (found.passable.nonzero() + found.low).tolist() == [(path[0, :3] / 0.2).floor().long().tolist()]
-    outside = torch.full((100, 7), 50.0, dtype=torch.float64)
-    one.follow(plan(outside))
-    one.advance(0, 100)
-    assert not bool(one.surroundings(0.125, 0.3).passable.any())
+    back = path.flip(0)[1:5]
+    one.follow(Plan(back, back[-1:], back[-1:, :4], 0.0, "retreat"))
+    one.advance(0, 2)
+    one.advance(2, 4)
+    assert torch.equal(one.trail, torch.cat([START[None, :3], path[:6, :3]]))
+    one.follow(plan(path[6:7]))
+    one.advance(0, 1)
+    assert torch.equal(one.trail, torch.cat([START[None, :3], path[:7, :3]]))
 
 
 def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
