@@ -36,10 +36,13 @@ def _guarded(config: DictConfig) -> float | None:
 
 def run(config: DictConfig) -> float | None:
     """One run; returns the entropy reduction (bits) of the last mission, to be optimised over."""
+    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.report.progress import ProgressBars
 
     if common.set_up(config) != "cpu":
-        raise _no_device(config.runtime.device)
+        raise InvalidArgumentError(
+            f"runtime.device={config.runtime.device} is not for exploring, which runs on the cpu."
+        )
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
         work = _explore if config.study is None else _compare
@@ -47,12 +50,6 @@ def run(config: DictConfig) -> float | None:
     common.print_table(rows, _TABLE.split(), f"{rows[0]['world']}: {rows[0]['n_robots']} robots")
     common.print_files(folder, folder / "results.json")
     return float(rows[-1]["entropy_reduction_bits"])
-
-
-def _no_device(device: str) -> Exception:
-    from gmmtorch.errors import InvalidArgumentError
-
-    return InvalidArgumentError(f"runtime.device={device} is not for exploring, which runs on the cpu.")
 
 
 def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:

@@ -81,14 +81,3 @@ class Coordination:
             settled.update((robot, found[robot]) for robot in best)
             left = [robot for robot in left if robot not in best]
         return settled
-
-
-def coordinate(
-    name: str,
-    robots: Iterable[int],
-    plan: Callable[[int, dict[int, P]], P],
-    generator: torch.Generator,
-    n_rounds: int = 3,
-) -> dict[int, P]:
-    """The plan of each robot by a rule of that name, see `Coordination`."""
-    return Coordination(name, n_rounds).coordinate(robots, plan, generator)

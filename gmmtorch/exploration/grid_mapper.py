@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mapper import Heard, Memo, Sensed, novel_beams
+from gmmtorch.exploration.mapper import Heard, Mapper, Memo, Sensed, novel_beams
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
-from gmmtorch.sharing.messages import Message, PointsMessage, decode, encode_points
+from gmmtorch.sharing.messages import PointsMessage, encode_points
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 
-class GridMapper:
+class GridMapper(Mapper):
     """The map of one robot of a team with voxel grids.
 
     Its own frames count in full; `shared`: teammates are sent, and count, the beams that were novel to
@@ -34,9 +34,8 @@ class GridMapper:
         memo: Memo,
         shared: bool,
     ) -> None:
-        self.local, self.belief = local, belief
-        self._robot, self._width, self._novelty = robot, width, novelty
-        self._memo, self._shared = memo, shared
+        super().__init__(robot, local, belief, width, novelty, memo)
+        self._shared = shared
         self._n_frames = 0
 
     def center_on(self, position: Tensor) -> None:
@@ -75,7 +74,7 @@ class GridMapper:
         """The evidence of the points of a frame that have arrived."""
 
         def make() -> CellEvidence:
-            said = [self._decoded(data) for data in datagrams]
+            said = [self._memo.decoded(datagram) for datagram in datagrams]
             points = [message for message in said if isinstance(message, PointsMessage)]
             ends = torch.cat([message.ends for message in points]).double()
             is_hit = torch.cat([message.is_hit for message in points])
@@ -84,24 +83,12 @@ class GridMapper:
 
         return self._memo(tuple(datagrams), make)
 
-    def _decoded(self, datagram: bytes) -> Message:
-        return self._memo(("message", datagram), lambda: decode(datagram))
-
-    def _add(self, evidence: CellEvidence) -> None:
-        self.local.add(evidence)
-        self.belief.add(evidence)
-
     def components(self) -> None:
         """A grid has none."""
 
     def state(self) -> dict[str, Any]:
-        return {
-            "local": self.local.state(),
-            "belief": self.belief.state(),
-            "n_frames": self._n_frames,
-        }
+        return {**super().state(), "n_frames": self._n_frames}
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.local.restore(state["local"])
-        self.belief.restore(state["belief"])
+        super().restore(state)
         self._n_frames = int(state["n_frames"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
-from gmmtorch.sharing.messages import Message
+from gmmtorch.sharing.messages import Message, decode
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 T = TypeVar("T")
@@ -41,33 +42,6 @@ class Heard(NamedTuple):
     message: Message
 
 
-class Mapper(Protocol):
-    """One robot's map: a window of voxels to plan in, and behind it all that the robot knows.
-
-    `local` is the window, `belief` the map that the evaluator reads; what `sense` and `receive` return
-    is in both already.
-    """
-
-    local: SlidingVoxelMap
-    belief: BeliefMap
-
-    def center_on(self, position: Tensor) -> None:
-        """Move the window along with the robot at (3,), and fill what it uncovers from what is known."""
-
-    def sense(self, frame: DepthFrame) -> Sensed:
-        """Learn from a frame of the robot's own camera."""
-
-    def receive(self, heard: Sequence[Heard]) -> None:
-        """Learn from what teammates sent."""
-
-    def components(self) -> Components | None:
-        """The mixture, of maps that are one."""
-
-    def state(self) -> dict[str, Any]: ...
-
-    def restore(self, state: dict[str, Any]) -> None: ...
-
-
 class Memo:
     """Values of a pure function that several robots of a simulation would work out alike: kept a while.
 
@@ -89,6 +63,63 @@ class Memo:
                 self._values.popitem(last=False)
         value: T = self._values[key]
         return value
+
+    def decoded(self, datagram: bytes) -> Message:
+        """What a datagram says."""
+        return self(("message", datagram), lambda: decode(datagram))
+
+
+class Mapper(ABC):
+    """One robot's map: a window of voxels to plan in, and behind it all that the robot knows.
+
+    local: the window. belief: the map that the evaluator reads. What `sense` and `receive` take in is in
+    both already when they return.
+
+    Args:
+        robot: its number. width: of its images, pixels. novelty: when a beam is novel.
+        memo: shared by the robots of a simulation.
+    """
+
+    def __init__(
+        self,
+        robot: int,
+        local: SlidingVoxelMap,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        memo: Memo,
+    ) -> None:
+        self.local, self.belief = local, belief
+        self._robot, self._width, self._novelty, self._memo = robot, width, novelty, memo
+
+    @abstractmethod
+    def center_on(self, position: Tensor) -> None:
+        """Move the window along with the robot at (3,), and fill what it uncovers from what is known."""
+
+    @abstractmethod
+    def sense(self, frame: DepthFrame) -> Sensed:
+        """Learn from a frame of the robot's own camera."""
+
+    @abstractmethod
+    def receive(self, heard: Sequence[Heard]) -> None:
+        """Learn from what teammates sent."""
+
+    @abstractmethod
+    def components(self) -> Components | None:
+        """The mixture, of maps that are one."""
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` of a mapper made alike needs to go on as this one."""
+        return {"local": self.local.state(), "belief": self.belief.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take the place of the mapper whose `state` is given; this one must be new."""
+        self.local.restore(state["local"])
+        self.belief.restore(state["belief"])
+
+    def _add(self, evidence: CellEvidence) -> None:
+        self.local.add(evidence)
+        self.belief.add(evidence)
 
 
 def novel_beams(

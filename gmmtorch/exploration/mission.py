@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -24,10 +24,8 @@ from gmmtorch.exploration.views import ViewEvaluator
 from gmmtorch.exploration.world import World
 from gmmtorch.occupancy.cell_evidence import cast_evidence, flat_index
 from gmmtorch.sharing.messages import (
-    Message,
     PlanMessage,
     ViewsMessage,
-    decode,
     encode_plan,
     encode_views,
 )
@@ -37,8 +35,6 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 
 _SEEN_STRIDE = 4  # pixels
 _CHECKS_PER_STEP = 4  # for collisions
-
-Progress = Callable[["Mission"], None]
 
 
 class Mission:
@@ -73,6 +69,7 @@ class Mission:
         }
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in robots]
         self.stages: dict[str, float] = {}
+        self._inner_seconds = 0.0
         # A bit for each robot that saw a cell.
         bits = torch.int16 if len(robots) < 16 else torch.int32
         self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
@@ -104,8 +101,7 @@ class Mission:
         """One tick: sense, exchange, plan if it is due, fly on."""
         for robot in self.robots:
             self._sense(robot)
-        with self._timed("sharing"):
-            self._exchange(self.now)
+        self._exchange(self.now)
         if self.tick % self.options.ticks_per_plan == 0:
             self._plan()
         self._fly()
@@ -168,19 +164,22 @@ class Mission:
     def _exchange(self, now: float) -> None:
         """Every robot takes in what has reached it by `now`."""
         for robot in self.robots:
-            heard = [
-                Heard(sender, datagram, self._decoded(datagram))
-                for sender, datagram in self.network.deliver(robot.number, now)
-            ]
-            robot.mapper.receive(heard)
+            heard = self._heard(robot, now)
+            with self._timed("mapping"):
+                robot.mapper.receive(heard)
             for item in heard:
                 if isinstance(item.message, ViewsMessage):
                     robot.library.merge(item.message)
                 elif isinstance(item.message, PlanMessage):
                     robot.plans[item.message.sender] = (item.message.time, item.message.views)
 
-    def _decoded(self, datagram: bytes) -> Message:
-        return self._memo(("message", datagram), lambda: decode(datagram))
+    def _heard(self, robot: Robot, now: float) -> list[Heard]:
+        """What has reached a robot by `now`, and what it says."""
+        with self._timed("sharing"):
+            return [
+                Heard(sender, datagram, self._memo.decoded(datagram))
+                for sender, datagram in self.network.deliver(robot.number, now)
+            ]
 
     # -- planning ---------------------------------------------------------------------------------
 
@@ -262,8 +261,9 @@ class Mission:
         with self._timed("flying"):
             flown = []
             for robot in self.robots:
-                before = robot.position
-                passed = torch.cat([before[None], robot.advance(begin, begin + options.steps_per_tick)])
+                passed = torch.cat(
+                    [robot.position[None], robot.advance(begin, begin + options.steps_per_tick)]
+                )
                 # Between two states a robot may touch what it touches at neither.
                 flown.append(_finely(passed, _CHECKS_PER_STEP))
                 self.trajectories[robot.number].append(robot.state[:4].clone())
@@ -287,9 +287,12 @@ class Mission:
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
-        begin = time.perf_counter()
+        """Wall time to a stage, but for what stages within it take."""
+        begin, outer, self._inner_seconds = time.perf_counter(), self._inner_seconds, 0.0
         yield
-        self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
+        spent = time.perf_counter() - begin
+        self.stages[stage] = self.stages.get(stage, 0.0) + spent - self._inner_seconds
+        self._inner_seconds = outer + spent
 
     # -- keeping ----------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.mapper import Heard, Memo, Sensed, novel_beams
+from gmmtorch.exploration.mapper import Heard, Mapper, Memo, Sensed, novel_beams
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.codec import spatial_order
@@ -32,7 +32,6 @@ from gmmtorch.sharing.messages import (
     ComponentsMessage,
     CountsMessage,
     Message,
-    decode,
     encode_components,
     encode_counts,
 )
@@ -87,7 +86,7 @@ class FrameRule:
         return CellRule(self.noise, length, self.cell, self.components, self.iterations)
 
 
-class MixtureMapper:
+class MixtureMapper(Mapper):
     """The map of one robot of a team that shares mixtures."""
 
     def __init__(
@@ -101,15 +100,12 @@ class MixtureMapper:
         memo: Memo,
         codec: str = "quantized",
     ) -> None:
-        self.local, self.belief = local, belief
+        super().__init__(robot, local, belief, width, novelty, memo)
         self.tiles = MixtureTiles()
-        self._robot, self._width, self._novelty, self._rule = robot, width, novelty, rule
-        self._memo, self._codec = memo, codec
+        self._rule, self._codec = rule, codec
         self._n_numbered = 0
         self._batches: dict[int, list[tuple[int, Components]]] = {}  # by robot: first sequence, batch
         self._gained: dict[tuple[int, int], float] = {}  # counts not sent yet, by id
-        self._keys: list[tuple[Any, ...]] = []
-        self._known: set[tuple[Any, ...]] = set()
         self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
 
     # -- sensing ----------------------------------------------------------------------------------
@@ -125,7 +121,7 @@ class MixtureMapper:
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
         counts = encode_counts(self._robot, self._counted(frame, ~novel), self._codec)
         datagrams = encode_components(self._learned(frame, novel), self._codec)
-        added = [self._take(datagram, self._decoded(datagram)) for datagram in (*datagrams, *counts)]
+        added = [self._take(datagram, self._memo.decoded(datagram)) for datagram in (*datagrams, *counts)]
         return Sensed({"components": datagrams, "counts": counts}, added, novel)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
@@ -185,26 +181,22 @@ class MixtureMapper:
             if isinstance(item.message, ComponentsMessage | CountsMessage):
                 self._take(item.datagram, item.message)
 
-    def _decoded(self, datagram: bytes) -> Message:
-        return self._memo(("message", datagram), lambda: decode(datagram))
-
     def _take(self, datagram: bytes, message: Message) -> CellEvidence:
         """Enter what a datagram says, one's own included."""
         if isinstance(message, CountsMessage):
             batch = self._with_counts(message)
-            name: tuple[Any, ...] = ("counts", message.sender, len(self._keys))
+            name: tuple[Any, ...] = ("counts", message.sender, len(self.tiles))
         else:
             assert isinstance(message, ComponentsMessage)  # `receive` and `sense` pass on no others
             batch = message.components
             name = ("components", *(batch.ids[0].tolist() if len(batch) else ()))
         key = (datagram, *batch.ids.flatten().tolist())  # counts of unknown components are left out
-        if len(batch) == 0 or name in self._known:  # components that came twice count once
+        if len(batch) == 0 or name in self.tiles:  # components that came twice count once
             return CellEvidence.empty()
         self._enter(name, batch)
         grid = self.belief.grid
         evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, grid.box))
-        self.local.add(evidence)
-        self.belief.add(evidence)
+        self._add(evidence)
         return evidence
 
     def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
@@ -228,8 +220,6 @@ class MixtureMapper:
 
     def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
         """Keep a batch of components seen from one place, or of counts that are added to some."""
-        self._keys.append(name)
-        self._known.add(name)
         self.tiles.add(name, batch)
         for place in {self._place(origin) for origin in batch.origins}:
             self._places.setdefault(place, []).append(batch)
@@ -254,21 +244,20 @@ class MixtureMapper:
 
     def components(self) -> Components:
         """All components with all their counts, in the order of their ids."""
-        return summed(self.tiles.all()) if self._keys else Components.empty(3)
+        return summed(self.tiles.all())
 
     def state(self) -> dict[str, Any]:
+        names, batches = zip(*self.tiles.items(), strict=True) if len(self.tiles) else ((), ())
         return {
-            "local": self.local.state(),
-            "belief": self.belief.state(),
-            "names": [list(name) for name in self._keys],
-            "batches": packed([batch for _, batch in self.tiles.items()]),
+            **super().state(),
+            "names": list(names),
+            "batches": packed(batches),
             "n_numbered": self._n_numbered,
             "gained": [[*key, count] for key, count in self._gained.items()],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        self.local.restore(state["local"])
-        self.belief.restore(state["belief"])
+        super().restore(state)
         for name, batch in zip(state["names"], unpacked(state["batches"]), strict=True):
             self._enter(tuple(name), batch)
         self._n_numbered = int(state["n_numbered"])

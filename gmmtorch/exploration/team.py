@@ -14,7 +14,6 @@ from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.mixture_mapper import MixtureMapper
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.planners import make_planner
-from gmmtorch.exploration.planning import Planner
 from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.robot import Robot
@@ -68,7 +67,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             number,
             poses[number],
             _mapper(number, world, options, belief(), memo),
-            _planner(options, primitives, evaluator),
+            make_planner(options.planner, primitives, evaluator),
             ViewLibrary(number),
             Roadmap(),
             start_radius=float(clear[number]),
@@ -94,7 +93,3 @@ def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, 
             number, local, belief, width, options.novelty, options.frame, memo, options.codec
         )
     return GridMapper(number, local, belief, width, options.novelty, memo, shared=options.shares)
-
-
-def _planner(options: TeamOptions, primitives: Primitives, evaluator: ViewEvaluator) -> Planner:
-    return make_planner(options.planner, primitives, evaluator)

@@ -68,7 +68,7 @@ class Trial:
     """One mission in one world.
 
     folder: where its checkpoint and its row are kept; None: nowhere. checkpoint_every: simulated seconds
-    between checkpoints; 0: none. name: what progress calls it.
+    between checkpoints; 0: none.
     """
 
     world: WorldOptions
@@ -81,10 +81,6 @@ class Trial:
             raise InvalidArgumentError(
                 f"checkpoint.every={self.checkpoint_every} must be finite seconds, at least zero."
             )
-
-    @property
-    def name(self) -> str:
-        return f"{self.team.framework} {self.team.planner} seed {self.team.seed}"
 
     def facts(self) -> dict[str, Any]:
         """What a checkpoint must agree in to go on from it."""

@@ -46,6 +46,9 @@ class MixtureTiles:
     def __len__(self) -> int:
         return len(self._batches)
 
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._keys
+
     def items(self) -> Iterator[tuple[Hashable, Components]]:
         """All batches in the order in which they came."""
         return ((batch.key, batch.components) for batch in self._batches)

@@ -11,10 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.coordination import COORDINATIONS, Coordination, coordinate
+from gmmtorch.exploration.coordination import COORDINATIONS, Coordination
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""
+
+
+def coordinate(name, robots, plan, generator, n_rounds=3):
+    """The plans of a team by the rule of that name."""
+    return Coordination(name, n_rounds).coordinate(robots, plan, generator)
 
 
 @dataclass(frozen=True)

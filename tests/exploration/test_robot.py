@@ -31,7 +31,7 @@ class Idle:
         self.number = 0
 
     def plan(self, task: Any) -> Plan:
-        raise NotImplementedError
+        raise AssertionError("A robot does not ask its planner; the mission does.")
 
     def state(self) -> dict[str, Any]:
         return {"number": self.number}

@@ -1,0 +1,72 @@
+"""Messages that the tests of messages send."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+
+from gmmtorch.mapping.codec import spatial_order
+from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.messages import (
+    CODECS,
+    ViewsMessage,
+    encode_components,
+    encode_counts,
+    encode_plan,
+    encode_points,
+    encode_views,
+    quantized_poses,
+)
+
+codecs = pytest.mark.parametrize("codec", CODECS)
+numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
+places = st.sampled_from([0.0, -37.25, 5e5])
+
+
+def sealed(data: bytes) -> bytes:
+    """A first byte and a body with a checksum that is right."""
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def assert_same(one: object, other: object) -> None:
+    for field in fields(one):  # type: ignore[arg-type]
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, field.name
+
+
+def frame_of_components(k: int, **options) -> Components:
+    """Components of one frame: near one another, seen from one place, numbered in spatial order."""
+    made = random_components(
+        3, k=k, extent=6.0, n_origins=1, max_sightings=1, deviations=(5e-3, 0.5), **options
+    )
+    return replace(made.rearranged(spatial_order(made)), ids=made.ids)
+
+
+def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> ViewsMessage:
+    generator = torch.Generator().manual_seed(seed)
+    poses = torch.rand(n, 4, generator=generator, dtype=torch.float64) * 40 - 20
+    return ViewsMessage(
+        ids=torch.stack([torch.arange(n) % 3, torch.arange(n) * 2], 1),
+        poses=quantized_poses(poses + center),
+        values=(torch.rand(n, generator=generator) * 200).half().double(),
+        stamps=torch.arange(n, dtype=torch.float64) / 8,
+        removed=torch.stack([torch.full((n_removed,), 7), torch.arange(n_removed)], 1),
+        removed_stamps=torch.full((n_removed,), 12.5, dtype=torch.float64),
+    )
+
+
+def examples() -> list[bytes]:
+    """A sound datagram of every kind."""
+    components, counts = frame_of_components(9), {(0, 3): 5.0, (0, 4): 7.5, (2, 900): 0.0}
+    ends = torch.arange(30, dtype=torch.float64).reshape(10, 3)
+    made = [encode_components(components, codec) for codec in CODECS]
+    made += [encode_counts(1, counts, codec) for codec in CODECS]
+    made += [encode_points(1, 2, ends[0], ends, ends[:, 0] > 9), encode_views(views(6, 3))]
+    made += [encode_plan(2, 5, 12.0, 0.2, views(11).poses, views(3).poses)]
+    assert all(len(datagrams) == 1 for datagrams in made)
+    return [datagrams[0] for datagrams in made]
