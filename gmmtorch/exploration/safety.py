@@ -26,6 +26,9 @@ _SPACING = 1.0
 """Cells between the points at which a path is checked; half of it is kept around the body besides."""
 _FINE_SPACING = 0.25
 """The same for a robot that has to leave where it does not fit: there is no room to spare."""
+_STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
+"""A cell with so many hits that are so large a share of its rays holds something, however thin: a rail of a
+twentieth of a cell's width is hit by no more of them."""
 _ROUNDING = 1e-9
 _CHUNK_PAIRS = 1 << 22
 
@@ -68,7 +71,8 @@ def surroundings_of(
     """What a planner reads, from the hits H and misses M of dense cells (nx, ny, nz).
 
     The map's occupancy is θ = (H + N_p)/(H + M + 2N_p), the planner's (H + 2N_p π)/(H + M + 2N_p). A cell
-    is free if observed with θ below `free_below`, or if it lies wholly in a sphere that is known to be free.
+    is free if observed with θ below `free_below` and hardly ever hit, or if it lies wholly in a sphere that
+    is known to be free.
 
     Args:
         low: (3,) int64, index of the lowest cell on the lattice. resolution: side (m) of the cells.
@@ -84,8 +88,9 @@ def surroundings_of(
         raise InvalidArgumentError(f"prior={prior} must be above zero rays.")
     total = hits + misses
     observed = total > 0
+    struck = (hits >= _STRUCK_RAYS) & (hits >= _STRUCK_SHARE * total)
     total += 2 * prior
-    free = observed & (hits + prior < free_below * total)
+    free = observed & ~struck & (hits + prior < free_below * total)
     for center, reach in known_free:
         _mark_sphere(free, low, resolution, center, reach)
     if obstacles is not None:

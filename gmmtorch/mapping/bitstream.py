@@ -86,11 +86,19 @@ class BitWriter:
 
     def fixed(self, values: Ints, widths: Ints | int) -> None:
         """Each number ≥ 0 in its width of bits."""
-        width = np.broadcast_to(np.asarray(widths, np.int64), values.shape)
         for begin in range(0, len(values), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
-            which, shift = _spread(width[block])
-            self._parts.append(((values[block][which] >> shift) & 1).astype(np.uint8))
+            block = values[begin : begin + _BLOCK]
+            if isinstance(widths, int):
+                bits = block[:, None] >> _shifts(widths)
+            else:
+                which, shift = _spread(widths[begin : begin + _BLOCK])
+                bits = block[which] >> shift
+            self._parts.append((bits & 1).astype(np.uint8).reshape(-1))
+
+    def one(self, value: int, width: int) -> None:
+        """One number ≥ 0 in that many bits: what `fixed` writes, without its arrays."""
+        bits = [(value >> shift) & 1 for shift in range(width - 1, -1, -1)]
+        self._parts.append(np.array(bits, np.uint8))
 
     def number(self, value: int) -> None:
         """One whole number of either sign: zigzag, groups of 7 bits, lowest first, a bit for "more"."""
@@ -99,7 +107,7 @@ class BitWriter:
             raise InvalidArgumentError(f"{value} does not fit into {MAX_WIDTH} bits.")
         while True:
             more, group = code >> _GROUP, code & ((1 << _GROUP) - 1)
-            self.fixed(np.array([(more > 0) << _GROUP | group]), 1 + _GROUP)
+            self.one((more > 0) << _GROUP | group, 1 + _GROUP)
             if not more:
                 return
             code = more
@@ -115,8 +123,8 @@ class BitWriter:
     def column(self, values: Ints) -> None:
         """Any whole numbers, in the code of `Code` that is shortest: code, parameter, base, numbers."""
         coding = best_code(values)
-        self.fixed(np.array([coding.code]), 2)
-        self.fixed(np.array([coding.parameter]), 6)
+        self.one(coding.code, 2)
+        self.one(coding.parameter, 6)
         self.number(coding.base)
         if coding.code is Code.FIXED:
             self.fixed(values - coding.base, coding.parameter)
@@ -128,7 +136,7 @@ class BitWriter:
     def rice_column(self, values: Ints) -> None:
         """Numbers ≥ 0 in a Rice code, its low bits first: at least a bit for each number."""
         low = _rice_parameter(values)
-        self.fixed(np.array([low]), 6)
+        self.one(low, 6)
         self.rice(values, low)
 
     def scaled(self, values: Ints, scales: Ints) -> None:
@@ -139,7 +147,7 @@ class BitWriter:
         codes = zigzag(values)
         size = [_rice_size(codes, np.maximum(scales - t, 0)) for t in range(16)]
         t = int(np.argmin(size))
-        self.fixed(np.array([t]), 4)
+        self.one(t, 4)
         self.rice(codes, np.maximum(scales - t, 0))
 
 
@@ -172,28 +180,42 @@ class BitReader:
 
     def fixed(self, n: int, widths: Ints | int) -> Ints:
         """So many numbers of these widths."""
-        if isinstance(widths, int):
-            self.require(n * widths)
-        width = np.broadcast_to(np.asarray(widths, np.int64), (n,))
-        if n and (int(width.max()) > MAX_WIDTH or int(width.min()) < 0):
-            raise DataError(f"Numbers of {int(width.max())} bits; at most {MAX_WIDTH} are read.")
-        self.require(int(width.sum()))
+        if n and not 0 <= np.min(widths) <= np.max(widths) <= MAX_WIDTH:
+            raise DataError(f"Numbers of {np.max(widths)} bits; at most {MAX_WIDTH} are read.")
+        self.require(n * widths if isinstance(widths, int) else int(widths.sum()))
         values = np.zeros(n, np.int64)
         for begin in range(0, n, _BLOCK):
-            block = width[begin : begin + _BLOCK]
+            if isinstance(widths, int):
+                rows = values[begin : begin + _BLOCK]
+                bits = self._next(len(rows) * widths).reshape(len(rows), widths)
+                rows[:] = (bits << _shifts(widths)).sum(1)
+                continue
+            block = widths[begin : begin + _BLOCK]
             which, shift = _spread(block)
-            bits = self._bits[self._at : self._at + len(which)].astype(np.int64) << shift
+            bits = self._next(len(which)) << shift
             wide = np.flatnonzero(block)
             if len(wide):
                 values[begin + wide] = np.add.reduceat(bits, (np.cumsum(block) - block)[wide])
-            self._at += len(which)
         return values
+
+    def one(self, width: int) -> int:
+        """One number of that many bits."""
+        self.require(width)
+        value = 0
+        for bit in self._bits[self._at : self._at + width].tolist():
+            value = value << 1 | bit
+        self._at += width
+        return value
+
+    def _next(self, n: int) -> Ints:
+        self._at += n
+        return self._bits[self._at - n : self._at].astype(np.int64)
 
     def number(self) -> int:
         """One whole number of either sign."""
         code = shift = 0
         while True:
-            group = int(self.fixed(1, 1 + _GROUP)[0])
+            group = self.one(1 + _GROUP)
             code |= (group & ((1 << _GROUP) - 1)) << shift
             shift += _GROUP
             if code.bit_length() > MAX_WIDTH + 1 or shift > 70:
@@ -218,7 +240,7 @@ class BitReader:
 
     def column(self, n: int) -> Ints:
         """So many numbers of either sign, |x| < 2⁶²."""
-        code, parameter = int(self.fixed(1, 2)[0]), int(self.fixed(1, 6)[0])
+        code, parameter = self.one(2), self.one(6)
         base = self.number()
         if code == Code.FIXED:
             return _bounded(self.fixed(n, parameter), base)
@@ -233,11 +255,11 @@ class BitReader:
 
     def rice_column(self, n: int) -> Ints:
         """So many numbers ≥ 0."""
-        return self.rice(n, int(self.fixed(1, 6)[0]))
+        return self.rice(n, self.one(6))
 
     def scaled(self, scales: Ints) -> Ints:
         """A number of either sign for each scale."""
-        t = int(self.fixed(1, 4)[0])
+        t = self.one(4)
         return unzigzag(self.rice(len(scales), np.maximum(scales - t, 0)))
 
 
@@ -245,6 +267,11 @@ def _spread(width: Ints) -> tuple[Ints, Ints]:
     """Of each bit of numbers of these widths, highest first: whose it is, and how far from the lowest."""
     which = np.repeat(np.arange(len(width)), width)
     return which, np.cumsum(width)[which] - 1 - np.arange(len(which))
+
+
+def _shifts(width: int) -> Ints:
+    """By how much each bit of a number of this width is above the lowest, highest first."""
+    return np.arange(width - 1, -1, -1)
 
 
 def _bounded(above: Ints, base: int) -> Ints:
@@ -255,7 +282,8 @@ def _bounded(above: Ints, base: int) -> Ints:
 
 def _rice_size(values: Ints, low: Ints | int) -> float:
     """Bits of a Rice code; a float, which does not overflow."""
-    return float(((values >> low) + (1.0 + np.asarray(low))).sum())
+    each = float((low + 1) * len(values)) if isinstance(low, int) else float((low + 1).sum())
+    return float((values >> low).sum(dtype=np.float64)) + each
 
 
 def _rice_parameter(values: Ints) -> int:

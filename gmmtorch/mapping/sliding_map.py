@@ -133,12 +133,12 @@ class SlidingVoxelMap:
         ends: Tensor,
         is_hit: Tensor,
         rule: NoveltyRule,
-        clamp: tuple[float, float] | None = None,
         short: float = 0.0,
         within: Box | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Bits (N,) float64 that each beam would take off the window's entropy, and whether it crosses a
-        cell that was not observed, (N,) bool (thesis 4.1.2).
+        cell that was not observed, (N,) bool (thesis 4.1.2). The cell that a hit ends in was observed only
+        if hits were: a rail in a cell that most rays pass by is news to a map that calls the cell free.
 
         Σ h(p) − h(p′) over the cells that a beam passes through, and ends in if it is a hit: p is the
         occupancy, p′ that with this beam's own miss or hit added. Cells outside the window do not
@@ -147,16 +147,12 @@ class SlidingVoxelMap:
         Args:
             origin: (3,), metres. ends: (N, 3). is_hit: (N,) bool, False for beams that met no surface.
             rule: its prior, and from how many rays on a cell counts as observed.
-            clamp: lowest and highest occupancy that the map tells apart; a cell that is beyond, and
-                stays there, gives nothing.
             short: metres before its end over which a beam is not asked about free space, as maps may not
                 speak of it that close to surfaces.
             within: cells that count at all, where a map takes in no evidence of others; all if not given.
         """
         if not 0 <= short < math.inf:
             raise InvalidArgumentError(f"short={short} must be finite metres, at least zero.")
-        if clamp is not None and not 0 <= clamp[0] < clamp[1] <= 1:
-            raise InvalidArgumentError(f"clamp={clamp} must be two probabilities, the lower one first.")
         stops = in_cells(ends, self.resolution, "ends")
         starts = in_cells(origin, self.resolution, "origin").expand_as(stops)
         told = torch.zeros(len(stops), dtype=torch.float64, device=stops.device)
@@ -169,9 +165,9 @@ class SlidingVoxelMap:
             return told, torch.zeros_like(told, dtype=torch.bool)
         # No beam can tell more bits than it crosses cells: one sum holds the bits, and how many cells
         # were unobserved, as multiples of what is more than twice that.
-        mark = 2.0 * (sum(self.shape) + 2)
+        mark = 2.0 * (sum(self.shape) + 3)
         hits, misses = self._read(passage.window).double()
-        table = _told(hits, misses, 0, 1, rule, clamp, mark)
+        table = _told(hits, misses, 0, 1, rule, mark)
         if passage.block is not passage.window:
             table = torch.nn.functional.pad(table, (1,) * 6)
         table = table.view(-1)
@@ -180,7 +176,9 @@ class SlidingVoxelMap:
         flat, inside = flat_index(stops.floor().long() - passage.window.low, passage.window.shape)
         ended = (is_hit & inside).nonzero().squeeze(1)
         flat = flat[ended]
-        told[ended] += _told(hits.view(-1)[flat], misses.view(-1)[flat], 1, 0, rule, clamp, mark)
+        hits, misses = hits.view(-1)[flat], misses.view(-1)[flat]
+        told[ended] += _told(hits, misses, 1, 0, rule, mark)
+        told[ended] += mark * ((hits < rule.observed) & (hits + misses >= rule.observed))
         n_unobserved = (told / mark).round()
         return told - n_unobserved * mark, n_unobserved > 0
 
@@ -251,20 +249,11 @@ class SlidingVoxelMap:
             yield tuple(stored for stored, _ in piece), tuple(local for _, local in piece)
 
 
-def _told(
-    hits: Tensor,
-    misses: Tensor,
-    hit: int,
-    miss: int,
-    rule: NoveltyRule,
-    clamp: tuple[float, float] | None,
-    mark: float,
-) -> Tensor:
+def _told(hits: Tensor, misses: Tensor, hit: int, miss: int, rule: NoveltyRule, mark: float) -> Tensor:
     """Bits that one more hit or miss takes off cells, `mark` added to those that were not observed."""
 
     def entropy(h: Tensor, m: Tensor) -> Tensor:
-        probability = occupancy_probability(h, m, rule.prior)
-        return bernoulli_entropy(probability if clamp is None else probability.clamp(*clamp))
+        return bernoulli_entropy(occupancy_probability(h, m, rule.prior))
 
     bits = entropy(hits, misses) - entropy(hits + hit, misses + miss)
     return bits + mark * (hits + misses < rule.observed)

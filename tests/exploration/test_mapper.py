@@ -90,7 +90,7 @@ def test_nothing_is_novel_where_everything_is_certain() -> None:
     sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.low.tolist()], indexing="ij")
     cells = torch.stack(sides, -1).reshape(-1, 3)
     assert bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN).all())
-    local.add(CellEvidence(cells, torch.zeros(len(cells)), torch.full((len(cells),), 1e4)))
+    local.add(CellEvidence(cells, torch.full((len(cells),), 1e4), torch.full((len(cells),), 1e4)))
     assert not bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN).any())
 
 

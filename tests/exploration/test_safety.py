@@ -119,18 +119,18 @@ def test_a_body_without_size_is_refused(radius):
 
 
 def test_probabilities_are_those_of_pseudo_counts():
-    hits = torch.tensor([0.0, 0, 3, 0.5, 1]).view(5, 1, 1).expand(5, 4, 4)
-    misses = torch.tensor([0.0, 9, 1, 0, 5]).view(5, 1, 1).expand(5, 4, 4)
+    hits = torch.tensor([0.0, 0, 3, 0.5, 1, 0.5, 1]).view(7, 1, 1).expand(7, 4, 4)
+    misses = torch.tensor([0.0, 9, 1, 0, 18, 7, 20]).view(7, 1, 1).expand(7, 4, 4)
     given_hits, given_misses = hits.clone(), misses.clone()
     found = surroundings_of(
         torch.tensor([1, 2, 3]), 0.5, given_hits, given_misses,
         prior=0.5, planning_prior=0.125, free_below=0.25, radius=0.3,
     )  # fmt: skip
-    expected = [0.125, 0.125 / 10, 3.125 / 5, 0.625 / 1.5, 1.125 / 7]
+    expected = [0.125, 0.125 / 10, 3.125 / 5, 0.625 / 1.5, 1.125 / 20, 0.625 / 8.5, 1.125 / 22]
     assert found.occupancy[:, 0, 0].tolist() == pytest.approx(expected)
-    assert found.observed[:, 2, 1].tolist() == [False, True, True, True, True]
-    # θ: ½, 0.05, 0.7, 0.667, 0.214
-    assert found.free[:, 3, 3].tolist() == [False, True, False, False, True]
+    assert found.observed[:, 2, 1].tolist() == [False, True, True, True, True, True, True]
+    # θ: ½, 0.05, 0.7, 0.667, 0.075, 0.118, 0.068; of the last three, one was hit by every 19th ray.
+    assert found.free[:, 3, 3].tolist() == [False, True, False, False, False, True, True]
     assert not bool(found.passable.any())  # at 0.5 m, the body needs more than four cells
     assert found.occupancy.dtype == torch.float32
     assert torch.equal(given_hits, hits)
