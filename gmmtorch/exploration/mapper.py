@@ -20,6 +20,7 @@ from gmmtorch.sharing.messages import Message, decode
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 T = TypeVar("T")
+_BLOCK = 3  # pixels along the side of those that one beam speaks for
 
 
 class Sensed(NamedTuple):
@@ -132,12 +133,12 @@ def novel_beams(
 ) -> Tensor:
     """Which beams (N,) of a frame tell the map something new; `width` of the image, pixels.
 
-    The first beam of every two by two pixels speaks for all four: neighbouring pixels are much closer
+    The first beam of every three by three pixels speaks for all nine: neighbouring pixels are much closer
     to one another than the cells are large. `within`, `short`: see
     `SlidingVoxelMap.beam_novelty`.
     """
-    n, across = len(frame.pixel), (width + 1) // 2
-    block = frame.pixel // (2 * width) * across + frame.pixel % width // 2
+    n, across = len(frame.pixel), -(-width // _BLOCK)
+    block = frame.pixel // (_BLOCK * width) * across + frame.pixel % width // _BLOCK
     first = block.new_full((int(block.max()) + 1 if n else 0,), n)
     first.scatter_reduce_(0, block, torch.arange(n, device=block.device), "amin")
     present = first < n

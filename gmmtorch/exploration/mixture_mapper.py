@@ -40,6 +40,7 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
 _EMPTY_LENGTH = 0.7
+_EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
 _EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
 
 
@@ -213,8 +214,16 @@ class MixtureMapper(Mapper):
                 rays_per_cell=rule.rays,
                 shell=rule.shell,
                 hits_per_ray=_HITS_PER_RAY,
+                thinned=True,
             ),
-            component_evidence(empty, resolution, box, rays_per_cell=rule.rays, cutoff=_EMPTY_CUTOFF),
+            component_evidence(
+                empty,
+                resolution,
+                box,
+                rays_per_cell=_EMPTY_RAYS * rule.rays,
+                cutoff=_EMPTY_CUTOFF,
+                thinned=True,
+            ),
         ]
         return united(parts)
 

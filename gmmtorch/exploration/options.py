@@ -30,7 +30,7 @@ class TeamOptions:
 
     framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and search.
     rate: frames a second (Hz); a robot plans each time it has flown a primitive (`dynamics.duration`).
-    window: cells of the sliding map along x, y, z. planner, information, coordination: by
+    window: cells around a robot, along x, y, z, that it plans in. planner, information, coordination: by
     name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior: occupancy that the planner
     expects of unknown cells. codec: of components, see `sharing.messages`. latency (s), bandwidth
     (bytes/s of each sender; None: no limit), loss: of the network. sample_every: simulated seconds

@@ -92,13 +92,16 @@ class Robot:
         hit[(cells - low).unbind(1)] = True
         self._recent.append(hit.nonzero() + low)
 
-    def surroundings(self, planning_prior: float, radius: float) -> Surroundings:
-        """What the planner is given to read."""
+    def surroundings(
+        self, planning_prior: float, radius: float, window: tuple[int, int, int] | None = None
+    ) -> Surroundings:
+        """What the planner is given to read: so many cells around the robot, or all of its local map."""
         local, rule = self.mapper.local, self.mapper.belief.rule
-        hits, misses = local.evidence()
+        box = local.box if window is None else local.around(self.position, window)
+        hits, misses = local.evidence(box)
         recent = list(self._recent)
         return surroundings_of(
-            local.low,
+            box.low,
             local.resolution,
             hits,
             misses,

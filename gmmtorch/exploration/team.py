@@ -24,7 +24,10 @@ from gmmtorch.exploration.world import World
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.sharing.network import Network
 
-_STEP = 8  # cells by which windows move
+_SLACK = 24
+"""Cells that a robot may be off the middle of its sliding map before that moves, by as many. Rays are long:
+filled in broad slabs a map draws each of them far less often. Planners see the window around the robot."""
+_ROUNDING = 4  # cells that the planner's window may be off the robot
 _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
 
 
@@ -38,13 +41,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             f"{options.size} robots."
         )
     world.check_start(poses)
-    sight = (min(options.window[:2]) / 2 - _STEP) * world.resolution
-    if sight < options.camera.max_range:
-        raise InvalidArgumentError(
-            f"map.window={list(options.window)} cells of {world.resolution} m reaches {max(sight, 0):.3g} m "
-            f"around the robot, less than sensor.max_range={options.camera.max_range} m; take a larger "
-            "window."
-        )
+    _check_window(options, world.resolution)
     # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
     needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
     clear = world.mesh.clearance(poses[:, :3]).clamp_max(needed)
@@ -85,8 +82,23 @@ def assemble(world: World, options: TeamOptions) -> Mission:
     return Mission(world, robots, belief(), network, evaluator, coordination, options, memo)
 
 
+def _check_window(options: TeamOptions, resolution: float) -> None:
+    """Raises unless all that a camera sees lies in the window."""
+    camera = options.camera
+    far = (camera.max_range, camera.max_range, camera.max_range * math.sin(camera.vertical_fov / 2))
+    for axis, n, needed in zip("xyz", options.window, far, strict=True):
+        sight = (n / 2 - _ROUNDING) * resolution
+        if sight < needed:
+            raise InvalidArgumentError(
+                f"map.window={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
+                f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
+                f"sensor.max_range={camera.max_range} m sees; take a larger window."
+            )
+
+
 def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, memo: Memo) -> Mapper:
-    local = SlidingVoxelMap(world.resolution, options.window, _STEP)
+    x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
+    local = SlidingVoxelMap(world.resolution, (x, y, z), _SLACK)
     width = options.camera.width
     if options.framework == "gmm_shared":
         return MixtureMapper(

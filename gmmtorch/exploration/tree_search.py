@@ -170,10 +170,8 @@ class TreeSearch:
 
     A branch returns what its views bring, given each other and the teammates' plans, and the goal's weight
     for every metre that it comes closer; the sooner, the more, so that nothing is put off. What the robot
-    sees from where it is counts as seen. The next primitive to try
-    maximises Q̄(a) + c √(ln N / N_a); a leaf counts as visited, with no return, until its round is over.
-
-    Args:
+    sees from where it is counts as seen. The next primitive to try maximises Q̄(a) + c √(ln N / N_a); a leaf
+    counts as visited, with no return, until its round is over.
     """
 
     def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
@@ -245,7 +243,7 @@ class _Tree:
                 chosen.append(leaf)
             if not chosen:
                 break
-            self._extend(chosen)
+            self._extend(chosen, is_last=turn == self._rule.n_rounds)
 
     def best(self) -> Found | None:
         """The branch to the node of the largest return, the first of equals."""
@@ -305,8 +303,8 @@ class _Tree:
 
     # -- what they are worth, and what follows them -----------------------------------------------
 
-    def _extend(self, nodes: list[_Node]) -> None:
-        """Place and value new nodes, and find out which primitives can follow them."""
+    def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
+        """Place and value new nodes, and find out which primitives can follow them, unless none will."""
         rows = [node.number for node in nodes]
         parents = [node.above.number for node in nodes]
         actions = [node.action for node in nodes]
@@ -326,7 +324,7 @@ class _Tree:
             self._scale = max(self._scale, node.value)
             for above in (self._nodes[0], *node.branch()):
                 above.total += node.value
-            node.closed = node.depth == self._rule.depth
+            node.closed = is_last or node.depth == self._rule.depth
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]
             states = self._states[[node.number for node in some]]

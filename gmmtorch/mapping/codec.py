@@ -46,6 +46,7 @@ RASTER_BITS = 60
 LARGEST_SIDE = 30
 """log2 of a cell's side (m) at most: such cells hold the world."""
 _SIDES_TRIED = 10
+_WORSE_IN_A_ROW = 2
 
 
 def encode(components: Components) -> bytes:
@@ -175,6 +176,8 @@ def _cell_exponent(places: Lattice, in_order: bool) -> int:
             raster = _raster(cells, least, extent)
             column = best_code(raster if in_order else np.sort(raster)).n_bits
             sizes[exponent] = column + float(np.maximum(exponent - exponents, 0).sum())
+        if exponent - min(sizes, key=lambda tried: sizes[tried], default=exponent) >= _WORSE_IN_A_ROW:
+            break
         exponent += 1
     return min(sizes, key=lambda tried: sizes[tried])
 

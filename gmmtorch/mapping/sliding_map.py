@@ -122,10 +122,32 @@ class SlidingVoxelMap:
             self._counts[0][stored] += hits[local]
             self._counts[1][stored] += misses[local]
 
-    def evidence(self) -> tuple[Tensor, Tensor]:
-        """Hits and misses (nx, ny, nz), float32, of the window in the order of the lattice: a copy."""
-        hits, misses = self._read(self.box)
+    def evidence(self, box: Box | None = None) -> tuple[Tensor, Tensor]:
+        """Hits and misses (nx, ny, nz), float32, of the window in the order of the lattice, or of a box
+        within it: a copy."""
+        box = self.box if box is None else box
+        if bool((box.low < self.low).any() | (box.high > self.box.high).any()):
+            raise InvalidArgumentError(
+                f"box from {box.low.tolist()} to {box.high.tolist()} reaches out of the window, which goes "
+                f"from {self.low.tolist()} to {self.box.high.tolist()}."
+            )
+        hits, misses = self._read(box)
         return hits, misses
+
+    def around(self, position: Tensor, shape: tuple[int, int, int], step: int = 8) -> Box:
+        """The box of `shape` cells within the window that has a place (3,), metres, nearest its middle, of
+        those that begin at multiples of `step` cells from the lowest of the window.
+
+        Raises `InvalidArgumentError` if the window is smaller.
+        """
+        size = torch.tensor(shape, device=self._counts.device)
+        spare = torch.tensor(self.shape, device=size.device) - size
+        if bool((spare < 0).any()):
+            raise InvalidArgumentError(f"shape={tuple(shape)} is more than the window's {self.shape} cells.")
+        cell = in_cells(position, self.resolution, "position").floor().long() - self.low
+        steps = (2 * cell - size + step) // (2 * step)  # rounded
+        low = self.low + torch.minimum(steps.clamp_min(0), spare // step) * step
+        return Box(low, low + size)
 
     def beam_novelty(
         self,

@@ -220,10 +220,11 @@ def shares_near(apex: Tensor, low: Tensor, high: Tensor, box: Box) -> tuple[Tens
     the box bounds t. A ray is the hull of its start and its end.
     """
     first, last = torch.zeros_like(apex[:, 0]), torch.ones_like(apex[:, 0])
+    lowest, highest = box.low.tolist(), box.high.tolist()
     for axis in range(3):
         start = apex[:, axis]
-        for bound, side, sign in ((box.high, low, 1.0), (box.low, high, -1.0)):
-            room = sign * (float(bound[axis]) - start) + 0.5
+        for bound, side, sign in ((highest, low, 1.0), (lowest, high, -1.0)):
+            room = sign * (bound[axis] - start) + 0.5
             slope = sign * (side[:, axis] - start)  # t · slope ≤ room
             share = room / slope
             last = torch.where(slope > 0, torch.minimum(last, share), last)

@@ -37,13 +37,13 @@ def frame(width: int, height: int, seed: int, missing: float) -> DepthFrame:
 
 
 def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float) -> list[bool]:
-    """Each beam answers as the beam of the lowest pixel of its two by two that there is."""
+    """Each beam answers as the beam of the lowest pixel of its three by three that there is."""
     speaker: dict[tuple[int, int], int] = {}
     for beam, pixel in enumerate(seen.pixel.tolist()):
-        speaker.setdefault((pixel // width // 2, pixel % width // 2), beam)
+        speaker.setdefault((pixel // width // 3, pixel % width // 3), beam)
     answers = []
     for pixel in seen.pixel.tolist():
-        beam = speaker[(pixel // width // 2, pixel % width // 2)]
+        beam = speaker[(pixel // width // 3, pixel % width // 3)]
         bits, unobserved = local.beam_novelty(
             seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short, within=WITHIN
         )
@@ -53,8 +53,8 @@ def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float
 
 @pytest.mark.parametrize("short", [0.0, 0.5])
 @pytest.mark.parametrize("missing", [0.0, 0.3, 0.9])
-@pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (7, 1), (1, 9), (2, 2)])
-def test_the_first_beam_of_four_pixels_speaks_for_them(
+@pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (7, 1), (1, 9), (2, 2), (10, 11)])
+def test_the_first_beam_of_nine_pixels_speaks_for_them(
     width: int, height: int, missing: float, short: float
 ) -> None:
     local, seen = known(width), frame(width, height, height, missing)

@@ -31,7 +31,7 @@ SMALL = TeamOptions(
     size=2,
     duration=20.0,
     camera=DepthCamera(width=48, height=36, max_range=4.5),
-    window=(64, 64, 24),
+    window=(64, 64, 32),
     sample_every=5.0,
     n_beams=60,
 )
@@ -169,7 +169,7 @@ def test_a_lone_grid_is_the_sum_of_its_frames(world: World, monkeypatch: pytest.
 
 
 def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
-    mission = flown(world, replace(SMALL, window=(62, 62, 16), duration=14.0))
+    mission = flown(world, replace(SMALL, window=(62, 62, 30), duration=14.0))
     for robot in mission.robots:
         mapper = robot.mapper
         assert isinstance(mapper, MixtureMapper)
@@ -239,7 +239,7 @@ START: dict[str, Callable[[], TeamOptions]] = {
     "loss": lambda: replace(SMALL, loss=1.0),
     "coordination": lambda: replace(SMALL, coordination="none"),
     "information": lambda: replace(SMALL, information="all"),
-    "window": lambda: replace(SMALL, window=(40, 40, 24)),
+    "window": lambda: replace(SMALL, window=(40, 40, 32)),
     "codec": lambda: replace(SMALL, codecs=("jpeg",)),
 }
 

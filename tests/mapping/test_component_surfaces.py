@@ -238,23 +238,61 @@ def test_denser_hits_come_closer_to_the_limit() -> None:
     assert 0 < errors[8] < 0.5 * errors[1]
 
 
+# -- fewer rays near the sensor -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("empty", [False, True])
+def test_thinned_rays_miss_the_same_cells_as_often(view: str, empty: bool) -> None:
+    component, _, _ = sheet(*VIEWS[view])
+    component = replace(component, max_range=torch.tensor([empty]))
+    options = {"least": 20_000, "most": 20_000, "shell": 1.0}
+    limit, found = (
+        dense(component_evidence(component, RESOLUTION, AROUND, **options, thinned=thinned), AROUND)
+        for thinned in (False, True)
+    )
+    assert torch.equal(found[0], limit[0])
+    many = limit[1] > 20
+    assert int(many.sum()) > 20
+    torch.testing.assert_close(found[1][many], limit[1][many], rtol=0.1, atol=2.0)
+    assert float(found[1].sum()) == pytest.approx(float(limit[1].sum()), rel=2e-3)
+
+
+def test_all_rays_count_where_they_begin_however_few_are_followed() -> None:
+    component, _, _ = sheet(*VIEWS["tilted"])
+    for least in range(1, 10):
+        plain, thinned = (
+            component_evidence(component, RESOLUTION, AROUND, least=least, most=least, thinned=thinned)
+            for thinned in (False, True)
+        )
+        if least == 1:
+            assert torch.equal(plain.cells, thinned.cells)
+        # However many there are, all count where they begin.
+        sensor = (component.origins[0] / RESOLUTION).floor().long()
+        begun = [float(e.misses[(e.cells == sensor).all(1)]) for e in (plain, thinned)]
+        assert begun == pytest.approx([1000.0, 1000.0], rel=1e-5)
+
+
+@pytest.mark.parametrize("thinned", [False, True])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_disjoint_boxes_add_up(shell: float) -> None:
+def test_disjoint_boxes_add_up(shell: float, thinned: bool) -> None:
+    options = {"shell": shell, "hits_per_ray": 8, "thinned": thinned}
     components = random_components(30, 3, seed=4, empty=0.2)
     whole = Box(torch.tensor([-12] * 3), torch.tensor([12] * 3))
     halves = []
     for octant in itertools.product((0, 1), repeat=3):
         low = torch.tensor([(-12, 3)[side] for side in octant])
         high = torch.tensor([(3, 12)[side] for side in octant])
-        halves.append(component_evidence(components, RESOLUTION, Box(low, high), shell=shell, hits_per_ray=8))
-    expected = component_evidence(components, RESOLUTION, whole, shell=shell, hits_per_ray=8)
+        halves.append(component_evidence(components, RESOLUTION, Box(low, high), **options))
+    expected = component_evidence(components, RESOLUTION, whole, **options)
     assert float(expected.hits.sum()) > 10
     torch.testing.assert_close(dense(united(halves), whole), dense(expected, whole), rtol=1e-5, atol=1e-4)
 
 
-def test_company_changes_nothing() -> None:
+@pytest.mark.parametrize("thinned", [False, True])
+def test_company_changes_nothing(thinned: bool) -> None:
     components = random_components(20, 3, seed=6, empty=0.2)
-    options = {"shell": 1.0, "hits_per_ray": 8}
+    options = {"shell": 1.0, "hits_per_ray": 8, "thinned": thinned}
     alone = united(
         component_evidence(components.selected(torch.tensor([k])), RESOLUTION, AROUND, **options)
         for k in range(20)
