@@ -183,6 +183,46 @@ def test_a_wandering_window_equals_one_made_from_scratch(seed, far):
             torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
 
 
+# -- a part of it ---------------------------------------------------------------------------------
+
+
+@given(
+    x=st.floats(-30, 30), y=st.floats(-30, 30), z=st.floats(-9, 9), step=st.sampled_from([1, 2, 4]),
+    seed=st.integers(0, 99),
+)  # fmt: skip
+def test_a_box_around_a_place_is_a_part_of_the_window(x, y, z, step, seed):
+    sliding = new_map()
+    sliding.center_on(at(x, y, z))
+    sliding.add(random_evidence(4000, seed))
+    shape = (12, 9, 7)
+    box = sliding.around(at(x, y, z), shape, step)
+    assert box.shape == shape
+    assert bool((box.low >= sliding.low).all() & (box.high <= sliding.box.high).all())
+    assert bool(((box.low - sliding.low) % step == 0).all())
+    cell = (at(x, y, z) / 0.25).floor()
+    off = (box.low + box.high) / 2 - cell - 0.5
+    fits = (box.low > sliding.low) & (box.high + step <= sliding.box.high)  # not held back by the window
+    assert bool((off.abs() <= (step + 1) / 2)[fits].all())
+    inside = tuple(
+        slice(a, b)
+        for a, b in zip((box.low - sliding.low).tolist(), (box.high - sliding.low).tolist(), strict=True)
+    )
+    for part, whole in zip(sliding.evidence(box), sliding.evidence(), strict=True):
+        assert torch.equal(part, whole[inside])
+
+
+def test_no_box_reaches_out_of_the_window():
+    sliding = new_map()
+    sliding.center_on(at(0, 0, 0))
+    box = sliding.box
+    with pytest.raises(InvalidArgumentError, match="reaches out of the window"):
+        sliding.evidence(Box(box.low, box.high + 1))
+    with pytest.raises(InvalidArgumentError, match="reaches out of the window"):
+        sliding.evidence(Box(box.low - 1, box.high))
+    with pytest.raises(InvalidArgumentError, match="is more than the window's"):
+        sliding.around(at(0, 0, 0), (12, 99, 7))
+
+
 # -- novelty --------------------------------------------------------------------------------------
 
 
