@@ -109,6 +109,10 @@ class Primitives:
         library = [*arcs, *slow, *turns, *vertical, (0.0, 0.0, 0.0)]
         self.commands = torch.tensor(library, dtype=torch.float64)
         self.stop = len(library) - 1
+        # Nearly all states asked about are ends of primitives: what follows is known but for the pose.
+        ends = torch.cat([torch.zeros(len(library), 4, dtype=torch.float64), self.commands], 1)
+        self._paths = self._rollout(ends)
+        self._stops = self._braking(ends)
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -123,12 +127,43 @@ class Primitives:
         the integral by three Gauss–Legendre nodes. At constant velocities it is that of the closed form,
         x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)), to better than 10⁻⁸ m.
         """
-        return _integrated(states[:, None], self.commands, self.dynamics, self.dynamics.n_steps)
+        states = states.double()
+        follows = self._follows(states)
+        if follows is None:
+            return self._rollout(states)
+        return _moved(self._paths[follows], states[:, None])
 
     def braking(self, states: Tensor) -> Tensor:
         """States (..., B, 7) on the way to rest from states (..., 7); the last is at rest."""
+        flat = states.double().reshape(-1, 7)
+        follows = self._follows(flat)
+        if follows is None:
+            return self._braking(states)
+        return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
+
+    def _follows(self, states: Tensor) -> Tensor | None:
+        """The primitive (N,) that each of states (N, 7) has the velocities of; None unless all have one's."""
+        is_end = (states[:, None, 4:] == self.commands).all(-1)
+        which = is_end.int().argmax(1)
+        return which if bool(is_end.any(1).all()) else None
+
+    def _rollout(self, states: Tensor) -> Tensor:
+        return _integrated(states[:, None], self.commands, self.dynamics, self.dynamics.n_steps)
+
+    def _braking(self, states: Tensor) -> Tensor:
         at_rest = torch.zeros(3, dtype=torch.float64)
         return _integrated(states, at_rest, self.dynamics, self.dynamics.n_braking_steps)
+
+
+def _moved(paths: Tensor, states: Tensor) -> Tensor:
+    """Paths (..., S, 7) that begin at the origin with yaw 0, from the poses of states (..., 7) instead."""
+    pose = states[..., None, :]
+    cos, sin = pose[..., 3].cos(), pose[..., 3].sin()
+    moved = paths.clone()
+    moved[..., 0] = pose[..., 0] + cos * paths[..., 0] - sin * paths[..., 1]
+    moved[..., 1] = pose[..., 1] + sin * paths[..., 0] + cos * paths[..., 1]
+    moved[..., 2:4] += pose[..., 2:4]
+    return moved
 
 
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:

@@ -104,6 +104,22 @@ def test_braking_is_that_of_a_differential_equation_solver():
         np.testing.assert_allclose(path[:, :4].numpy(), exact, atol=2e-7)
 
 
+def test_ends_of_primitives_are_followed_as_any_other_state_is():
+    paths = LIBRARY.rollout(random_states(4, 1))
+    ends = paths[:, :, -1]
+    one = random_states(1, 2)  # in its company none is looked up
+    among_others = torch.cat([ends[0], one])
+    torch.testing.assert_close(
+        LIBRARY.rollout(ends[0]), LIBRARY.rollout(among_others)[:-1], rtol=0, atol=1e-9
+    )
+    torch.testing.assert_close(
+        LIBRARY.braking(ends[0]), LIBRARY.braking(among_others)[:-1], rtol=0, atol=1e-9
+    )
+    assert LIBRARY.braking(ends).shape == (*ends.shape[:2], LIBRARY.dynamics.n_braking_steps, 7)
+    assert LIBRARY.braking(ends[0, 0]).shape == (LIBRARY.dynamics.n_braking_steps, 7)
+    assert bool((LIBRARY.braking(ends)[..., -1, 4:] == 0).all())
+
+
 @given(
     seed=st.integers(0, 10**6),
     speed=st.floats(0.1, 5),
