@@ -156,6 +156,7 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
     from gmmtorch.exploration.mixture_mapper import FrameRule
     from gmmtorch.exploration.options import TeamOptions
     from gmmtorch.exploration.primitives import Dynamics
+    from gmmtorch.exploration.returns import RestRule
     from gmmtorch.exploration.scoring import BeliefRule
     from gmmtorch.mapping.novelty import NoveltyRule
     from gmmtorch.simulation.depth_camera import DepthCamera
@@ -191,6 +192,7 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
         coordination=variant.get("coordination", config.coordination),
         n_rounds=config.rounds,
         planning_prior=variant.get("planning_prior", config.planner.prior),
+        rest=RestRule(config.planner.rest),
         codec=variant.get("codec", config.codec),
         latency=config.network.delay,
         bandwidth=config.network.bandwidth,

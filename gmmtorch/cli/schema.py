@@ -325,6 +325,7 @@ class Team:
 class PlannerOptions:
     name: str = MISSING
     prior: float = 0.125  # occupancy that the planner expects of what nobody has seen
+    rest: float = 0.01  # share of its best two minutes below which a robot that learns no more rests
 
 
 @dataclass

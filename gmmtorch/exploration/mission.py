@@ -14,7 +14,7 @@ from gmmtorch.exploration.collisions import collides, meets_others
 from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.mapper import Heard, Memo, Sensed
 from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.planning import Plan, PlanningTask
+from gmmtorch.exploration.planning import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.retreat import retreat
 from gmmtorch.exploration.robot import Robot
@@ -76,6 +76,7 @@ class Mission:
         self.coordination = coordination.name
         self._evaluator, self._coordination = evaluator, coordination
         self._primitives = Primitives(options.dynamics)
+        self._waiting = Waiting(self._primitives)
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)
         self._memo = memo
@@ -125,9 +126,7 @@ class Mission:
                 self._generator,
             )
         with self._timed("mapping"):
-            robot.mapper.center_on(robot.position)
-            sensed = robot.mapper.sense(frame)
-            robot.remember(frame)
+            sensed = robot.sense(frame)
         with self._timed("scoring"):
             for evidence in sensed.evidence:
                 self.union.add(evidence)
@@ -192,6 +191,7 @@ class Mission:
                 )
                 for robot in self.robots
             }
+            resting = [robot.rests(self.now) for robot in self.robots]
             for robot in self.robots:
                 robot.roadmap.update(surroundings[robot.number])
         said: set[int] = set()
@@ -227,7 +227,10 @@ class Mission:
                 generator=self._generator,
                 trail=robot.trail,
             )
-            plan = retreat(self._primitives, task) or robot.planner.plan(task)
+            if resting[number]:
+                plan = self._waiting.rest(task)
+            else:
+                plan = retreat(self._primitives, task) or robot.planner.plan(task)
             proposed[number] = plan
             return plan
 

@@ -10,6 +10,7 @@ from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.mixture_mapper import FrameRule
 from gmmtorch.exploration.planners import PLANNERS
 from gmmtorch.exploration.primitives import Dynamics
+from gmmtorch.exploration.returns import RestRule
 from gmmtorch.exploration.scoring import BeliefRule
 from gmmtorch.exploration.views import INFORMATION
 from gmmtorch.mapping.novelty import NoveltyRule
@@ -28,14 +29,15 @@ FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
 class TeamOptions:
     """How a team explores, everything but the world.
 
-    framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and search.
-    rate: frames a second (Hz); a robot plans each time it has flown a primitive (`dynamics.duration`).
-    window: cells around a robot, along x, y, z, that it plans in. planner, information, coordination: by
-    name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior: occupancy that the planner
-    expects of unknown cells. codec: of components, see `sharing.messages`. latency (s), bandwidth
-    (bytes/s of each sender; None: no limit), loss: of the network. sample_every: simulated seconds
-    between the numbers kept. codecs: what the novel points are also encoded with, to compare. margin:
-    metres that robots keep between them. start: (size, 4) poses; None: chosen by the world.
+    framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and
+    search. rate: frames a second (Hz); a robot plans each time it has flown a primitive
+    (`dynamics.duration`). window: cells around a robot, along x, y, z, that it plans in. planner,
+    information, coordination: by name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior:
+    occupancy that the planner expects of unknown cells. rest: when a robot has seen enough. codec: of
+    components, see `sharing.messages`. latency (s), bandwidth (bytes/s of each sender; None: no limit),
+    loss: of the network. sample_every: simulated seconds between the numbers kept. codecs: what the
+    novel points are also encoded with, to compare. margin: metres that robots keep between them. start:
+    (size, 4) poses; None: chosen by the world.
     """
 
     framework: str = "gmm_shared"
@@ -55,6 +57,7 @@ class TeamOptions:
     coordination: str = "greedy"
     n_rounds: int = 3
     planning_prior: float = 0.125
+    rest: RestRule = field(default_factory=RestRule)
     codec: str = "quantized"
     latency: float = 0.05
     bandwidth: float | None = None

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mapper import Mapper
+from gmmtorch.exploration.mapper import Mapper, Sensed
 from gmmtorch.exploration.planning import Plan, Planner
 from gmmtorch.exploration.retreat import shortened
+from gmmtorch.exploration.returns import DiminishingReturns, RestRule
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.safety import surroundings_of
 from gmmtorch.exploration.surroundings import Surroundings
@@ -39,6 +40,7 @@ class Robot:
         library: ViewLibrary,
         roadmap: Roadmap,
         start_radius: float,
+        rest: RestRule | None = None,
     ) -> None:
         self.number = number
         self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
@@ -52,6 +54,8 @@ class Robot:
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
         self._retreats = False
         self.trail = pose[None, :3].double().clone()
+        self.returns = DiminishingReturns(rest)
+        self._learned = 0.0
 
     @property
     def position(self) -> Tensor:
@@ -81,7 +85,21 @@ class Robot:
         moved = (way[1:] - way[:-1]).norm(dim=1) > _STANDING
         self.trail = torch.cat([self.trail, flown[moved]])[-_TRAIL:]
 
-    def remember(self, frame: DepthFrame) -> None:
+    def sense(self, frame: DepthFrame) -> Sensed:
+        """Learn from a frame of its camera."""
+        self.mapper.center_on(self.position)
+        before = self.mapper.belief.known_bits
+        sensed = self.mapper.sense(frame)
+        self._learned += self.mapper.belief.known_bits - before
+        self._remember(frame)
+        return sensed
+
+    def rests(self, now: float) -> bool:
+        """Whether it has learned too little lately to fly on."""
+        self.returns.note(now, self._learned, self.mapper.belief.known_bits)
+        return self.returns.rests
+
+    def _remember(self, frame: DepthFrame) -> None:
         """Keep the cells of a frame's returns, which the planner stays clear of."""
         resolution = self.mapper.local.resolution
         cells = (frame.ends[frame.is_hit] / resolution).floor().long()
@@ -129,6 +147,8 @@ class Robot:
             "recent": list(self._recent),
             "trail": self.trail,
             "retreats": self._retreats,
+            "returns": self.returns.state(),
+            "learned": self._learned,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -141,3 +161,5 @@ class Robot:
         self.plans = {int(number): (float(when), poses) for number, when, poses in state["plans"]}
         self._recent = deque(state["recent"], maxlen=_REMEMBERED)
         self.trail, self._retreats = state["trail"], bool(state["retreats"])
+        self.returns.restore(state["returns"])
+        self._learned = float(state["learned"])

@@ -72,16 +72,17 @@ class BeliefMap:
         self._shape = box.shape
         self.observable_bits = float(observable.sum())
         self.entropy_bits = self.observable_bits
+        self.known_bits = 0.0  # off the entropy of all cells, observable or not, as a robot can tell
         self.n_observed = 0
 
     def add(self, evidence: CellEvidence) -> Tensor:
         """Count evidence in; returns which of its cells (C,) are observable."""
-        hits_before, misses_before = self.grid.add(evidence)
+        h, m = self.grid.add(evidence)
         chosen = self._is_observable(evidence.cells)
-        h, m = hits_before[chosen], misses_before[chosen]
-        after = self.rule.entropy(h + evidence.hits[chosen], m + evidence.misses[chosen])
-        self.entropy_bits += float((after - self.rule.entropy(h, m)).sum(dtype=torch.float64))
-        self.n_observed += int((h + m == 0).sum())
+        gone = self.rule.entropy(h, m) - self.rule.entropy(h + evidence.hits, m + evidence.misses)
+        self.known_bits += float(gone.sum(dtype=torch.float64))
+        self.entropy_bits -= float(gone[chosen].sum(dtype=torch.float64))
+        self.n_observed += int((h + m == 0)[chosen].sum())
         return chosen
 
     def _is_observable(self, cells: Tensor) -> Tensor:
@@ -96,12 +97,14 @@ class BeliefMap:
         return {
             "grid": self.grid.state(),
             "entropy_bits": self.entropy_bits,
+            "known_bits": self.known_bits,
             "n_observed": self.n_observed,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         self.grid.restore(state["grid"])
         self.entropy_bits = float(state["entropy_bits"])
+        self.known_bits = float(state["known_bits"])
         self.n_observed = int(state["n_observed"])
 
 

@@ -68,6 +68,7 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             ViewLibrary(number),
             Roadmap(),
             start_radius=float(clear[number]),
+            rest=options.rest,
         )
         for number in range(options.size)
     ]

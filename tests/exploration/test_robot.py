@@ -162,7 +162,7 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     wall = torch.tensor([[4.5, 3.1, 1.5], [4.5, 3.3, 1.5]], dtype=torch.float64)
     thin = torch.tensor([[2.1, 3.1, 1.5]], dtype=torch.float64)  # the end of an empty beam
     ends, is_hit = torch.cat([wall, thin]), torch.tensor([True, True, False])
-    one.remember(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
+    one._remember(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
     found = one.surroundings(0.125, 0.3)
     taken = free.free & ~found.free
     cells = (wall / 0.2).floor().long()
@@ -175,11 +175,11 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     # After twelve frames more it is forgotten; frames without returns do not count.
     nothing = DepthFrame(START[:3], ends[2:], is_hit[2:], torch.arange(1))
     for _ in range(20):
-        one.remember(nothing)
+        one._remember(nothing)
     assert not bool(one.surroundings(0.125, 0.3).is_passable(wall).any())
     elsewhere = DepthFrame(START[:3], wall[:1] + 1.0, is_hit[:1], torch.arange(1))
     for _ in range(12):
-        one.remember(elsewhere)
+        one._remember(elsewhere)
     assert bool(one.surroundings(0.125, 0.3).is_passable(wall).all())
 
 
@@ -205,7 +205,7 @@ def test_a_restored_robot_goes_on_alike() -> None:
     one.collisions = 2
     one.plans = {3: (1.5, START[None].clone()), 1: (0.5, torch.zeros(0, 4, dtype=torch.float64))}
     wall = torch.tensor([[4.5, 3.1, 1.5]], dtype=torch.float64)
-    one.remember(DepthFrame(START[:3], wall, torch.tensor([True]), torch.arange(1)))
+    one._remember(DepthFrame(START[:3], wall, torch.tensor([True]), torch.arange(1)))
     twin = robot(1.4)
     twin.restore(one.checkpoint())
     assert twin.planner.number == 7
@@ -215,7 +215,7 @@ def test_a_restored_robot_goes_on_alike() -> None:
     assert torch.equal(twin.plans[3][1], START[None])
     for each in (one, twin):
         each.advance(4, 8)
-        each.remember(DepthFrame(START[:3], wall + 0.5, torch.tensor([True]), torch.arange(1)))
+        each._remember(DepthFrame(START[:3], wall + 0.5, torch.tensor([True]), torch.arange(1)))
     assert twin.path_length == one.path_length == pytest.approx(4 * 0.3 + 4 * 0.4)
     assert torch.equal(twin.state, one.state)
     assert torch.equal(twin.braking, one.braking)
@@ -231,7 +231,7 @@ def test_what_happens_later_does_not_change_a_checkpoint() -> None:
     one.advance(0, 4)
     state = one.checkpoint()
     one.advance(4, 8)
-    one.remember(DepthFrame(START[:3], path[:1, :3], torch.tensor([True]), torch.arange(1)))
+    one._remember(DepthFrame(START[:3], path[:1, :3], torch.tensor([True]), torch.arange(1)))
     everywhere(one, 1.0, 0.0)
     twin = robot()
     twin.restore(state)

@@ -1,0 +1,75 @@
+"""Diminishing returns: when flying on is no longer worth it, and when it is again."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from gmmtorch.errors import InvalidArgumentError
+
+_NEWS = 0.25  # of the best window: what teammates must find before a robot that rests looks for more
+
+
+@dataclass(frozen=True)
+class RestRule:
+    """A robot rests once what it learned in the last `window` seconds is below `share` of the most it ever
+    learned in as many; 0: never. A window should be longer than a way across the map."""
+
+    share: float = 0.01
+    window: float = 120.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share < 1:
+            raise InvalidArgumentError(f"planner.rest={self.share} must be at least 0, and below 1.")
+        if not 0 < self.window < math.inf:
+            raise InvalidArgumentError(f"window={self.window} must be above zero seconds, and finite.")
+
+
+class DiminishingReturns:
+    """Follows what a robot learns, and says whether it should rest.
+
+    Views promise more than they bring where only slivers are left that no camera resolves, and a
+    planner that believes them flies on for ever. What a robot's own frames take off the entropy
+    of its map cannot be argued with. Once it rests, news of teammates that add up to a quarter of its best
+    window wake it, for a window at least.
+    """
+
+    def __init__(self, rule: RestRule | None = None) -> None:
+        self.rests = False
+        self._rule = RestRule() if rule is None else rule
+        self._noted: deque[tuple[float, float]] = deque()  # time (s) and bits learned, a window of them
+        self._best = 0.0
+        self._known = 0.0  # bits, when it came to rest
+
+    def note(self, now: float, learned: float, known: float) -> None:
+        """What is so at time `now` (s): bits that the robot's own frames took off the entropy of its map,
+        and bits that are off it altogether."""
+        if self.rests:
+            if known - self._known >= _NEWS * self._best:
+                self.rests = False
+                self._noted.clear()
+            return
+        self._noted.append((now, learned))
+        while len(self._noted) > 1 and self._noted[1][0] <= now - self._rule.window:
+            self._noted.popleft()
+        begin, before = self._noted[0]
+        if now - begin < self._rule.window:
+            return
+        self._best = max(self._best, learned - before)
+        if learned - before < self._rule.share * self._best:
+            self.rests, self._known = True, known
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "rests": self.rests,
+            "noted": [list(entry) for entry in self._noted],
+            "best": self._best,
+            "known": self._known,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.rests = bool(state["rests"])
+        self._noted = deque((float(now), float(learned)) for now, learned in state["noted"])
+        self._best, self._known = float(state["best"]), float(state["known"])

@@ -1,0 +1,96 @@
+"""When robots rest, against the rule written out over everything that was noted."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.returns import DiminishingReturns, RestRule
+
+GAINS = st.lists(st.floats(0, 100), min_size=1, max_size=60)
+
+
+def rests_by_the_book(gains: list[float], every: float, rule: RestRule) -> int | None:
+    """After which of the notes a robot rests, that nobody tells anything."""
+    times = [i * every for i in range(len(gains))]
+    learned = [sum(gains[: i + 1]) for i in range(len(gains))]
+    best = 0.0
+    for i, now in enumerate(times):
+        before = [j for j in range(i + 1) if times[j] <= now - rule.window]
+        if before:
+            gained = learned[i] - learned[max(before)]
+            best = max(best, gained)
+            if gained < rule.share * best:
+                return i
+    return None
+
+
+@given(gains=GAINS, every=st.sampled_from([1.0, 2.0, 7.0]), share=st.sampled_from([0.0, 0.1, 0.6, 0.9]))
+def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
+    rule = RestRule(share, window=10.0)
+    returns, learned = DiminishingReturns(rule), 0.0
+    expected = rests_by_the_book(gains, every, rule)
+    for i, gain in enumerate(gains):
+        learned += gain
+        returns.note(i * every, learned, known=learned)
+        assert returns.rests == (expected is not None and i >= expected)
+        if returns.rests:
+            learned -= gain  # at rest it learns nothing, and so is not woken
+            break
+
+
+def resting() -> DiminishingReturns:
+    """At rest at 30 s, having learned 100 bits in its best 10 s, with 150 known."""
+    returns = DiminishingReturns(RestRule(0.05, window=10.0))
+    for now, learned in ((0, 0), (10, 100), (20, 110), (30, 110)):
+        assert not returns.rests
+        returns.note(now, learned, 40.0 + learned)
+    assert returns.rests
+    return returns
+
+
+def test_news_wake_it_for_a_window_at_least():
+    returns = resting()
+    returns.note(32, 110, 170.0)
+    assert returns.rests
+    returns.note(34, 110, 175.0)
+    assert not returns.rests
+    for now in (36, 40, 45):
+        returns.note(now, 110, 175.0)
+        assert not returns.rests
+    returns.note(46, 110, 175.0)
+    assert returns.rests
+
+
+def test_a_share_of_nothing_never_rests():
+    returns = DiminishingReturns(RestRule(0.0, window=4.0))
+    for now in range(50):
+        returns.note(now, 0.0, 0.0)
+    assert not returns.rests
+
+
+def test_its_state_is_all_there_is():
+    one, other = resting(), DiminishingReturns(RestRule(0.05, window=10.0))
+    other.restore(one.state())
+    for now, known in ((33, 160.0), (34, 190.0), (36, 190.0), (44, 190.0), (46, 190.0)):
+        one.note(now, 110, known)
+        other.note(now, 110, known)
+        assert one.rests == other.rests
+        assert one.state() == other.state()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"share": -0.1}, "planner.rest=-0.1"),
+        ({"share": 1.0}, "planner.rest=1.0"),
+        ({"share": float("nan")}, "planner.rest=nan"),
+        ({"window": 0.0}, "window=0.0"),
+        ({"window": float("inf")}, "window=inf"),
+    ],
+)
+def test_what_cannot_be(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        RestRule(**options)
