@@ -8,4 +8,5 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gmmtorch.cli.fit import main
 
-main()
+if __name__ == "__main__":  # the processes of a study import this file
+    main()
