@@ -106,6 +106,8 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
 def _variants(config: DictConfig) -> list[dict[str, Any]]:
     from gmmtorch.errors import InvalidArgumentError
 
+    if config.study.name != "trials":
+        raise InvalidArgumentError(f"study.name={config.study.name!r} is not known; known is trials.")
     variants: list[dict[str, Any]] = [dict(variant) for variant in config.study.variants]
     known = {"team", "planner", "information", "coordination", "planning_prior", "codec", "loss"}
     for variant in variants:

@@ -79,26 +79,6 @@ class Roadmap:
             kept = self._blocks.setdefault(block, np.zeros((_BLOCK,) * 3, np.uint8))
             kept[inside] = (kept[inside] & ~known[outside]) | flags[outside]
 
-    def traverse(self, points: Tensor, resolution: float) -> None:
-        """Take over that robots have flown along points (M, 3), metres, less than a node apart."""
-        self._resolution, self._cached = resolution, None
-        cells = np.floor(points.cpu().numpy() / self.spacing).astype(np.int64)
-        for cell in cells:
-            self._mark(cell, _PASSABLE)
-        for one, other in itertools.pairwise(cells):
-            at = one.copy()
-            for axis in range(3):  # face by face, so that every step has a node to stand on
-                while at[axis] != other[axis]:
-                    step = 1 if other[axis] > at[axis] else -1
-                    self._mark(at - (step < 0) * np.eye(3, dtype=np.int64)[axis], _EDGES[axis])
-                    at[axis] += step
-                    self._mark(at, _PASSABLE)
-
-    def _mark(self, cell: np.ndarray, flag: int) -> None:
-        block = tuple(int(c) for c in cell // _BLOCK)
-        kept = self._blocks.setdefault(block, np.zeros((_BLOCK,) * 3, np.uint8))  # type: ignore[arg-type]
-        kept[tuple(cell % _BLOCK)] |= flag
-
     def route(self, start: Tensor, goals: Tensor) -> Route:
         """The shortest ways from `start` (3,) to goals (M, 3), metres."""
         graph = self._graph

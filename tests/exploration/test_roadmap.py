@@ -109,16 +109,6 @@ def test_what_is_reached_from_a_goal_agrees_with_the_routes_to_it(seed):
         torch.testing.assert_close(route.metres[0], metres[row])
 
 
-def test_flown_paths_join_what_no_window_has_shown():
-    roadmap = Roadmap()
-    ends = torch.tensor([[0.5, 0.5, 0.5], [9.0, -4.0, 2.0]], dtype=torch.float64)
-    share = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
-    roadmap.traverse(ends[0] + share * (ends[1] - ends[0]), RESOLUTION)
-    metres = float(roadmap.route(ends[0], ends[1:]).metres[0])
-    straight = float((ends[1] - ends[0]).norm())
-    assert straight - 1.4 < metres < 1.4 * straight + 1.4
-
-
 def test_nothing_known_means_no_way():
     roadmap = Roadmap()
     point = torch.zeros(1, 3, dtype=torch.float64)
