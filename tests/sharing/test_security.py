@@ -1,0 +1,323 @@
+"""Sealed datagrams: against the library used directly, and against whatever else may come in."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import os
+import pickle
+import random
+import sys
+import threading
+
+import pytest
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, OutputError
+from gmmtorch.sharing.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
+from gmmtorch.sharing.team_key import TeamKey
+
+SECRET = bytes(range(32))
+KEY = TeamKey(SECRET)
+datagrams = st.binary(max_size=1200)
+
+
+def refused(opener: Opener) -> dict[str, int]:
+    return {reason: n for reason, n in opener.refused.items() if n}
+
+
+# -- keys --------------------------------------------------------------------------------------------------
+
+
+def test_a_key_comes_back_from_its_file_which_nobody_else_may_read(tmp_path):
+    key = TeamKey.generate()
+    path = key.save(tmp_path / "team.key")
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert TeamKey.from_file(path) == key
+    assert TeamKey.from_file(path) != TeamKey.generate()
+    with pytest.raises(OutputError, match=r"team\.key"):
+        TeamKey.generate().save(path)
+    assert TeamKey.from_file(path) == key
+
+
+def test_a_key_is_what_openssl_writes(tmp_path, monkeypatch):
+    path = tmp_path / "team.key"
+    path.write_text(SECRET.hex() + "\n")
+    path.chmod(0o400)
+    assert TeamKey.from_file(path) == KEY
+    monkeypatch.setenv("GMMTORCH_TEAM_KEY", SECRET.hex().upper())
+    assert TeamKey.from_environment() == KEY
+    monkeypatch.setenv("OTHER", "ff" * 32)
+    assert TeamKey.from_environment("OTHER") == TeamKey(b"\xff" * 32)
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o660, 0o602])
+def test_files_open_to_others_are_refused(tmp_path, mode):
+    path = KEY.save(tmp_path / "team.key")
+    path.chmod(mode)
+    with pytest.raises(DataError, match=f"mode {mode:o}.*chmod 600 .*team.key"):
+        TeamKey.from_file(path)
+
+
+def test_bad_keys_are_named_and_never_shown(tmp_path, monkeypatch):
+    digits, path, messages = SECRET.hex(), tmp_path / "team.key", []
+
+    def error_of(kind, make):
+        with pytest.raises(kind) as caught:
+            make()
+        error = caught.value
+        while error is not None:  # nor in what caused it
+            messages.append(str(error) + repr(error))
+            error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+        return str(caught.value)
+
+    for text, what in [
+        (digits[:-1], "63 characters"),
+        (digits + "00", "66 characters"),
+        ("", "0 characters"),
+        (digits[:-1] + "x", "hexadecimal"),
+        (digits[:-1] + "é", "65 characters"),
+        (digits[:-2] + "é", "hexadecimal"),
+        (digits * 1000, "1024 characters"),
+    ]:
+        path.write_bytes(text.encode())
+        path.chmod(0o600)
+        message = error_of(DataError, lambda: TeamKey.from_file(path))
+        assert what in message
+        assert str(path) in message
+        assert "openssl rand -hex 32" in message
+    monkeypatch.setenv("GMMTORCH_TEAM_KEY", digits[:-2])
+    assert "$GMMTORCH_TEAM_KEY has 62" in error_of(DataError, TeamKey.from_environment)
+    monkeypatch.delenv("GMMTORCH_TEAM_KEY")
+    assert "$GMMTORCH_TEAM_KEY is not set" in error_of(MissingDataError, TeamKey.from_environment)
+    absent = tmp_path / "absent"
+    assert f"{absent} does not exist" in error_of(MissingDataError, lambda: TeamKey.from_file(absent))
+    assert "is no file" in error_of(MissingDataError, lambda: TeamKey.from_file(tmp_path))
+    assert "31 bytes" in error_of(InvalidArgumentError, lambda: TeamKey(SECRET[:31]))
+    assert "33 bytes" in error_of(InvalidArgumentError, lambda: TeamKey(SECRET + b"!"))
+    assert "str" in error_of(InvalidArgumentError, lambda: TeamKey(digits))
+    error_of(InvalidArgumentError, lambda: pickle.dumps(KEY))
+    error_of(InvalidArgumentError, lambda: copy.deepcopy(KEY))
+    error_of(OutputError, lambda: KEY.save(tmp_path / "no" / "folder"))
+    shown = [*messages, repr(KEY), str(KEY), f"{KEY}", f"{[KEY]}", "%r" % KEY]  # noqa: UP031
+    assert not any(digits[:8] in text or repr(SECRET)[2:20] in text for text in shown)
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "cryptography"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(GmmTorchError, match=r"pip install 'gmmtorch\[network\]'"):
+        Sealer(0, KEY)
+    assert Opener().open(Sealer(0).seal(b"plain")) == (0, b"plain")  # which needs none
+
+
+# -- frames ------------------------------------------------------------------------------------------------
+
+
+@given(datagram=datagrams, sender=st.integers(0, 65535))
+def test_a_frame_is_what_the_library_makes_of_its_fields(datagram, sender):
+    """Byte by byte as docs/network.md says, and read back by hand."""
+    sealer, aead = Sealer(sender, KEY), ChaCha20Poly1305(SECRET)
+    for number in range(3):
+        frame = sealer.seal(datagram)
+        header = b"\xf1" + sender.to_bytes(2, "little") + sealer.session + number.to_bytes(4, "little")
+        assert frame[:15] == header
+        assert frame[15:] == aead.encrypt(header[3:], datagram, header)
+        assert len(frame) == len(datagram) + SEALED_OVERHEAD == len(datagram) + 31
+    header = b"\xf1" + sender.to_bytes(2, "little") + b"sessions" + b"\1\2\3\4"
+    assert Opener(KEY).open(header + aead.encrypt(header[3:], datagram, header)) == (sender, datagram)
+
+
+@given(datagram=datagrams)
+def test_without_a_key_a_frame_is_a_header_and_the_datagram(datagram):
+    sealer = Sealer(300)
+    frames = [sealer.seal(datagram) for _ in range(2)]
+    assert frames == [b"\xe1\x2c\x01" + sealer.session + bytes([i, 0, 0, 0]) + datagram for i in range(2)]
+    assert len(frames[0]) == len(datagram) + PLAIN_OVERHEAD == len(datagram) + 15
+    assert [Opener().open(frame) for frame in frames] == [(300, datagram)] * 2
+
+
+def test_the_longest_frame_fits_every_path_of_ipv6():
+    assert len(Sealer(0, KEY).seal(bytes(1200))) + 40 + 8 <= 1280
+
+
+@settings(max_examples=60)
+@given(order=st.permutations(range(50)), repeats=st.lists(st.integers(0, 49), max_size=50))
+def test_whatever_the_order_each_datagram_is_opened_once(order, repeats):
+    sealer, opener = Sealer(5, KEY), Opener(KEY)
+    frames = [sealer.seal(bytes([i])) for i in range(50)]
+    assert [opener.open(frames[i]) for i in order] == [(5, bytes([i])) for i in order]
+    assert [opener.open(frames[i]) for i in repeats] == [None] * len(repeats)
+    assert refused(opener) == ({"replayed": len(repeats)} if repeats else {})
+
+
+def test_no_nonce_comes_twice():
+    sealers = [Sealer(1, KEY), Sealer(1, KEY), Sealer(2, KEY)]
+    nonces = [sealer.seal(b"same")[3:15] for sealer in sealers for _ in range(100)]
+    sealers[0]._number = 2**32 - 1
+    nonces += [sealers[0].seal(b"same")[3:15] for _ in range(3)]  # the last number, then another session
+    assert nonces[-3].endswith(b"\xff" * 4)
+    assert nonces[-2].endswith(b"\0" * 4)
+    found: list[bytes] = []
+    threads = [
+        threading.Thread(target=lambda: found.extend([sealers[1].seal(b"")[3:15] for _ in range(2000)]))
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    nonces += found
+    assert len(nonces) == 8303
+    assert len(set(nonces)) == len(nonces)
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(InvalidArgumentError, match="nonces"):
+            copied(sealers[0])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_has_nonces_of_its_own():
+    sealer = Sealer(1, KEY)
+    sealer.seal(b"before")
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.write(writing, sealer.seal(b"child"))
+        os._exit(0)
+    os.waitpid(child, 0)
+    frames = [os.read(reading, 2000), sealer.seal(b"parent")]
+    os.close(reading)
+    os.close(writing)
+    assert frames[0][3:11] != frames[1][3:11]
+    assert [Opener(KEY).open(frame) for frame in frames] == [(1, b"child"), (1, b"parent")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [((-1,), "sender=-1"), ((65536,), "sender=65536"), ((1.5,), "sender=1.5")]
+)
+def test_senders_that_cannot_be_are_named(arguments, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Sealer(*arguments, KEY)
+
+
+def test_what_cannot_be_sealed_is_named():
+    for datagram, message in ((bytes(1201), "1201 bytes"), ("text", "str")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            Sealer(0, KEY).seal(datagram)
+
+
+# -- what else comes in ------------------------------------------------------------------------------------
+
+
+def test_every_cut_flipped_bit_and_added_byte_is_refused():
+    opener, frame = Opener(KEY), Sealer(9, KEY).seal(b"the plan of the ninth robot")
+    n = 0
+    for length in range(len(frame)):
+        assert opener.open(frame[:length]) is None
+        n += 1
+    for bit in range(8 * len(frame)):
+        damaged = bytearray(frame)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert opener.open(bytes(damaged)) is None
+        n += 1
+    assert opener.open(frame + b"\0") is None
+    assert sum(opener.refused.values()) == n + 1
+    assert opener.open(frame) == (9, b"the plan of the ninth robot")  # and none of it has done harm
+
+
+@settings(max_examples=500)
+@given(data=st.binary(max_size=1400), key=st.sampled_from([KEY, None]))
+def test_noise_is_refused_and_counted(data, key):
+    opener = Opener(key)
+    opened = opener.open(data)
+    assert (opened is None) == (sum(opener.refused.values()) == 1)
+    assert opened is None or (key is None and opened[1] == data[15:])
+
+
+@settings(max_examples=500)
+@given(header=st.binary(min_size=14, max_size=14), data=st.binary(max_size=1300))
+def test_noise_that_looks_like_a_frame_is_refused_and_leaves_nothing_behind(header, data):
+    opener = Opener(KEY)
+    assert opener.open(b"\xf1" + header + data) is None
+    reason = "oversized" if len(data) > 1216 else "malformed" if len(data) < 16 else "wrong_key"
+    assert refused(opener) == {reason: 1}
+    assert len(opener._sessions) == 0
+
+
+def test_each_reason_is_told_apart(caplog):
+    other = TeamKey.generate()
+    sealer = Sealer(1, KEY)
+    frame = Sealer(2, KEY).seal(b"again")
+    for reason, frames in {
+        "oversized": [bytes(1232), b"\xe1" + bytes(1215), bytes(65000)],
+        "foreign": [b"", b"\x11" + bytes(100), b"\x41", b"GET / HTTP/1.1"],
+        "version": [b"\xf2" + bytes(100), b"\xe0", b"\xff"],
+        "malformed": [b"\xf1", b"\xf1" + bytes(29), b"\xe1" + bytes(13)],
+        "wrong_key": [b"\xf1" + bytes(30), Sealer(3, other).seal(b"x"), Sealer(3).seal(b"x")],
+        "echo": [sealer.seal(b"x"), sealer.seal(b"x")],
+        "replayed": [frame, frame],
+        "namesake": [Sealer(1, KEY).seal(b"x")],
+    }.items():
+        opener = Opener(KEY, own=sealer)
+        for each in [Sealer(2, KEY).seal(b"x"), *([frame] if reason == "replayed" else [])]:
+            assert opener.open(each) is not None
+        assert [opener.open(each) for each in frames] == [None] * len(frames), reason
+        assert refused(opener) == {reason: len(frames)}
+        assert tuple(opener.refused) == REFUSALS
+    assert [Opener().open(each) for each in (Sealer(3, KEY).seal(b"x"), b"\xf1" + bytes(60))] == [None] * 2
+
+
+def test_a_wrong_key_is_said_once_and_never_floods_the_log(caplog):
+    other, opener = Sealer(3, TeamKey.generate()), Opener(KEY)
+    with caplog.at_level(logging.DEBUG):
+        for _ in range(100):
+            opener.open(other.seal(b"x"), "10.0.0.5:7447")
+    (message,) = caplog.messages
+    assert "10.0.0.5:7447" in message
+    assert "robot 3" in message
+    assert "same team key" in message
+    with caplog.at_level(logging.DEBUG):
+        for sender in range(2000):
+            opener.open(b"\xf1" + sender.to_bytes(2, "little") + bytes(40))
+    assert len(caplog.messages) == 16
+    assert opener.refused["wrong_key"] == 2100
+
+
+def test_two_robots_with_one_number_are_named_and_refused(caplog):
+    first, second, opener = Sealer(3, KEY), Sealer(3, KEY), Opener(KEY, own=Sealer(4, KEY))
+    heard = []
+    for _ in range(10):
+        heard += [opener.open(first.seal(b"1"), "10.0.0.5:1"), opener.open(second.seal(b"2"), "10.0.0.6:1")]
+    assert heard[:2] == [(3, b"1"), (3, b"2")]
+    assert heard[6:] == [None] * 14
+    assert set(opener.namesakes) == {3}
+    (message,) = caplog.messages
+    assert "number 3" in message
+    assert "10.0.0.5:1" in message
+    assert "10.0.0.6:1" in message
+
+
+def test_whoever_has_this_robots_own_number_is_refused_at_once(caplog):
+    opener = Opener(KEY, own=Sealer(3, KEY))
+    assert opener.open(Sealer(3, KEY).seal(b"x"), "10.0.0.6:1") is None
+    assert opener.namesakes == {3: "10.0.0.6:1 and this robot"}
+    assert refused(opener) == {"namesake": 1}
+    assert "10.0.0.6:1 and this robot" in caplog.text
+
+
+def test_thousands_of_altered_frames_do_not_disturb_those_that_are_sound():
+    rng, sealer, opener = random.Random(0), Sealer(6, KEY), Opener(KEY)
+    for i in range(2000):
+        datagram = rng.randbytes(rng.randrange(100))
+        frame = bytearray(sealer.seal(datagram))
+        sound = bytes(frame)
+        for _ in range(3):
+            frame[rng.randrange(len(frame))] ^= rng.randrange(1, 256)
+        if bytes(frame) != sound:
+            assert opener.open(bytes(frame)) is None
+        assert opener.open(sound) == (6, datagram), i
+    assert opener.refused["replayed"] == 0
+    assert len(opener._sessions) == 1

@@ -1,0 +1,115 @@
+"""Sessions: replays against a set that forgets nothing, and two robots with one number."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.sharing.sessions import MAX_SESSIONS, RETURNS, SILENCE, WINDOW, ReplayWindow, Sessions
+
+A, B, C = b"A" * 8, b"B" * 8, b"C" * 8
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@settings(max_examples=300)
+@given(
+    steps=st.lists(st.integers(-WINDOW - 2, WINDOW + 2) | st.integers(-3, 3) | st.just(1), max_size=60),
+    start=st.sampled_from([0, 5, 2**31, 2**32 - 1]),
+)
+def test_a_window_takes_each_number_once_and_none_from_below(steps, start):
+    window, seen, number = ReplayWindow(), set(), start
+    for step in [0, *steps]:
+        number = min(max(number + step, 0), 2**32 - 1)
+        is_new = number not in seen and (not seen or number > max(seen) - WINDOW)
+        assert window.accept(number) == is_new
+        assert not window.accept(number)
+        seen.add(number)
+        assert window.highest == max(seen)
+
+
+@given(order=st.permutations(range(40)), stretch=st.sampled_from([1, WINDOW // 40]))
+def test_whatever_comes_within_the_window_is_taken_in_any_order(order, stretch):
+    window = ReplayWindow()
+    assert all(window.accept(i * stretch) for i in order)
+    assert not any(window.accept(i * stretch) for i in order)
+
+
+def test_the_window_is_1024_wide():
+    window = ReplayWindow()
+    assert window.accept(5000)
+    assert window.accept(5000 - 1023)
+    assert not window.accept(5000 - 1024)
+
+
+def test_a_robot_that_restarts_is_believed_and_its_stragglers_too():
+    sessions = Sessions(Clock())
+    assert all(sessions.refusal(3, A, i) is None for i in (0, 1, 2, 4, 5))
+    assert all(sessions.refusal(3, B, i) is None for i in range(3))
+    assert sessions.refusal(3, A, 3) is None  # late
+    assert sessions.refusal(3, A, 6) is None  # later still
+    assert sessions.refusal(3, B, 3) is None
+    assert sessions.refusal(3, A, 4) == "replayed"
+    assert all(sessions.refusal(3, C, i) is None for i in range(100))  # another restart
+    assert sessions.namesakes == {}
+
+
+def test_stragglers_of_a_former_start_are_no_second_robot():
+    sessions = Sessions(Clock())
+    assert sessions.refusal(3, A, 50) is None
+    assert all(sessions.refusal(3, *spoken) is None for i in range(50) for spoken in ((B, i), (A, i)))
+    assert sessions.namesakes == {}
+
+
+def test_two_robots_with_one_number_are_refused_until_one_is_silent():
+    clock = Clock()
+    sessions = Sessions(clock)
+    turns = [(A, 0, "a:1"), (B, 0, "b:2"), *((s, i, w) for i in (1, 2) for s, w in ((A, "a:1"), (B, "b:2")))]
+    answers = [sessions.refusal(3, session, i, source) for session, i, source in turns]
+    assert answers == [None] * (1 + RETURNS) + [
+        "namesake"
+    ]  # each that came back after the first two: RETURNS
+    assert sessions.namesakes == {3: "a:1 and b:2"}
+    assert sessions.refusal(4, C, 0) is None  # others are not meant
+    clock.now = SILENCE - 1
+    assert sessions.refusal(3, B, 3) == "namesake"
+    clock.now = SILENCE
+    assert sessions.refusal(3, B, 4) is None
+    assert sessions.namesakes == {}
+    for i in range(3, 8):  # A was only away
+        last = [sessions.refusal(3, A, i), sessions.refusal(3, B, 2 + i)]
+    assert last == ["namesake"] * 2
+
+
+def test_memory_is_bounded_whoever_speaks():
+    sessions = Sessions(Clock())
+    for i in range(4 * MAX_SESSIONS):
+        name = i.to_bytes(8, "little")
+        sessions.refusal(i % 60000, name, i)
+        sessions.refusal(7, name, 2 * i)
+        sessions.refusal(7, A, 3 * i)
+    assert len(sessions) == MAX_SESSIONS
+    assert len(sessions._speakers) <= MAX_SESSIONS
+    assert set(sessions.namesakes) <= set(sessions._speakers)
+
+
+def test_what_has_long_been_silent_is_forgotten_first():
+    sessions = Sessions(Clock())
+
+    def others_speak(n: int, tag: int) -> None:
+        for i in range(n):
+            assert sessions.refusal(2, bytes([tag]) + i.to_bytes(7, "little"), 0) is None
+
+    assert sessions.refusal(1, A, 0) is None
+    others_speak(MAX_SESSIONS - 1, 0)
+    assert sessions.refusal(1, A, 0) == "replayed"
+    assert sessions.refusal(1, A, 1) is None
+    others_speak(MAX_SESSIONS - 1, 1)
+    assert sessions.refusal(1, A, 0) == "replayed"
+    others_speak(1, 2)
+    assert sessions.refusal(1, A, 0) is None

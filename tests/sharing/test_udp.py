@@ -1,0 +1,417 @@
+"""UDP: real sockets on loopback, and all that can go wrong with them."""
+
+from __future__ import annotations
+
+import errno
+import math
+import random
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.sharing.network import Network, Traffic, Transport
+from gmmtorch.sharing.security import Sealer
+from gmmtorch.sharing.team_key import TeamKey
+from gmmtorch.sharing.udp import UdpTransport
+
+KEY = TeamKey(bytes(range(32)))
+GROUP = "239.71.77.7"
+Opening = Callable[..., UdpTransport]
+
+
+@pytest.fixture
+def opening() -> Iterator[Opening]:
+    """Opens transports that are closed after the test."""
+    with ExitStack() as stack:
+        yield lambda robot, *a, **options: stack.enter_context(UdpTransport.unicast(robot, *a, **options))
+
+
+@pytest.fixture
+def raw() -> Iterator[socket.socket]:
+    """A socket of somebody else."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        bound.settimeout(10)
+        yield bound
+
+
+def team(opening: Opening, n: int, **options: object) -> list[UdpTransport]:
+    """Transports of robots 0 … n − 1, each with all others as its peers."""
+    transports = [opening(robot, **options) for robot in range(n)]
+    for transport in transports:
+        transport.peers = [other.address for other in transports if other is not transport]
+    return transports
+
+
+def until(is_done: Callable[[], bool]) -> None:
+    """Sockets and threads take their time; a test that fails takes ten seconds."""
+    end = time.monotonic() + 10
+    while not is_done():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def heard(transport: UdpTransport, n: int) -> list[tuple[int, bytes]]:
+    """The next n datagrams."""
+    found: list[tuple[int, bytes]] = []
+    until(lambda: len(found.extend(transport.deliver(transport.robot, 0.0)) or found) >= n)
+    return found
+
+
+# -- what is sent, heard, and counted ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", [KEY, None])
+def test_all_others_hear_a_datagram_once_and_in_order(opening, key):
+    transports: list[Transport] = list(team(opening, 3, key=key))
+    sent = [bytes([i]) * (i * 40) for i in range(31)]
+    transports[1].send(1, sent, 0.0, "maps")
+    for robot in (0, 2):
+        assert heard(transports[robot], 31) == [(1, datagram) for datagram in sent]
+        assert transports[robot].deliver(robot, 1.0) == []
+    assert transports[1].deliver(1, 1.0) == []
+
+
+@pytest.mark.parametrize("key", [KEY, None])
+def test_the_socket_carries_what_the_simulation_counts_and_the_frames(opening, raw, key):
+    """Against a plain socket that measures what really comes, and against `Network` given the same."""
+    a, b = team(opening, 2, key=key)
+    a.peers = [b.address, raw.getsockname()]
+    network, rng, n_measured, n_bytes = Network(2), random.Random(0), 0, 0
+    for turn in range(20):
+        datagrams = [rng.randbytes(rng.randrange(1201)) for _ in range(rng.randrange(4))]
+        kind = rng.choice(["maps", "plans"])
+        a.send(0, datagrams, float(turn), kind)
+        network.send(0, datagrams, float(turn), kind)
+        for _ in datagrams:
+            n_measured += 1
+            n_bytes += len(raw.recv(2000))
+    for sender in (0, 1, None):
+        for kind in ("maps", "plans", None):
+            assert a.traffic(sender, kind) == network.traffic(sender, kind)
+    assert a.overhead == (31 if key else 15)
+    assert n_bytes == network.n_bytes + a.overhead * n_measured
+    assert a.sent == Traffic(2 * n_measured, 2 * n_bytes)
+    assert a.sent.wire_bytes == 2 * (n_bytes + 28 * n_measured)
+    until(lambda: b.received == Traffic(n_measured, n_bytes))
+    assert a.failures == {}
+
+
+def test_clocks_that_jump_do_no_harm(opening):
+    a, b = team(opening, 2, key=KEY)
+    times = [1e9, 0.0, -1e12, math.nan, math.inf, 5.0]
+    for now in times:
+        a.send(0, [b"x"], now, "maps")
+    found: list[tuple[int, bytes]] = []
+    until(lambda: len(found.extend(b.deliver(1, times[len(found) % 6])) or found) == 6)
+    assert found == [(0, b"x")] * 6
+
+
+@pytest.fixture
+def multicast() -> None:
+    """Skips where plain sockets cannot reach a group on loopback."""
+    options = [
+        (socket.IP_ADD_MEMBERSHIP, socket.inet_aton(GROUP) + socket.inet_aton("127.0.0.1")),
+        (socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1")),
+    ]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.settimeout(1)
+        try:
+            probe.bind(("", 0))
+            for option, value in options:
+                probe.setsockopt(socket.IPPROTO_IP, option, value)
+            probe.sendto(b"probe", (GROUP, probe.getsockname()[1]))
+            probe.recv(100)
+        except OSError as error:
+            pytest.skip(f"no multicast on loopback here: {error}")
+
+
+@pytest.mark.usefixtures("multicast")
+@pytest.mark.parametrize("key", [KEY, None])
+def test_a_team_by_multicast_sends_once_and_hears_the_others_alone(key):
+    with ExitStack() as stack:
+        a = stack.enter_context(UdpTransport.multicast(0, (GROUP, 0), key=key))
+        group = a.address
+        assert group[0] == GROUP
+        b, c = (stack.enter_context(UdpTransport.multicast(i, group, key=key)) for i in (1, 2))
+        a.send(0, [b"x", b"y"], 0.0, "maps")
+        assert [heard(each, 2) for each in (b, c)] == [[(0, b"x"), (0, b"y")]] * 2
+        until(lambda: a.refused["echo"] == 2)
+        assert a.deliver(0, 0.0) == []
+        assert a.sent == a.received == b.received == Traffic(2, 2 * (1 + a.overhead))
+        with pytest.raises(InvalidArgumentError, match=f"port={group[1]}.*another process"):
+            UdpTransport.unicast(3, ("0.0.0.0", group[1]), key=KEY)
+
+
+OTHER_PROCESS = """
+import os, socket, sys
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+aead = ChaCha20Poly1305(bytes(range(32)))
+me = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+me.bind(("127.0.0.1", 0))
+me.settimeout(10)
+print(me.getsockname()[1], flush=True)
+session = os.urandom(8)
+for number in range(50):
+    frame, whence = me.recvfrom(2000)
+    datagram = aead.decrypt(frame[3:15], frame[15:], frame[:15])
+    header = b"\\xf1" + (7).to_bytes(2, "little") + session + number.to_bytes(4, "little")
+    me.sendto(header + aead.encrypt(header[3:], datagram[::-1], header), whence)
+"""
+
+
+def test_another_process_that_knows_the_format_takes_part(opening):
+    """Written from docs/network.md alone: it has none of our code."""
+    a = opening(0, key=KEY)
+    with subprocess.Popen([sys.executable, "-c", OTHER_PROCESS], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        a.peers = [("127.0.0.1", int(other.stdout.readline()))]
+        sent = [f"datagram {i}".encode() for i in range(50)]
+        a.send(0, sent, 0.0, "maps")
+        assert heard(a, 50) == [(7, datagram[::-1]) for datagram in sent]
+        assert other.wait(10) == 0
+
+
+# -- what else comes in ------------------------------------------------------------------------------------
+
+
+def test_whatever_strangers_send_is_counted_and_the_team_goes_on(opening, raw):
+    a, b = team(opening, 2, key=KEY)
+    rng, stranger = random.Random(0), Sealer(0, TeamKey.generate())
+    a.peers = [*a.peers, raw.getsockname()]
+    a.send(0, [b"one"], 0.0, "maps")
+    frame = raw.recv(2000)
+    hostile = {
+        "foreign": [b"", b"hello", b"\x11" + rng.randbytes(1199)],
+        "oversized": [rng.randbytes(1232), bytes(60000)],
+        "version": [b"\xf3" + rng.randbytes(99)],
+        "malformed": [frame[:30], b"\xf1"],
+        "wrong_key": [frame[:-1], frame[:-1] + b"?", stranger.seal(b"x"), Sealer(0).seal(b"x")],
+        "replayed": [frame, frame, frame],
+    }
+    for datagrams in hostile.values():
+        for datagram in datagrams:
+            raw.sendto(datagram, b.address)
+    a.send(0, [b"two"], 0.0, "maps")
+    assert heard(b, 2) == [(0, b"one"), (0, b"two")]
+    assert {reason: n for reason, n in b.refused.items() if n} == {r: len(d) for r, d in hostile.items()}
+    sizes = [len(datagram) for datagrams in hostile.values() for datagram in datagrams]
+    assert b.received == Traffic(2 + len(sizes), 2 * 34 + sum(sizes))
+
+
+def test_thousands_of_forged_frames_take_no_memory(opening, raw):
+    a, b = team(opening, 2, key=KEY, max_waiting=10)
+    rng = random.Random(1)
+    for i in range(3000):
+        raw.sendto(b"\xf1" + rng.randbytes(rng.randrange(1300)), b.address)
+        if i % 50 == 0:
+            until(lambda i=i: b.received.datagrams + b.n_overflowed > i)
+    until(lambda: b.received.datagrams == 3000)
+    a.send(0, [b"x"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"x")]
+    assert len(b._opener._sessions) == 1
+    assert sum(b.refused.values()) == 3000
+
+
+def test_of_too_many_that_wait_the_newest_are_kept(opening):
+    a, b = team(opening, 2, key=KEY, max_waiting=100)
+    for i in range(250):
+        a.send(0, [i.to_bytes(2, "little")], 0.0, "maps")
+    until(lambda: b.received.datagrams == 250)
+    assert b.deliver(1, 0.0) == [(0, i.to_bytes(2, "little")) for i in range(150, 250)]
+    assert b.n_dropped == 150
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket has no room for")
+def test_what_the_system_has_no_room_for_is_counted(opening, raw, monkeypatch):
+    """The receiving thread is held up until the socket's own buffer has run over."""
+    monkeypatch.setattr("gmmtorch.sharing.udp._BUFFER_BYTES", 1 << 14)
+    b = opening(1)
+    sealer, n = Sealer(0), 200
+    with b._lock:
+        for _ in range(n):
+            raw.sendto(sealer.seal(bytes(1000)), b.address)
+    until(lambda: not heard_any(b))
+    raw.sendto(sealer.seal(b"last"), b.address)  # which brings the count with it
+    until(lambda: b.deliver(1, 0.0) == [(0, b"last")])
+    assert b.n_overflowed > 0
+    assert b.received.datagrams + b.n_overflowed == n + 1
+
+
+def heard_any(transport: UdpTransport) -> bool:
+    before = transport.received
+    time.sleep(0.05)
+    transport.deliver(transport.robot, 0.0)
+    return transport.received != before
+
+
+def test_two_robots_with_one_number_are_found_by_all(opening, caplog):
+    a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
+    everybody = [each.address for each in (a, first, second)]
+    for each in (a, first, second):
+        each.peers = [address for address in everybody if address != each.address]
+    for n in range(20):
+        (first, second)[n % 2].send(3, [bytes([n])], 0.0, "maps")
+        until(lambda n=n: a.received.datagrams == n + 1)
+    until(lambda: first.refused["namesake"] == second.refused["namesake"] == 10)
+    assert len(a.deliver(0, 0.0)) < 8
+    assert a.refused["namesake"] > 12
+    assert set(a.namesakes) == set(first.namesakes) == set(second.namesakes) == {3}
+    for each in (first, second):
+        assert f"127.0.0.1:{each.address[1]}" in a.namesakes[3]
+    assert sum("number 3" in message for message in caplog.messages) == 3  # one of each
+
+
+def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
+    a = opening(0, key=KEY)
+    with UdpTransport.unicast(1, peers=[a.address], key=KEY) as first:
+        port = first.address
+        first.send(1, [b"before"] * 5, 0.0, "maps")
+    with UdpTransport.unicast(1, port, peers=[a.address], key=KEY) as second:
+        second.send(1, [b"after"] * 5, 0.0, "maps")
+    assert heard(a, 10) == [(1, b"before")] * 5 + [(1, b"after")] * 5
+    assert sum(a.refused.values()) == 0
+
+
+# -- where it may listen, and what goes wrong --------------------------------------------------------------
+
+
+def test_without_a_key_nobody_outside_is_spoken_to_by_accident(opening):
+    for open_it in (
+        lambda **o: UdpTransport.unicast(0, ("0.0.0.0", 0), **o),
+        lambda **o: UdpTransport.multicast(0, (GROUP, 0), "0.0.0.0", **o),
+    ):
+        with pytest.raises(InvalidArgumentError, match=r"no key.*insecure=True"):
+            open_it()
+    for options in ({"key": KEY}, {"insecure": True}):
+        with UdpTransport.unicast(0, ("0.0.0.0", 0), [("10.0.0.5", 7447)], **options) as transport:
+            assert transport.peers == [("10.0.0.5", 7447)]
+    assert opening(0).address[0] == "127.0.0.1"
+    with pytest.raises(InvalidArgumentError, match=r"10\.0\.0\.5.*cannot be reached"):
+        opening(0).peers = [("10.0.0.5", 7447)]
+    with pytest.raises(InvalidArgumentError, match=r"10\.0\.0\.5.*cannot be reached"):
+        opening(0, peers=[("10.0.0.5", 7447)])
+
+
+def test_a_port_in_use_is_named_with_what_to_do(opening):
+    taken = opening(0).address
+    with pytest.raises(InvalidArgumentError, match=f"port={taken[1]}.*another process.*another port"):
+        opening(1, taken)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot": -1}, "sender=-1"),
+        ({"robot": 65536}, "sender=65536"),
+        ({"address": ("localhost", 0)}, "address=.*IPv4 address"),
+        ({"address": ("::1", 0)}, "address=.*IPv4 address"),
+        ({"address": "127.0.0.1"}, "address='127.0.0.1'"),
+        ({"address": (2130706433, 0)}, "address=.*IPv4 address"),
+        ({"address": ("127.0.0.1", 65536)}, "65535"),
+        ({"address": ("127.0.0.1", -1)}, "port of address=-1"),
+        ({"address": ("198.51.100.7", 0), "key": KEY}, "no such address"),
+        ({"peers": [("127.0.0.1", 0)]}, "port of peers=0"),
+        ({"peers": [("robot1", 7447)]}, "names are not looked up"),
+        ({"peers": [(GROUP, 7447)]}, "multicast"),
+        ({"max_waiting": 0}, "max_waiting=0"),
+    ],
+)
+def test_options_that_cannot_be_are_named(options, message):
+    n_threads = threading.active_count()
+    with pytest.raises(InvalidArgumentError, match=message):
+        UdpTransport.unicast(**{"robot": 0, **options})
+    assert threading.active_count() == n_threads
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"group": ("10.0.0.1", 7447)}, "group=.*multicast address"),
+        ({"interface": "eth0"}, "interface="),
+        ({"interface": "198.51.100.7", "key": KEY}, "interface='198.51.100.7'.*ip -4 address"),
+        ({"ttl": 256}, "ttl=256"),
+        ({"ttl": -1}, "ttl=-1"),
+    ],
+)
+def test_groups_that_cannot_be_joined_are_named(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        UdpTransport.multicast(**{"robot": 0, "group": (GROUP, 0), **options})
+
+
+class Unplugged:
+    """A socket whose network is away."""
+
+    def __init__(self, bound: socket.socket, code: int) -> None:
+        self._bound, self._code = bound, code
+
+    def sendto(self, *_: object) -> int:
+        raise OSError(self._code, "away")
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._bound, name)
+
+
+@pytest.mark.parametrize("name", ["ENETUNREACH", "EHOSTUNREACH", "EPERM", "ENOBUFS", "EAGAIN", "ENETDOWN"])
+def test_a_network_that_is_away_is_counted_and_the_robot_goes_on(opening, caplog, name):
+    a, b = team(opening, 2, key=KEY)
+    plugged = a._socket
+    a._socket = Unplugged(plugged, getattr(errno, name))
+    for _ in range(5):
+        a.send(0, [b"x", b"y"], 0.0, "maps")
+    assert a.failures == {name: 10}
+    assert len(caplog.messages) == 1
+    assert (a.sent, a.traffic()) == (Traffic(), Traffic(10, 10))
+    a._socket = plugged
+    a.send(0, [b"z"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"z")]
+    assert a.sent == Traffic(1, 32)
+
+
+def test_what_the_system_itself_refuses_to_send_is_counted(opening):
+    """Broadcasts need a permission that the socket does not ask for."""
+    a = opening(0, ("0.0.0.0", 0), [("255.255.255.255", 7447)], key=KEY)
+    a.send(0, [b"x"], 0.0, "maps")
+    assert sum(a.failures.values()) == 1
+    assert a.sent == Traffic()
+
+
+def test_only_its_own_robot_sends_and_hears_through_it(opening):
+    a, b = team(opening, 2)
+    with pytest.raises(InvalidArgumentError, match="sender=1 must be 0"):
+        a.send(1, [b"x"], 0.0, "maps")
+    with pytest.raises(InvalidArgumentError, match="robot=1 must be 0"):
+        a.deliver(1, 0.0)
+    for datagrams, message in (([b"", bytes(1201)], "1201 bytes"), (["text"], "str")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            a.send(0, datagrams, 0.0, "maps")
+    assert a.sent == a.traffic() == b.received == Traffic()
+
+
+def test_closing_gives_back_port_and_thread_and_can_be_done_twice():
+    n_threads = threading.active_count()
+    with UdpTransport.unicast(0) as transport:
+        assert threading.active_count() == n_threads + 1
+        assert f"{transport.robot}" in threading.enumerate()[-1].name
+    transport.close()
+    assert threading.active_count() == n_threads
+    for use in (lambda: transport.send(0, [b"x"], 0.0, "maps"), lambda: transport.deliver(0, 0.0)):
+        with pytest.raises(GmmTorchError, match="closed"):
+            use()
+    with UdpTransport.unicast(1, transport.address) as other:
+        assert other.address == transport.address
+
+
+def test_keys_are_in_no_message_of_a_transport(opening, caplog):
+    a, b = opening(0, key=KEY), opening(1, key=TeamKey.generate())
+    b.peers = [a.address]
+    b.send(1, [b"x"], 0.0, "maps")
+    until(lambda: a.refused["wrong_key"] == 1)
+    assert bytes(range(32)).hex()[:8] not in caplog.text + repr(a) + repr(vars(a)) + repr(vars(a._opener))
