@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gmmtorch import datasets as datasets
+    from gmmtorch import sharing as sharing
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
@@ -80,6 +81,7 @@ __all__ = [
     "fit_depth_image",
     "merge",
     "prune",
+    "sharing",
     "simplify",
 ]
 
@@ -87,8 +89,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
-    if name == "datasets":
-        return importlib.import_module("gmmtorch.datasets")
+    if name in ("datasets", "sharing"):
+        return importlib.import_module(f"gmmtorch.{name}")
     raise AttributeError(f"module 'gmmtorch' has no attribute {name!r}")
 
 

@@ -148,6 +148,13 @@ class GaussianMap(nn.Module):
         made._n_numbered = k
         return made
 
+    @classmethod
+    def of(cls, components: Components, **options: Any) -> GaussianMap:
+        """A map of components as they are, ids included; `options` as for `from_components`."""
+        made = cls(**{"codec": "float", **options})
+        made._commit(components.checked())
+        return made
+
     # -- learning ---------------------------------------------------------------------------------
 
     def insert(self, scan: Scan) -> None:

@@ -23,7 +23,7 @@ from gmmtorch.mapping.thesis_message import (
     encode_thesis,
     encode_thesis_updates,
 )
-from gmmtorch.sharing.envelope import Kind, check_codec, sealed, split
+from gmmtorch.sharing.envelope import MAX_BYTES, Kind, check_codec, sealed, split
 from gmmtorch.sharing.fields import check_ids, id_order, read_ids, read_number, write_ids, write_number
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, sightings
@@ -45,18 +45,25 @@ class CountsMessage:
     counts: dict[tuple[int, int], float]
 
 
-def encode_components(components: Components, codec: str = "quantized") -> list[bytes]:
+def encode_components(
+    components: Components, codec: str = "quantized", max_bytes: int = MAX_BYTES
+) -> list[bytes]:
     """Datagrams of components in order, each with the sensor positions that it needs; none of none.
 
     Args:
         codec: "quantized": 8 to 10 bytes a component, and `mapping.codec.quantized` says what comes out.
             "float": float64, as they are. "thesis": 57 bytes for each component and sensor position.
+        max_bytes: of each datagram.
 
     Raises `InvalidArgumentError` for what the codec cannot store, and for a component of so many sensor
     positions that it does not fit into a datagram.
     """
     write = {"quantized": _quantized, "float": _float, "thesis": _thesis}[check_codec(codec)]
-    return split(len(components), lambda begin, end: write(_part(components, begin, end)), "component")
+
+    def part(begin: int, end: int) -> bytes:
+        return write(_part(components, begin, end))
+
+    return split(len(components), part, "component", max_bytes)
 
 
 def encode_counts(
@@ -207,7 +214,7 @@ def _quantized_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
     writer = BitWriter()
     write_number(writer, "sender", sender)
     write_ids(writer, ids.numpy())
-    writer.column(_count_steps(counts))
+    writer.column(count_steps(counts))
     return sealed(Kind.COUNTS, writer.to_bytes())
 
 
@@ -216,17 +223,22 @@ def read_quantized_counts(body: bytes) -> CountsMessage:
     sender, ids = read_number(reader), read_ids(reader)
     steps = reader.column(len(ids))
     reader.finish()
-    if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
-        raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
-    values = np.where(steps == NO_COUNT, 0.0, power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy())
-    return _counts(sender, ids, values)
+    return _counts(sender, ids, counts_of(steps))
 
 
-def _count_steps(counts: Tensor) -> Ints:
+def count_steps(counts: Tensor) -> Ints:
     """log2 of the counts in steps, as `mapping.quantization` has the support of components."""
     least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
     steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
     return torch.where(counts < least / 2, NO_COUNT, steps).numpy()
+
+
+def counts_of(steps: Ints) -> np.ndarray:
+    """The counts that steps stand for. Raises `DataError` for what `count_steps` does not give."""
+    if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
+        raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
+    told = power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy()
+    return np.where(steps == NO_COUNT, 0.0, told)
 
 
 def _float_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:

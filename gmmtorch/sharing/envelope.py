@@ -29,6 +29,10 @@ class Kind(IntEnum):
     POINTS = 7
     VIEWS = 8
     PLAN = 9
+    ANNOUNCEMENT = 10
+    SUPERSESSION = 11
+    TOTALS = 12
+    CORRECTION = 13
 
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})
@@ -66,7 +70,7 @@ def opened(datagram: bytes) -> tuple[Kind, bytes]:
     return kind, data[1:]
 
 
-def split(n: int, encode: Callable[[int, int], bytes], what: str) -> list[bytes]:
+def split(n: int, encode: Callable[[int, int], bytes], what: str, max_bytes: int = MAX_BYTES) -> list[bytes]:
     """Datagrams of n things, halved until each fits; encode(begin, end) writes those from begin to end − 1.
 
     Raises `InvalidArgumentError` where a single one does not fit.
@@ -74,11 +78,11 @@ def split(n: int, encode: Callable[[int, int], bytes], what: str) -> list[bytes]
 
     def parts(begin: int, end: int) -> list[bytes]:
         datagram = encode(begin, end)
-        if len(datagram) <= MAX_BYTES:
+        if len(datagram) <= max_bytes:
             return [datagram]
         if end - begin == 1:
             raise InvalidArgumentError(
-                f"A single {what} takes {len(datagram)} bytes; a datagram has room for {MAX_BYTES}. "
+                f"A single {what} takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
                 "Let it have fewer sensor positions."
             )
         middle = (begin + end) // 2

@@ -9,7 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.sharing import component_messages, point_messages, view_messages
+from gmmtorch.sharing import announce_messages, component_messages, point_messages, view_messages
+from gmmtorch.sharing.announce_messages import (
+    AnnouncementMessage,
+    CorrectionMessage,
+    SupersessionMessage,
+    TotalsMessage,
+)
 from gmmtorch.sharing.component_messages import (
     ComponentsMessage,
     CountsMessage,
@@ -24,11 +30,15 @@ from gmmtorch.sharing.view_messages import PlanMessage, ViewsMessage, encode_pla
 __all__ = [
     "CODECS",
     "MAX_BYTES",
+    "AnnouncementMessage",
     "ComponentsMessage",
+    "CorrectionMessage",
     "CountsMessage",
     "Message",
     "PlanMessage",
     "PointsMessage",
+    "SupersessionMessage",
+    "TotalsMessage",
     "ViewsMessage",
     "decode",
     "encode_components",
@@ -39,7 +49,17 @@ __all__ = [
     "quantized_poses",
 ]
 
-Message = ComponentsMessage | CountsMessage | PointsMessage | ViewsMessage | PlanMessage
+Message = (
+    ComponentsMessage
+    | CountsMessage
+    | PointsMessage
+    | ViewsMessage
+    | PlanMessage
+    | AnnouncementMessage
+    | SupersessionMessage
+    | TotalsMessage
+    | CorrectionMessage
+)
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.COMPONENTS: component_messages.read_quantized,
@@ -51,6 +71,10 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.POINTS: point_messages.read_points,
     Kind.VIEWS: view_messages.read_views,
     Kind.PLAN: view_messages.read_plan,
+    Kind.ANNOUNCEMENT: announce_messages.read_announcement,
+    Kind.SUPERSESSION: announce_messages.read_supersession,
+    Kind.TOTALS: announce_messages.read_totals,
+    Kind.CORRECTION: announce_messages.read_correction,
 }
 
 

@@ -1,0 +1,103 @@
+"""Sets of whole numbers as intervals: what a robot holds of what others have numbered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gmmtorch.errors import InvalidArgumentError
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """A set of whole numbers of 64 bits; takes memory by its intervals, however long they are.
+
+    edges (2n,): strictly rising; the numbers from edges[0] to edges[1] − 1, from edges[2] to edges[3] − 1, …
+    So intervals are sorted, do not touch, and equal sets have equal edges.
+    """
+
+    edges: Ints
+
+    def __post_init__(self) -> None:
+        edges = self.edges
+        if edges.ndim != 1 or len(edges) % 2 or edges.dtype != np.int64 or (edges[1:] <= edges[:-1]).any():
+            raise InvalidArgumentError(
+                f"edges of shape {edges.shape} and {edges.dtype} must be pairs of int64 that rise strictly."
+            )
+
+    @classmethod
+    def empty(cls) -> Intervals:
+        return cls(np.zeros(0, np.int64))
+
+    @classmethod
+    def span(cls, begin: int, end: int) -> Intervals:
+        """The numbers from `begin` to `end` − 1; none if `end` is not above `begin`."""
+        return cls(np.array([begin, end] if begin < end else [], np.int64))
+
+    @classmethod
+    def of(cls, numbers: Ints) -> Intervals:
+        """The set of these numbers (N,), in any order."""
+        if not len(numbers):
+            return cls.empty()
+        rising = np.unique(numbers)
+        breaks = np.flatnonzero(np.diff(rising) > 1)
+        begins, lasts = rising[np.append(0, breaks + 1)], rising[np.append(breaks, len(rising) - 1)]
+        return cls(np.stack([begins, lasts + 1], 1).reshape(-1).astype(np.int64))
+
+    def __len__(self) -> int:
+        """How many intervals there are."""
+        return len(self.edges) // 2
+
+    @property
+    def size(self) -> int:
+        """How many numbers there are."""
+        return sum((self.edges[1::2] - self.edges[::2]).tolist())  # Python's ints do not overflow
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Begin and end of each interval, the end not in it."""
+        return list(zip(self.edges[::2].tolist(), self.edges[1::2].tolist(), strict=True))
+
+    def contains(self, numbers: Ints) -> NDArray[np.bool_]:
+        """Which of these numbers (N,) are in the set: those with an odd number of edges up to them."""
+        return np.searchsorted(self.edges, numbers, side="right") % 2 == 1
+
+    def covers(self, other: Intervals) -> bool:
+        """Whether all of the other set is in this one."""
+        return not (other - self)
+
+    def __contains__(self, number: int) -> bool:
+        return bool(self.contains(np.array([number], np.int64))[0])
+
+    def __or__(self, other: Intervals) -> Intervals:
+        places, here, there = self._against(other)
+        return _where(places, here | there)
+
+    def __and__(self, other: Intervals) -> Intervals:
+        places, here, there = self._against(other)
+        return _where(places, here & there)
+
+    def __sub__(self, other: Intervals) -> Intervals:
+        places, here, there = self._against(other)
+        return _where(places, here & ~there)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Intervals) and np.array_equal(self.edges, other.edges)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
+
+    def _against(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Where either set may change, and whether the numbers from there on are in each."""
+        places = np.unique(np.concatenate([self.edges, other.edges]))
+        return places, self.contains(places), other.contains(places)
+
+
+def _where(places: Ints, inside: NDArray[np.bool_]) -> Intervals:
+    """The set that the numbers from each place to the next are in, or not; after the last none is."""
+    return Intervals(places[np.diff(inside, prepend=False)])

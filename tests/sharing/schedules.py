@@ -1,0 +1,184 @@
+"""Random schedules of what can happen to a team: loss, repetition, reordering, partitions, crashes, restarts.
+
+`run_schedule(seed)` runs one and says how it ended; a script may run as many as it likes:
+
+    for seed in range(1000):
+        assert run_schedule(seed).converged
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, field
+from typing import Any
+from unittest import mock
+
+import torch
+from mapping.random_components import random_components
+from torch import Tensor
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.sharing import authorship
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.replica import Replica
+
+MOST_ROUNDS = 8
+"""Of announcing and answering without loss, until all should hold the same."""
+_LONGEST_DELAY = 6  # steps; so datagrams overtake one another
+_SNAPSHOT_EVERY = 5
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """converged: all digests equal; rounds without loss that it took; complete: what anybody held at the end
+    of the trouble, all hold; refused: datagrams by reason, all robots together."""
+
+    converged: bool
+    complete: bool
+    rounds: int
+    replicas: list[Replica]
+    refused: dict[str, int]
+    crashes: int
+
+
+@dataclass
+class _Team:
+    rng: random.Random
+    replicas: list[Replica]
+    loss: float
+    repeats: float
+    now: int = 0
+    flying: list[tuple[int, int, bytes]] = field(default_factory=list)  # arrival, receiver, datagram
+    cut: set[int] = field(default_factory=set)  # robots on one side of a partition
+    snapshots: dict[int, dict[str, Any]] = field(default_factory=dict)
+    refused: dict[str, int] = field(default_factory=dict)
+    crashes: int = 0
+
+    def broadcast(self, sender: int, datagrams: list[bytes]) -> None:
+        for datagram in datagrams:
+            for receiver in range(len(self.replicas)):
+                if receiver == sender or (receiver in self.cut) != (sender in self.cut):
+                    continue
+                for _ in range(1 + (self.rng.random() < self.repeats)):
+                    if self.rng.random() >= self.loss:
+                        arrival = self.now + self.rng.randint(0, _LONGEST_DELAY)
+                        self.flying.append((arrival, receiver, datagram))
+
+    def deliver(self) -> None:
+        due = [item for item in self.flying if item[0] <= self.now]
+        self.flying = [item for item in self.flying if item[0] > self.now]
+        self.rng.shuffle(due)
+        for _, receiver, datagram in due:
+            self.replicas[receiver].receive(datagram)
+
+    def restart(self, robot: int, keeps_disk: bool) -> None:
+        """A new process: with an old snapshot of its disk, or with nothing."""
+        self.crashes += 1
+        self.note_refused(robot)
+        self.replicas[robot] = Replica(robot, incarnation=self.rng.getrandbits(24))
+        if keeps_disk and robot in self.snapshots:
+            self.replicas[robot].restore(self.snapshots[robot])
+
+    def note_refused(self, robot: int) -> None:
+        for reason, n in self.replicas[robot].refused.items():
+            self.refused[reason] = self.refused.get(reason, 0) + n
+
+
+def components(rng: random.Random, n: int) -> Components:
+    return random_components(3, k=n, seed=rng.getrandbits(31), extent=8.0)
+
+
+def act(rng: random.Random, replica: Replica) -> None:
+    """Something that a robot may do to its own map."""
+    known = replica.components().ids
+    own = known[known[:, 0] == replica.robot]
+    kind = rng.choice(["add", "add", "supersede", "supersede", "count", "count", "correct"])
+    if kind == "add":
+        replica.add(components(rng, rng.randint(1, 5)))
+    elif kind == "supersede" and len(own):
+        replica.add(components(rng, rng.randint(0, 2)), supersedes=_some(rng, own))
+    elif kind == "count" and len(known):
+        replica.count({tuple(row): rng.uniform(0.5, 500.0) for row in _some(rng, known).tolist()})
+    elif kind == "correct" and len(own):
+        motion = torch.eye(4, dtype=torch.float64)
+        motion[:3, 3] = torch.tensor([rng.uniform(-1, 1) for _ in range(3)])
+        replica.correct(rng.randrange(3), motion, _some(rng, own))
+
+
+def _some(rng: random.Random, rows: Tensor) -> Tensor:
+    return rows[sorted(rng.sample(range(len(rows)), rng.randint(1, min(4, len(rows)))))]
+
+
+def run_schedule(seed: int, n_robots: int = 3, n_steps: int = 40) -> Outcome:
+    """A team in trouble for so many steps, then a network that works.
+
+    With odd seeds robots tidy up what they said as soon as they can, which else takes long missions.
+    """
+    tidy = {"_MOST_SUPERSESSIONS": 1, "_SLACK": 1} if seed % 2 else {"_MOST_SUPERSESSIONS": 32}
+    with mock.patch.multiple(authorship, **tidy):
+        return _run(random.Random(seed), n_robots, n_steps)
+
+
+def _run(rng: random.Random, n_robots: int, n_steps: int) -> Outcome:
+    replicas = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(n_robots)]
+    team = _Team(rng, replicas, loss=rng.choice([0.0, 0.1, 0.3, 0.5]), repeats=rng.choice([0.0, 0.3]))
+    for team.now in range(n_steps):
+        _trouble(team)
+        for robot, replica in enumerate(team.replicas):
+            if rng.random() < 0.3:
+                act(rng, replica)
+            if rng.random() < 0.3:
+                team.broadcast(robot, replica.announcements())
+            if rng.random() < 0.7:
+                team.broadcast(robot, replica.datagrams(budget=rng.choice([None, 1500])))
+            if rng.randrange(_SNAPSHOT_EVERY) == 0:
+                team.snapshots[robot] = replica.state()
+        team.deliver()
+    rounds = _heal(team, held := _union(team.replicas))
+    for robot in range(n_robots):
+        team.note_refused(robot)
+    return Outcome(
+        converged=_agree(team.replicas),
+        complete=all(_held(replica).covers(held) for replica in team.replicas),
+        rounds=rounds,
+        replicas=team.replicas,
+        refused=team.refused,
+        crashes=team.crashes,
+    )
+
+
+def _trouble(team: _Team) -> None:
+    rng = team.rng
+    if rng.random() < 0.1:
+        team.cut = set() if team.cut else {rng.randrange(len(team.replicas))}
+    if rng.random() < 0.05:
+        team.restart(rng.randrange(len(team.replicas)), keeps_disk=rng.random() < 0.5)
+
+
+def _heal(team: _Team, held: Intervals) -> int:
+    """How many rounds it takes until all hold all, and the same."""
+    team.loss, team.cut = 0.0, set()
+    for done in range(MOST_ROUNDS + 1):
+        if not team.flying and _agree(team.replicas):
+            return done
+        for robot, replica in enumerate(team.replicas):
+            team.broadcast(robot, [*replica.announcements(), *replica.datagrams()])
+        team.now += _LONGEST_DELAY
+        team.deliver()
+    return MOST_ROUNDS + 1
+
+
+def _agree(replicas: list[Replica]) -> bool:
+    return len({replica.digest() for replica in replicas}) == 1
+
+
+def _held(replica: Replica) -> Intervals:
+    edges = replica.state()["records"]["held"].numpy()
+    return Intervals(edges)
+
+
+def _union(replicas: list[Replica]) -> Intervals:
+    held = Intervals.empty()
+    for replica in replicas:
+        held |= _held(replica)
+    return held

@@ -1,0 +1,322 @@
+"""Announcements, and the records that are no components: what comes out is what went in; and who answers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components, rotations
+from sharing.message_examples import sealed
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mapping.bitstream import BitWriter
+from gmmtorch.mapping.quantization import COUNT_ERROR
+from gmmtorch.sharing.announce_messages import (
+    AnnouncementMessage,
+    CorrectionMessage,
+    SupersessionMessage,
+    TotalsMessage,
+    encode_announcements,
+    encode_record,
+    pose_of,
+    totals_message,
+)
+from gmmtorch.sharing.anti_entropy import MOST_PEERS, Backlog
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import MAX_BYTES, decode
+from gmmtorch.sharing.record_ids import END, first_key
+from gmmtorch.sharing.replica import Replica
+
+robots = st.integers(0, 1023)
+lives = st.integers(0, (1 << 24) - 1)
+keys = st.integers(0, 300) | st.integers(0, END - 1)
+
+
+def of(*numbers: int) -> Intervals:
+    return Intervals.of(np.array(numbers, np.int64))
+
+
+def within(robot: int, *numbers: int) -> Intervals:
+    return of(*(first_key(robot) + number for number in numbers))
+
+
+# -- messages ----------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    sender=robots,
+    incarnation=lives,
+    held=st.sets(keys, max_size=400),
+    max_bytes=st.sampled_from([1000, 1200]),
+)
+def test_announcements_say_what_is_held_everywhere(sender, incarnation, held, max_bytes):
+    datagrams = encode_announcements(sender, incarnation, of(*held), max_bytes)
+    assert all(len(datagram) <= max_bytes for datagram in datagrams)
+    messages = [decode(datagram) for datagram in datagrams]
+    assert {(type(m), m.sender, m.incarnation) for m in messages} == {
+        (AnnouncementMessage, sender, incarnation)
+    }
+    told, scope = Intervals.empty(), Intervals.empty()
+    for message in messages:
+        assert message.scope.covers(message.held)
+        assert not scope & message.scope
+        told, scope = told | message.held, scope | message.scope
+    assert told == of(*held)
+    assert scope == Intervals.span(0, END)
+
+
+def test_an_announcement_of_a_team_takes_few_bytes():
+    held = Intervals.empty()
+    for robot in range(16):
+        begin = first_key(robot, 12345 * robot)
+        held |= Intervals.span(begin, begin + 5000)
+    (datagram,) = encode_announcements(3, 99, held)
+    assert len(datagram) <= 16 * 11 + 30
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    robot=robots,
+    number=st.integers(0, (1 << 52) - 1),
+    old=st.sets(st.integers(0, 500), min_size=1, max_size=60),
+    new=st.sets(st.integers(501, 900), max_size=60),
+)
+def test_supersessions(robot, number, old, new):
+    key = first_key(robot) + number
+    if number in old | new:
+        number = key = first_key(robot) + 1000
+    message = decode(encode_record(SupersessionMessage(key, within(robot, *old), within(robot, *new))))
+    assert isinstance(message, SupersessionMessage)
+    assert (message.key, message.old, message.new) == (key, within(robot, *old), within(robot, *new))
+
+
+@settings(max_examples=60, deadline=None)
+@given(key=keys, totals=st.dictionaries(keys, st.floats(0, 2.0**40), max_size=30))
+def test_totals(key, totals):
+    message = decode(encode_record(totals_message(key, totals)))
+    assert isinstance(message, TotalsMessage)
+    assert message.key == key
+    assert message.components.tolist() == sorted(totals)
+    for name, total in zip(message.components.tolist(), message.totals.tolist(), strict=True):
+        assert total == pytest.approx(totals[name], rel=COUNT_ERROR + 1e-9, abs=2.0**-10)
+    assert encode_record(message) == encode_record(totals_message(key, totals))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 999),
+    dim=st.sampled_from([2, 3]),
+    scan=st.integers(0, 1 << 50),
+    version=st.integers(0, 99),
+)
+def test_corrections(seed, dim, scan, version):
+    generator = torch.Generator().manual_seed(seed)
+    transform = torch.eye(dim + 1, dtype=torch.float64)
+    turn = rotations(1, dim, generator)[0]
+    transform[:-1, :-1] = turn * torch.linalg.det(turn).sign() if dim == 3 else _proper(turn)
+    transform[:-1, -1] = torch.randn(dim, generator=generator, dtype=torch.float64) * 1e4
+    moved = within(5, 1, 2, 3, 9)
+    sent = CorrectionMessage(first_key(5, 77), scan, version, moved, pose_of(transform))
+    message = decode(encode_record(sent))
+    assert isinstance(message, CorrectionMessage)
+    assert (message.key, message.scan, message.version, message.moved) == (sent.key, scan, version, moved)
+    assert torch.equal(message.pose, sent.pose)
+    assert torch.allclose(message.transform(), transform, atol=1e-9)
+
+
+def _proper(turn: torch.Tensor) -> torch.Tensor:
+    return turn if torch.linalg.det(turn) > 0 else turn * torch.tensor([1.0, -1.0], dtype=torch.float64)
+
+
+def test_half_turns_are_corrections_too():
+    for axis in range(3):
+        transform = -torch.eye(4, dtype=torch.float64)
+        transform[axis, axis] = transform[3, 3] = 1.0
+        message = CorrectionMessage(0, 0, 1, of(1), pose_of(transform))
+        assert torch.allclose(message.transform(), transform, atol=1e-12)
+    with pytest.raises(InvalidArgumentError, match="is not rigid"):
+        pose_of(2 * torch.eye(3))
+    with pytest.raises(InvalidArgumentError, match="shape"):
+        pose_of(torch.eye(5))
+
+
+# -- hostile -----------------------------------------------------------------------------------------------
+
+
+def examples() -> list[bytes]:
+    held = Intervals.span(0, 70) | within(3, 5, 6, 900)
+    pose = pose_of(torch.eye(4))
+    return [
+        *encode_announcements(1, 2, held),
+        encode_record(SupersessionMessage(first_key(2, 5), within(2, 0, 1, 2, 7), within(2, 30, 31))),
+        encode_record(totals_message(first_key(1, 9), {1: 5.0, first_key(4) + 3: 800.0})),
+        encode_record(CorrectionMessage(first_key(2, 9), 3, 1, within(2, 4, 5), pose)),
+    ]
+
+
+def test_every_cut_flipped_bit_and_added_byte_is_noticed():
+    assert [datagram[0] for datagram in examples()] == [0x1A, 0x1B, 0x1C, 0x1D]
+    for datagram in examples():
+        damaged = [datagram[:length] for length in range(len(datagram))]
+        for bit in range(8 * len(datagram)):
+            flipped = bytearray(datagram)
+            flipped[bit // 8] ^= 1 << bit % 8
+            damaged.append(bytes(flipped))
+        for data in [*damaged, datagram + b"\0"]:
+            with pytest.raises(DataError):
+                decode(data)
+
+
+@settings(max_examples=300, deadline=None)
+@given(kind=st.integers(10, 13), body=st.binary(max_size=300))
+def test_noise_with_a_sound_checksum_is_refused_or_sound(kind, body):
+    try:
+        message = decode(sealed(bytes([0x10 | kind]) + body))
+    except DataError:
+        return
+    if not isinstance(message, AnnouncementMessage):
+        again = decode(encode_record(message))
+        assert encode_record(again) == encode_record(message)
+
+
+@pytest.mark.parametrize("n", [2**20, 2**40, 2**61])
+@pytest.mark.parametrize("kind", [10, 11, 12])
+def test_numbers_that_nothing_backs_take_no_memory(n, kind):
+    writer = BitWriter()
+    for value in {10: (1, 2, 0, END - 1, n), 11: (1, n), 12: (1, 1, 0, n)}[kind]:
+        writer.number(value)
+    with pytest.raises(DataError):
+        decode(sealed(bytes([0x10 | kind]) + writer.to_bytes() + bytes(900)))
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (1024, 0, 0, 5, 0),  # no such robot
+        (1, 1 << 24, 0, 5, 0),  # no such life
+        (1, 2, 5, END - 1, 0),  # beyond all keys
+        (1, 2, 0, 9, 1, 0, 10),  # an interval beyond its scope
+        (1, 2, 0, 9, 2, 0, 0, 0, 0),  # intervals that touch
+        (1, 2, 0, 9, 1, 0, -2),  # an empty one
+        (1, 2, 0, 9, -1),
+    ],
+)
+def test_announcements_of_nonsense_are_refused(numbers):
+    writer = BitWriter()
+    for value in numbers:
+        writer.number(value)
+    with pytest.raises(DataError):
+        decode(sealed(b"\x1a" + writer.to_bytes()))
+
+
+def test_records_of_nonsense_are_refused():
+    key = first_key(2)
+    pose = pose_of(torch.eye(4))
+    long, infinite, far = pose.clone(), pose.clone(), pose.clone()
+    long[6], infinite[0], far[1] = 1.1, math.inf, 1e9
+    for record in (
+        SupersessionMessage(key + 9, Intervals.empty(), within(2, 1)),
+        SupersessionMessage(key + 9, within(2, 1), within(2, 1, 2)),  # waits for what it supersedes
+        SupersessionMessage(key + 9, within(2, 9), within(2, 1)),  # supersedes itself
+        *(CorrectionMessage(key, 0, 1, within(2, 1), bad) for bad in (long, infinite, far)),
+    ):
+        with pytest.raises(DataError):
+            decode(encode_record(record))
+    for others in (within(1, 5), within(3, 5)):  # nobody supersedes or moves what is another's
+        with pytest.raises((DataError, InvalidArgumentError)):
+            decode(encode_record(SupersessionMessage(key + 9, others, Intervals.empty())))
+
+
+# -- who answers -------------------------------------------------------------------------------------------
+
+
+def says(sender: int, held: Intervals, scope: Intervals | None = None) -> AnnouncementMessage:
+    begin, end = (scope or Intervals.span(0, END)).pairs()[0]
+    return AnnouncementMessage(sender, 0, begin, end, held)
+
+
+def test_who_made_a_record_sends_it_at_once_and_others_if_it_is_still_missing():
+    backlog = Backlog(1)
+    held = within(1, 0, 1, 2) | within(2, 0, 1)
+    backlog.announced(says(3, within(1, 0)), held)
+    assert backlog.due == within(1, 1, 2)
+    backlog.sent(backlog.due)
+    backlog.sent(Intervals.empty())
+    backlog.announced(says(3, within(1, 0, 1, 2) | within(2, 0)), held)
+    assert backlog.due == within(2, 1)
+    backlog.heard(within(2, 1))  # another has sent it
+    assert not backlog.due
+
+
+def test_what_was_just_sent_or_heard_is_on_its_way():
+    backlog = Backlog(1)
+    held = within(1, 0, 1)
+    backlog.sent(within(1, 0))
+    backlog.announced(says(3, Intervals.empty()), held)
+    assert backlog.due == within(1, 1)
+    backlog.sent(within(1, 1))
+    backlog.announced(says(3, Intervals.empty()), held)
+    assert backlog.due == within(1, 0)  # an announcement later it is missing
+
+
+def test_an_announcement_speaks_of_its_scope_alone():
+    backlog = Backlog(1)
+    held = within(1, 0, 1, 2, 3, 4)
+    backlog.announced(says(3, within(1, 2), Intervals.span(first_key(1) + 1, first_key(1) + 4)), held)
+    assert backlog.due == within(1, 1, 3)
+
+
+def test_gaps_of_few_robots_are_remembered():
+    backlog = Backlog(1)
+    for sender in range(2, 2 + 3 * MOST_PEERS):
+        backlog.announced(says(sender, Intervals.empty()), within(0, 1))
+    assert len(backlog._gaps) == MOST_PEERS
+
+
+def test_who_joins_late_catches_up_from_a_third_robot():
+    one, relay, late = Replica(0), Replica(1), Replica(2)
+    one.add(random_components(3, k=300))
+    one.count({tuple(one.components().ids[0].tolist()): 100.0})
+    for datagram in one.datagrams():
+        relay.receive(datagram)
+    sent = []
+    for _ in range(2):  # `one` is gone
+        for datagram in late.announcements():
+            relay.receive(datagram)
+        sent.append(relay.datagrams())
+        for datagram in sent[-1]:
+            assert late.receive(datagram)
+    assert not sent[0]
+    assert late.digest() == relay.digest() == one.digest()
+    for datagram in late.announcements():
+        relay.receive(datagram)
+    assert relay.datagrams() == []
+
+
+def test_those_who_hold_the_same_fall_silent():
+    replicas = [Replica(robot) for robot in range(3)]
+    for replica in replicas:
+        replica.add(random_components(3, k=10, seed=replica.robot))
+    for _ in range(4):
+        said = {replica.robot: [*replica.announcements(), *replica.datagrams()] for replica in replicas}
+        for sender, datagrams in said.items():
+            for replica in replicas:
+                for datagram in datagrams if replica.robot != sender else []:
+                    replica.receive(datagram)
+    assert len({replica.digest() for replica in replicas}) == 1
+    assert all(replica.datagrams() == [] for replica in replicas)
+    assert all(len(datagram) < 60 <= MAX_BYTES for r in replicas for datagram in r.announcements())
+
+
+def test_an_echo_is_no_twin():
+    one = Replica(0)
+    one.add(random_components(3, k=3))
+    for datagram in [*one.announcements(), *one.datagrams()]:
+        one.receive(datagram)
+    assert one.refused == {"own": 1}
+    assert not one.conflicts

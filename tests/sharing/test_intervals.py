@@ -1,0 +1,65 @@
+"""Intervals: sets of whole numbers, against Python's sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.sharing.intervals import Intervals
+
+numbers = st.sets(st.integers(0, 40))
+
+
+def of(values: set[int]) -> Intervals:
+    return Intervals.of(np.array(list(values), np.int64))
+
+
+def members(intervals: Intervals) -> set[int]:
+    return {number for begin, end in intervals.pairs() for number in range(begin, end)}
+
+
+@given(one=numbers, other=numbers)
+def test_operations_are_those_of_sets(one, other):
+    a, b = of(one), of(other)
+    assert members(a) == one
+    assert members(a | b) == one | other
+    assert members(a & b) == one & other
+    assert members(a - b) == one - other
+    assert a.covers(b) == (other <= one)
+    assert (a == b) == (one == other)
+    assert bool(a) == bool(one)
+    assert a.size == len(one)
+
+
+@given(one=numbers, asked=st.lists(st.integers(-3, 45)))
+def test_contains(one, asked):
+    found = of(one).contains(np.array(asked, np.int64))
+    assert found.tolist() == [number in one for number in asked]
+    assert all((number in of(one)) == (number in one) for number in asked)
+
+
+@given(one=numbers, other=numbers)
+def test_intervals_never_touch_and_are_as_few_as_can_be(one, other):
+    joined = of(one) | of(other)
+    assert (np.diff(joined.edges) > 0).all()
+    starts = [number for number in one | other if number - 1 not in one | other]
+    assert len(joined) == len(starts)
+
+
+def test_long_intervals_take_no_memory():
+    whole = Intervals.span(0, 1 << 62)
+    hole = Intervals.span(1 << 40, 1 << 50)
+    assert (whole - hole).size == (1 << 62) - (1 << 50) + (1 << 40)
+    assert len(whole - hole) == 2
+    assert not Intervals.span(5, 5)
+    assert not Intervals.span(6, 5)
+    assert repr(Intervals.span(3, 6)) == "Intervals(3…5)"
+
+
+@pytest.mark.parametrize("edges", [[1], [2, 1], [1, 1], [0, 2, 2, 3]])
+def test_edges_that_are_none_are_refused(edges):
+    with pytest.raises(InvalidArgumentError, match="edges"):
+        Intervals(np.array(edges, np.int64))
