@@ -1,0 +1,207 @@
+"""Distance to a mixture's surfaces and collision probability, against closed forms, sampling and search."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mapping.component_cases import random_components
+from scipy import optimize, stats
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.clearance import clearance, collision_probability, expected_returns
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+
+dims = pytest.mark.parametrize("dim", [2, 3])
+
+
+def one(covariance: list[float], weight: float = 1.0) -> tuple[torch.Tensor, ...]:
+    """A component at the origin, axis-aligned."""
+    variances = torch.tensor([covariance], dtype=torch.float64)
+    return torch.zeros_like(variances), torch.diag_embed(variances), torch.tensor([weight]).double()
+
+
+def brute_distance(point: np.ndarray, mean: np.ndarray, covariance: np.ndarray, q: float) -> float:
+    """Distance to an ellipsoid's surface by search over directions from its centre."""
+    root = q * np.linalg.cholesky(covariance)
+
+    def gap(u: np.ndarray) -> float:
+        return float(np.linalg.norm(mean + root @ (u / np.linalg.norm(u)) - point))
+
+    rng = np.random.default_rng(0)
+    starts = sorted(rng.normal(size=(400, len(mean))), key=gap)[:5]
+    return min(float(optimize.minimize(gap, start, options={"gtol": 1e-9}).fun) for start in starts)
+
+
+@dims
+def test_clearance_is_the_distance_to_the_nearest_ellipsoid(dim):
+    c = random_components(6, dim, seed=1, spread=1.0)
+    points = torch.randn(12, dim, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    points = torch.cat([points, c.means + 0.1 * points[:6]])
+    found = clearance(c, points, deviations=1.5)
+    signs = set()
+    for point, distance in zip(points, found.tolist(), strict=True):
+        each = []
+        for mean, covariance in zip(c.means, c.covariances, strict=True):
+            offset = point - mean
+            inside = float(offset @ torch.linalg.solve(covariance, offset)) < 1.5**2
+            gap = brute_distance(point.numpy(), mean.numpy(), covariance.numpy(), 1.5)
+            each.append(-gap if inside else gap)
+        assert distance == pytest.approx(min(each), abs=1e-6)
+        signs.add(distance < 0)
+    assert signs == {True, False}
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ([0.0, 0.0], -1.0),  # the centre: the short axis away
+        ([0.5, 0.0], -math.sqrt(0.75 * (1 - 0.25 / 12))),  # still within the evolute
+        ([4.0, 0.0], 0.0),
+        ([5.0, 0.0], 1.0),
+        ([0.0, -3.0], 2.0),
+    ],
+)
+def test_on_the_axes_of_an_ellipse_the_distance_is_known(point, expected):
+    # Semi-axes 4 and 1; on the long one at x the nearest place is x_e = 16 x / 15.
+    if point == [0.5, 0.0]:
+        x = 16 * 0.5 / 15
+        expected = -math.hypot(x - 0.5, math.sqrt(1 - x**2 / 16))
+    found = clearance(one([4.0, 0.25]), torch.tensor([point]).double())
+    assert float(found) == pytest.approx(expected, abs=1e-9)
+
+
+@given(st.integers(0, 10**6), st.sampled_from([2, 3]))
+def test_clearance_neither_jumps_nor_depends_on_the_frame(seed, dim):
+    c = random_components(5, dim, seed=seed, spread=1.0)
+    generator = torch.Generator().manual_seed(seed)
+    points = 2 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
+    nearby = points + 0.3 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
+    here, there = clearance(c, points), clearance(c, nearby)
+    # Outside, distances are 1-Lipschitz; so is the depth in each ellipsoid, and the least of all.
+    assert bool(((here - there).abs() <= (points - nearby).norm(dim=1) + 1e-9).all())
+    shift = torch.full((dim,), 5e5, dtype=torch.float64)
+    far = clearance((c.means + shift, c.covariances, c.support), points + shift)
+    torch.testing.assert_close(far, here, rtol=0, atol=1e-6)
+
+
+def test_gradients_of_clearance_point_away_from_the_surface():
+    points = torch.tensor([[3.0, 0.4, -1.0], [0.1, 0.02, 0.3]], dtype=torch.float64, requires_grad=True)
+    mixture = one([1.0, 0.04, 0.25])
+    assert torch.autograd.gradcheck(lambda x: clearance(mixture, x), points, atol=1e-5)
+    (slope,) = torch.autograd.grad(clearance(mixture, points).sum(), points)
+    torch.testing.assert_close(slope.norm(dim=1), torch.ones(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.3, 5.0])
+@pytest.mark.parametrize("radius", [0.1, 0.5, 2.0])
+@dims
+def test_the_mass_in_a_ball_is_noncentral_chi_square(dim, radius, sigma):
+    points = torch.zeros(9, dim, dtype=torch.float64)
+    offset = torch.linspace(0, radius + 5 * sigma, 9, dtype=torch.float64)
+    points[:, 0] = offset
+    found = expected_returns(one([sigma**2] * dim, 7.0), points, radius)
+    expected = 7 * stats.ncx2.cdf((radius / sigma) ** 2, dim, (offset.numpy() / sigma) ** 2 + 1e-300)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-9)
+
+
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from([2, 3]),
+    st.lists(st.floats(-2.0, 0.5), min_size=3, max_size=3),
+    st.floats(0.05, 1.5),
+)
+def test_the_mass_in_a_ball_is_that_of_samples(seed, dim, log_deviations, radius):
+    generator = torch.Generator().manual_seed(seed)
+    turn = torch.linalg.qr(torch.randn(dim, dim, generator=generator, dtype=torch.float64))[0]
+    factor = turn * 10 ** torch.tensor(log_deviations[:dim], dtype=torch.float64)
+    drawn = torch.randn(40_000, dim, generator=generator, dtype=torch.float64) @ factor.T
+    point = drawn[:1] + 0.5 * radius * torch.randn(1, dim, generator=generator, dtype=torch.float64)
+    mixture = (torch.zeros(1, dim).double(), (factor @ factor.T)[None], torch.ones(1).double())
+    share = float(((drawn - point).norm(dim=1) <= radius).double().mean())
+    found = float(expected_returns(mixture, point, radius)[0])
+    assert abs(found - share) <= 5 * math.sqrt(max(found, 1e-4) / 40_000)
+
+
+def test_thin_sheets_agree_with_a_finer_quadrature():
+    sigma = np.array([0.003, 0.4, 0.7])
+    center = np.array([0.28, 0.1, -0.2])
+    mixture = one((sigma**2).tolist())
+    found = float(expected_returns(mixture, torch.from_numpy(-center)[None], 0.3)[0])
+    # Discs of the ball across the thin axis, each by a fine polar rule.
+    x = np.linspace(0.25, 0.3, 2001)
+    rho = np.sqrt(np.maximum(0.09 - x**2, 0))
+    t, w = np.polynomial.legendre.leggauss(40)
+    share, angle = (t + 1) / 2, np.pi * (t + 1)
+    radius = rho[:, None, None] * share[:, None]
+    density = stats.norm.pdf(radius * np.cos(angle), center[1], sigma[1])
+    density *= stats.norm.pdf(radius * np.sin(angle), center[2], sigma[2])
+    disc = (density * radius * w).sum(2) @ w * rho / 2 * np.pi
+    expected = np.trapezoid(disc * stats.norm.pdf(x, center[0], sigma[0]), x)
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+@dims
+def test_collision_probability_of_a_mixture_is_that_of_its_returns(dim):
+    c = random_components(8, dim, seed=4, spread=0.7, empty=0.3)
+    points = torch.randn(30, dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    expected = torch.zeros(30, dtype=torch.float64)
+    for k in range(len(c)):
+        if not bool(c.max_range[k]):
+            part = c.means[k : k + 1], c.covariances[k : k + 1], c.support[k : k + 1]
+            expected += expected_returns(part, points, 0.2)
+    torch.testing.assert_close(expected_returns(c, points, 0.2), expected)
+    torch.testing.assert_close(collision_probability(c, points, 0.2), 1 - torch.exp(-expected))
+    assert bool(c.max_range.any())
+
+
+@given(st.integers(0, 10**6))
+def test_larger_bodies_touch_more(seed):
+    c = random_components(5, 3, seed=seed, spread=1.0)
+    points = 2 * torch.randn(10, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    small, large = (collision_probability(c, points, r) for r in (0.2, 0.3))
+    assert bool((large >= small - 1e-12).all())
+    assert float(small.min()) >= 0
+    assert float(large.max()) <= 1
+
+
+@dims
+def test_an_empty_map_is_clear(dim):
+    points = torch.zeros(2, dim, dtype=torch.float64)
+    for nothing in (Components.empty(dim), GaussianMap()):
+        assert clearance(nothing, points).tolist() == [math.inf] * 2
+        assert collision_probability(nothing, points, 0.3).tolist() == [0.0] * 2
+
+
+def test_infinitely_far_everything_is_clear_and_no_points_are_no_question():
+    c = random_components(4, 3, seed=0)
+    far = torch.tensor([[math.inf, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    assert float(clearance(c, far)[0]) == math.inf
+    assert float(collision_probability(c, far, 0.3)[0]) == 0
+    torch.testing.assert_close(clearance(c, far)[1:], clearance(c, far[1:]))
+    for answer in (clearance(c, torch.zeros(0, 3)), expected_returns(c, torch.zeros(0, 3), 0.3)):
+        assert answer.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda c: clearance(c, torch.full((1, 3), torch.nan)),
+        lambda c: clearance(c, torch.zeros(1, 2)),
+        lambda c: clearance(c, torch.zeros(1, 3), deviations=0.0),
+        lambda c: expected_returns(c, torch.zeros(1, 3), 0.0),
+        lambda c: expected_returns(c, torch.zeros(1, 3), math.nan),
+        lambda c: clearance("map", torch.zeros(1, 3)),
+        lambda c: clearance(("a", "b", "c"), torch.zeros(1, 3)),
+        lambda c: clearance((c.means, c.covariances, -c.support), torch.zeros(1, 3)),
+        lambda c: clearance((c.means * math.nan, c.covariances, c.support), torch.zeros(1, 3)),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(ask):
+    with pytest.raises(InvalidArgumentError):
+        ask(random_components(3, 3, seed=0))
