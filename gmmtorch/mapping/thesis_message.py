@@ -130,4 +130,5 @@ def _ids(numbers: Tensor) -> Tensor:
 
 
 def _doubles(values: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(values.astype(np.float64))
+    with np.errstate(invalid="ignore"):  # some NaNs signal when they are cast; any are refused later
+        return torch.from_numpy(values.astype(np.float64))

@@ -79,10 +79,10 @@ class RawPoints:
     def decode(self, data: bytes) -> Tensor:
         if len(data) % 12:
             raise DataError(f"{len(data)} bytes are not whole points of 12 bytes.")
-        rows = np.frombuffer(data, "<f4").reshape(-1, 3).astype(np.float64)
+        rows = np.frombuffer(data, "<f4").reshape(-1, 3)
         if not np.isfinite(rows).all():
             raise DataError("Points are NaN or infinite.")
-        return torch.from_numpy(rows)
+        return torch.from_numpy(rows.astype(np.float64))
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,12 @@ def read_points(body: bytes) -> PointsMessage:
     sender, frame, x, y, z, part, n_parts, n = _HEADER.unpack_from(body)
     if len(body) != _HEADER.size + _POINT_BYTES * n + (n + 7) // 8 or not part < n_parts or n == 0:
         raise DataError(f"{len(body)} bytes with {n} points, part {part} of {n_parts}: it is damaged.")
-    offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3).astype(np.float64)
+    offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3)
     bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=_HEADER.size + _POINT_BYTES * n))
     place = np.array([x, y, z])
     if bits[n:].any() or not (np.isfinite(offsets).all() and np.isfinite(place).all()):
         raise DataError("Points are NaN or infinite, or filling bits are set: it is damaged.")
+    offsets = offsets.astype(np.float64)  # not before: some NaNs signal when they are cast
     return PointsMessage(
         sender=sender,
         frame=frame,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 
 import numpy as np
 import pytest
@@ -122,6 +123,18 @@ def test_numbers_that_nothing_backs_take_no_memory(n, kind):
         writer.number(value)
     with pytest.raises(DataError):
         decode(sealed(bytes([0x10 | kind]) + writer.to_bytes() + bytes(900)))
+
+
+@pytest.mark.parametrize(("kind", "place"), [(3, 8), (6, 5), (7, 40)])
+def test_a_nan_that_signals_is_refused_without_a_warning(sound, kind, place):
+    """As any other is; to cast such a float32 is what warns."""
+    (datagram,) = (each for each in sound if each[0] & 15 == kind)
+    body = datagram[1:-4]
+    changed = body[:place] + struct.pack("<I", 0x7F800001) + body[place + 4 :]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(DataError):
+            decode(forged(datagram, changed))
 
 
 def test_float_components_that_are_none_are_refused(sound):

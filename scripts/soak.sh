@@ -1,0 +1,7 @@
+#!/usr/bin/env bash
+# Long runs of sharing: a thousand teams in trouble, a million hostile packets. Some 15 minutes on two cores.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+./scripts/setup.sh
+.venv/bin/python benchmarks/soak.py "$@"
