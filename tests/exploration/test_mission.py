@@ -19,6 +19,7 @@ from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.mixture_mapper import MixtureMapper
 from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.outcome import row_of, with_times
+from gmmtorch.exploration.returns import RestRule
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.trials import CHECKPOINT, ROW, Trial, WorldOptions, run_mission, run_trials
 from gmmtorch.exploration.world import World
@@ -183,6 +184,18 @@ def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
         torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(found[1], misses, rtol=1e-4, atol=1e-3)
         assert float(misses.sum()) > 0
+
+
+def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) -> None:
+    # Nearly all that a window can bring is asked of each: the second is less, and the first was the best.
+    mission = flown(world, replace(SMALL, rest=RestRule(0.99, window=4.0), duration=44.0))
+    assert all(robot.returns.rests for robot in mission.robots)
+    for robot, path in zip(mission.robots, mission.trajectories, strict=True):
+        assert robot.state[4:].tolist() == [0, 0, 0]
+        assert torch.equal(path[-1], path[-4])
+        assert not torch.equal(path[0], path[-1])
+    awake = flown(world, replace(SMALL, rest=RestRule(0.0), duration=24.0))
+    assert not any(robot.returns.rests for robot in awake.robots)
 
 
 def test_robots_that_hear_everything_hold_the_same_components(world: World) -> None:
