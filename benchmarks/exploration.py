@@ -17,7 +17,7 @@ import time
 
 import torch
 
-import gmmtorch.exploration.mission
+import gmmtorch.exploration.stopwatch
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.team import assemble
@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=120.0)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    # The mission's own clock, read as CPU time: other work on the machine then counts less.
-    gmmtorch.exploration.mission.time.perf_counter = time.process_time
+    # The clock of the stages, read as CPU time: other work on the machine then counts less.
+    gmmtorch.exploration.stopwatch.time.perf_counter = time.process_time
     world = (
         open_world("mesh", path=options.mesh)
         if options.mesh is not None

@@ -1,10 +1,12 @@
-"""What the tests of sharing do briefly, for long: teams in trouble, and hostile bytes.
+"""What the tests of sharing do briefly, for long: teams in trouble, robots killed, and hostile bytes.
 
-    python benchmarks/soak.py                                    # some 15 minutes on two cores
-    python benchmarks/soak.py --schedules 100 --packets 100000
+    python benchmarks/soak.py                                    # some 20 minutes on two cores
+    python benchmarks/soak.py --schedules 100 --kills 50 --packets 100000
 
 Schedules lose, repeat, delay and reorder datagrams, cut robots off, crash and restart them; once the
-network works again all replicas must be equal and hold all that anybody held. Packets are noise, sound
+network works again all replicas must be equal and hold all that anybody held. Robots that keep a journal
+are killed (kill -9) at random, also half-way through writing: what was acknowledged must be there when they
+start again, and nothing else but the beginning of what was being written. Packets are noise, sound
 datagrams cut off or altered (their checksums made right again or not), and frames of a stranger: none may
 be believed, nothing raised but `DataError`, and memory must not grow. Altered ones whose checksum is right
 may say something in range.
@@ -17,9 +19,12 @@ import concurrent.futures
 import logging
 import random
 import sys
+import tempfile
 import tracemalloc
 import zlib
 from collections import Counter
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +42,7 @@ _WARM = 5_000  # packets until caches are filled
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--schedules", type=int, default=1000)
+    parser.add_argument("--kills", type=int, default=500)
     parser.add_argument("--packets", type=int, default=1_000_000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -44,16 +50,30 @@ def main() -> int:
     with concurrent.futures.ProcessPoolExecutor(options.workers, initializer=_alone) as pool:
         seeds = range(options.seed, options.seed + options.schedules)
         team = _schedules(list(pool.map(_schedule, seeds, chunksize=5)))
-        share = -(-options.packets // options.workers)
-        parts = list(pool.map(_packets, range(options.workers), [share] * options.workers))
+        killed = _summed(pool.map(_kills, *_shares(options.kills, options.workers, options.seed)))
+        parts = list(pool.map(_packets, *_shares(options.packets, options.workers, 0)))
     print(format_table([team], list(team)))
+    print(format_table([killed], list(killed)))
     rows = [
         {"what": what, **{key: sum(part[what][key] for part in parts) for key in parts[0][what]}}
         for what in parts[0]
     ]
     print(format_table(rows, list(rows[0])))
     sound = team["converged"] == team["complete"] == options.schedules
+    sound = sound and not any(killed[what] for what in ("lost", "unequal", "damaged", "failed"))
     return 0 if sound and not any(row["raised"] + row["believed"] for row in rows) else 1
+
+
+def _shares(n: int, workers: int, seed: int) -> tuple[range, list[int]]:
+    """A seed and a part of n for each worker."""
+    return range(seed, seed + workers), [(n + worker) // workers for worker in range(workers)]
+
+
+def _summed(parts: Iterable[dict[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for part in parts:
+        total = {name: total.get(name, 0) + value for name, value in part.items()}
+    return total
 
 
 def _alone() -> None:
@@ -82,6 +102,13 @@ def _schedules(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
         "most_rounds": max((outcome["rounds"] for outcome in outcomes), default=0),
         "crashes": sum(outcome["crashes"] for outcome in outcomes),
     }
+
+
+def _kills(seed: int, n: int) -> dict[str, int]:
+    from sharing.kill_journal import kill_often
+
+    with tempfile.TemporaryDirectory() as folder:
+        return asdict(kill_often(n, seed, Path(folder)))
 
 
 def _packets(seed: int, n: int) -> dict[str, Counter[str]]:

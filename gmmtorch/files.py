@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import tempfile
@@ -9,7 +10,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load as safetensors_load
 from safetensors.torch import save as safetensors_save
@@ -19,6 +22,7 @@ from gmmtorch.errors import DataError, MissingDataError, OutputError
 
 MAX_FILE_BYTES = 8 << 30
 NARROW_DTYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)
+_TENSOR = "$tensor"
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
@@ -63,6 +67,13 @@ def _write_all(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
+def write_npz(path: str | Path, **arrays: NDArray[Any]) -> Path:
+    """Write named arrays as one compressed npz file, atomically."""
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)  # type: ignore[arg-type]
+    return write_bytes(path, packed.getvalue())
+
+
 def write_json(path: str | Path, value: Any) -> Path:
     """Write JSON atomically; NaN and infinity are refused, as JSON has neither."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
@@ -90,7 +101,13 @@ def read_tensors(path: str | Path, kind: str, *versions: int) -> tuple[dict[str,
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise DataError(f"{path} has {size:,} bytes, more than the {MAX_FILE_BYTES:,} that are read.")
-    data = path.read_bytes()
+    return unpack_tensors(path.read_bytes(), path, kind, *versions)
+
+
+def unpack_tensors(
+    data: bytes, path: str | Path, kind: str, *versions: int
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and facts of what `pack_tensors` wrote; `path` is where it was found. Raises `DataError`."""
     about = _about(data, path, kind)
     if about.get("format") != kind:
         raise DataError(f"{path} holds {about.get('format', 'something else')!r}; expected {kind!r}.")
@@ -109,7 +126,7 @@ def read_tensors(path: str | Path, kind: str, *versions: int) -> tuple[dict[str,
         raise DataError(f"{path} is damaged: {error}") from error
 
 
-def _about(data: bytes, path: Path, kind: str) -> dict[str, Any]:
+def _about(data: bytes, path: str | Path, kind: str) -> dict[str, Any]:
     """What `pack_tensors` wrote into the header of a safetensors file."""
     try:
         length = int.from_bytes(data[:8], "little")
@@ -123,6 +140,35 @@ def _about(data: bytes, path: Path, kind: str) -> dict[str, Any]:
         raise DataError(
             f"{path} is truncated, or not a file of gmmtorch ({error!r}); expected {kind!r}."
         ) from error
+
+
+def split_tensors(value: Any) -> tuple[Any, dict[str, Tensor]]:
+    """A nest of dicts, lists and plain values, with names in the places of its tensors; and the tensors."""
+    tensors: dict[str, Tensor] = {}
+    return _stripped(value, tensors), tensors
+
+
+def _stripped(value: Any, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        name = str(len(tensors))
+        tensors[name] = value.detach().cpu().contiguous().clone()
+        return {_TENSOR: name}
+    if isinstance(value, dict):
+        return {str(key): _stripped(item, tensors) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_stripped(item, tensors) for item in value]
+    return value
+
+
+def joined_tensors(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """The inverse of `split_tensors`. Raises `KeyError` or `TypeError` for a tensor that is not there."""
+    if isinstance(tree, dict):
+        if set(tree) == {_TENSOR}:
+            return tensors[tree[_TENSOR]]
+        return {key: joined_tensors(item, tensors) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [joined_tensors(item, tensors) for item in tree]
+    return tree
 
 
 def narrowest(values: Tensor) -> Tensor:

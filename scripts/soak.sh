@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Long runs of sharing: a thousand teams in trouble, a million hostile packets. Some 15 minutes on two cores.
+# Long runs of sharing: a thousand teams in trouble, 500 robots killed, a million hostile packets. Some 20
+# minutes on two cores.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

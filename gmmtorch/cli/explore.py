@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ _TABLE = (
 )
 
 _STAGE = "simulated seconds"
+_OF_ROBOTS = ("announce", "budget")  # options of the network that are not of its links
 
 
 def main() -> None:
@@ -42,6 +44,10 @@ def run(config: DictConfig) -> float | None:
     if common.set_up(config) != "cpu":
         raise InvalidArgumentError(
             f"runtime.device={config.runtime.device} is not for exploring, which runs on the cpu."
+        )
+    if config.transport != "in_process":
+        raise InvalidArgumentError(
+            f"transport={config.transport!r} is not one of in_process; gmmtorch-team has the others."
         )
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
@@ -108,17 +114,17 @@ def _variants(config: DictConfig) -> list[dict[str, Any]]:
 
     if config.study.name != "trials":
         raise InvalidArgumentError(f"study.name={config.study.name!r} is not known; known is trials.")
-    variants: list[dict[str, Any]] = [dict(variant) for variant in config.study.variants]
-    known = {"team", "planner", "information", "coordination", "planning_prior", "codec", "loss"}
+    variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
+    known = {"team", "planner", "information", "coordination", "planning_prior", "codec", *config.network}
     for variant in variants:
         if not set(variant) <= known:
             raise InvalidArgumentError(
                 f"study.variants has {sorted(set(variant) - known)}; a variant may set "
                 f"{', '.join(sorted(known))}."
             )
-        for key in ("planning_prior", "loss"):
-            if not isinstance(variant.get(key, 0.0), int | float):
-                raise InvalidArgumentError(f"study.variants has {key}={variant[key]!r}, which is no number.")
+        prior = variant.get("planning_prior", 0.0)
+        if not isinstance(prior, int | float):
+            raise InvalidArgumentError(f"study.variants has planning_prior={prior!r}, which is no number.")
     if not variants or not config.study.seeds:
         raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
     return variants
@@ -133,17 +139,23 @@ def _trial(
     home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
     chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
-    about = "_".join(f"{key}-{value}" for key, value in chosen.items())
+    about = "_".join(f"{key}-{_short(value)}" for key, value in chosen.items())
     home = home / "trials" / f"{about}_seed-{seed}"  # sweeps may share a folder
     return Trial(
-        world=_world(config),
-        team=_team(config, seed, variant or {}),
+        world=world_options(config),
+        team=team_options(config, seed, variant or {}),
         folder=home,
         checkpoint_every=config.checkpoint.every,
     )
 
 
-def _world(config: DictConfig) -> WorldOptions:
+def _short(value: Any) -> str:
+    """A value in the name of a folder: lists are too long for one."""
+    return f"{zlib.crc32(repr(value).encode()):08x}" if isinstance(value, list) else str(value)
+
+
+def world_options(config: DictConfig) -> WorldOptions:
+    """The world that the options describe."""
     from gmmtorch.exploration.trials import WorldOptions
 
     options: dict[str, Any] = {
@@ -153,8 +165,8 @@ def _world(config: DictConfig) -> WorldOptions:
     return WorldOptions(**options, cache=config.runtime.cache)
 
 
-def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
-    from gmmtorch.errors import InvalidArgumentError
+def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
+    """The team that the options describe, but for what a variant sets."""
     from gmmtorch.exploration.mixture_mapper import FrameRule
     from gmmtorch.exploration.options import TeamOptions
     from gmmtorch.exploration.primitives import Dynamics
@@ -163,8 +175,6 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
     from gmmtorch.mapping.novelty import NoveltyRule
     from gmmtorch.simulation.depth_camera import DepthCamera
 
-    if config.transport != "in_process":
-        raise InvalidArgumentError(f"transport={config.transport!r} is not one of in_process.")
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
     rate, window = sensor.pop("rate"), mapping.pop("window")
     threshold, observed, distance = (mapping.pop(name) for name in ("threshold", "observed", "distance"))
@@ -196,13 +206,26 @@ def _team(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions
         planning_prior=variant.get("planning_prior", config.planner.prior),
         rest=RestRule(config.planner.rest),
         codec=variant.get("codec", config.codec),
-        latency=config.network.delay,
-        bandwidth=config.network.bandwidth,
-        loss=variant.get("loss", config.network.loss),
+        **_network(config, variant),
+        announce_every=variant.get("announce", config.network.announce),
+        budget=variant.get("budget", config.network.budget),
         sample_every=config.evaluation.every,
         codecs=tuple(config.evaluation.codecs),
         start=None if start is None else _poses(start),
     )
+
+
+def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
+    """What `TeamOptions` has of the network; errors call it what the user does."""
+    from gmmtorch.sharing.link_conditions import LinkConditions
+
+    given = {key: value for key, value in common.as_options(config.network).items() if key not in _OF_ROBOTS}
+    names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
+    given |= {key: variant[key] for key in given if key in variant}
+    given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
+    conditions = LinkConditions(**given, names=names)
+    conditions.check_team(config.team.size, names)
+    return {name: getattr(conditions, name) for name in given}
 
 
 def _poses(start: Any) -> tuple[tuple[float, ...], ...]:

@@ -370,23 +370,29 @@ class TeamMap:
     window: list[int] = field(default_factory=lambda: [80, 80, 40])
     threshold: float = 1.0
     observed: float = 0.5
-    distance: float = 0.5
+    distance: float = 2.0
     noise: float = 0.03
-    length: float = 0.5
+    length: float = 0.7
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
     rays: float = 4.0
-    shell: float = 1.0
+    shell: float = 0.5
     update_at: float = 2.0
-    update_stride: int = 4
+    update_stride: int = 9
 
 
 @dataclass
 class NetworkOptions:
     delay: float = 0.05
+    jitter: float = 0.0
     bandwidth: float | None = None
     loss: float = 0.0
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: list[Any] = field(default_factory=list)
+    announce: float = 5.0
+    budget: float | None = None
 
 
 @dataclass
@@ -451,6 +457,53 @@ class Explore:
     runtime: ExploreRuntime = field(default_factory=ExploreRuntime)
 
 
+@dataclass
+class Link:
+    listen: str = "127.0.0.1:0"
+    peers: list[str] = field(default_factory=list)
+    group: str | None = None
+    interface: str = "127.0.0.1"
+    ttl: int = 1
+    key_file: str | None = None
+    insecure: bool = False
+    team: str = "team"
+    listen_endpoints: list[str] = field(default_factory=list)
+    connect_endpoints: list[str] = field(default_factory=list)
+    scouting: bool | None = None
+    zenoh_config: str | None = None
+
+
+@dataclass
+class JournalOptions:
+    enabled: bool = True
+    folder: str | None = None
+    sync: str = "snapshot"
+
+
+@dataclass
+class LogOptions:
+    """What a robot replays."""
+
+    dataset: Any = None
+    map: Any = MISSING
+    rate: float = 1.0
+    every: int = 1
+    part: str = "consecutive"
+
+
+@dataclass
+class RobotOptions(Explore):
+    id: int = 0
+    source: str = "world"
+    clock: str | None = "wall"
+    speed: float = 1.0
+    settle: float = 10.0
+    transport: str = "udp"
+    link: Link = field(default_factory=Link)
+    journal: JournalOptions = field(default_factory=JournalOptions)
+    log: LogOptions = field(default_factory=LogOptions)
+
+
 def register() -> None:
     """Make the schemas known to Hydra, under the names that the files in conf/ use."""
     store = ConfigStore.instance()
@@ -458,6 +511,7 @@ def register() -> None:
     store.store(name="fit_schema", node=Fit)
     store.store(name="export_schema", node=Export)
     store.store(name="explore_schema", node=Explore)
+    store.store(name="robot_schema", node=RobotOptions)
     store.store(group="schema/world", name="generated", node=GeneratedWorld)
     store.store(group="schema/world", name="mesh", node=MeshWorldOptions)
     store.store(group="schema/team", name="team", node=Team)

@@ -19,6 +19,14 @@ def collides(world: MeshWorld, positions: Tensor, radius: float) -> Tensor:
     return world.clearance(positions, threads=torch.get_num_threads()) < radius
 
 
+def finely(positions: Tensor, n: int = 4) -> Tensor:
+    """Positions (1 + n S, 3) evenly on the way through positions (1 + S, 3): between two states a robot may
+    touch what it touches at neither."""
+    share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
+    between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
+    return torch.cat([positions[:1], between.reshape(-1, 3)])
+
+
 def meets_others(positions: Tensor, radius: float) -> Tensor:
     """Whether each robot (R, S) is nearer than two radii to any other, at positions (R, S, 3), metres."""
     apart = (positions[:, None] - positions[None]).norm(dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,9 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import PointsMessage, encode_points
+from gmmtorch.sharing.point_messages import MOST_PARTS
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 
@@ -37,6 +40,8 @@ class GridMapper(Mapper):
         super().__init__(robot, local, belief, width, novelty, memo)
         self._shared = shared
         self._n_frames = 0
+        self._due: list[bytes] = []
+        self._come: dict[int, Intervals] = {}  # parts of teammates' frames, by sender
 
     def center_on(self, position: Tensor) -> None:
         for box in self.local.center_on(position):
@@ -54,21 +59,36 @@ class GridMapper(Mapper):
         else:
             rest = torch.ones_like(novel)
         self._n_frames += 1
+        self._due += datagrams
         grid = self.belief.grid
         parts.append(
             cast_evidence(frame.origin, frame.ends[rest], frame.is_hit[rest], grid.resolution, grid.box)
         )
         for part in parts:
             self._add(part)
-        return Sensed({"points": datagrams}, parts, novel)
+        return Sensed(parts, novel)
 
-    def receive(self, heard: Sequence[Heard]) -> None:
+    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
         frames: dict[tuple[int, int], list[bytes]] = {}
         for item in heard:
-            if isinstance(item.message, PointsMessage):
+            if isinstance(item.message, PointsMessage) and self._is_new(item.message):
                 frames.setdefault((item.message.sender, item.message.frame), []).append(item.datagram)
         for datagrams in frames.values():
             self._add(self._said(datagrams))
+        return [datagram for datagrams in frames.values() for datagram in datagrams]
+
+    def _is_new(self, message: PointsMessage) -> bool:
+        """Whether this part of a frame has not come before; it has, from now on."""
+        number = message.frame * MOST_PARTS + message.part
+        part, come = Intervals.span(number, number + 1), self._come.get(message.sender, Intervals.empty())
+        self._come[message.sender] = come | part
+        return number not in come
+
+    def datagrams(self, budget: int | None = None) -> list[bytes]:
+        total = itertools.accumulate(map(len, self._due))
+        n = len(self._due) if budget is None else sum(size <= budget for size in total)
+        sent, self._due = self._due[:n], self._due[n:]
+        return sent
 
     def _said(self, datagrams: list[bytes]) -> CellEvidence:
         """The evidence of the points of a frame that have arrived."""
@@ -87,8 +107,19 @@ class GridMapper(Mapper):
         """A grid has none."""
 
     def state(self) -> dict[str, Any]:
-        return {**super().state(), "n_frames": self._n_frames}
+        return {
+            **super().state(),
+            "n_frames": self._n_frames,
+            "due": [_bytes(datagram) for datagram in self._due],
+            "come": [[sender, torch.from_numpy(come.edges)] for sender, come in self._come.items()],
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         self._n_frames = int(state["n_frames"])
+        self._due = [data.numpy().tobytes() for data in state["due"]]
+        self._come = {int(sender): Intervals(edges.numpy()) for sender, edges in state["come"]}
+
+
+def _bytes(datagram: bytes) -> Tensor:
+    return torch.frombuffer(bytearray(datagram), dtype=torch.uint8)

@@ -16,6 +16,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import Message, decode
 from gmmtorch.simulation.depth_camera import DepthFrame
 
@@ -26,11 +27,10 @@ _BLOCK = 3  # pixels along the side of those that one beam speaks for
 class Sensed(NamedTuple):
     """What a frame has brought.
 
-    messages: datagrams for the team by kind. evidence: what it adds to the robot's own map, in parts.
+    evidence: what it adds to the robot's own map, in parts.
     novel: (N,) bool, the beams of the frame that the map learned from.
     """
 
-    messages: dict[str, list[bytes]]
     evidence: list[CellEvidence]
     novel: Tensor
 
@@ -102,8 +102,30 @@ class Mapper(ABC):
         """Learn from a frame of the robot's own camera."""
 
     @abstractmethod
-    def receive(self, heard: Sequence[Heard]) -> None:
-        """Learn from what teammates sent."""
+    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+        """Learn from what teammates sent; returns the datagrams that were understood."""
+
+    @abstractmethod
+    def datagrams(self, budget: int | None = None) -> list[bytes]:
+        """What is due to be sent to the team, in so many bytes at most; what does not fit stays due."""
+
+    def announcements(self) -> list[bytes]:
+        """What this robot holds, for those who have more or less."""
+        return []
+
+    @property
+    def version(self) -> int:
+        """Changes with what is announced."""
+        return 0
+
+    @property
+    def held(self) -> Intervals:
+        """Names of the records that the map is of, where it is of any."""
+        return Intervals.empty()
+
+    def digest(self) -> bytes:
+        """Equal for robots whose maps are the same, where they can tell."""
+        return b""
 
     @abstractmethod
     def components(self) -> Components | None:

@@ -2,39 +2,30 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import functools
+import math
+import operator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.collisions import collides, meets_others
+from gmmtorch.exploration.agent import Agent
+from gmmtorch.exploration.collisions import collides, finely, meets_others
 from gmmtorch.exploration.coordination import Coordination
-from gmmtorch.exploration.mapper import Heard, Memo, Sensed
+from gmmtorch.exploration.mapper import Sensed
 from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.planning import Plan, PlanningTask, Waiting
-from gmmtorch.exploration.primitives import Primitives
-from gmmtorch.exploration.retreat import retreat
 from gmmtorch.exploration.robot import Robot
 from gmmtorch.exploration.scoring import BeliefMap
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.views import ViewEvaluator
+from gmmtorch.exploration.stopwatch import Stopwatch
+from gmmtorch.exploration.turns import take_turns
 from gmmtorch.exploration.world import World
 from gmmtorch.occupancy.cell_evidence import cast_evidence, flat_index
-from gmmtorch.sharing.messages import (
-    PlanMessage,
-    ViewsMessage,
-    encode_plan,
-    encode_views,
-)
 from gmmtorch.sharing.network import Network
 from gmmtorch.sharing.point_codecs import bytes_of_points
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _SEEN_STRIDE = 4  # pixels
-_CHECKS_PER_STEP = 4  # for collisions
 
 
 class Mission:
@@ -43,44 +34,51 @@ class Mission:
     Robots hear what the network brings, and one another's committed paths, which a short-range beacon
     would tell them; nothing else passes between them. The evaluator's maps are the robots' own evidence
     (`union`) and what each robot holds (`Robot.mapper.belief`).
+
+    Args:
+        agents: by number. union: new. watch: the one that times the agents' stages.
     """
 
     def __init__(
         self,
         world: World,
-        robots: list[Robot],
+        agents: list[Agent],
         union: BeliefMap,
         network: Network,
-        evaluator: ViewEvaluator,
         coordination: Coordination,
         options: TeamOptions,
-        memo: Memo,
+        watch: Stopwatch,
     ) -> None:
-        self.world, self.robots, self.union, self.network = world, robots, union, network
-        self.options = options
+        self.world, self.agents, self.union, self.network = world, agents, union, network
+        self.options, self.watch = options, watch
         self.tick = 0
         self.samples: dict[str, list[Any]] = {
             "times": [],
             "entropy_bits": [],
-            "entropy_bits_per_robot": [[] for _ in robots],
+            "entropy_bits_per_robot": [[] for _ in agents],
             "bytes_over_time": [],
+            "missing_share": [],
             "raw_points_bytes_over_time": [],
             **{f"{name}_bytes_over_time": [] for name in options.codecs},
         }
-        self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in robots]
-        self.stages: dict[str, float] = {}
-        self._inner_seconds = 0.0
+        self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in self.robots]
         # A bit for each robot that saw a cell.
-        bits = torch.int16 if len(robots) < 16 else torch.int32
+        bits = torch.int16 if len(agents) < 16 else torch.int32
         self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
         self.coordination = coordination.name
-        self._evaluator, self._coordination = evaluator, coordination
-        self._primitives = Primitives(options.dynamics)
-        self._waiting = Waiting(self._primitives)
+        self._coordination = coordination
         self._generator = torch.Generator().manual_seed(options.seed)
         self._raw = dict.fromkeys(("raw_points", *options.codecs), 0)
-        self._memo = memo
         self._sample()
+
+    @property
+    def robots(self) -> list[Robot]:
+        return [agent.robot for agent in self.agents]
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """Wall seconds by stage, of all robots together."""
+        return self.watch.seconds
 
     # -- time -------------------------------------------------------------------------------------
 
@@ -101,42 +99,53 @@ class Mission:
     def step(self) -> None:
         """One tick: sense, exchange, plan if it is due, fly on."""
         with torch.inference_mode():  # a sixth of the time of small operations is book-keeping for gradients
-            for robot in self.robots:
-                self._sense(robot)
-            self._exchange(self.now)
+            self.network.place(torch.stack([robot.position for robot in self.robots]))
+            for agent in self.agents:
+                self._sense(agent)
+            self._listen()
             if self.tick % self.options.ticks_per_plan == 0:
-                self._plan()
+                number = self.tick // self.options.ticks_per_plan
+                take_turns(self.agents, self._coordination, self.options, self.now, number, self._generator)
             self._fly()
             self.tick += 1
             if self.is_over:
-                self._exchange(self.now)  # what was sent in the last tick
+                self._listen()  # to what was sent in the last tick
             if self.sampled_now:
                 self._sample()
 
-    # -- sensing and sharing ----------------------------------------------------------------------
+    def converge(self, limit: float) -> float | None:
+        """Robots go on talking where they are, without a look around, until all hold the same; returns for
+        how many seconds, at most `limit`, or None if that is not enough."""
+        with torch.inference_mode():
+            for tick in range(math.floor(limit * self.options.rate) + 1):
+                if len({agent.digest() for agent in self.agents}) == 1:
+                    return tick / self.options.rate
+                now = self.now + tick / self.options.rate
+                for agent in self.agents:
+                    agent.send(now)
+                    agent.tell_views(now)
+                for agent in self.agents:
+                    agent.listen(now + self.options.tick_seconds)
+        return None
 
-    def _sense(self, robot: Robot) -> None:
-        others = [other.position for other in self.robots if other is not robot]
-        with self._timed("rendering"):
-            frame = self.options.camera.sense(
-                self.world.mesh,
-                robot.state[:4],
-                torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64),
-                self.options.dynamics.radius,
-                self._generator,
-            )
-        with self._timed("mapping"):
-            sensed = robot.sense(frame)
-        with self._timed("scoring"):
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def _sense(self, agent: Agent) -> None:
+        others = [other.position for other in self.robots if other is not agent.robot]
+        there = torch.stack(others) if others else torch.zeros(0, 3, dtype=torch.float64)
+        frame = agent.look(self.world.mesh, there)
+        sensed = agent.learn(frame, self.now)
+        with self.watch("scoring"):
             for evidence in sensed.evidence:
                 self.union.add(evidence)
-            self._note_seen(robot, frame)
+            self._note_seen(agent.robot, frame)
             self._raw["raw_points"] += 12 * int(sensed.novel.sum())
             for name, size in self._encoded(frame, sensed).items():
                 self._raw[name] += size
-        with self._timed("sharing"):
-            for kind, datagrams in sensed.messages.items():
-                self.network.send(robot.number, datagrams, self.now, kind)
+
+    def _listen(self) -> None:
+        for agent in self.agents:
+            agent.listen(self.now)
 
     def _encoded(self, frame: DepthFrame, sensed: Sensed) -> dict[str, int]:
         """Bytes that the novel beams of a frame take by other codecs: returns, and ends of the others."""
@@ -161,117 +170,18 @@ class Mission:
         flat, _ = flat_index(seen.cells - self.world.box.low, self.world.box.shape)
         self.seen_by[flat] |= 1 << robot.number
 
-    def _exchange(self, now: float) -> None:
-        """Every robot takes in what has reached it by `now`."""
-        for robot in self.robots:
-            heard = self._heard(robot, now)
-            with self._timed("mapping"):
-                robot.mapper.receive(heard)
-            for item in heard:
-                if isinstance(item.message, ViewsMessage):
-                    robot.library.merge(item.message)
-                elif isinstance(item.message, PlanMessage):
-                    robot.plans[item.message.sender] = (item.message.time, item.message.views)
-
-    def _heard(self, robot: Robot, now: float) -> list[Heard]:
-        """What has reached a robot by `now`, and what it says."""
-        with self._timed("sharing"):
-            return [
-                Heard(sender, datagram, self._memo.decoded(datagram))
-                for sender, datagram in self.network.deliver(robot.number, now)
-            ]
-
-    # -- planning ---------------------------------------------------------------------------------
-
-    def _plan(self) -> None:
-        with self._timed("planning"):
-            surroundings = {
-                robot.number: robot.surroundings(
-                    self.options.planning_prior, self.options.dynamics.radius, self.options.window
-                )
-                for robot in self.robots
-            }
-            resting = [robot.rests(self.now) for robot in self.robots]
-            for robot in self.robots:
-                robot.roadmap.update(surroundings[robot.number])
-        said: set[int] = set()
-        proposed: dict[int, Plan] = {}
-
-        def say(fixed: dict[int, Plan]) -> None:
-            """Fixed plans are told as soon as others plan after them."""
-            for number, plan in fixed.items():
-                if number not in said and self.options.shares:
-                    said.add(number)
-                    datagrams = encode_plan(
-                        number, self.tick, self.now, self.options.dynamics.step, plan.path[:, :4], plan.views
-                    )
-                    self.network.send(number, datagrams, self.now, "plans")
-
-        def plan_of(number: int, fixed: dict[int, Plan]) -> Plan:
-            robot = self.robots[number]
-            say(fixed)
-            self._exchange(self.now + self.options.plan_slack * len(fixed))
-            view = surroundings[number]
-            known = [
-                poses for other, (when, poses) in robot.plans.items() if other in fixed and when >= self.now
-            ]
-            task = PlanningTask(
-                robot=number,
-                state=robot.state,
-                surroundings=view,
-                traffic=self._traffic(number, fixed, proposed),
-                residual=self._evaluator.residual(view, torch.cat(known) if known else torch.zeros(0, 4)),
-                library=robot.library,
-                roadmap=robot.roadmap,
-                now=self.now,
-                generator=self._generator,
-                trail=robot.trail,
-            )
-            if resting[number]:
-                plan = self._waiting.rest(task)
-            else:
-                plan = retreat(self._primitives, task) or robot.planner.plan(task)
-            proposed[number] = plan
-            return plan
-
-        with self._timed("planning"):
-            plans = self._coordination.coordinate(range(len(self.robots)), plan_of, self._generator)
-            for number, plan in plans.items():
-                self.robots[number].follow(plan)
-        with self._timed("sharing"):
-            say(plans)
-            if self.options.shares:
-                for robot in self.robots:
-                    datagrams = encode_views(robot.library.take_changes())
-                    self.network.send(robot.number, datagrams, self.now, "views")
-
-    def _traffic(self, number: int, fixed: dict[int, Plan], proposed: dict[int, Plan]) -> Traffic:
-        """Where the others may be: on what they settled on or proposed, or braking if that may change."""
-        is_final = self._coordination.name != "distributed_greedy"
-        paths = []
-        for robot in self.robots:
-            if robot.number == number:
-                continue
-            plan = fixed.get(robot.number, proposed.get(robot.number))
-            if plan is not None:
-                paths.append(torch.cat([plan.path, plan.braking])[:, :3])
-            if plan is None or not (is_final or robot.number in fixed):
-                paths.append(robot.braking[:, :3])
-        return Traffic.of(paths, 2 * self.options.dynamics.radius + self.options.margin)
-
     # -- flying -----------------------------------------------------------------------------------
 
     def _fly(self) -> None:
         options = self.options
         begin = (self.tick % options.ticks_per_plan) * options.steps_per_tick
-        with self._timed("flying"):
+        with self.watch("flying"):
             flown = []
             for robot in self.robots:
                 passed = torch.cat(
                     [robot.position[None], robot.advance(begin, begin + options.steps_per_tick)]
                 )
-                # Between two states a robot may touch what it touches at neither.
-                flown.append(_finely(passed, _CHECKS_PER_STEP))
+                flown.append(finely(passed))
                 self.trajectories[robot.number].append(robot.state[:4].clone())
             met = meets_others(torch.stack(flown), options.dynamics.radius).any(1)
             for robot, positions, has_met in zip(self.robots, flown, met.tolist(), strict=True):
@@ -288,17 +198,16 @@ class Mission:
         for curve, robot in zip(s["entropy_bits_per_robot"], self.robots, strict=True):
             curve.append(robot.mapper.belief.entropy_bits)
         s["bytes_over_time"].append(self.network.n_bytes)
+        s["missing_share"].append(self._missing_share())
         for name, size in self._raw.items():
             s[f"{name}_bytes_over_time"].append(size)
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        """Wall time to a stage, but for what stages within it take."""
-        begin, outer, self._inner_seconds = time.perf_counter(), self._inner_seconds, 0.0
-        yield
-        spent = time.perf_counter() - begin
-        self.stages[stage] = self.stages.get(stage, 0.0) + spent - self._inner_seconds
-        self._inner_seconds = outer + spent
+    def _missing_share(self) -> float:
+        """Of the records that anybody holds, what share the robot lacks that lacks the most."""
+        held = [agent.robot.mapper.held for agent in self.agents]
+        everything = functools.reduce(operator.or_, held)
+        lacking = max((everything - one).size for one in held)
+        return lacking / everything.size if everything else 0.0
 
     # -- keeping ----------------------------------------------------------------------------------
 
@@ -306,7 +215,7 @@ class Mission:
         """Everything that changes, for a checkpoint."""
         return {
             "tick": self.tick,
-            "robots": [robot.checkpoint() for robot in self.robots],
+            "agents": [agent.state() for agent in self.agents],
             "union": self.union.state(),
             "network": self.network.state(),
             "samples": self.samples,
@@ -320,21 +229,14 @@ class Mission:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint, as if nothing had come between."""
         self.tick = int(state["tick"])
-        for robot, kept in zip(self.robots, state["robots"], strict=True):
-            robot.restore(kept)
+        for agent, kept in zip(self.agents, state["agents"], strict=True):
+            agent.restore(kept)
         self.union.restore(state["union"])
         self.network.restore(state["network"])
         self.samples = state["samples"]
         self.trajectories = [list(path) for path in state["trajectories"]]
-        self.stages = {name: float(seconds) for name, seconds in state["stages"].items()}
+        self.watch.seconds = {name: float(seconds) for name, seconds in state["stages"].items()}
         seen, bits = state["seen_by"]
         self.seen_by = torch.zeros_like(self.seen_by).index_copy_(0, seen, bits.to(self.seen_by.dtype))
         self._generator.set_state(state["generator"])
         self._raw = {name: int(size) for name, size in state["raw"].items()}
-
-
-def _finely(positions: Tensor, n: int) -> Tensor:
-    """Positions (1 + n S, 3) evenly on the way through positions (1 + S, 3)."""
-    share = torch.arange(1, n + 1, dtype=positions.dtype)[:, None] / n
-    between = positions[:-1, None] + share * (positions[1:, None] - positions[:-1, None])
-    return torch.cat([positions[:1], between.reshape(-1, 3)])

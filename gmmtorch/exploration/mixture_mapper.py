@@ -3,17 +3,17 @@
 Novelty → learn → update → share → sliding map. Components are immutable once they are learned, by
 whoever learned them; points that they explain later are counts that anybody may add. All robots hold
 the components as they were decoded from the datagrams, the owner too, so that all maps are the same.
+The voxels follow the mixture: each of its changes is cast into them once.
 """
 
 from __future__ import annotations
 
-import bisect
+import hashlib
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
@@ -28,18 +28,14 @@ from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.mapping.updating import count_explained, summed
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, common, united
-from gmmtorch.sharing.messages import (
-    ComponentsMessage,
-    CountsMessage,
-    Message,
-    encode_components,
-    encode_counts,
-)
+from gmmtorch.sharing.broadcast import Broadcast
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.replica import Replica
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
-_EMPTY_LENGTH = 0.7
+_EMPTY_LENGTH = 0.8
 _EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
 _EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
 
@@ -55,14 +51,14 @@ class FrameRule:
     """
 
     noise: float = 0.03
-    length: float = 0.5
+    length: float = 0.7
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
     rays: float = 4.0
-    shell: float = 1.0
+    shell: float = 0.5
     update_at: float = 2.0
-    update_stride: int = 4
+    update_stride: int = 9
 
     def __post_init__(self) -> None:
         for name in ("noise", "length", "cell"):
@@ -88,7 +84,10 @@ class FrameRule:
 
 
 class MixtureMapper(Mapper):
-    """The map of one robot of a team that shares mixtures."""
+    """The map of one robot of a team that shares mixtures.
+
+    shared: the mixture, new; `Replica`, or `Broadcast` for other codecs than its own.
+    """
 
     def __init__(
         self,
@@ -99,13 +98,12 @@ class MixtureMapper(Mapper):
         novelty: NoveltyRule,
         rule: FrameRule,
         memo: Memo,
-        codec: str = "quantized",
+        shared: Replica | Broadcast,
     ) -> None:
         super().__init__(robot, local, belief, width, novelty, memo)
+        self.shared = shared
         self.tiles = MixtureTiles()
-        self._rule, self._codec = rule, codec
-        self._n_numbered = 0
-        self._batches: dict[int, list[tuple[int, Components]]] = {}  # by robot: first sequence, batch
+        self._rule = rule
         self._gained: dict[tuple[int, int], float] = {}  # counts not sent yet, by id
         self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
 
@@ -120,22 +118,19 @@ class MixtureMapper(Mapper):
         # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
-        counts = encode_counts(self._robot, self._counted(frame, ~novel), self._codec)
-        datagrams = encode_components(self._learned(frame, novel), self._codec)
-        added = [self._take(datagram, self._memo.decoded(datagram)) for datagram in (*datagrams, *counts)]
-        return Sensed({"components": datagrams, "counts": counts}, added, novel)
+        gains = self._counted(frame, ~novel)
+        self.shared.add(self._learned(frame, novel))
+        self.shared.count(gains)
+        return Sensed(self._follow(), novel)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
-        """The components of the novel beams, numbered in an order that takes few bytes."""
+        """The components of the novel beams, in an order that takes few bytes."""
         origin, rule = frame.origin[None], self._rule
         surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
         empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
         parts = [surfaces, empty]
         found = Components.concatenate([part for part in parts if len(part)] or parts[:1])
-        found = found.rearranged(spatial_order(found)) if len(found) else found
-        number = self._n_numbered + torch.arange(len(found))
-        self._n_numbered += len(found)
-        return replace(found, ids=torch.stack([torch.full_like(number, self._robot), number], 1))
+        return found.rearranged(spatial_order(found)) if len(found) else found
 
     def _counted(self, frame: DepthFrame, known: Tensor) -> dict[tuple[int, int], float]:
         """Counts that are due to be sent, once the beams (N,) that told nothing new are counted."""
@@ -175,30 +170,61 @@ class MixtureMapper(Mapper):
         """Which cell of the index of origins a place (3,) is in."""
         return tuple((origin / self._novelty.distance).floor().long().tolist())
 
-    # -- what datagrams say -----------------------------------------------------------------------
+    # -- the team ---------------------------------------------------------------------------------
 
-    def receive(self, heard: Sequence[Heard]) -> None:
-        for item in heard:
-            if isinstance(item.message, ComponentsMessage | CountsMessage):
-                self._take(item.datagram, item.message)
+    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+        taken = [item.datagram for item in heard if self.shared.receive(item.datagram, item.message)]
+        self._follow()
+        return taken
 
-    def _take(self, datagram: bytes, message: Message) -> CellEvidence:
-        """Enter what a datagram says, one's own included."""
-        if isinstance(message, CountsMessage):
-            batch = self._with_counts(message)
-            name: tuple[Any, ...] = ("counts", message.sender, len(self.tiles))
-        else:
-            assert isinstance(message, ComponentsMessage)  # `receive` and `sense` pass on no others
-            batch = message.components
-            name = ("components", *(batch.ids[0].tolist() if len(batch) else ()))
-        key = (datagram, *batch.ids.flatten().tolist())  # counts of unknown components are left out
-        if len(batch) == 0 or name in self.tiles:  # components that came twice count once
-            return CellEvidence.empty()
-        self._enter(name, batch)
+    def datagrams(self, budget: int | None = None) -> list[bytes]:
+        return self.shared.datagrams(budget=budget)
+
+    def announcements(self) -> list[bytes]:
+        return self.shared.announcements()
+
+    @property
+    def version(self) -> int:
+        return self.shared.version
+
+    @property
+    def held(self) -> Intervals:
+        return self.shared.held
+
+    def digest(self) -> bytes:
+        return self.shared.digest()
+
+    def _follow(self) -> list[CellEvidence]:
+        """Enter what the mixture has come to hold; the evidence of it, in parts."""
+        changes = self.shared.changes()
+        if changes.rebuilt:
+            return self._start_over()
+        batches = [*changes.added, changes.gained]
+        return [self._enter(batch) for batch in batches if len(batch)]
+
+    def _start_over(self) -> list[CellEvidence]:
+        """Cast the whole mixture anew, once components were moved, or others took their place. None of it is
+        evidence that nobody had."""
+        self.local.clear()
+        self.belief.clear()
+        self.tiles, self._places = MixtureTiles(), {}
+        everything = self.shared.components()
+        if len(everything):
+            self._enter(everything)
+        return []
+
+    def _enter(self, batch: Components) -> CellEvidence:
+        """Keep a batch of components, or of counts that are added to some; returns what it says."""
+        self._keep(batch)
         grid = self.belief.grid
-        evidence = self._memo(key, lambda: self._evidence(batch, grid.resolution, grid.box))
+        evidence = self._memo(_name(batch), lambda: self._evidence(batch, grid.resolution, grid.box))
         self._add(evidence)
         return evidence
+
+    def _keep(self, batch: Components) -> None:
+        self.tiles.add(len(self.tiles), batch)
+        for place in {self._place(origin) for origin in batch.origins}:
+            self._places.setdefault(place, []).append(batch)
 
     def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
         """What components say of the cells of a box."""
@@ -227,47 +253,31 @@ class MixtureMapper(Mapper):
         ]
         return united(parts)
 
-    def _enter(self, name: tuple[Any, ...], batch: Components) -> None:
-        """Keep a batch of components seen from one place, or of counts that are added to some."""
-        self.tiles.add(name, batch)
-        for place in {self._place(origin) for origin in batch.origins}:
-            self._places.setdefault(place, []).append(batch)
-        if name[0] == "components":
-            batches = self._batches.setdefault(name[1], [])
-            bisect.insort(batches, (name[2], batch), key=lambda entry: entry[0])
-
-    def _with_counts(self, message: CountsMessage) -> Components:
-        """The components that a message adds counts to, with those counts; unknown ones are left out."""
-        rows = []
-        for (robot, number), count in message.counts.items():
-            batches = self._batches.get(robot, [])
-            at = bisect.bisect_right(batches, number, key=lambda entry: entry[0]) - 1
-            if at >= 0 and number - batches[at][0] < len(batches[at][1]):
-                batch = batches[at][1]
-                one = batch.selected(torch.tensor([number - batches[at][0]]))
-                support = torch.full_like(one.support, count)
-                rows.append(replace(one, support=support, seen_count=support[one.seen_by]))
-        return Components.concatenate(rows) if rows else Components.empty(3)
-
     # -- the whole --------------------------------------------------------------------------------
 
     def components(self) -> Components:
         """All components with all their counts, in the order of their ids."""
-        return summed(self.tiles.all())
+        return self.shared.components()
 
     def state(self) -> dict[str, Any]:
-        names, batches = zip(*self.tiles.items(), strict=True) if len(self.tiles) else ((), ())
         return {
             **super().state(),
-            "names": list(names),
-            "batches": packed(batches),
-            "n_numbered": self._n_numbered,
+            "shared": self.shared.state(),
+            "batches": packed([batch for _, batch in self.tiles.items()]),
             "gained": [[*key, count] for key, count in self._gained.items()],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
-        for name, batch in zip(state["names"], unpacked(state["batches"]), strict=True):
-            self._enter(tuple(name), batch)
-        self._n_numbered = int(state["n_numbered"])
+        self.shared.restore(state["shared"])
+        for batch in unpacked(state["batches"]):
+            self._keep(batch)
         self._gained = {(int(robot), int(number)): count for robot, number, count in state["gained"]}
+
+
+def _name(batch: Components) -> bytes:
+    """Of all that a batch says: components that were corrected have the ids and the support that they had."""
+    digest = hashlib.blake2b(digest_size=16)
+    for value in vars(batch).values():
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.digest()

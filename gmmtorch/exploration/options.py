@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.coordination import Coordination
+from gmmtorch.exploration.heartbeat import Heartbeat
 from gmmtorch.exploration.mixture_mapper import FrameRule
 from gmmtorch.exploration.planners import PLANNERS
 from gmmtorch.exploration.primitives import Dynamics
@@ -15,11 +16,13 @@ from gmmtorch.exploration.scoring import BeliefRule
 from gmmtorch.exploration.views import INFORMATION
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.sharing.envelope import check_codec
-from gmmtorch.sharing.network import Network
+from gmmtorch.sharing.link_conditions import LinkConditions, Partition
 from gmmtorch.sharing.point_codecs import POINT_CODECS
+from gmmtorch.sharing.token_bucket import TokenBucket
 from gmmtorch.simulation.depth_camera import DepthCamera
 
 _MOST_ROBOTS = 31  # as many bits as say who saw a cell
+_LATE = 5  # mean jitters: less than a hundredth of the datagrams are later
 
 FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
 """What the thesis calls them."""
@@ -34,10 +37,12 @@ class TeamOptions:
     (`dynamics.duration`). window: cells around a robot, along x, y, z, that it plans in. planner,
     information, coordination: by name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior:
     occupancy that the planner expects of unknown cells. rest: when a robot has seen enough. codec: of
-    components, see `sharing.messages`. latency (s), bandwidth (bytes/s of each sender; None: no limit),
-    loss: of the network. sample_every: simulated seconds between the numbers kept. codecs: what the
-    novel points are also encoded with, to compare. margin: metres that robots keep between them. start:
-    (size, 4) poses; None: chosen by the world.
+    components, see `sharing.messages`; others than quantized are not repaired after losses. latency …
+    partitions: of the network, see `LinkConditions`. announce_every (s): see `Heartbeat`. budget: bytes a
+    second that a robot sends of its map; None: no limit.
+    sample_every: simulated seconds between the numbers kept. codecs: what the novel points are also
+    encoded with, to compare. margin: metres that robots keep between them. start: (size, 4) poses; None:
+    chosen by the world.
     """
 
     framework: str = "gmm_shared"
@@ -48,7 +53,9 @@ class TeamOptions:
     camera: DepthCamera = field(default_factory=DepthCamera)
     dynamics: Dynamics = field(default_factory=Dynamics)
     belief: BeliefRule = field(default_factory=BeliefRule)
-    novelty: NoveltyRule = field(default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5))
+    novelty: NoveltyRule = field(
+        default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
+    )
     frame: FrameRule = field(default_factory=FrameRule)
     window: tuple[int, int, int] = (80, 80, 40)
     planner: str = "mcts"
@@ -60,8 +67,14 @@ class TeamOptions:
     rest: RestRule = field(default_factory=RestRule)
     codec: str = "quantized"
     latency: float = 0.05
+    jitter: float = 0.0
     bandwidth: float | None = None
     loss: float = 0.0
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: tuple[Partition, ...] = ()
+    announce_every: float = 5.0
+    budget: float | None = None
     sample_every: float = 10.0
     codecs: tuple[str, ...] = ()
     margin: float = 0.1
@@ -90,7 +103,10 @@ class TeamOptions:
                 f"information={self.information!r} is not one of {', '.join(INFORMATION)}."
             )
         Coordination(self.coordination, self.n_rounds)  # they check their own
-        Network(self.size, self.latency, self.bandwidth, self.loss)
+        Heartbeat(self.announce_every)
+        if self.budget is not None:
+            TokenBucket(self.budget)
+        self.conditions.check_team(self.size)
         if not 0 <= self.margin < math.inf:
             raise InvalidArgumentError(f"margin={self.margin} must be finite metres, at least zero.")
         if not 0 < self.planning_prior < 1:
@@ -122,10 +138,23 @@ class TeamOptions:
         return max(1, round(self.sample_every * self.rate))
 
     @property
+    def conditions(self) -> LinkConditions:
+        """Of the network."""
+        return LinkConditions(
+            latency=self.latency,
+            jitter=self.jitter,
+            bandwidth=self.bandwidth,
+            loss=self.loss,
+            duplication=self.duplication,
+            reach=self.reach,
+            partitions=self.partitions,
+        )
+
+    @property
     def plan_slack(self) -> float:
         """Seconds that robots wait for the plan of the one before them; none where the network is too slow
         for all to wait for one another."""
-        slack = 2 * self.latency + 0.01
+        slack = 2 * self.latency + _LATE * self.jitter + 0.01
         return slack if slack * self.size <= self.tick_seconds / 2 else 0.0
 
     @property

@@ -33,10 +33,19 @@ def row_of(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "information": options.information,
         "coordination": mission.coordination,
         "codec": options.codec,
-        "delay": options.latency,
-        "bandwidth": options.bandwidth,
         "planning_prior": options.planning_prior,
+        "delay": options.latency,
+        "jitter": options.jitter,
+        "bandwidth": options.bandwidth,
         "loss": options.loss,
+        "duplication": options.duplication,
+        "reach": options.reach,
+        "partitions": [
+            {"begin": cut.begin, "end": cut.end, "groups": [list(group) for group in cut.groups]}
+            for cut in options.partitions
+        ],
+        "announce": options.announce_every,
+        "budget": options.budget,
         "resolution": world.resolution,
         **mission.samples,
         "observable_bits": union.observable_bits,
@@ -47,6 +56,7 @@ def row_of(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "bytes_raw_points": mission.samples["raw_points_bytes_over_time"][-1],
         **{f"bytes_{name}": mission.samples[f"{name}_bytes_over_time"][-1] for name in options.codecs},
         "datagrams": mission.network.n_datagrams,
+        "reception": mission.network.reception()._asdict(),
         "n_components": None if components[0] is None else len(components[0]),
         "map_disagreement": disagreement([r.mapper.belief for r in mission.robots], cells),
         **accuracy(union, cells, occupied),
@@ -69,7 +79,7 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     final: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
-        final.setdefault(tuple(row.get(key) for key in _VARIANT), []).append(row["entropy_reduction_bits"])
+        final.setdefault(_variant(row), []).append(row["entropy_reduction_bits"])
     means = {variant: sum(bits) / len(bits) for variant, bits in final.items()}
     of_grids = [bits for variant, bits in means.items() if variant[0] == "grid_shared"]
     reference = max(of_grids or means.values(), default=0.0)
@@ -84,7 +94,15 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return timed
 
 
-_VARIANT = ("framework", "planner", "information", "coordination", "planning_prior", "codec", "loss")
+_VARIANT = (
+    *("framework", "planner", "information", "coordination", "planning_prior", "codec"),
+    *("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions", "announce", "budget"),
+)
+
+
+def _variant(row: dict[str, Any]) -> tuple[Any, ...]:
+    """What the seeds of a variant have in common, to be counted by; the framework first."""
+    return tuple(str(value) if isinstance(value, list) else value for value in map(row.get, _VARIANT))
 
 
 def _finite(value: float) -> float | None:

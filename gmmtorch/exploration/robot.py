@@ -16,6 +16,7 @@ from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.safety import surroundings_of
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.sharing.messages import PlanMessage
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 _REMEMBERED = 12  # frames whose returns are kept away from, whatever the map makes of them
@@ -49,7 +50,7 @@ class Robot:
         self.braking = self.state[None].clone()
         self.path_length = 0.0
         self.collisions = 0
-        self.plans: dict[int, tuple[float, Tensor]] = {}  # heard of teammates: when, view poses
+        self.plans: dict[int, PlanMessage] = {}  # the last heard of each teammate
         self._start = (pose[:3].double().clone(), start_radius)
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
         self._retreats = False
@@ -143,7 +144,7 @@ class Robot:
             "braking": self.braking,
             "path_length": self.path_length,
             "collisions": self.collisions,
-            "plans": [[number, when, poses] for number, (when, poses) in self.plans.items()],
+            "plans": [dict(vars(plan)) for plan in self.plans.values()],
             "recent": list(self._recent),
             "trail": self.trail,
             "retreats": self._retreats,
@@ -158,7 +159,7 @@ class Robot:
         self.state, self.path, self.braking = state["state"], state["path"], state["braking"]
         self.path_length = float(state["path_length"])
         self.collisions = int(state["collisions"])
-        self.plans = {int(number): (float(when), poses) for number, when, poses in state["plans"]}
+        self.plans = {int(plan["sender"]): PlanMessage(**plan) for plan in state["plans"]}
         self._recent = deque(state["recent"], maxlen=_REMEMBERED)
         self.trail, self._retreats = state["trail"], bool(state["retreats"])
         self.returns.restore(state["returns"])

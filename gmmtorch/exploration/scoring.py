@@ -71,6 +71,11 @@ class BeliefMap:
         self._observable = observable.reshape(-1)
         self._shape = box.shape
         self.observable_bits = float(observable.sum())
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all evidence."""
+        self.grid = BlockGrid(self.grid.resolution, self.grid.box)
         self.entropy_bits = self.observable_bits
         self.known_bits = 0.0  # off the entropy of all cells, observable or not, as a robot can tell
         self.n_observed = 0

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.agent import Agent
 from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.grid_mapper import GridMapper
 from gmmtorch.exploration.mapper import Mapper, Memo
@@ -18,11 +20,14 @@ from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.robot import Robot
 from gmmtorch.exploration.scoring import BeliefMap
+from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.exploration.views import ViewEvaluator
 from gmmtorch.exploration.world import World
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.sharing.network import Network
+from gmmtorch.sharing.broadcast import Broadcast
+from gmmtorch.sharing.network import Network, Transport
+from gmmtorch.sharing.replica import Replica
 
 _SLACK = 24
 """Cells that a robot may be off the middle of its sliding map before that moves, by as many. Rays are long:
@@ -33,6 +38,19 @@ _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way a
 
 def assemble(world: World, options: TeamOptions) -> Mission:
     """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin."""
+    poses = start_poses(world, options)
+    network = Network(options.size, options.conditions, seed=options.seed)
+    memo, watch = Memo(_REMEMBERED), Stopwatch()
+    agents = [
+        make_agent(number, poses[number], world, options, network, memo, watch)
+        for number in range(options.size)
+    ]
+    union = BeliefMap(world.resolution, world.box, world.observable, options.belief)
+    return Mission(world, agents, union, network, coordination_of(options), options, watch)
+
+
+def start_poses(world: World, options: TeamOptions) -> Tensor:
+    """Where the robots start (n, 4). Raises `InvalidArgumentError` for where they cannot."""
     start = options.start
     poses = world.start_poses(options.size) if start is None else torch.tensor(start, dtype=torch.float64)
     if poses.shape != (options.size, 4):
@@ -41,46 +59,57 @@ def assemble(world: World, options: TeamOptions) -> Mission:
             f"{options.size} robots."
         )
     world.check_start(poses)
+    return poses
+
+
+def coordination_of(options: TeamOptions) -> Coordination:
+    """How the team plans; robots that do not talk plan on their own."""
+    return Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
+
+
+def make_agent(
+    number: int,
+    pose: Tensor,
+    world: World,
+    options: TeamOptions,
+    transport: Transport,
+    memo: Memo | None = None,
+    watch: Stopwatch | None = None,
+    incarnation: int = 0,
+) -> Agent:
+    """A robot at its start pose (4,), with a transport.
+
+    memo, watch: shared by the robots of a simulation; None: its own. incarnation: of its replica; what may
+    be started again needs another each time (`record_ids.drawn_incarnation`).
+
+    Raises `InvalidArgumentError` for options that do not go together.
+    """
     _check_window(options, world.resolution)
     # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
     needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
-    clear = world.mesh.clearance(poses[:, :3]).clamp_max(needed)
+    clear = world.mesh.clearance(pose[None, :3]).clamp_max(needed)
+    camera, memo = options.camera, Memo(_REMEMBERED) if memo is None else memo
     evaluator = ViewEvaluator(
-        options.camera.horizontal_fov,
-        options.camera.vertical_fov,
-        options.camera.max_range,
+        camera.horizontal_fov,
+        camera.vertical_fov,
+        camera.max_range,
         world.resolution,
         information=options.information,
         n_beams=options.n_beams,
     )
     primitives = Primitives(options.dynamics)
-    memo = Memo(_REMEMBERED)
-
-    def belief() -> BeliefMap:
-        return BeliefMap(world.resolution, world.box, world.observable, options.belief)
-
-    robots = [
-        Robot(
-            number,
-            poses[number],
-            _mapper(number, world, options, belief(), memo),
-            make_planner(options.planner, primitives, evaluator),
-            ViewLibrary(number),
-            Roadmap(),
-            start_radius=float(clear[number]),
-            rest=options.rest,
-        )
-        for number in range(options.size)
-    ]
-    network = Network(
-        options.size,
-        latency=options.latency,
-        bandwidth=options.bandwidth,
-        loss=options.loss,
-        seed=options.seed,
+    robot = Robot(
+        number,
+        pose,
+        _mapper(number, world, options, memo, incarnation),
+        make_planner(options.planner, primitives, evaluator),
+        ViewLibrary(number, incarnation=incarnation),
+        Roadmap(),
+        start_radius=float(clear),
+        rest=options.rest,
     )
-    coordination = Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
-    return Mission(world, robots, belief(), network, evaluator, coordination, options, memo)
+    watch = Stopwatch() if watch is None else watch
+    return Agent(robot, transport, evaluator, primitives, options, memo, watch)
 
 
 def _check_window(options: TeamOptions, resolution: float) -> None:
@@ -97,12 +126,16 @@ def _check_window(options: TeamOptions, resolution: float) -> None:
             )
 
 
-def _mapper(number: int, world: World, options: TeamOptions, belief: BeliefMap, memo: Memo) -> Mapper:
+def _mapper(number: int, world: World, options: TeamOptions, memo: Memo, incarnation: int) -> Mapper:
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
     local = SlidingVoxelMap(world.resolution, (x, y, z), _SLACK)
+    belief = BeliefMap(world.resolution, world.box, world.observable, options.belief)
     width = options.camera.width
-    if options.framework == "gmm_shared":
-        return MixtureMapper(
-            number, local, belief, width, options.novelty, options.frame, memo, options.codec
-        )
-    return GridMapper(number, local, belief, width, options.novelty, memo, shared=options.shares)
+    if options.framework != "gmm_shared":
+        return GridMapper(number, local, belief, width, options.novelty, memo, shared=options.shares)
+    shared: Replica | Broadcast
+    if options.codec == "quantized":
+        shared = Replica(number, dim=3, incarnation=incarnation)
+    else:
+        shared = Broadcast(number, options.codec)
+    return MixtureMapper(number, local, belief, width, options.novelty, options.frame, memo, shared)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import io
 import json
 import math
 import multiprocessing
@@ -13,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
@@ -24,7 +22,7 @@ from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.outcome import row_of
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.world import World, open_world
-from gmmtorch.files import write_bytes, write_json
+from gmmtorch.files import write_json, write_npz
 
 CHECKPOINT = "mission.safetensors"
 ROW = "row.json"
@@ -154,9 +152,7 @@ def run_trials(
 def save_trajectories(mission: Mission, path: Path) -> None:
     """Poses (T, 4) of every robot, one a tick, as arrays robot_0, robot_1, … of an npz file."""
     paths = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(mission.trajectories)}
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **paths)  # type: ignore[arg-type]
-    write_bytes(path, packed.getvalue())
+    write_npz(path, **paths)
 
 
 def _run_one(trial: Trial) -> dict[str, Any]:

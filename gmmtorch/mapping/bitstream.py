@@ -21,6 +21,7 @@ MAX_WIDTH = 62
 MAX_BYTES = 1 << 28
 """Longest stream, some 25 million components: bits are spread to bytes while it is read."""
 _BLOCK = 1 << 16  # numbers taken apart at once: their bits take 24 bytes each meanwhile
+_AROUND = np.array([-1, 0, 1])  # low bits that are tried
 _GROUP = 7  # bits in a group of a single number
 
 
@@ -55,18 +56,34 @@ def best_code(values: Ints) -> Coding:
     """The code in which these whole numbers are shortest."""
     if not len(values):
         return Coding(Code.FIXED, 0, 0, 0.0)
-    base = int(values.min())
-    width = (int(values.max()) - base).bit_length()
-    if width > MAX_WIDTH - 1 or abs(base) >> MAX_WIDTH:
-        raise InvalidArgumentError(f"Numbers from {base} to {values.max()} take more than {MAX_WIDTH} bits.")
-    above, steps = values - base, zigzag(np.diff(values))
-    low, low_step = _rice_parameter(above), _rice_parameter(steps)
+    base, largest = int(values.min()), int(values.max())
+    if largest - base >> (MAX_WIDTH - 1) or abs(base) >> MAX_WIDTH:
+        raise InvalidArgumentError(f"Numbers from {base} to {largest} take more than {MAX_WIDTH} bits.")
+    if base == largest:
+        return Coding(Code.FIXED, 0, base, 0.0)
     codings = [
-        Coding(Code.FIXED, width, base, float(width * len(values))),
-        Coding(Code.RICE, low, base, _rice_size(above, low)),
-        Coding(Code.DIFFERENCES, low_step, int(values[0]), _rice_size(steps, low_step)),
+        Coding(
+            code, int(parameter[0]), int(values[0]) if code is Code.DIFFERENCES else base, float(n_bits[0])
+        )
+        for code, (parameter, n_bits) in _codings(values[None]).items()
     ]
     return min(codings, key=lambda coding: coding.n_bits)
+
+
+def fewest_bits(rows: Ints) -> NDArray[np.float64]:
+    """The bits (T,) that each row of (T, N) takes in its shortest code."""
+    return np.minimum.reduce([n_bits for _, n_bits in _codings(rows).values()])
+
+
+def _codings(rows: Ints) -> dict[Code, tuple[Ints, NDArray[np.float64]]]:
+    """Parameters (T,) of each code for rows (T, N), N > 0, and the bits (T,) that they take."""
+    base = rows.min(1)
+    width = np.array([extent.bit_length() for extent in (rows.max(1) - base).tolist()])
+    return {
+        Code.FIXED: (width, width * float(rows.shape[1])),
+        Code.RICE: _rice_codes(rows - base[:, None]),
+        Code.DIFFERENCES: _rice_codes(zigzag(rows[:, 1:] - rows[:, :-1])),
+    }
 
 
 class BitWriter:
@@ -135,7 +152,7 @@ class BitWriter:
 
     def rice_column(self, values: Ints) -> None:
         """Numbers ≥ 0 in a Rice code, its low bits first: at least a bit for each number."""
-        low = _rice_parameter(values)
+        low = int(_rice_codes(values[None])[0][0])
         self.one(low, 6)
         self.rice(values, low)
 
@@ -145,10 +162,10 @@ class BitWriter:
         A Rice code whose low bits are each number's scale less t, t written first.
         """
         codes = zigzag(values)
-        size = [_rice_size(codes, np.maximum(scales - t, 0)) for t in range(16)]
-        t = int(np.argmin(size))
+        low = np.maximum(scales - np.arange(16)[:, None], 0)
+        t = int(np.argmin(_sums(codes >> low) + _sums(low + 1)))
         self.one(t, 4)
-        self.rice(codes, np.maximum(scales - t, 0))
+        self.rice(codes, low[t])
 
 
 class BitReader:
@@ -280,13 +297,19 @@ def _bounded(above: Ints, base: int) -> Ints:
     return above + base
 
 
-def _rice_size(values: Ints, low: Ints | int) -> float:
-    """Bits of a Rice code; a float, which does not overflow."""
-    each = float((low + 1) * len(values)) if isinstance(low, int) else float((low + 1).sum())
-    return float((values >> low).sum(dtype=np.float64)) + each
+def _rice_codes(rows: Ints) -> tuple[Ints, NDArray[np.float64]]:
+    """The numbers (T,) of low bits that make the Rice codes of rows (T, N) of numbers ≥ 0 shortest, and
+    their bits (T,); floats, which do not overflow."""
+    t, n = rows.shape
+    if not n:
+        return np.zeros(t, np.int64), np.zeros(t)
+    about = np.log2(_sums(rows) / n + 1).astype(np.int64)
+    low = np.minimum(np.maximum(about[:, None] + _AROUND, 0), MAX_WIDTH - 1)
+    size = _sums(rows[:, None] >> low[:, :, None]) + (low + 1.0) * n
+    best = (np.arange(t), np.argmin(size, axis=1))
+    return low[best], size[best]
 
 
-def _rice_parameter(values: Ints) -> int:
-    """The number of low bits that makes the Rice code of these shortest."""
-    about = int(np.log2(float(values.mean()) + 1)) if len(values) else 0
-    return min(range(max(about - 1, 0), min(about + 2, MAX_WIDTH)), key=lambda low: _rice_size(values, low))
+def _sums(values: Ints) -> NDArray[np.float64]:
+    """Along the last axis."""
+    return np.add.reduce(values, axis=-1, dtype=np.float64)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.mapping import lattice
-from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints, best_code
+from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints, fewest_bits
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.lattice import (
     AXIS_ORDERS,
@@ -51,21 +51,26 @@ _WORSE_IN_A_ROW = 2
 
 def encode(components: Components) -> bytes:
     """A batch of components. Raises `InvalidArgumentError` for what cannot be stored, and says why."""
-    values = quantize(components)
+    return encode_quantized(quantize(components))
+
+
+def encode_quantized(values: Quantized) -> bytes:
+    """A batch of components that are whole numbers already."""
+    dim, k = values.places.dim, len(values)
     writer = BitWriter()
-    writer.number(components.dim)
-    writer.number(len(components))
+    writer.number(dim)
+    writer.number(k)
     writer.number(len(values.origins))
-    writer.fixed(_ints(values.places.axis_order), _ORDER_BITS[components.dim])
+    writer.fixed(_ints(values.places.axis_order), _ORDER_BITS[dim])
     writer.column(_ints(values.ids[:, 0]))
     # Consecutive ids become equal numbers, which take no bits.
-    writer.column(_ints(values.ids[:, 1]) - np.arange(len(components)))
+    writer.column(_ints(values.ids[:, 1]) - np.arange(k))
     _write_covariances(writer, values.places)
     _write_means(writer, values.places)
     writer.column(_ints(values.count))
     writer.column(_ints(values.max_range))
     _write_sightings(writer, _ints(values.sightings), _ints(values.seen_from), _ints(values.share))
-    for axis in range(components.dim):
+    for axis in range(dim):
         writer.column(_ints(values.origins[:, axis]))
     body = bytes([BATCH_VERSION]) + writer.to_bytes()
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
@@ -108,8 +113,13 @@ def spatial_order(components: Components) -> Tensor:
     For those who number components afterwards: ids are cheap only where they are consecutive.
     """
     places = lattice.nearest(components.means.double().cpu(), components.covariances.double().cpu())
-    cells = _cells(places, _cell_exponent(places, in_order=False))
-    return torch.from_numpy(np.lexsort(cells.T[::-1])).to(components.means.device)
+    return order_of(places).to(components.means.device)
+
+
+def order_of(places: Lattice) -> Tensor:
+    """The `spatial_order` (K,) of components on the lattice."""
+    cells = _cells(places, np.array([_cell_exponent(places, in_order=False)]))[0]
+    return torch.from_numpy(np.lexsort(cells.T[::-1]))
 
 
 # -- writing ---------------------------------------------------------------------------------------------
@@ -127,7 +137,7 @@ def _write_covariances(writer: BitWriter, places: Lattice) -> None:
 def _write_means(writer: BitWriter, places: Lattice) -> None:
     """The cells of a common grid that the means lie in, then where in its cell each lies."""
     exponent = _cell_exponent(places, in_order=True)
-    cells = _cells(places, exponent)
+    cells = _cells(places, np.array([exponent]))[0]
     least, extent = _box(cells)
     writer.number(exponent)
     for axis in range(places.dim):
@@ -156,9 +166,10 @@ def _firsts(sightings: Ints) -> NDArray[np.bool_]:
     return first
 
 
-def _cells(places: Lattice, exponent: int) -> Ints:
-    """Cells (K, D) of side 2^exponent m that the means lie in."""
-    mean, finer = _ints(_by_world_axis(places, places.mean)), exponent - _ints(_world_exponents(places))
+def _cells(places: Lattice, exponents: Ints) -> Ints:
+    """Cells (T, K, D) of sides 2^exponent m, for exponents (T,), that the means lie in."""
+    mean, step = _ints(_by_world_axis(places, places.mean)), _ints(_world_exponents(places))
+    finer = exponents[:, None, None] - step
     return np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
 
 
@@ -167,19 +178,26 @@ def _cell_exponent(places: Lattice, in_order: bool) -> int:
     exponents = _ints(_world_exponents(places))
     if not len(exponents):
         return 0
-    sizes: dict[int, float] = {}
-    exponent = int(np.median(exponents))
-    while len(sizes) < _SIDES_TRIED and exponent <= LARGEST_SIDE:
-        cells = _cells(places, exponent)
-        least, extent = _box(cells)
-        if not math.prod(extent) >> RASTER_BITS:
-            raster = _raster(cells, least, extent)
-            column = best_code(raster if in_order else np.sort(raster)).n_bits
-            sizes[exponent] = column + float(np.maximum(exponent - exponents, 0).sum())
-        if exponent - min(sizes, key=lambda tried: sizes[tried], default=exponent) >= _WORSE_IN_A_ROW:
+    rising = np.sort(exponents, axis=None)
+    first = int((rising[(len(rising) - 1) // 2] + rising[len(rising) // 2]) / 2)
+    while first < LARGEST_SIDE and _is_wide(places, first):
+        first += 1
+    tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
+    rasters = np.stack([_raster(cells, *_box(cells)) for cells in _cells(places, tried)])
+    within = np.maximum(tried[:, None, None] - exponents, 0).sum((1, 2))
+    sizes = fewest_bits(rasters if in_order else np.sort(rasters, axis=1)) + within
+    best = 0
+    for row in range(len(tried)):
+        if sizes[row] < sizes[best]:
+            best = row
+        if row - best >= _WORSE_IN_A_ROW:
             break
-        exponent += 1
-    return min(sizes, key=lambda tried: sizes[tried])
+    return int(tried[best])
+
+
+def _is_wide(places: Lattice, exponent: int) -> bool:
+    """Whether cells of this side are too many to be numbered."""
+    return bool(math.prod(_box(_cells(places, np.array([exponent]))[0])[1]) >> RASTER_BITS)
 
 
 def _box(cells: Ints) -> tuple[list[int], list[int]]:

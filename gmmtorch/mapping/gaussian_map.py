@@ -310,6 +310,11 @@ class GaussianMap(nn.Module):
     def n_components(self) -> int:
         return len(self.components()) if self.dim is not None else 0
 
+    @property
+    def n_pending(self) -> int:
+        """Scans of the unfinished window; 0: all components are final."""
+        return len(self._pending)
+
     def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
         """Move components by a rigid motion (D+1, D+1), and with them the origins they were seen from.
 
@@ -412,6 +417,35 @@ class GaussianMap(nn.Module):
         made._n_numbered = n_numbered
         made._n_numbered = made._next_number(components)
         return made
+
+    def state(self) -> dict[str, Any]:
+        """All that learning goes on from, unrounded, and the scans that wait."""
+        return {
+            "learning": {"kind": _KINDS[type(self.learning)], **changed(self.learning)},
+            "components": None if self.dim is None else dict(vars(self._committed())),
+            "pending": [dict(vars(scan)) for scan in self._pending],
+            "n_windows": self._n_windows,
+            "n_numbered": self._n_numbered,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on as the map whose `state` is given, with this one's seed and answering. Raises `DataError` for a
+        state that is damaged; nothing has changed then."""
+        try:
+            learning = _read_rule(**state["learning"])
+            components = None if state["components"] is None else Components(**state["components"]).checked()
+            pending = [Scan(**scan) for scan in state["pending"]]
+            n_windows = check_whole("n_windows", state["n_windows"], 0)
+            n_numbered = check_whole("n_numbered", state["n_numbered"], 0)
+        except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise DataError(f"The state of the map is damaged ({error}).") from error
+        self.learning, self._pending, self._n_windows = learning, pending, n_windows
+        for name in _BUFFERS if components is None else ():
+            self._buffers.pop(name, None)
+        if components is not None:
+            self._set(components)
+        self._n_numbered = n_numbered
+        self._forget()
 
 
 def changed(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:

@@ -21,7 +21,7 @@ component becomes depends neither on its company nor on a frame, and rounding ag
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -120,14 +120,13 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     `FARTHEST` and `LARGEST_DEVIATION`.
     """
     _check(means, covariances)
-    found, exact = _exact(means, covariances)
-    if bool(exact.all()):
-        return found
+    exact, rows = _exact(means, covariances)
+    if len(rows) == len(means):
+        return exact
     rounded = _rounded(means, covariances, _pivots(covariances))
     # Of several axis orders that restore the same component the first is taken, whatever order the
     # component came in with: so the bytes of what was rounded before are the same again.
-    again, same = _exact(*rounded.restored())
-    return _chosen(exact, found, _chosen(same, again, rounded))
+    return _replaced(_replaced(rounded, *_exact(*rounded.restored())), exact, rows)
 
 
 def shear_exponents(deviation: Tensor) -> Tensor:
@@ -164,18 +163,24 @@ def _check(means: Tensor, covariances: Tensor) -> None:
 
 
 def _exact(means: Tensor, covariances: Tensor) -> tuple[Lattice, Tensor]:
-    """The first axis order in which each component is on the lattice as it is; and which (K,) are at all."""
+    """Those components that are on the lattice as they are, in the first axis order in which they are; and
+    their rows (J,), rising."""
     k, dim = means.shape
-    n_orders = len(AXIS_ORDERS[dim])
-    # All orders at once: maps are often so small that the number of operations is what takes time.
-    orders = torch.arange(n_orders).repeat_interleave(k)
-    every_mean, every_covariance = means.repeat(n_orders, 1), covariances.repeat(n_orders, 1, 1)
-    tried = _rounded(every_mean, every_covariance, orders)
+    # The first axis of such an order has a variance that the lattice has: of most components few do.
+    variances = covariances.diagonal(dim1=1, dim2=2)
+    least, largest = LEAST_DEVIATION, LARGEST_DEVIATION
+    steps = (torch.log2(variances.clamp_min(1e-300)) * (PER_OCTAVE / 2)).round().long().clamp(least, largest)
+    row, order = (power(2 * steps) == variances)[:, AXIS_ORDERS[dim][:, 0]].nonzero(as_tuple=True)
+    if not len(row):
+        none = order.new_zeros(0, dim)
+        return Lattice(order, none, order.new_zeros(0, dim * (dim - 1) // 2), none), order
+    tried = _rounded(means[row], covariances[row], order)
     mean, covariance = tried.restored()
-    same = (mean == every_mean).all(1) & (covariance == every_covariance).flatten(1).all(1)
-    same = (same & tried.is_valid()).view(n_orders, k)
-    row = same.long().argmax(0) * k + torch.arange(k)  # the first that is true, else the first
-    return tried.taken(row), same.any(0)
+    same = (mean == means[row]).all(1) & (covariance == covariances[row]).flatten(1).all(1)
+    same = (same & tried.is_valid()).nonzero().squeeze(1)
+    first = torch.full((k,), len(row)).scatter_reduce_(0, row[same], same, "amin")
+    rows = (first < len(row)).nonzero().squeeze(1)
+    return tried.taken(first[rows]), rows
 
 
 def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
@@ -223,16 +228,11 @@ def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([v1, v2, v3], 1), torch.stack([l21, l31, l32], 1)
 
 
-def _chosen(which: Tensor, one: Lattice, other: Lattice) -> Lattice:
-    """Rows of `one` where `which` (K,) is true, of `other` elsewhere."""
-    rows = torch.arange(len(which))
-    joined = Lattice(
-        torch.cat([one.axis_order, other.axis_order]),
-        torch.cat([one.deviation, other.deviation]),
-        torch.cat([one.shear, other.shear]),
-        torch.cat([one.mean, other.mean]),
+def _replaced(places: Lattice, others: Lattice, rows: Tensor) -> Lattice:
+    """The places with those of these rows (J,) replaced."""
+    return Lattice(
+        *(getattr(places, f.name).index_copy(0, rows, getattr(others, f.name)) for f in fields(Lattice))
     )
-    return joined.taken(torch.where(which, rows, len(rows) + rows))
 
 
 def _pivots(covariances: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ shares that sightings have of a component are powers of 2^(−1/2) of its larges
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,6 +48,27 @@ class Quantized:
     sightings: Tensor
     seen_from: Tensor
     share: Tensor
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def arranged(self, rows: Tensor) -> Quantized:
+        """The components of distinct rows (J,) in that order, their origins rising by coordinates."""
+        n = self.sightings[rows]
+        begins = (self.sightings.cumsum(0) - self.sightings)[rows]
+        kept = torch.repeat_interleave(begins - (n.cumsum(0) - n), n) + torch.arange(int(n.sum()))
+        origins, seen_from = torch.unique(self.origins[self.seen_from[kept]], dim=0, return_inverse=True)
+        return replace(
+            self,
+            places=self.places.taken(rows),
+            count=self.count[rows],
+            max_range=self.max_range[rows],
+            ids=self.ids[rows],
+            origins=origins,
+            sightings=n,
+            seen_from=seen_from,
+            share=self.share[kept],
+        )
 
     def restored(self) -> Components:
         """The components, float64 on the CPU."""

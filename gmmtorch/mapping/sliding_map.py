@@ -100,6 +100,10 @@ class SlidingVoxelMap:
 
     # -- evidence ---------------------------------------------------------------------------------
 
+    def clear(self) -> None:
+        """Forget all evidence; the window stays where it is."""
+        self._counts.zero_()
+
     def add(self, evidence: CellEvidence) -> None:
         """Add evidence; that of cells outside the window is left out."""
         local = evidence.cells - self.low

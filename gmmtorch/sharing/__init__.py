@@ -1,6 +1,6 @@
 """What robots tell one another, as bytes, and the networks that carry it.
 
-`Replica` is imported when it is first used, so that `import gmmtorch.sharing` stays light.
+`Replica` and `Journal` are imported when they are first used, so that `import gmmtorch.sharing` stays light.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gmmtorch.sharing.journal import Journal as Journal
     from gmmtorch.sharing.replica import Replica as Replica
 
-__all__ = ["Replica"]
+__all__ = ["Journal", "Replica"]
+
+_HOMES = {"Journal": "gmmtorch.sharing.journal", "Replica": "gmmtorch.sharing.replica"}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "Replica":
-        return importlib.import_module("gmmtorch.sharing.replica").Replica
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'gmmtorch.sharing' has no attribute {name!r}")

@@ -19,23 +19,26 @@ from gmmtorch.mapping.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.lattice import FARTHEST
 from gmmtorch.sharing.component_messages import count_steps, counts_of
 from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed, split
-from gmmtorch.sharing.fields import id_order, read_ids, read_number, write_ids, write_number
+from gmmtorch.sharing.fields import (
+    read_intervals,
+    read_keys,
+    read_number,
+    write_intervals,
+    write_keys,
+    write_number,
+)
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.record_ids import (
     END,
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
-    MOST_RECORDS,
-    NUMBER_BITS,
     first_key,
     keys_of_robot,
-    lives,
     robot_of,
 )
 
 RECORD_BYTES = 1000
 """Longest record: so all fit where encryption takes its share of a datagram."""
-_LEAST_BITS = 8  # of a number
 _POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
 _UNIT = 1e-9
 
@@ -135,7 +138,7 @@ def encode_announcements(
             write_number(writer, name, value)
         writer.number(first)
         writer.number(last - first)
-        _write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
+        write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
         return sealed(Kind.ANNOUNCEMENT, writer.to_bytes())
 
     return split(n, part, "interval", max_bytes) if n else [part(0, 0)]
@@ -150,7 +153,7 @@ def read_announcement(body: bytes) -> AnnouncementMessage:
     end = begin + reader.number() + 1
     if not 0 <= begin < end <= END:
         raise DataError(f"An announcement of the keys from {begin} to {end}: it is damaged.")
-    held = _read_intervals(reader, begin, end)
+    held = read_intervals(reader, begin, end)
     reader.finish()
     return AnnouncementMessage(sender, incarnation, begin, end, held)
 
@@ -164,28 +167,26 @@ def encode_record(record: RecordMessage) -> bytes:
     writer.number(record.key)
     base = first_key(robot_of(record.key))
     if isinstance(record, SupersessionMessage):
-        _write_intervals(writer, record.old, base)
-        _write_intervals(writer, record.new, base)
+        write_intervals(writer, record.old, base)
+        write_intervals(writer, record.new, base)
         return sealed(Kind.SUPERSESSION, writer.to_bytes())
     if isinstance(record, TotalsMessage):
-        # A life is a robot of its own here: sequences of two lives are far apart.
-        names = _by_life(record.components)
-        order = id_order(torch.from_numpy(names))
-        write_ids(writer, names[order])
+        order = np.argsort(record.components)
+        write_keys(writer, record.components[order])
         writer.column(record.steps[order])
         return sealed(Kind.TOTALS, writer.to_bytes())
     writer.number(record.scan)
     writer.number(record.version)
     writer.one(int(record.dim == 3), 1)
     writer.fixed(record.pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
-    _write_intervals(writer, record.moved, base)
+    write_intervals(writer, record.moved, base)
     return sealed(Kind.CORRECTION, writer.to_bytes())
 
 
 def read_supersession(body: bytes) -> SupersessionMessage:
     reader = BitReader(body)
     key, keys = _read_key(reader)
-    old, new = (_read_intervals(reader, *keys.pairs()[0]) for _ in range(2))
+    old, new = (read_intervals(reader, *keys.pairs()[0]) for _ in range(2))
     reader.finish()
     if not old or key in old or key in new or old & new:
         raise DataError(f"Record {key} supersedes {old!r} by {new!r}: it is damaged.")
@@ -195,15 +196,11 @@ def read_supersession(body: bytes) -> SupersessionMessage:
 def read_totals(body: bytes) -> TotalsMessage:
     reader = BitReader(body)
     key, _ = _read_key(reader)
-    names = read_ids(reader)
-    steps = reader.column(len(names))
+    components = read_keys(reader)
+    steps = reader.column(len(components))
     reader.finish()
-    if len(names) and (
-        int(names[:, 0].max()) >= END >> NUMBER_BITS or int(names[:, 1].max()) >= MOST_RECORDS
-    ):
-        raise DataError("Totals of components that no robot has: it is damaged.")
     counts_of(steps)  # which says what is wrong with them
-    return TotalsMessage(key, names[:, 0] << NUMBER_BITS | names[:, 1], steps)
+    return TotalsMessage(key, components, steps)
 
 
 def read_correction(body: bytes) -> CorrectionMessage:
@@ -212,7 +209,7 @@ def read_correction(body: bytes) -> CorrectionMessage:
     scan, version = read_number(reader), read_number(reader)
     dim = 2 + reader.one(1)
     halves = reader.fixed(2 * _POSE_NUMBERS[dim], 32)
-    moved = _read_intervals(reader, *keys.pairs()[0])
+    moved = read_intervals(reader, *keys.pairs()[0])
     reader.finish()
     pose = torch.from_numpy(halves.astype("<u4").view("<f8").astype(np.float64))
     if not (bool((pose[:dim].abs() <= FARTHEST).all()) and abs(float(pose[dim:].norm()) - 1) <= _UNIT):
@@ -244,37 +241,9 @@ def pose_of(transform: Tensor) -> Tensor:
 # -- fields ------------------------------------------------------------------------------------------------
 
 
-def _write_intervals(writer: BitWriter, intervals: Intervals, begin: int) -> None:
-    """How many; of each the gap before it, from `begin` or the end of the last, and its length less one."""
-    writer.number(len(intervals))
-    for first, end in intervals.pairs():
-        writer.number(first - begin)
-        writer.number(end - first - 1)
-        begin = end
-
-
-def _read_intervals(reader: BitReader, begin: int, end: int) -> Intervals:
-    """Intervals of numbers from `begin` to `end` − 1."""
-    n = reader.number()
-    if n < 0:
-        raise DataError(f"{n} intervals are announced: it is damaged.")
-    reader.require(2 * _LEAST_BITS * n)
-    edges = [begin]
-    for _ in range(n):
-        gap, length = reader.number(), reader.number() + 1
-        if gap < (len(edges) > 1) or length < 1 or edges[-1] + gap + length > end:
-            raise DataError("Intervals touch, are empty, or are out of range: it is damaged.")
-        edges += [edges[-1] + gap, edges[-1] + gap + length]
-    return Intervals(np.array(edges[1:], np.int64))
-
-
 def _read_key(reader: BitReader) -> tuple[int, Intervals]:
     """A record's key, and all that its robot may give."""
     key = reader.number()
     if not 0 <= key < END:
         raise DataError(f"Record {key} is out of range: it is damaged.")
     return key, keys_of_robot(robot_of(key))
-
-
-def _by_life(keys: Ints) -> Ints:
-    return np.stack([lives(keys), keys & (MOST_RECORDS - 1)], 1)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec import quantized, spatial_order
+from gmmtorch.mapping.codec import order_of, quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.quantization import NO_COUNT
+from gmmtorch.mapping.quantization import NO_COUNT, quantize
 from gmmtorch.sharing.announce_messages import (
     RECORD_BYTES,
     CorrectionMessage,
@@ -24,21 +24,34 @@ from gmmtorch.sharing.announce_messages import (
     pose_of,
     totals_message,
 )
+from gmmtorch.sharing.anti_entropy import Packet
+from gmmtorch.sharing.component_messages import fitted
 from gmmtorch.sharing.component_table import fingerprints, most_sightings
 from gmmtorch.sharing.envelope import split
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.record_ids import MOST_RECORDS, first_key, ids_of, keys_of_life, keys_of_robot
+from gmmtorch.sharing.record_ids import MOST_RECORDS, first_key, ids_of, keys_of_life, keys_of_robot, life_of
 from gmmtorch.sharing.records import MOST_SIGHTINGS, Records
 
 _MOST_SUPERSESSIONS = 32
 """Of this life, until they are made one."""
 _SLACK = 64
 """Entries of totals that may be out of date before all are written again."""
+_MOST_SHORT = 16
+"""Records of totals of half the length that they may have, until they are made one."""
+
+
+class Published(NamedTuple):
+    """keys (K,): of the components that were given; written: keys of all records that were written; packets:
+    datagrams of the components, ready to be sent."""
+
+    keys: Ints
+    written: Intervals
+    packets: list[Packet]
 
 
 class Author:
-    """Writes the records of one life of a robot. Each method returns the keys of what it has written."""
+    """Writes the records of one life of a robot. Methods return the keys of what they have written."""
 
     def __init__(self, records: Records, robot: int, incarnation: int) -> None:
         self._records, self._robot, self._incarnation = records, robot, incarnation
@@ -58,11 +71,8 @@ class Author:
 
     # -- components -------------------------------------------------------------------------------
 
-    def publish(self, components: Components, old: Intervals) -> tuple[Ints, Intervals]:
-        """Components as new records that supersede old ones of this robot.
-
-        Returns the key (K,) of each, and the keys of all that was written.
-        """
+    def publish(self, components: Components, old: Intervals, max_bytes: int) -> Published:
+        """Components as new records that supersede old ones of this robot."""
         if most_sightings(components) > MOST_SIGHTINGS:
             raise InvalidArgumentError(
                 f"A component was seen from {most_sightings(components)} places; {MOST_SIGHTINGS} fit into "
@@ -70,16 +80,24 @@ class Author:
             )
         if not self._mine.covers(old):
             raise InvalidArgumentError(f"Only who made records supersedes them; robot={self._robot}.")
-        decoded = quantized(components)
-        order = spatial_order(decoded) if len(decoded) else torch.arange(0)
-        first = self._numbers(len(decoded))
-        numbered = np.arange(first, first + len(decoded))
-        written = self._records.add_components(replace(decoded.rearranged(order), ids=ids_of(numbered)))
+        self._records.check_room(len(components), self._first)
+        values = quantize(components)
+        order = order_of(values.places)
+        first = self._numbers(len(order))
+        numbered = np.arange(first, first + len(order))
+        values = replace(values.arranged(order), ids=ids_of(numbered))
+        # Here, too, they come by datagrams: so all robots of a team have the same batches.
+        packets: list[Packet] = []
+        written = Intervals.empty()
+        for datagram, part in fitted(values, max_bytes):
+            packets.append((datagram, self._records.add_components(part.restored())))
+            written |= packets[-1][1]
         keys = np.empty_like(numbered)
         keys[order.numpy()] = numbered
-        return keys, written | self._supersede(old & self._records.live(), written)
+        superseded = self._supersede((old & self._records.held) - self._records.dead, written)
+        return Published(keys, written | superseded, packets)
 
-    def publish_map(self, components: Components) -> Intervals:
+    def publish_map(self, components: Components, max_bytes: int) -> Published:
         """What a map of this robot's holds now: what is new in it, or has changed, in place of what has
         gone, or was otherwise. Components are known by their ids."""
         if bool((components.ids[:, 0] != self._robot).any()):
@@ -97,12 +115,11 @@ class Author:
         rows = [row for row, is_same in enumerate(same) if not is_same]
         kept = {number: key for number, key, is_same in zip(numbers, said, same, strict=True) if is_same}
         gone = np.array(sorted(set(self._published.values()) - set(kept.values())), np.int64)
-        keys, written = self.publish(
-            components.selected(torch.tensor(rows, dtype=torch.int64)), Intervals.of(gone)
-        )
-        fresh = zip([numbers[row] for row in rows], keys.tolist(), strict=True)
+        changed = components.selected(torch.tensor(rows, dtype=torch.int64))
+        published = self.publish(changed, Intervals.of(gone), max_bytes)
+        fresh = zip([numbers[row] for row in rows], published.keys.tolist(), strict=True)
         self._published = {**kept, **dict(fresh)}
-        return written
+        return published
 
     # -- counts and corrections -------------------------------------------------------------------
 
@@ -113,21 +130,31 @@ class Author:
                 raise InvalidArgumentError(f"A component gained {gain} points; counts go from 0 to 2⁴⁰.")
             self._totals[key] = min(self._totals.get(key, 0.0) + gain, 2.0**40)
         due = totals_message(self._first, {key: self._totals[key] for key in gains})
+        lapsed = self._records.dead.contains(due.components)
         rises = {
             key: self._totals[key]
-            for key, step in zip(due.components.tolist(), due.steps.tolist(), strict=True)
-            if step > self._told.get(key, NO_COUNT)
+            for key, step, is_lapsed in zip(
+                due.components.tolist(), due.steps.tolist(), lapsed.tolist(), strict=True
+            )
+            if step > self._told.get(key, NO_COUNT) and not is_lapsed
         }
-        written = self._write_totals(rises)
-        mine = [record for record in self._records.of(TotalsMessage) if record.key in self.life]
+        return self._write_totals(rises) | self._totals_anew()
+
+    def _totals_anew(self) -> Intervals:
+        """Many records of totals become few, and what is out of date in them goes: all of them where that is
+        most; else those that are short."""
+        mine = list(self._records.totals.of(life_of(self._first)).values())
         if sum(len(record.components) for record in mine) <= 2 * len(self._told) + _SLACK:
-            return written
-        told = np.array(sorted(self._told), np.int64)
-        alive = told[~self._records.dead.contains(told)].tolist()
-        self._told = {}
-        anew = self._write_totals({key: self._totals[key] for key in alive})
+            mine = [r for r in mine if len(self._records.datagrams[r.key]) < RECORD_BYTES // 2]
+            if len(mine) <= _MOST_SHORT:
+                return Intervals.empty()
+        told = np.unique(np.concatenate([record.components for record in mine]))
+        lapsed = self._records.dead.contains(told)
+        for key in told[lapsed].tolist():
+            self._told.pop(key, None)
+        anew = self._write_totals({key: self._totals[key] for key in told[~lapsed].tolist()})
         old = Intervals.of(np.array([record.key for record in mine], np.int64))
-        return written | anew | self._supersede(old, anew)
+        return anew | self._supersede(old, anew)
 
     def correct(self, scan: int, transform: Tensor, moved: Intervals) -> Intervals:
         """A scan of this robot's, whose components these are, belongs elsewhere."""

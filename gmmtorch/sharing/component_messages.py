@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from gmmtorch.mapping import codec as batches
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.lattice import PER_OCTAVE, power
-from gmmtorch.mapping.quantization import LARGEST_COUNT, LEAST_COUNT, NO_COUNT
+from gmmtorch.mapping.quantization import LARGEST_COUNT, LEAST_COUNT, NO_COUNT, Quantized
 from gmmtorch.mapping.thesis_message import (
     decode_thesis,
     decode_thesis_updates,
@@ -27,6 +27,10 @@ from gmmtorch.sharing.envelope import MAX_BYTES, Kind, check_codec, sealed, spli
 from gmmtorch.sharing.fields import check_ids, id_order, read_ids, read_number, write_ids, write_number
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, sightings
+_TRIED = 128
+"""Components that are likely to fit into a datagram."""
+_FILL = 0.95
+"""Of a datagram, as components are not all of the same size."""
 _COUNT = np.dtype([("robot", "<i8"), ("number", "<i8"), ("count", "<f8")])
 
 
@@ -64,6 +68,29 @@ def encode_components(
         return write(_part(components, begin, end))
 
     return split(len(components), part, "component", max_bytes)
+
+
+def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
+    """Quantised components in order, as datagrams of as many as fit, and what each of these holds.
+
+    As many are tried as the datagram before lets expect to fit, rather than halves of all.
+    """
+    begin, n = 0, _TRIED
+    while begin < len(values):
+        whole = n >= len(values)
+        part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
+        datagram = sealed(Kind.COMPONENTS, batches.encode_quantized(part))
+        room = int(_FILL * len(part) * max_bytes / len(datagram))
+        if len(datagram) <= max_bytes:
+            yield datagram, part
+            begin, n = begin + len(part), max(1, room)
+        elif len(part) > 1:
+            n = max(1, min(room, len(part) - 1))
+        else:
+            raise InvalidArgumentError(
+                f"A single component takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
+                "Let it have fewer sensor positions."
+            )
 
 
 def encode_counts(

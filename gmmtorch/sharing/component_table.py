@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.linalg import pack_symmetric
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.intervals import Intervals, Ints
+from gmmtorch.sharing.intervals import Ints
 
 _PRINT_BYTES = 16
 
 
-class _Place(NamedTuple):
-    """Where a component is, and what its content hashes to."""
-
-    batch: int
-    row: int
-    print: bytes
-
-
 class ComponentTable:
-    """Components that are added, and dropped for good; nothing else changes."""
+    """Components that are added, and dropped for good; nothing else changes.
 
-    def __init__(self) -> None:
-        self._places: dict[int, _Place] = {}
+    Batches are numbered as they come; what is left of one from which some are dropped is a new batch.
+    """
+
+    def __init__(self, dim: int = 3) -> None:
+        self.dim = dim
+        self.end = 0
+        """The number of the next batch."""
+        self._places: dict[int, tuple[int, int]] = {}  # batch and row, by key
         self._batches: dict[int, tuple[Ints, Components]] = {}  # keys by row
-        self._n_batches = 0
-        self._keys = np.zeros(0, np.int64)
-        self._unsorted: list[Ints] = []
+        self._prints: dict[int, list[bytes]] = {}  # by batch: what was asked for
+        self._keys: Ints | None = None
 
     def __len__(self) -> int:
         return len(self._places)
@@ -42,54 +38,60 @@ class ComponentTable:
     def __contains__(self, key: int) -> bool:
         return key in self._places
 
+    def holds(self, keys: Ints) -> NDArray[np.bool_]:
+        """Which of these (K,) are here."""
+        return np.array([key in self._places for key in keys.tolist()], np.bool_)
+
     def print_of(self, key: int) -> bytes:
         """What the content of a component, but for its key, hashes to."""
-        return self._places[key].print
+        batch, row = self._places[key]
+        if batch not in self._prints:
+            self._prints[batch] = fingerprints(self._batches[batch][1])
+        return self._prints[batch][row]
 
     def keys(self) -> Ints:
         """Of all components, rising."""
-        if self._unsorted:
-            self._keys = np.sort(np.concatenate([self._keys, *self._unsorted]), kind="stable")
-            self._unsorted = []
+        if self._keys is None:
+            self._keys = np.sort(np.fromiter(self._places, np.int64, len(self._places)))
         return self._keys
 
-    def add(self, keys: Ints, components: Components, prints: Sequence[bytes]) -> None:
-        """Take in components (K,) of new keys, with their `fingerprints`."""
-        if len(keys):
-            self._put(keys, components, prints)
-            self._unsorted.append(keys)
+    def add(self, keys: Ints, components: Components) -> None:
+        """Take in a batch of components (K,) of new keys."""
+        if not len(keys):
+            return
+        self._places.update((key, (self.end, row)) for row, key in enumerate(keys.tolist()))
+        self._batches[self.end] = keys, components
+        self.end += 1
+        self.dim, self._keys = components.dim, None
 
-    def drop(self, dead: Intervals) -> None:
-        """Forget the components of these keys."""
-        keys = self.keys()
-        gone = keys[dead.contains(keys)]
-        for batch in {self._places[key].batch for key in gone.tolist()}:
+    def drop(self, keys: Ints) -> None:
+        """Forget the components of these keys, which are here."""
+        batches = {self._places.pop(key)[0] for key in keys.tolist()}
+        for batch in sorted(batches):
             members, components = self._batches.pop(batch)
-            left = np.flatnonzero(~dead.contains(members))
-            if len(left):
-                prints = [self._places[key].print for key in members[left].tolist()]
-                self._put(members[left], _tidy(components.selected(torch.from_numpy(left))), prints)
-        for key in gone.tolist():
-            del self._places[key]
-        self._keys = keys[~dead.contains(keys)]
+            self._prints.pop(batch, None)
+            left = np.flatnonzero(~np.isin(members, keys))
+            self.add(members[left], _tidy(components.selected(torch.from_numpy(left))))
+        self._keys = None
+
+    def since(self, batch: int) -> list[tuple[Ints, Components]]:
+        """Keys and components of each batch from this number on, as they came."""
+        numbers = range(batch, self.end)
+        return [self._batches[number] for number in numbers if number in self._batches]
 
     def taken(self, keys: Ints) -> Components:
         """The components of these keys (K,), in that order, each origin once."""
+        if not len(keys):
+            return Components.empty(self.dim)
         by_batch: dict[int, list[tuple[int, int]]] = {}
         for rank, key in enumerate(keys.tolist()):
-            place = self._places[key]
-            by_batch.setdefault(place.batch, []).append((rank, place.row))
+            batch, row = self._places[key]
+            by_batch.setdefault(batch, []).append((rank, row))
         parts, ranks = [], []
         for batch, members in by_batch.items():
             parts.append(self._batches[batch][1].selected(torch.tensor([row for _, row in members])))
             ranks += [rank for rank, _ in members]
         return _tidy(Components.concatenate(parts).rearranged(torch.tensor(ranks).argsort()))
-
-    def _put(self, keys: Ints, components: Components, prints: Sequence[bytes]) -> None:
-        for row, (key, print_) in enumerate(zip(keys.tolist(), prints, strict=True)):
-            self._places[key] = _Place(self._n_batches, row, print_)
-        self._batches[self._n_batches] = keys, components
-        self._n_batches += 1
 
 
 def fingerprints(components: Components) -> list[bytes]:

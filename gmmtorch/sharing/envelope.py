@@ -33,6 +33,7 @@ class Kind(IntEnum):
     SUPERSESSION = 11
     TOTALS = 12
     CORRECTION = 13
+    VIEWS_HELD = 14
 
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})

@@ -11,6 +11,8 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.mapping.lattice import FARTHEST
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.record_ids import END, MOST_RECORDS, NUMBER_BITS, lives
 
 LARGEST_NUMBER = (1 << 60) - 1
 """Of a robot, and of anything that a robot numbers."""
@@ -22,6 +24,7 @@ TICKS = 1000
 """Times go in milliseconds."""
 LATEST = 1e9
 """Seconds."""
+_LEAST_BITS = 8  # of a number
 _FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
 
 
@@ -75,6 +78,45 @@ def read_ids(reader: BitReader) -> Ints:
         parts.append(np.stack([np.full(n, robot), numbers], 1))
         last = robot
     return np.concatenate(parts)
+
+
+def write_keys(writer: BitWriter, keys: Ints) -> None:
+    """Distinct, rising keys (J,) of records, as ids. A life is a robot of its own: two are far apart."""
+    write_ids(writer, np.stack([lives(keys), keys & (MOST_RECORDS - 1)], 1))
+
+
+def read_keys(reader: BitReader) -> Ints:
+    """Keys (J,), rising; memory as for `read_ids`."""
+    names = read_ids(reader)
+    if len(names) and (
+        int(names[:, 0].max()) >= END >> NUMBER_BITS or int(names[:, 1].max()) >= MOST_RECORDS
+    ):
+        raise DataError("Names of records that no robot gives: it is damaged.")
+    return names[:, 0] << NUMBER_BITS | names[:, 1]
+
+
+def write_intervals(writer: BitWriter, intervals: Intervals, begin: int) -> None:
+    """How many; of each the gap before it, from `begin` or the end of the last, and its length less one."""
+    writer.number(len(intervals))
+    for first, end in intervals.pairs():
+        writer.number(first - begin)
+        writer.number(end - first - 1)
+        begin = end
+
+
+def read_intervals(reader: BitReader, begin: int, end: int) -> Intervals:
+    """Intervals of numbers from `begin` to `end` − 1."""
+    n = reader.number()
+    if n < 0:
+        raise DataError(f"{n} intervals are announced: it is damaged.")
+    reader.require(2 * _LEAST_BITS * n)
+    edges = [begin]
+    for _ in range(n):
+        gap, length = reader.number(), reader.number() + 1
+        if gap < (len(edges) > 1) or length < 1 or edges[-1] + gap + length > end:
+            raise DataError("Intervals touch, are empty, or are out of range: it is damaged.")
+        edges += [edges[-1] + gap, edges[-1] + gap + length]
+    return Intervals(np.array(edges[1:], np.int64))
 
 
 def quantized_poses(poses: Tensor) -> Tensor:

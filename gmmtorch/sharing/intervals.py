@@ -72,17 +72,29 @@ class Intervals:
     def __contains__(self, number: int) -> bool:
         return bool(self.contains(np.array([number], np.int64))[0])
 
+    def numbers(self) -> Ints:
+        """All numbers (N,), rising."""
+        begins, lengths = self.edges[::2], self.edges[1::2] - self.edges[::2]
+        return np.arange(lengths.sum()) + np.repeat(begins + lengths - np.cumsum(lengths), lengths)
+
+    # Sets are often large here, and what changes them small: only what is close to it is compared.
+
     def __or__(self, other: Intervals) -> Intervals:
-        places, here, there = self._against(other)
-        return _where(places, here | there)
+        large, small = (self, other) if len(self) >= len(other) else (other, self)
+        begin, end = large._reach(small)
+        places, here, there = large._part(begin, end)._against(small)
+        joined = _where(places, here | there).edges
+        return Intervals(np.concatenate([large.edges[:begin], joined, large.edges[end:]]))
 
     def __and__(self, other: Intervals) -> Intervals:
-        places, here, there = self._against(other)
+        places, here, there = self._near(other)._against(other._near(self))
         return _where(places, here & there)
 
     def __sub__(self, other: Intervals) -> Intervals:
-        places, here, there = self._against(other)
-        return _where(places, here & ~there)
+        begin, end = self._reach(other)
+        places, here, there = self._part(begin, end)._against(other._near(self))
+        left = _where(places, here & ~there).edges
+        return Intervals(np.concatenate([self.edges[:begin], left, self.edges[end:]]))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Intervals) and np.array_equal(self.edges, other.edges)
@@ -91,6 +103,21 @@ class Intervals:
 
     def __repr__(self) -> str:
         return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
+
+    def _reach(self, other: Intervals) -> tuple[int, int]:
+        """From which edge to which the intervals lie that may meet or touch the other set."""
+        if not other:
+            return 0, 0
+        begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
+        end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
+        return begin - begin % 2, end + end % 2
+
+    def _part(self, begin: int, end: int) -> Intervals:
+        return Intervals(self.edges[begin:end])
+
+    def _near(self, other: Intervals) -> Intervals:
+        """The intervals that may meet the other set."""
+        return self._part(*self._reach(other))
 
     def _against(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
         """Where either set may change, and whether the numbers from there on are in each."""

@@ -9,7 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.sharing import announce_messages, component_messages, point_messages, view_messages
+from gmmtorch.sharing import (
+    announce_messages,
+    component_messages,
+    point_messages,
+    view_announcements,
+    view_messages,
+)
 from gmmtorch.sharing.announce_messages import (
     AnnouncementMessage,
     CorrectionMessage,
@@ -25,6 +31,7 @@ from gmmtorch.sharing.component_messages import (
 from gmmtorch.sharing.envelope import CODECS, MAX_BYTES, Kind, opened
 from gmmtorch.sharing.fields import quantized_poses
 from gmmtorch.sharing.point_messages import PointsMessage, encode_points
+from gmmtorch.sharing.view_announcements import ViewsHeldMessage
 from gmmtorch.sharing.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
 
 __all__ = [
@@ -39,6 +46,7 @@ __all__ = [
     "PointsMessage",
     "SupersessionMessage",
     "TotalsMessage",
+    "ViewsHeldMessage",
     "ViewsMessage",
     "decode",
     "encode_components",
@@ -46,6 +54,7 @@ __all__ = [
     "encode_plan",
     "encode_points",
     "encode_views",
+    "kind_of",
     "quantized_poses",
 ]
 
@@ -59,6 +68,7 @@ Message = (
     | SupersessionMessage
     | TotalsMessage
     | CorrectionMessage
+    | ViewsHeldMessage
 )
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
@@ -75,7 +85,31 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.SUPERSESSION: announce_messages.read_supersession,
     Kind.TOTALS: announce_messages.read_totals,
     Kind.CORRECTION: announce_messages.read_correction,
+    Kind.VIEWS_HELD: view_announcements.read_views_held,
 }
+
+
+_NAMES: dict[Kind, str] = {
+    Kind.COMPONENTS: "components",
+    Kind.FLOAT_COMPONENTS: "components",
+    Kind.THESIS_COMPONENTS: "components",
+    Kind.COUNTS: "counts",
+    Kind.FLOAT_COUNTS: "counts",
+    Kind.THESIS_COUNTS: "counts",
+    Kind.TOTALS: "counts",
+    Kind.POINTS: "points",
+    Kind.VIEWS: "views",
+    Kind.PLAN: "plans",
+    Kind.ANNOUNCEMENT: "announcements",
+    Kind.VIEWS_HELD: "announcements",
+    Kind.SUPERSESSION: "supersessions",
+    Kind.CORRECTION: "corrections",
+}
+
+
+def kind_of(datagram: bytes) -> str:
+    """What a datagram is of, for the books: of one that `decode` can read."""
+    return _NAMES[Kind(datagram[0] & 15)]
 
 
 def decode(datagram: bytes) -> Message:

@@ -2,63 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from gmmtorch.mapping.quantization import quantize
 from gmmtorch.sharing.announce_messages import TotalsMessage
-from gmmtorch.sharing.component_messages import encode_components
+from gmmtorch.sharing.anti_entropy import Packet
+from gmmtorch.sharing.component_messages import fitted
 from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.record_ids import lives
+from gmmtorch.sharing.record_ids import keys_of, lives
 from gmmtorch.sharing.record_view import information
 from gmmtorch.sharing.records import Records
 
 _RUN = 96
 """Components with consecutive numbers that go, or wait, together: about a datagram."""
 
-_FILL = 0.95
-"""Of a datagram, as components are not all of the same size."""
 
-Packet = tuple[bytes, Intervals]
-"""A datagram, and the keys of the records in it."""
-
-
-def packets(records: Records, due: Intervals, max_bytes: int, by_information: bool) -> Iterator[Packet]:
-    """What supersedes or moves others, then components, then counts.
+def packets(
+    records: Records, due: Intervals, ready: Sequence[Packet], max_bytes: int, by_information: bool
+) -> Iterator[Packet]:
+    """What supersedes or moves others, then components, then counts; of components those that are `ready` as
+    they are.
 
     Components go by their keys, which takes the fewest bytes; or the most informative first, by short
     runs of consecutive keys, which takes few more.
     """
+    due = (due & records.held) - records.dead
     if not due:
         return
-    others = [records.others[key] for key in sorted(records.others) if key in due]
+    ready = [packet for packet in ready if len(packet[0]) <= max_bytes and due.covers(packet[1])]
+    for _, keys in ready:
+        due -= keys
+    numbers = due.numbers()
+    shapes = records.table.holds(numbers)
+    others = [records.others[key] for key in numbers[~shapes].tolist()]
     for record in others:
         if not isinstance(record, TotalsMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
-    keys = records.table.keys()
-    runs = _runs(keys[due.contains(keys)], _RUN if by_information else None)
-    if by_information:
-        worth = [float(information(records.table.taken(run)).sum()) for run in runs]
-        runs = [runs[row] for row in np.argsort(-np.array(worth), kind="stable")]
-    for run in runs:
-        yield from _of_components(records, run, max_bytes)
+    for run in _in_order(records, numbers[shapes], ready, by_information):
+        if isinstance(run, tuple):
+            yield run
+        else:
+            for datagram, part in fitted(quantize(records.table.taken(run)), max_bytes):
+                yield datagram, Intervals.of(keys_of(part.ids))
     for record in others:
         if isinstance(record, TotalsMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
 
 
-def _of_components(records: Records, keys: Ints, max_bytes: int) -> Iterator[Packet]:
-    """As many in each datagram as the one before lets expect to fit, rather than halves of all."""
-    begin, n = 0, _RUN
-    while begin < len(keys):
-        chosen = keys[begin : begin + n]
-        datagrams = encode_components(records.table.taken(chosen), max_bytes=max_bytes)
-        if len(datagrams) == 1:
-            yield datagrams[0], Intervals.of(chosen)
-            begin += len(chosen)
-        n_bytes = sum(map(len, datagrams))
-        n = max(1, int(_FILL * len(chosen) * max_bytes / n_bytes))
-        n = n if len(datagrams) == 1 else min(n, len(chosen) - 1)
+def _in_order(
+    records: Records, keys: Ints, ready: Sequence[Packet], by_information: bool
+) -> list[Packet | Ints]:
+    """Packets that are ready, and runs of the other keys, in the order in which they go."""
+    runs = _runs(keys, _RUN if by_information else None)
+    found: list[Packet | Ints] = [*ready, *runs]
+    members = [*(packet[1].numbers() for packet in ready), *runs]
+    if by_information:
+        rank = [-float(information(records.table.taken(one)).sum()) for one in members]
+    else:
+        rank = [float(one[0]) for one in members]
+    return [found[row] for row in np.argsort(np.array(rank), kind="stable")]
 
 
 def _runs(keys: Ints, most: int | None) -> list[Ints]:

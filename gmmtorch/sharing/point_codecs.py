@@ -43,7 +43,6 @@ BEST_LEVEL = 22
 """Of zstd."""
 _DRACO_BITS = 30
 _DRACO_LEVEL = 10
-_MILLIMETRES = 1000
 _DEEPEST = (1 << 16) - 1
 
 
@@ -203,23 +202,33 @@ class Draco:
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Depths of an image (H, W) in whole millimetres, 0 where there is none, by zstd.
+    """Depths of an image (H, W) in whole steps of `step` (m), 0 where there is none, by zstd.
 
     A bit for each pixel, whether it has a depth; then each depth less that of the pixel with one before it,
-    row by row, zigzag, as 16 bits, the high bytes before the low ones.
+    row by row, zigzag, as 16 bits, the high bytes before the low ones. Depths below half a step are lost.
     """
 
     level: int = BEST_LEVEL
+    step: float = 0.001
     name: ClassVar[str] = "depth_image"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.step) and self.step > 0):
+            raise InvalidArgumentError(f"step={self.step} must be above zero metres.")
+
+    @property
+    def _per_metre(self) -> float:
+        """Steps: of a millimetre exactly 1000, so that depths are the decimals nearest to them."""
+        return 1 / self.step
 
     def encode(self, depths: Tensor) -> bytes:
         """Depths (H, W), metres; NaN is an error, 0 no depth."""
         image = depths.detach().double().cpu().numpy()
-        if image.ndim != 2 or not ((image >= 0) & (image * _MILLIMETRES <= _DEEPEST)).all():
+        if image.ndim != 2 or not ((image >= 0) & (image * self._per_metre <= _DEEPEST)).all():
             raise InvalidArgumentError(
-                f"depths of shape {image.shape} must be (H, W), from 0 to {_DEEPEST / _MILLIMETRES} m."
+                f"depths of shape {image.shape} must be (H, W), from 0 to {_DEEPEST * self.step:g} m."
             )
-        steps = np.round(image * _MILLIMETRES).astype(np.int64).ravel()
+        steps = np.round(image * self._per_metre).astype(np.int64).ravel()
         present = steps > 0
         change = np.diff(steps[present], prepend=0)
         wrapped = (change + (1 << 15)) % (1 << 16) - (1 << 15)
@@ -241,7 +250,7 @@ class DepthImage:
         codes = np.ascontiguousarray(planes.reshape(2, -1).T).view(">u2").ravel().astype(np.int64)
         steps = np.zeros(n, np.int64)
         steps[present] = np.cumsum(unzigzag(codes)) % (1 << 16)
-        return torch.from_numpy(steps.reshape(int(height), int(width)) / _MILLIMETRES)
+        return torch.from_numpy(steps.reshape(int(height), int(width)) / self._per_metre)
 
 
 def point_codec(name: str, resolution: float, target_error: float) -> PointCodec:

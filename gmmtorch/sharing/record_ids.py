@@ -53,6 +53,11 @@ def robot_of(key: int) -> int:
     return key >> SEQUENCE_BITS
 
 
+def life_of(key: int) -> int:
+    """Robot and incarnation of a key, as one number."""
+    return key >> NUMBER_BITS
+
+
 def lives(keys: Ints) -> Ints:
     """Robot and incarnation (N,) of keys, as one number."""
     return keys >> NUMBER_BITS

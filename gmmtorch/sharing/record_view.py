@@ -10,34 +10,31 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import CorrectionMessage, TotalsMessage
+from gmmtorch.sharing.announce_messages import CorrectionMessage
 from gmmtorch.sharing.intervals import Ints
-from gmmtorch.sharing.record_ids import lives, robot_of
+from gmmtorch.sharing.record_ids import robot_of
 
 
-def with_totals(components: Components, keys: Ints, records: Sequence[TotalsMessage]) -> Components:
-    """Components (K,), by rising keys, with what every life of every robot has counted to them.
+def gains(components: Components, gain: Tensor) -> Components:
+    """What components (K,) gain by so many points (K,): support and counts are the gain alone.
 
-    Of each life the largest total counts, and lives are summed in their order: so it does not matter in
-    which order records came, or how often. Sightings grow in proportion.
+    Sightings gain in proportion to what they have.
     """
-    if not records or not len(keys):
-        return components
-    who = np.concatenate([np.repeat(lives(np.array([r.key])), len(r.components)) for r in records])
-    what = np.concatenate([r.components for r in records])
-    total = np.concatenate([r.totals for r in records])
-    order = np.lexsort((total, who, what))
-    who, what, total = who[order], what[order], total[order]
-    last = np.append((np.diff(what) != 0) | (np.diff(who) != 0), True)[: len(what)]
-    row = np.searchsorted(keys, what)
-    counted = last & (keys[np.minimum(row, len(keys) - 1)] == what)
-    gain = torch.from_numpy(np.bincount(row[counted], total[counted], len(keys)))
-    support = components.support + gain
-    factor = torch.where(components.support > 0, support / components.support, 0.0)
-    several = torch.bincount(components.seen_by, minlength=len(keys)).clamp_min(1)
+    ratio = torch.where(components.support > 0, gain / components.support, 0.0)
+    several = torch.bincount(components.seen_by, minlength=len(components)).clamp_min(1)
     alike = torch.where(components.support > 0, 0.0, gain / several)  # of what had no points
-    seen_count = components.seen_count * factor[components.seen_by] + alike[components.seen_by]
-    return replace(components, support=support, seen_count=seen_count)
+    seen_count = components.seen_count * ratio[components.seen_by] + alike[components.seen_by]
+    return replace(components, support=gain, seen_count=seen_count)
+
+
+def with_gains(components: Components, gain: Tensor) -> Components:
+    """Components (K,) with so many points (K,) more."""
+    more = gains(components, gain)
+    return replace(
+        components,
+        support=components.support + more.support,
+        seen_count=components.seen_count + more.seen_count,
+    )
 
 
 def current(records: Sequence[CorrectionMessage]) -> list[CorrectionMessage]:

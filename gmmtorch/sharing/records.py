@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -20,11 +19,13 @@ from gmmtorch.sharing.announce_messages import (
     TotalsMessage,
     encode_record,
 )
+from gmmtorch.sharing.changes import Changes, Journal
 from gmmtorch.sharing.component_table import ComponentTable, fingerprints, most_sightings
-from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import decode
 from gmmtorch.sharing.record_ids import keys_of, robot_of
-from gmmtorch.sharing.record_view import corrected, with_totals
+from gmmtorch.sharing.record_view import corrected, with_gains
+from gmmtorch.sharing.totals import Totals
 
 MOST_SIGHTINGS = 48
 """Of a component: so one by itself fits into `RECORD_BYTES`, and can be passed on."""
@@ -33,6 +34,8 @@ MOST_OTHERS = 1 << 12
 """Records that are no components."""
 MOST_INTERVALS = 1 << 14
 """Of what is held: more than a team leaves where datagrams are lost, and a bound on memory."""
+_PIECE = 128
+"""Components of a batch that is restored: dropping one costs as much as its batch is large."""
 
 _Record = TypeVar("_Record", bound=RecordMessage)
 
@@ -60,12 +63,15 @@ class Records:
         self.dim, self._most = dim, most_components
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
-        self.table = ComponentTable()
+        self.table = ComponentTable(dim or 3)
+        self.totals = Totals()
         self.others: dict[int, RecordMessage] = {}
         self.datagrams: dict[int, bytes] = {}  # of the others, as all robots write them
         self.version = 0
         """Rises with every change."""
+        self._kinds: dict[type, dict[int, RecordMessage]] = {}  # the others by kind
         self._waiting: dict[int, SupersessionMessage] = {}  # for successors
+        self._journal = Journal()
         self._view: tuple[int, Components] | None = None
 
     # -- growing ----------------------------------------------------------------------------------
@@ -86,19 +92,17 @@ class Records:
                 f"Components in {components.dim}D, seen from up to {most_sightings(components)} places; "
                 f"this map is in {self.dim or components.dim}D, and {MOST_SIGHTINGS} places are the most.",
             )
-        prints, fresh = fingerprints(components), ~self.held.contains(keys)
-        for key, print_ in zip(keys[~fresh].tolist(), _chosen(prints, ~fresh), strict=True):
-            if key in self.others or (key in self.table and self.table.print_of(key) != print_):
-                raise _conflict(key)
+        fresh = ~self.held.contains(keys)
+        if not fresh.all():
+            self._check_same(keys[~fresh], components.selected(torch.from_numpy(np.flatnonzero(~fresh))))
+            components = components.selected(torch.from_numpy(np.flatnonzero(fresh)))
+        self.check_room(len(components), int(keys[0]))
         added = Intervals.of(keys[fresh])
-        if len(self.table) + int(fresh.sum()) > self._most:
-            raise _full(int(keys[0]))
-        rows = torch.from_numpy(np.flatnonzero(fresh))
-        self._check_room(added)
-        self.table.add(keys[fresh], components.selected(rows), _chosen(prints, fresh))
+        self._check_held(added)
+        self.table.add(keys[fresh], components)
         self._hold(added)
         self.dim = components.dim
-        return Intervals.of(keys)
+        return added if fresh.all() else Intervals.of(keys)
 
     def add_record(self, record: RecordMessage) -> Intervals:
         """Take in another record; returns its key. Raises `RefusedError`, as `add_components` does."""
@@ -118,41 +122,79 @@ class Records:
             isinstance(record, SupersessionMessage) and len(record.old) > room
         ):
             raise _full(key)
-        self._check_room(span)
+        self._check_held(span)
         self.others[key], self.datagrams[key] = record, datagram
+        self._kinds.setdefault(type(record), {})[key] = record
         if isinstance(record, SupersessionMessage):
             self._waiting[key] = record
+        elif isinstance(record, TotalsMessage):
+            self.totals.add(record)
+            self._journal.counted(record.components)
+        else:
+            self._moved(record)
         self._hold(span)
         return span
 
-    def _check_room(self, added: Intervals) -> None:
+    def check_room(self, n: int, key: int) -> None:
+        """Raises `RefusedError` unless there is room for so many components; key: of one of them."""
+        if len(self.table) + n > self._most:
+            raise _full(key)
+
+    def _check_held(self, added: Intervals) -> None:
         if len(self.held | added) > max(len(self.held), MOST_INTERVALS):
             raise _full(added.pairs()[0][0])
+
+    def _check_same(self, keys: Ints, again: Components) -> None:
+        """Components of keys (K,) that are held already have come again."""
+        for key, print_ in zip(keys.tolist(), fingerprints(again), strict=True):
+            if key in self.others or (key in self.table and self.table.print_of(key) != print_):
+                raise _conflict(key)
 
     def _hold(self, added: Intervals) -> None:
         held = self.held | added
         if held == self.held:
             return
         self.version += 1
-        buried = Intervals.empty()
+        here, buried = held, Intervals.empty()
         while ready := [s for s in self._waiting.values() if held.covers(s.new)]:
             for supersession in ready:
                 del self._waiting[supersession.key]
                 buried |= supersession.old
             held |= buried
-        self.held, self.dead = held, self.dead | buried
         if buried:
-            self.table.drop(buried)
-            for key in [key for key in self.others if key in buried]:
-                del self.others[key], self.datagrams[key]
-                self._waiting.pop(key, None)
+            self._bury((here & buried) - self.dead)
+        self.held, self.dead = held, self.dead | buried
+
+    def _bury(self, gone: Intervals) -> None:
+        """Forget these records, which are here."""
+        keys = gone.numbers()
+        shapes = self.table.holds(keys)
+        if shapes.any():
+            self.table.drop(keys[shapes])
+            self._journal.broken()
+        totals = []
+        for key in keys[~shapes].tolist():
+            record = self.others.pop(key)
+            del self.datagrams[key], self._kinds[type(record)][key]
+            self._waiting.pop(key, None)
+            if isinstance(record, TotalsMessage):
+                totals.append(record)
+                self._journal.counted(record.components)
+            elif isinstance(record, CorrectionMessage):
+                self._moved(record)
+        self.totals.drop(totals)
+
+    def _moved(self, correction: CorrectionMessage) -> None:
+        """A correction has come, or has gone."""
+        if (correction.moved & self.held) - self.dead:
+            self._journal.broken()
 
     # -- reading ----------------------------------------------------------------------------------
 
     def of(self, kind: type[_Record]) -> list[_Record]:
         """The records of a kind that count, by key."""
-        found = (self.others[key] for key in sorted(self.others))
-        return [record for record in found if isinstance(record, kind)]
+        found = self._kinds.get(kind, {})
+        return [cast(_Record, found[key]) for key in sorted(found)]
 
     def effective(self) -> list[SupersessionMessage]:
         """Supersessions whose successors are all held."""
@@ -160,7 +202,7 @@ class Records:
 
     def live(self) -> Intervals:
         """Keys whose records are here."""
-        return Intervals.of(np.concatenate([self.table.keys(), np.array(list(self.others), np.int64)]))
+        return self.held - self.dead
 
     def components(self) -> Components:
         """All components that count, by key, with all counts, where they belong."""
@@ -168,15 +210,24 @@ class Records:
             keys = self.table.keys()
             if not len(keys):
                 return Components.empty(self.dim or 3)
-            plain = with_totals(self.table.taken(keys), keys, self.of(TotalsMessage))
+            gain = torch.from_numpy(self.totals.sums(keys))
+            plain = with_gains(self.table.taken(keys), gain)
             self._view = self.version, corrected(plain, keys, self.of(CorrectionMessage))
         return self._view[1]
+
+    def changes(self) -> Changes:
+        """What has come to be known since the last call."""
+        return self._journal.taken(self.table, self.totals, self.of(CorrectionMessage))
+
+    def break_off(self) -> None:
+        """Whoever follows the changes has to start over."""
+        self._journal = Journal(rebuilt=True)
 
     def digest(self) -> bytes:
         """16 bytes: equal if all that is held, and all that counts, is equal to the bit."""
         digest = hashlib.blake2b(self.held.edges.astype("<i8").tobytes(), digest_size=16)
-        for key in self.table.keys().tolist():
-            digest.update(key.to_bytes(8, "little") + self.table.print_of(key))
+        keys = self.table.keys().tolist()
+        digest.update(b"".join(key.to_bytes(8, "little") + self.table.print_of(key) for key in keys))
         for key in sorted(self.others):
             digest.update(self.datagrams[key])
         return digest.digest()
@@ -193,6 +244,7 @@ class Records:
             "components": dict(vars(components)),
             "record_bytes": torch.tensor([len(datagram) for datagram in datagrams], dtype=torch.int64),
             "records": torch.frombuffer(bytearray(b"".join(datagrams) or b"\0"), dtype=torch.uint8),
+            "journal": self._journal.state(self.table),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -201,7 +253,16 @@ class Records:
         components = Components(**state["components"]).checked()
         if fingerprints(quantized(components)) != fingerprints(components):
             raise DataError("Components are not as the codec leaves them: the state is damaged.")
-        fresh.add_components(components)
+        keys, journal = keys_of(components.ids), state["journal"]
+        untold = [batch.numpy() for batch in journal["keys"].split(journal["sizes"].tolist())]
+        if not np.isin(journal["keys"].numpy(), keys).all():
+            raise DataError("Components that came are not there: the state is damaged.")
+        told = np.flatnonzero(~np.isin(keys, journal["keys"].numpy()))
+        pieces = [told[begin : begin + _PIECE] for begin in range(0, len(told), _PIECE)]
+        row_of = dict(zip(keys.tolist(), range(len(keys)), strict=True))
+        pieces += [np.array([row_of[key] for key in batch.tolist()], np.int64) for batch in untold]
+        for piece in pieces:
+            fresh.add_components(components.selected(torch.from_numpy(piece)))
         data, at = state["records"].numpy().tobytes(), 0
         for n_bytes in state["record_bytes"].tolist():
             fresh.add_record(_record(data[at : at + n_bytes]))
@@ -209,6 +270,7 @@ class Records:
         held = Intervals(state["held"].numpy().astype(np.int64))
         fresh.dead = held - fresh.live()
         fresh._hold(held)
+        fresh._journal = Journal.restored(journal, len(pieces) - len(untold))
         fresh.version = self.version + 1
         fresh._view = None
         vars(self).update(vars(fresh))
@@ -219,10 +281,6 @@ def _record(datagram: bytes) -> RecordMessage:
     if not isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
         raise DataError("A record is none: the state is damaged.")
     return message
-
-
-def _chosen(prints: Iterable[bytes], which: np.ndarray) -> list[bytes]:
-    return [print_ for print_, chosen in zip(prints, which.tolist(), strict=True) if chosen]
 
 
 def _conflict(key: int) -> RefusedError:

@@ -24,9 +24,10 @@ from gmmtorch.sharing.announce_messages import (
 )
 from gmmtorch.sharing.anti_entropy import Backlog
 from gmmtorch.sharing.authorship import Author
+from gmmtorch.sharing.changes import Changes
 from gmmtorch.sharing.envelope import MAX_BYTES
 from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.messages import ComponentsMessage, decode
+from gmmtorch.sharing.messages import ComponentsMessage, Message, decode
 from gmmtorch.sharing.outbox import packets
 from gmmtorch.sharing.record_ids import (
     LARGEST_INCARNATION,
@@ -83,6 +84,7 @@ class Replica:
         self._records = Records(dim, check_whole("most_components", most_components, 1))
         self._author = Author(self._records, self.robot, self.incarnation)
         self._backlog = Backlog(self.robot)
+        self._max_bytes = MAX_BYTES  # as last asked for
         self.refused: Counter[str] = Counter()
         self.conflicts: Counter[int] = Counter()
 
@@ -102,14 +104,13 @@ class Replica:
                 raise InvalidArgumentError("supersedes: a map itself says what it no longer holds.")
             if new.dim is None:
                 return ids_of(np.zeros(0, np.int64))
-            before = self._records.held
-            self._backlog.add(self._author.publish_map(_on_cpu(self._of_dim(new.components()))))
-            keys = self._records.table.keys()
-            return ids_of(keys[~before.contains(keys)])
+            published = self._author.publish_map(_on_cpu(self._of_dim(new.components())), self._max_bytes)
+            self._backlog.add(published.written, published.packets)
+            return ids_of(np.sort(published.keys))
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
-        named, written = self._author.publish(_on_cpu(self._of_dim(new)), old)
-        self._backlog.add(written)
-        return ids_of(named)
+        published = self._author.publish(_on_cpu(self._of_dim(new)), old, self._max_bytes)
+        self._backlog.add(published.written, published.packets)
+        return ids_of(published.keys)
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
         """Points that components (robot, sequence), of whomever, have gained since the last call."""
@@ -141,10 +142,18 @@ class Replica:
                 first, then components, the most informative first, then counts. None: no limit.
         """
         _check_size(max_bytes)
+        self._max_bytes = max_bytes
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
         said = Intervals.empty()
-        for datagram, keys in packets(self._records, self._backlog.due, max_bytes, budget is not None):
+        waiting = packets(
+            self._records,
+            self._backlog.due,
+            self._backlog.ready,
+            max_bytes,
+            by_information=budget is not None,
+        )
+        for datagram, keys in waiting:
             left -= len(datagram)
             if left < 0:
                 break
@@ -158,12 +167,15 @@ class Replica:
         _check_size(max_bytes)
         return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
 
-    def receive(self, datagram: bytes) -> bool:
-        """Merge what a datagram says; whether it was understood, and merged. Never raises."""
+    def receive(self, datagram: bytes, message: Message | None = None) -> bool:
+        """Merge what a datagram says; whether it was understood, and merged. Never raises.
+
+        message: what `decode` makes of it, for those who have that already.
+        """
         try:
             if not isinstance(datagram, bytes):
                 raise RefusedError("damaged", -1, f"A datagram is {type(datagram).__name__}, not bytes.")
-            self._take(datagram)
+            self._take(datagram, decode(datagram) if message is None else message)
         except RefusedError as refusal:
             self.refused[refusal.reason] += 1
             if refusal.reason == "conflict":
@@ -174,8 +186,7 @@ class Replica:
             return False
         return True
 
-    def _take(self, datagram: bytes) -> None:
-        message = decode(datagram)
+    def _take(self, datagram: bytes, message: Message) -> None:
         if isinstance(message, AnnouncementMessage):
             self._check_sender(message)
             self._backlog.announced(message, self._records.held)
@@ -222,11 +233,29 @@ class Replica:
         """All components that count, by id, with what everybody counted, where corrections put them."""
         return self._records.components()
 
+    def changes(self) -> Changes:
+        """What has become known since the last call: by this robot's doing, or heard.
+
+        All `added` and `gained` together are `components()`, unless `rebuilt` says that this is to be
+        looked at anew. The first call tells all that there is. Takes time by what has changed.
+        """
+        return self._records.changes()
+
     def map(self, **options: Any) -> GaussianMap:
         """The components as a map, of its own; `options` as for `GaussianMap`."""
         if not len(self._records.table):
             return GaussianMap(robot=self.robot, **options)
         return GaussianMap.of(self.components(), robot=self.robot, **options)
+
+    @property
+    def held(self) -> Intervals:
+        """Names of all records that are here, or were superseded: what is announced."""
+        return self._records.held
+
+    @property
+    def version(self) -> int:
+        """Rises with what is held."""
+        return self._records.version
 
     @property
     def n_components(self) -> int:
@@ -235,7 +264,8 @@ class Replica:
     # -- keeping ----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Everything, for a file. What was sent before it is saved survives with those who heard it."""
+        """Everything, for a file, and what `changes` has told of it. What was sent before it is saved
+        survives with those who heard it."""
         return {
             "robot": self.robot,
             "records": self._records.state(),
@@ -246,6 +276,8 @@ class Replica:
     def restore(self, state: dict[str, Any]) -> None:
         """Hold what was saved, in place of what is held. The incarnation stays that of this replica.
 
+        In that incarnation `changes` goes on from where it was; in another one it says `rebuilt`.
+
         Raises `DataError` for a state that is damaged, or another robot's.
         """
         try:
@@ -254,6 +286,8 @@ class Replica:
             self._records.restore(state["records"])
             self._author.restore(state["author"])
             self._backlog.restore(state["backlog"])
+            if state["author"]["incarnation"] != self.incarnation:
+                self._records.break_off()
         except DataError:
             raise
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:

@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 import errno
-import logging
 import selectors
 import socket
 import struct
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
-from types import TracebackType
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.sharing.framed_transport import MAX_WAITING, FramedTransport
 from gmmtorch.sharing.network import Traffic
-from gmmtorch.sharing.security import Opener, Sealer, TeamKey
+from gmmtorch.sharing.security import TeamKey
 from gmmtorch.sharing.sockets import LOOPBACK, Address, check_address, multicast_socket, unicast_socket
 
-MAX_WAITING = 4096
-"""Datagrams that wait to be delivered; of more, the oldest are dropped."""
 _BUFFER_BYTES = 4 << 20  # asked of the system for what it keeps; it gives what it allows
 _LARGEST_READ = 1 << 16
 _SO_RXQ_OVFL = 40  # of Linux; Python has no name for it
 _REST = 0.01  # seconds, after the socket has failed
-_log = logging.getLogger(__name__)
 
 
-class UdpTransport:
+class UdpTransport(FramedTransport):
     """One robot's end of a network; see `Transport`. To be closed, or used as a context manager.
 
     Lost datagrams stay lost. A network that is down is no error: what cannot be sent is counted in
-    `failures`. A thread takes what comes in from the socket, opens it (`Opener`), and lets it wait, so that
-    a robot may think for as long as it likes between two calls of `deliver`. Times `now` are not used: what
-    is there is delivered, whatever the clocks of the team say.
+    `failures`, by the name of the error: ENETUNREACH, ENOBUFS, …. A thread takes what comes in from the
+    socket, opens it (`Opener`), and lets it wait, so that a robot may think for as long as it likes between
+    two calls of `deliver`. `sent` counts a copy for each peer.
     """
 
     def __init__(
@@ -48,21 +43,9 @@ class UdpTransport:
         `opened`: makes the socket, bound to where it listens, which is also where it sends to until `peers`
         are given. It is closed with this.
         """
-        self._sealer = Sealer(robot, key)
-        self._opener = Opener(key, self._sealer)
-        self.robot = self._sealer.sender
-        self._waiting: deque[tuple[int, bytes]] = deque()
-        self._max_waiting = check_whole("max_waiting", max_waiting, 1)
-        self.sent, self.received = Traffic(), Traffic()
-        """What has passed the socket: frames, a copy for each peer, refused ones too."""
-        self.failures: dict[str, int] = {}
-        """How often the socket failed, by the name of the error: ENETUNREACH, ENOBUFS, …"""
-        self.n_dropped = 0
-        """Datagrams that were opened, waited, and had to give way to newer ones."""
+        super().__init__(robot, key, max_waiting)
         self.n_overflowed = 0
         """Datagrams that the system had no room for, as far as it says so (Linux)."""
-        self._broadcast: dict[str, Traffic] = {}
-        self._lock = threading.Lock()
         self._socket = opened()
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
@@ -71,7 +54,6 @@ class UdpTransport:
         self.address: Address = self._socket.getsockname()
         """Where the socket is bound; the port that was chosen, where 0 was asked for."""
         self._peers = [self.address]
-        self._closing = threading.Event()
         self._wake, self._woken = socket.socketpair()
         self._thread = threading.Thread(target=self._listen, name=f"udp-{self.robot}", daemon=True)
         self._thread.start()
@@ -140,91 +122,24 @@ class UdpTransport:
         _check_peers(peers, self.address)
         self._peers = list(peers)
 
-    # -- the transport -------------------------------------------------------------------------------------
+    # -- inside --------------------------------------------------------------------------------------------
 
-    def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
-        """Broadcast datagrams of at most 1200 bytes; the only `sender` is this robot. See `Transport`.
-
-        Does not wait: what the system does not take at once is lost, and counted in `failures`.
-        """
-        self._check("sender", sender)
-        frames = [self._sealer.seal(datagram) for datagram in datagrams]
+    def _carry(self, frame: bytes, kind: str) -> Traffic:
+        """A copy to each peer."""
         n_sent = n_bytes = 0
-        for frame in frames:
-            for peer in self._peers:
-                try:
-                    n_bytes += self._socket.sendto(frame, peer)
-                    n_sent += 1
-                except OSError as error:
-                    self._fails(error, f"to {peer[0]}:{peer[1]}")
-        size = sum(map(len, datagrams))
-        with self._lock:
-            self.sent = _sum(self.sent, Traffic(n_sent, n_bytes))
-            before = self._broadcast.get(kind, Traffic())
-            self._broadcast[kind] = _sum(before, Traffic(len(frames), size))
+        for peer in self._peers:
+            try:
+                n_bytes += self._socket.sendto(frame, peer)
+                n_sent += 1
+            except OSError as error:
+                self._failed(error, f"to {peer[0]}:{peer[1]}")
+        return Traffic(n_sent, n_bytes)
 
-    def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
-        """(sender, datagram) in the order of arrival, at most `max_waiting`; see `Transport`. Never waits."""
-        self._check("robot", robot)
-        with self._lock:
-            delivered = list(self._waiting)
-            self._waiting.clear()
-        return delivered
-
-    # -- the books -----------------------------------------------------------------------------------------
-
-    def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
-        """What this robot has broadcast, counted as `Network` does: each datagram once, without its frame.
-
-        To n peers, and with no failures, `sent` is n times as many datagrams, each `overhead` longer.
-        """
-        if sender not in (None, self.robot):
-            return Traffic()
-        with self._lock:
-            return _sum(*(traffic for what, traffic in self._broadcast.items() if kind in (None, what)))
-
-    @property
-    def overhead(self) -> int:
-        """Bytes that a frame adds to a datagram."""
-        return self._sealer.overhead
-
-    @property
-    def refused(self) -> dict[str, int]:
-        """How many frames that came in were refused, by reason: `security.REFUSALS`."""
-        return dict(self._opener.refused)
-
-    @property
-    def namesakes(self) -> dict[int, str]:
-        """Numbers that two robots have, and the addresses they were heard from."""
-        return self._opener.namesakes
-
-    # -- opening and closing -------------------------------------------------------------------------------
-
-    def close(self) -> None:
-        """Stop listening, and give the port back. What waits is forgotten. May be called again."""
-        if self._closing.is_set():
-            return
-        self._closing.set()
+    def _shut(self) -> None:
         self._wake.send(b"\0")
         self._thread.join()
         for each in (self._socket, self._wake, self._woken):
             each.close()
-
-    def __enter__(self) -> UdpTransport:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    # -- inside --------------------------------------------------------------------------------------------
-
-    def _check(self, name: str, robot: int) -> None:
-        if robot != self.robot:
-            raise InvalidArgumentError(f"{name}={robot} must be {self.robot}, the robot of this transport.")
-        if self._closing.is_set():
-            raise GmmTorchError(f"The transport of robot {self.robot} is closed; open another.")
 
     def _listen(self) -> None:
         """Until the transport is closed: take in what comes."""
@@ -244,18 +159,11 @@ class UdpTransport:
             except BlockingIOError:
                 return
             except OSError as error:
-                self._fails(error, "from the network")
+                self._failed(error, "from the network")
                 self._closing.wait(_REST)
                 return
-            opened = self._opener.open(bytes(buffer[:size]), f"{source[0]}:{source[1]}")
-            with self._lock:
-                self.received = _sum(self.received, Traffic(1, size))
-                self._note(notes)
-                if opened is not None:
-                    if len(self._waiting) == self._max_waiting:
-                        self._waiting.popleft()
-                        self.n_dropped += 1
-                    self._waiting.append(opened)
+            self._note(notes)
+            self._take(bytes(buffer[:size]), f"{source[0]}:{source[1]}")
 
     def _note(self, notes: list[tuple[int, int, bytes]]) -> None:
         """What Linux tells with a datagram: how many it has had no room for so far."""
@@ -263,16 +171,8 @@ class UdpTransport:
             if (level, kind) == (socket.SOL_SOCKET, _SO_RXQ_OVFL):
                 self.n_overflowed = struct.unpack("=I", data)[0]
 
-    def _fails(self, error: OSError, whither: str) -> None:
-        """Count it, and say so the first time."""
-        name = errno.errorcode.get(error.errno or 0, "unknown")
-        with self._lock:
-            self.failures[name] = n = self.failures.get(name, 0) + 1
-        if n == 1:
-            _log.warning(
-                "Robot %d goes on without what did not get %s: %s (%s).",
-                self.robot, whither, error.strerror, name,
-            )  # fmt: skip
+    def _failed(self, error: OSError, whither: str) -> None:
+        self._fails(errno.errorcode.get(error.errno or 0, "unknown"), f"{error.strerror}", whither)
 
 
 def _check_reach(name: str, address: Address, key: TeamKey | None, insecure: bool) -> None:
@@ -296,7 +196,3 @@ def _check_peers(peers: Sequence[Address], address: Address) -> None:
                 f"peers={peer!r} cannot be reached from address={address[0]!r}, which is this machine alone; "
                 "listen on 0.0.0.0, with a key."
             )
-
-
-def _sum(*traffic: Traffic) -> Traffic:
-    return Traffic(sum(t.datagrams for t in traffic), sum(t.bytes for t in traffic))

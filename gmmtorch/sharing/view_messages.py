@@ -13,19 +13,22 @@ from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed, split
 from gmmtorch.sharing.fields import (
     check_ids,
-    id_order,
     pose_steps,
-    read_ids,
+    read_intervals,
+    read_keys,
     read_number,
     read_path,
     read_poses,
     seconds_of,
     ticks,
-    write_ids,
+    write_intervals,
+    write_keys,
     write_number,
     write_path,
     write_poses,
 )
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.record_ids import END, ids_of, keys_of
 
 MOST_POSES = 1000
 """Of a path, and of the views of a plan: a robot at rest takes no bits for its poses."""
@@ -36,16 +39,15 @@ _HALF_BITS = 16
 class ViewsMessage:
     """Views that are new or changed, and those that are no longer worth a visit.
 
-    ids (V, 2): (sender, number), rising; poses (V, 4); values (V,); stamps (V,) s.
-    removed (R, 2), rising; removed_stamps (R,) s.
+    ids (V, 2): (robot, sequence), as of records; poses (V, 4); values (V,); stamps (V,) s.
+    removed: their keys, as in `record_ids`.
     """
 
     ids: Tensor
     poses: Tensor
     values: Tensor
     stamps: Tensor
-    removed: Tensor
-    removed_stamps: Tensor
+    removed: Intervals
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,54 +66,52 @@ class PlanMessage:
     views: Tensor
 
 
-def encode_views(message: ViewsMessage) -> list[bytes]:
-    """Datagrams of views and tombstones, 9 to 11 bytes a view; none of none. Ids may be in any order.
+def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[bytes]:
+    """Datagrams of views, 9 to 11 bytes each, and of tombstones; none of none. Ids may be in any order.
 
     Poses go to 1 cm and 1/256 of a turn (`quantized_poses`), values as float16 (65504 at most), stamps to
     1 ms. Raises `InvalidArgumentError` for what is not finite, for ids that come twice, and for rows that
     do not match.
     """
     m = message
-    sizes = (len(m.poses), len(m.values), len(m.stamps), len(m.removed_stamps))
-    if sizes != (len(m.ids),) * 3 + (len(m.removed),):
+    sizes = (len(m.poses), len(m.values), len(m.stamps))
+    if sizes != (len(m.ids),) * 3:
         raise InvalidArgumentError(
-            f"{len(m.ids)} ids with {sizes[0]} poses, {sizes[1]} values, {sizes[2]} stamps, and "
-            f"{len(m.removed)} removed with {sizes[3]} stamps: one each is needed."
+            f"{len(m.ids)} ids with {sizes[0]} poses, {sizes[1]} values and {sizes[2]} stamps: one each is "
+            "needed."
         )
-    order, dead = id_order(check_ids("ids", m.ids)), id_order(check_ids("removed", m.removed))
-    names, dead_names = m.ids.cpu().numpy()[order], m.removed.cpu().numpy()[dead]
+    if not Intervals.span(0, END).covers(m.removed):
+        raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the keys that robots give.")
+    keys = _keys(m.ids)
+    order, dead = np.argsort(keys), m.removed
+    keys = keys[order]
     steps, halves = pose_steps("poses", m.poses)[order], _halves(m.values)[order]
     times = ticks("stamps", m.stamps)[order]
-    dead_times = ticks("removed_stamps", m.removed_stamps)[dead]
 
     def some(begin: int, end: int) -> bytes:
-        """Views begin … end − 1 of the row of all views and all tombstones."""
-        seen = slice(min(begin, len(names)), min(end, len(names)))
-        gone = slice(max(begin - len(names), 0), max(end - len(names), 0))
+        """Views begin … end − 1 of the row of all views and all intervals of tombstones."""
+        seen = slice(min(begin, len(keys)), min(end, len(keys)))
+        gone = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
         writer = BitWriter()
-        write_ids(writer, names[seen])
+        write_keys(writer, keys[seen])
         write_poses(writer, steps[seen])
         writer.fixed(halves[seen], _HALF_BITS)
         writer.column(times[seen])
-        write_ids(writer, dead_names[gone])
-        writer.column(dead_times[gone])
+        write_intervals(writer, Intervals(dead.edges[gone]), 0)
         return sealed(Kind.VIEWS, writer.to_bytes())
 
-    return split(len(names) + len(dead_names), some, "view")
+    return split(len(keys) + len(dead), some, "view", max_bytes)
 
 
 def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
-    ids = read_ids(reader)
-    poses = read_poses(reader, len(ids))
-    values = _values(reader.fixed(len(ids), _HALF_BITS))
-    stamps = seconds_of(reader.column(len(ids)))
-    removed = read_ids(reader)
-    removed_stamps = seconds_of(reader.column(len(removed)))
+    keys = read_keys(reader)
+    poses = read_poses(reader, len(keys))
+    values = _values(reader.fixed(len(keys), _HALF_BITS))
+    stamps = seconds_of(reader.column(len(keys)))
+    removed = read_intervals(reader, 0, END)
     reader.finish()
-    return ViewsMessage(
-        torch.from_numpy(ids), poses, values, stamps, torch.from_numpy(removed), removed_stamps
-    )
+    return ViewsMessage(ids_of(keys), poses, values, stamps, removed)
 
 
 def encode_plan(
@@ -170,6 +170,13 @@ def _read_size(reader: BitReader) -> int:
     if not 0 <= n <= MOST_POSES:
         raise DataError(f"{n} poses are announced; {MOST_POSES} are the most: it is damaged.")
     return n
+
+
+def _keys(ids: Tensor) -> Ints:
+    try:
+        return keys_of(check_ids("ids", ids))
+    except DataError as error:
+        raise InvalidArgumentError(f"ids: {error}") from error
 
 
 def _halves(values: Tensor) -> Ints:

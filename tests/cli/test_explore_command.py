@@ -260,11 +260,17 @@ def test_other_planners_fly(planner, run):
 
 def test_options_reach_the_mission(run):
     options = ["information=fsmi", "coordination=myopic", "network.loss=0.5", "world.resolution=0.25"]
+    cut = {"begin": 1.0, "end": 3.0, "groups": [[0], [1]]}
+    options += ["network.jitter=0.02", "network.duplication=0.5", "network.reach=15", "network.delay=0.1"]
+    options += ["network.partitions=[{begin: 1, end: 3, groups: [[0], [1]]}]"]
     options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]", "planner.prior=0.5"]
     done = succeeded(run(*options))
     (row,) = done.results()["rows"]
     names = ["information", "coordination", "loss", "resolution", "planning_prior"]
     assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25, 0.5]
+    names = ["delay", "jitter", "duplication", "reach", "partitions"]
+    assert [row[name] for name in names] == [0.1, 0.02, 0.5, 15.0, [cut]]
+    assert row["reception"]["cut_off"] > 0
     assert 0 < row["bytes_octree"] < row["bytes_raw_points"]
     with np.load(done.folder / "trajectories.npz") as kept:
         assert kept["robot_0"][0].tolist() == [2, 3, 1.5, 0]
@@ -424,9 +430,16 @@ def test_without_checkpoints_none_is_written(run):
         ("sensor.max_range=0", "max_range=0.0"),
         ("sensor.rate=0.7", "sensor.rate=0.7 robot.duration"),
         ("duration=-1", "duration=-1.0"),
-        ("network.loss=1", "loss=1.0"),
-        ("network.bandwidth=0", "bandwidth=0.0"),
-        ("network.delay=-1", "-1.0 time"),
+        ("network.loss=1", "network.loss=1.0"),
+        ("network.bandwidth=0", "network.bandwidth=0.0"),
+        ("network.delay=-1", "network.delay=-1.0 time"),
+        ("network.jitter=-1", "network.jitter=-1.0 time"),
+        ("network.duplication=2", "network.duplication=2.0"),
+        ("network.reach=0", "network.reach=0.0 metres"),
+        ("network.partitions=[{begin:2,end:1,groups:[[0]]}]", "network.partitions[0]= begin end"),
+        ("network.partitions=[{begin:0,end:1,groups:[[0,2]]}]", "network.partitions[0].groups= 2"),
+        ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= nobody"),
+        ("network.partitions=[cut]", "network.partitions[0]='cut'"),
         ("map.window=[8,8]", "map.window=[8, three"),
         ("map.window=[8,8,8]", "map.window=[8, sensor.max_range"),
         ("map.rays=0", "rays=0.0"),
@@ -481,17 +494,18 @@ def test_a_value_of_the_wrong_kind_is_named_in_one_line(options, run):
 
 def test_a_bad_variant_is_found_before_the_first_is_flown(run, steps):
     variants = "study.variants=[{team:grid_isolated},{loss:1}]"
-    assert "loss=1" in refused(run("experiment=fig4_4_entropy", "study.seeds=[0]", variants))
+    assert "study.variants: loss=1 " in refused(run("experiment=fig4_4_entropy", "study.seeds=[0]", variants))
     assert steps == []
 
 
 def test_variants_that_differ_in_an_option_alone_are_kept_apart(run, steps, tmp_path):
-    variants = "study.variants=[{loss:0.5},{planning_prior:0.5}]"
+    cut = "partitions:[{begin:0,end:1,groups:[[0]]}]"
+    variants = f"study.variants=[{{loss:0.5}},{{planning_prior:0.5}},{{{cut}}},{{delay:0.2}}]"
     options = ["experiment=fig4_4_entropy", "study.seeds=[0]", variants, "duration=2"]
     options.append(f"checkpoint.folder={tmp_path / 'kept'}")
     succeeded(run(*options))
     succeeded(run(*options, name="again"))
-    assert len(steps) == 2 * 2
+    assert len(steps) == 4 * 2
 
 
 def test_a_mesh_that_was_not_given_is_asked_for(monkeypatch, tmp_path):

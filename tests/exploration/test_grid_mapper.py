@@ -92,7 +92,9 @@ def test_own_frames_count_in_full_whether_they_are_shared_or_not() -> None:
 
 def test_who_is_isolated_sends_nothing() -> None:
     alone = mapper(shared=False)
-    assert all(alone.sense(frame(seed)).messages == {"points": []} for seed in range(3))
+    for seed in range(3):
+        alone.sense(frame(seed))
+    assert alone.datagrams() == alone.announcements() == []
 
 
 def test_only_novel_beams_are_sent() -> None:
@@ -101,7 +103,7 @@ def test_only_novel_beams_are_sent() -> None:
     for number in range(12):
         view = frame(number % 2)
         sensed = one.sense(view)
-        messages = [decode(datagram) for datagram in sensed.messages["points"]]
+        messages = [decode(datagram) for datagram in one.datagrams()]
         ends = [m.ends for m in messages if isinstance(m, PointsMessage)]
         assert len(ends) == len(messages)
         for message in messages:
@@ -120,7 +122,7 @@ def test_a_frame_without_beams_says_nothing() -> None:
     for shared in (False, True):
         one = mapper(shared=shared)
         sensed = one.sense(frame(0, n=0))
-        assert sensed.messages == {"points": []}
+        assert one.datagrams() == []
         assert sensed.novel.shape == (0,)
         assert float(believed(one).sum()) == 0
 
@@ -164,16 +166,44 @@ def test_who_hears_all_that_is_novel_has_what_was_novel() -> None:
     parts = []
     for view in views:
         sensed = speaker.sense(view)
-        listener.receive(heard(*sensed.messages["points"]))
+        datagrams = speaker.datagrams()
+        assert listener.receive(heard(*datagrams)) == datagrams
         parts.append((view.origin, view.ends[sensed.novel], view.is_hit[sensed.novel]))
     torch.testing.assert_close(believed(listener), dense_of(parts))
     assert float(believed(listener).sum()) < float(believed(speaker).sum())
 
 
+def test_parts_that_come_twice_count_once() -> None:
+    view = frame(0, n=3 * POINTS_PER_DATAGRAM)
+    first, second, third = said(view)
+    one = mapper()
+    assert one.receive(heard(first, first)) == [first]
+    assert one.receive(heard(third, first, third)) == [third]
+    one.receive(heard(second))
+    one.receive(heard(second, sender=2))  # passed on by another
+    torch.testing.assert_close(believed(one), dense_of(beams(view)))
+
+
+def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
+    free, bound = mapper(), mapper()
+    for one in (free, bound):
+        one.sense(frame(0))
+    due = free.datagrams()
+    assert len(due) > 3
+    assert bound.datagrams(0) == bound.datagrams(len(due[0]) - 1) == []
+    got: list[bytes] = []
+    for budget in (len(due[0]), len(due[1]) + len(due[2]) + 5, 10**6):
+        sent = bound.datagrams(budget)
+        assert 0 < sum(map(len, sent)) <= budget
+        got += sent
+    assert got == due
+    assert bound.datagrams() == []
+
+
 def test_other_messages_are_ignored() -> None:
     one = mapper()
-    one.receive(heard(*encode_counts(1, {(1, 0): 5.0})))
-    one.receive([])
+    assert one.receive(heard(*encode_counts(1, {(1, 0): 5.0}))) == []
+    assert one.receive([]) == []
     assert float(believed(one).sum()) == 0
     assert one.components() is None
 
@@ -203,15 +233,20 @@ def test_a_restored_mapper_goes_on_alike() -> None:
     one, twin = mapper(), mapper()
     for seed in range(3):
         one.sense(frame(seed))
-    one.receive(heard(*said(frame(7))))
+    one.receive(heard(*said(frame(7))[1:]))
+    one.datagrams(3000)
     twin.restore(one.state())
+    for each in (one, twin):
+        each.receive(heard(*said(frame(7))))  # of which most have come already
     there = torch.tensor([1.2, 0.0, 0.0], dtype=torch.float64)
     for seed in range(3, 6):
         for each in (one, twin):
             each.center_on(there)
         view = frame(seed, origin=there)
         a, b = one.sense(view), twin.sense(view)
-        assert a.messages == b.messages
+        sent = one.datagrams()
+        assert sent == twin.datagrams()
+        assert sent
         assert torch.equal(a.novel, b.novel)
     assert torch.equal(believed(one), believed(twin))
     for a, b in zip(one.local.evidence(), twin.local.evidence(), strict=True):

@@ -25,6 +25,7 @@ from gmmtorch.exploration.trials import CHECKPOINT, ROW, Trial, WorldOptions, ru
 from gmmtorch.exploration.world import World
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cell_evidence import cast_evidence
+from gmmtorch.sharing.link_conditions import Partition
 from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.solids import box
 
@@ -135,6 +136,8 @@ def test_a_mission_that_was_interrupted_ends_as_one_that_was_not(
     options = replace(
         SMALL, framework=framework, planner=planner, duration=10.0, loss=0.2, bandwidth=3e4, latency=1.3
     )
+    cut = Partition(3.0, 6.5, ((0,), (1,)))
+    options = replace(options, jitter=0.4, duplication=0.3, reach=4.0, partitions=(cut,))
     whole = flown(world, options)
     path = save_checkpoint(tmp_path / "half.safetensors", flown(world, options, to=5).state())
     resumed = assemble(world, options)
@@ -144,6 +147,17 @@ def test_a_mission_that_was_interrupted_ends_as_one_that_was_not(
     assert without_seconds(row_of(resumed, 1.0)) == without_seconds(row_of(whole, 1.0))
     for one, other in zip(whole.trajectories, resumed.trajectories, strict=True):
         assert torch.equal(torch.stack(one), torch.stack(other))
+
+
+def test_robots_hear_who_is_in_reach_where_they_have_flown_to(world: World) -> None:
+    options = replace(SMALL, framework="grid_shared", duration=8.0)
+    near, far = (flown(world, replace(options, reach=reach)) for reach in (0.1, 1e3))
+    row = row_of(near, 1.0)
+    assert row["reception"]["out_of_reach"] == row["datagrams"] > 0
+    assert row["reception"]["datagrams"] == near.network.n_in_flight == 0
+    kept = [without_seconds(row_of(made, 1.0)) for made in (far, flown(world, options))]
+    assert [each.pop("reach") for each in kept] == [1e3, None]
+    assert kept[0] == kept[1]
 
 
 def test_a_lone_grid_is_the_sum_of_its_frames(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -250,6 +264,7 @@ START: dict[str, Callable[[], TeamOptions]] = {
     "frames out of step": lambda: replace(SMALL, rate=0.7),
     "prior": lambda: replace(SMALL, planning_prior=1.0),
     "loss": lambda: replace(SMALL, loss=1.0),
+    "a cut of nobody": lambda: replace(SMALL, partitions=(Partition(0.0, 1.0, ((0, 1),)),)),
     "coordination": lambda: replace(SMALL, coordination="none"),
     "information": lambda: replace(SMALL, information="all"),
     "window": lambda: replace(SMALL, window=(40, 40, 32)),

@@ -12,6 +12,7 @@ import torch
 from gmmtorch.exploration.outcome import row_of, with_times
 from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.sharing.network import Reception
 
 VARIANT = {
     "framework": "gmm_shared",
@@ -21,6 +22,10 @@ VARIANT = {
     "planning_prior": 0.125,
     "codec": "quantized",
     "loss": 0.0,
+    "jitter": 0.0,
+    "partitions": [],
+    "announce": 5.0,
+    "budget": None,
 }
 
 
@@ -77,7 +82,9 @@ def test_without_grids_the_best_variant_is_the_reference() -> None:
 
 @pytest.mark.parametrize("name", list(VARIANT))
 def test_what_makes_a_variant(name: str) -> None:
-    other = {"planning_prior": 0.5, "loss": 0.3}.get(name, "grid_isolated")
+    others = {"planning_prior": 0.5, "loss": 0.3, "jitter": 0.1, "partitions": [{"begin": 1.0}]}
+    others |= {"announce": 9.0, "budget": 100.0}
+    other = others.get(name, "grid_isolated")
     rows = [row([0, 400]), row([0, 600], **{name: other})]
     assert with_times(rows)[0]["reference_bits"] == 600.0
     rows = [row([0, 400], seed=0), row([0, 600], seed=1)]
@@ -120,8 +127,9 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
     mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
     mask[20:] = 7  # not observable: not counted
     names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
-    names += ["coordination", "codec", "latency", "bandwidth"]
-    options = SimpleNamespace(size=3, codecs=("zip",), **dict.fromkeys(names, "x"))
+    names += ["coordination", "codec", "latency", "jitter", "bandwidth", "duplication", "reach"]
+    names += ["announce_every", "budget"]
+    options = SimpleNamespace(size=3, codecs=("zip",), partitions=(), **dict.fromkeys(names, "x"))
     robots = [
         SimpleNamespace(
             path_length=length,
@@ -144,7 +152,13 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
         seen_by=mask,
         robots=robots,
         samples={"raw_points_bytes_over_time": [1, 22], "zip_bytes_over_time": [1, 11]},
-        network=SimpleNamespace(n_bytes=100, n_wire_bytes=128, bytes_by_kind=Counter(a=100), n_datagrams=1),
+        network=SimpleNamespace(
+            n_bytes=100,
+            n_wire_bytes=128,
+            bytes_by_kind=Counter(a=100),
+            n_datagrams=1,
+            reception=lambda: Reception(1, 100, lost=1),
+        ),
         stages={"plan": 1.0},
         now=30.0,
     )
@@ -166,6 +180,8 @@ def test_the_figures_of_a_mission_by_hand() -> None:
     assert found["bytes_zip"] == 11
     assert found["simulated_per_wall_seconds"] == 3.0
     assert found["n_components"] is None
+    assert found["partitions"] == []
+    assert (found["reception"]["bytes"], found["reception"]["lost"]) == (100, 1)
 
 
 def test_the_figures_of_a_mission_that_went_nowhere() -> None:

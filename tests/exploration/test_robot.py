@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from sharing.message_examples import assert_same
 from torch import Tensor
 
 from gmmtorch.exploration.grid_mapper import GridMapper
@@ -18,6 +19,7 @@ from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.sharing.messages import PlanMessage
 from gmmtorch.simulation.depth_camera import DepthFrame
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
@@ -203,7 +205,11 @@ def test_a_restored_robot_goes_on_alike() -> None:
     one.follow(plan(path))
     one.advance(0, 4)
     one.collisions = 2
-    one.plans = {3: (1.5, START[None].clone()), 1: (0.5, torch.zeros(0, 4, dtype=torch.float64))}
+    views = torch.zeros(0, 4, dtype=torch.float64)
+    one.plans = {
+        3: PlanMessage(3, 7, 1.5, 0.2, START[None].clone(), views),
+        1: PlanMessage(1, 6, 0.5, 0.1, START.expand(4, 4).clone(), START[None].clone()),
+    }
     wall = torch.tensor([[4.5, 3.1, 1.5]], dtype=torch.float64)
     one._remember(DepthFrame(START[:3], wall, torch.tensor([True]), torch.arange(1)))
     twin = robot(1.4)
@@ -211,8 +217,8 @@ def test_a_restored_robot_goes_on_alike() -> None:
     assert twin.planner.number == 7
     assert twin.collisions == 2
     assert list(twin.plans) == [3, 1]
-    assert twin.plans[3][0] == 1.5
-    assert torch.equal(twin.plans[3][1], START[None])
+    for number, heard in one.plans.items():
+        assert_same(twin.plans[number], heard)
     for each in (one, twin):
         each.advance(4, 8)
         each._remember(DepthFrame(START[:3], wall + 0.5, torch.tensor([True]), torch.arange(1)))

@@ -1,18 +1,21 @@
-"""The view library: a set that merges in any order, and a list of the best views kept apart."""
+"""The view library: what is told of it, and a list of the best views kept apart."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from exploration.voxel_worlds import surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.view_library import ViewLibrary
-from gmmtorch.sharing.messages import ViewsMessage, decode, encode_views
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import ViewsMessage, decode
 
 
 def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:
@@ -20,61 +23,42 @@ def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:
 
 
 def same(one: ViewLibrary, other: ViewLibrary) -> bool:
-    mine, theirs = one.everything(), other.everything()
-    return all(
-        torch.equal(getattr(mine, name), getattr(theirs, name)) for name in ViewsMessage.__dataclass_fields__
-    )
+    mine, theirs = one.candidates(), other.candidates()
+    equal = mine.ids == theirs.ids and all(map(torch.equal, mine[1:], theirs[1:]))
+    assert (one.digest() == other.digest()) == equal  # where the same are dead
+    return equal
 
 
-def message_of(views: list[tuple[int, int, float, float, float]], removed: list[tuple[int, int, float]]):
-    """Views (robot, number, x, value, stamp) and tombstones (robot, number, stamp); an id once in each."""
-    alive = sorted({view[:2]: view for view in views}.values())
-    dead = sorted({gone[:2]: gone for gone in removed}.values())
+def message_of(
+    views: list[tuple[int, int, float, float, float]], removed: list[tuple[int, int]]
+) -> ViewsMessage:
+    """Views (robot, number, x, value, stamp) and tombstones (robot, number)."""
     return ViewsMessage(
-        torch.tensor([view[:2] for view in alive], dtype=torch.int64).reshape(-1, 2),
-        poses_of(*((x, 0.0, 0.0, 0.0) for _, _, x, _, _ in alive)),
-        torch.tensor([value for *_, value, _ in alive], dtype=torch.float64),
-        torch.tensor([stamp for *_, stamp in alive], dtype=torch.float64),
-        torch.tensor([gone[:2] for gone in dead], dtype=torch.int64).reshape(-1, 2),
-        torch.tensor([stamp for *_, stamp in dead], dtype=torch.float64),
+        torch.tensor([view[:2] for view in views], dtype=torch.int64).reshape(-1, 2),
+        poses_of(*((x, 0.0, 0.0, 0.0) for _, _, x, _, _ in views)),
+        torch.tensor([value for *_, value, _ in views], dtype=torch.float64),
+        torch.tensor([stamp for *_, stamp in views], dtype=torch.float64),
+        Intervals.of(np.array([robot << 52 | number for robot, number in removed], np.int64)),
     )
 
 
-ids = (st.integers(0, 2), st.integers(0, 3))
-quarters = st.integers(0, 8).map(lambda n: n / 4)
-messages = st.builds(
-    message_of,
-    st.lists(st.tuples(*ids, quarters, quarters, quarters), max_size=6),
-    st.lists(st.tuples(*ids, quarters), max_size=3),
-)
+def said(library: ViewLibrary) -> list[ViewsMessage]:
+    """What has changed there since it last spoke."""
+    return [decode(datagram) for datagram in library.datagrams()]
 
 
-@given(parts=st.lists(messages, min_size=2, max_size=4), data=st.data())
-def test_merging_is_commutative_associative_and_idempotent(parts, data):
-    one, other, nested = ViewLibrary(0), ViewLibrary(0), ViewLibrary(0)
-    for part in parts:
-        one.merge(part)
-    for part in data.draw(st.permutations([*parts, *parts])):
-        other.merge(part)
-    between = ViewLibrary(1)
-    for part in parts[1:]:
-        between.merge(part)
-    nested.merge(between.everything())
-    nested.merge(parts[0])
-    assert same(one, other)
-    assert same(one, nested)
-    before = one.everything()
-    one.merge(before)
-    assert same(one, other)
+def tell(library: ViewLibrary, other: ViewLibrary) -> None:
+    for message in said(library):
+        assert other.receive(message)
 
 
 def test_the_later_value_counts_and_what_is_removed_stays_so():
     library = ViewLibrary(0)
-    library.merge(message_of([(1, 0, 0.0, 5.0, 2.0), (1, 1, 4.0, 6.0, 2.0)], []))
-    library.merge(message_of([(1, 0, 0.0, 1.0, 3.0), (1, 1, 4.0, 9.0, 1.0)], []))
+    library.receive(message_of([(1, 0, 0.0, 5.0, 2.0), (1, 1, 4.0, 6.0, 2.0)], []))
+    library.receive(message_of([(1, 0, 0.0, 1.0, 3.0), (1, 1, 4.0, 9.0, 1.0)], []))
     assert library.candidates().values.tolist() == [1.0, 6.0]
-    library.merge(message_of([], [(1, 0, 0.5)]))
-    library.merge(message_of([(1, 0, 0.0, 9.0, 99.0)], []))
+    library.receive(message_of([], [(1, 0)]))
+    library.receive(message_of([(1, 0, 0.0, 9.0, 99.0)], []))
     assert library.candidates().ids == [(1, 1)]
 
 
@@ -108,7 +92,7 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
 
 def test_the_own_views_are_bounded_and_the_least_valuable_go():
     library = ViewLibrary(0, size=4)
-    library.merge(message_of([(1, n, 100.0 + 5 * n, 0.5, 0.0) for n in range(4)], []))
+    library.receive(message_of([(1, n, 100.0 + 5 * n, 0.5, 0.0) for n in range(4)], []))
     for n in range(10):
         library.add(poses_of((5.0 * n, 0, 0, 0)), torch.tensor([float(n + 1)]), float(n), 0.0)
     own = [
@@ -119,7 +103,9 @@ def test_the_own_views_are_bounded_and_the_least_valuable_go():
     assert sorted(float(value) for value in own) == [7.0, 8.0, 9.0, 10.0]
     assert len(library) == 8
     other = ViewLibrary(2)
-    other.merge(library.everything())
+    everything = message_of([(1, n, 100.0 + 5 * n, 0.5, 0.0) for n in range(4)], [])
+    other.receive(everything)
+    tell(library, other)
     assert same(library, other)
 
 
@@ -164,19 +150,35 @@ def test_the_best_view_is_worth_the_way():
 def test_changes_tell_others_all_that_happened_here():
     library, other = ViewLibrary(0), ViewLibrary(1)
     theirs = other.add(poses_of((50, 0, 0, 0), (60, 0, 0, 0)), torch.tensor([7.0, 7.5]), 0.5, 0.0)
-    library.merge(other.take_changes())
+    tell(other, library)
     library.add(poses_of((0, 0, 0, 0), (5, 0, 0, 0)), torch.tensor([1.0, 2.0]), 1.0, 0.0)
-    first = library.version
-    assert len(library.take_changes().ids) == 2
-    assert len(library.take_changes().ids) == 0
+    version, (first,) = library.version, said(library)
+    assert first.ids.tolist() == [[0, 0], [0, 1]]
+    assert said(library) == []
     library.revalue([(0, 0)], torch.tensor([4.0]), 2.0, 0.0)
     library.remove([theirs[0]], 3.0)
-    assert library.changes_since(first).ids.tolist() == [[0, 0]]
-    assert library.changes_since(first).removed.tolist() == [list(theirs[0])]
-    other.merge(library.changes_since(0))
+    assert library.version > version
+    (second,) = said(library)
+    assert second.ids.tolist() == [[0, 0]]
+    assert second.removed == Intervals.span(1 << 52, (1 << 52) + 1)
+    for message in (second, first):
+        other.receive(message)
     assert same(library, other)
     library.revalue([(0, 1)], library.candidates().values[1:2] * 1.01, 9.0, 0.0)
-    assert len(library.take_changes().ids) == 1  # of (0, 0): so small a change is not told
+    assert said(library) == []  # so small a change is not told
+
+
+def test_what_was_lost_is_told_again():
+    one, other = ViewLibrary(0), ViewLibrary(1)
+    one.add(poses_of((0, 0, 0, 0), (5, 0, 0, 0)), torch.tensor([1.0, 2.0]), 1.0, 0.0)
+    one.remove([(0, 0)], 2.0)
+    assert one.datagrams()  # nobody hears it
+    for _ in range(5):
+        for sender, receiver in ((one, other), (other, one)):
+            for datagram in [*sender.announcements(), *sender.datagrams()]:
+                assert receiver.receive(decode(datagram))
+    assert other.candidates().ids == [(0, 1)]
+    assert same(one, other)
 
 
 def test_replicas_hold_the_same_bits_after_a_message():
@@ -185,24 +187,24 @@ def test_replicas_hold_the_same_bits_after_a_message():
     poses = torch.randn(20, 4, generator=generator, dtype=torch.float64) * 20
     library.add(poses, torch.rand(20, generator=generator) * 1e3, 12.34567, 0.0, most=20)
     library.remove(library.candidates().ids[:3], 13.00049)
-    for datagram in encode_views(library.take_changes()):
-        other.merge(decode(datagram))
+    tell(library, other)
     assert same(library, other)
 
 
-def test_restored_it_goes_on_as_before():
+def test_restored_it_goes_on_as_before(tmp_path):
     library = ViewLibrary(0)
     library.add(poses_of((0, 0, 0, 0), (5, 0, 0, 0)), torch.tensor([1.0, 2.0]), 1.0, 0.0)
-    library.take_changes()
+    said(library)
     library.revalue([(0, 0)], torch.tensor([1.05]), 30.0, 0.0)
     library.remove([(0, 1)], 2.0)
     other = ViewLibrary(0)
-    other.restore(library.state())
+    save_checkpoint(tmp_path / "library", library.state())
+    other.restore(load_checkpoint(tmp_path / "library"))
     here = surroundings_from(torch.ones(10, 10, 10, dtype=torch.bool), (-5, -5, -5))
     assert same(library, other)
     assert other.covered(here, 35.0, 9) == library.covered(here, 35.0, 9) == []
     for one in (library, other):
-        assert one.take_changes().removed.tolist() == [[0, 1]]
+        assert [message.removed for message in said(one)] == [Intervals.span(1, 2)]
         one.add(poses_of((9, 0, 0, 0)), torch.tensor([3.0]), 4.0, 0.0)
     assert same(library, other)
     assert other.candidates().ids == [(0, 0), (0, 2)]
@@ -215,3 +217,5 @@ def test_bad_input_is_named():
         ViewLibrary(-1)
     with pytest.raises(InvalidArgumentError, match="size"):
         ViewLibrary(0, size=0)
+    with pytest.raises(DataError, match="robot 1"):
+        ViewLibrary(0).restore(ViewLibrary(1).state())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import (
     CODECS,
     ViewsMessage,
@@ -22,6 +24,7 @@ from gmmtorch.sharing.messages import (
     encode_views,
     quantized_poses,
 )
+from gmmtorch.sharing.record_ids import first_key
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
@@ -55,8 +58,7 @@ def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> Vie
         poses=quantized_poses(poses + center),
         values=(torch.rand(n, generator=generator) * 200).half().double(),
         stamps=torch.arange(n, dtype=torch.float64) / 8,
-        removed=torch.stack([torch.full((n_removed,), 7), torch.arange(n_removed)], 1),
-        removed_stamps=torch.full((n_removed,), 12.5, dtype=torch.float64),
+        removed=Intervals.of(first_key(7) + 2 * np.arange(n_removed)),
     )
 
 

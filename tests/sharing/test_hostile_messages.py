@@ -56,8 +56,8 @@ def test_every_cut_flipped_bit_and_added_byte_is_noticed(sound):
 def test_other_versions_kinds_and_sizes_are_refused_by_name():
     with pytest.raises(DataError, match="version 2"):
         decode(sealed(b"\x24" + bytes(9)))
-    with pytest.raises(DataError, match="kind 14"):
-        decode(sealed(b"\x1e" + bytes(9)))
+    with pytest.raises(DataError, match="kind 15"):
+        decode(sealed(b"\x1f" + bytes(9)))
     with pytest.raises(DataError, match="1201 bytes"):
         decode(bytes(1201))
     with pytest.raises(DataError, match="empty"):

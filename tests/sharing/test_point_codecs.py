@@ -167,6 +167,17 @@ def test_no_points_take_no_bytes():
     assert nothing == {"octree": 0, "draco": 0, "depth_image": 0}
 
 
+@pytest.mark.parametrize("step", [0.001, 0.0125, 0.2])
+def test_depths_come_back_to_half_a_step(step):
+    depths = torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 5
+    depths[depths < 0.5] = 0.0
+    codec = DepthImage(step=step)
+    found = codec.decode(codec.encode(depths))
+    assert torch.equal(found == 0, depths == 0)
+    assert float((found - depths).abs().max()) <= step / 2 + 1e-12
+    np.testing.assert_allclose(found / step, (found / step).round(), atol=1e-9)
+
+
 # -- what cannot be encoded or decoded ---------------------------------------------------------------------
 
 
@@ -197,6 +208,8 @@ def test_codecs_that_cannot_be_are_named():
         (lambda: Draco(math.nan), "error=nan"),
         (lambda: Octree(0.0), "resolution"),
         (lambda: QuantizedPoints(-1.0), "resolution"),
+        (lambda: DepthImage(step=0.0), "step=0.0"),
+        (lambda: DepthImage(step=math.nan), "step=nan"),
         (lambda: point_codec("zip", 0.2, 0.1), "'zip' is no codec"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):

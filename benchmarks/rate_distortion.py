@@ -1,0 +1,427 @@
+"""Bytes of a frame against what comes back of it: mixtures and codecs of points.
+
+    OMP_NUM_THREADS=1 python benchmarks/rate_distortion.py --data FOLDER [--jobs 2] [--rows FILE.json]
+
+FOLDER holds kinect/ and hall/; the warehouse is simulated. Every frame is a message by itself: encoded,
+decoded, and only what was decoded is measured.
+
+PSNR2: of the frame's points and those decoded, or as many drawn from the mixture decoded. AUC: every fifth
+frame is held out, its beams are asked about in the map of all others. Each codec is credited with its best
+receiver: who has points counts their beams on a grid of once, twice or four times the resolution or of
+the codec's own cells, or learns a mixture from them; mixtures are asked about cubes of once or twice
+the resolution.
+
+Needs the extra [baselines]. Writes its table into BENCHMARKS.md and docs/images/rate_distortion.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tables import ROOT, hardware, markdown, publish
+from torch import Tensor
+
+from gmmtorch import GaussianMap, IncrementalRule, datasets
+from gmmtorch.baselines.occupancy_grid import OccupancyGrid
+from gmmtorch.datasets.depth_frames import DepthFrames, back_project
+from gmmtorch.evaluation.metrics import psnr_terms, roc
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries, hit_and_free, test_beams
+from gmmtorch.evaluation.split import split_indices
+from gmmtorch.files import write_bytes
+from gmmtorch.mapping.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.codec import spatial_order
+from gmmtorch.mapping.compaction import compact
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.report.rate_distortion import QUALITIES, figures, leads
+from gmmtorch.report.save import save_figure
+from gmmtorch.scan import Scan
+from gmmtorch.sharing.messages import ComponentsMessage, decode, encode_components
+from gmmtorch.sharing.point_bytes import compressed
+from gmmtorch.sharing.point_codecs import (
+    BEST_LEVEL,
+    DepthImage,
+    Draco,
+    Octree,
+    PointCodec,
+    QuantizedPoints,
+    RawPoints,
+)
+from gmmtorch.simulation.depth_camera import DepthCamera
+from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.warehouse import warehouse
+
+RESOLUTIONS = {"kinect": 0.05, "hall": 0.2, "warehouse": 0.2}  # metres, of the cells asked about
+COMPONENTS = (8, 16, 32, 64, 128, 256, 384)  # of a frame at most: our knob
+TEST_EVERY, MAX_BEAMS, SEED = 5, 5_000, 0
+PIXEL_STRIDE = 4  # kinect's images come to 160 × 120 pixels, as the simulated camera's
+POSES_APART, N_POSES = 9, 16  # neighbouring frames of kinect; frames of the warehouse
+FINER = 3  # than a map's rule: a frame by itself has more components than its share of a window
+RECEIVED = 1500  # components that a receiver merges all it got into, about as many as it learns from points
+_IDS_APART = 1 << 13
+
+
+class Frame(NamedTuple):
+    """A frame in the world frame; its depth image, and the points (N, 3) that any such image stands for."""
+
+    scan: Scan
+    depth: Tensor | None = None
+    points_of: Callable[[Tensor], Tensor] | None = None
+
+
+class Task(NamedTuple):
+    dataset: str
+    codec: str
+    setting: float
+    folder: Path | None
+    n_frames: int | None
+
+
+Rows = list[dict[str, Any]]
+
+
+# -- data --------------------------------------------------------------------------------------------------
+
+
+def kinect(folder: Path) -> list[Frame]:
+    data = datasets.load("depth_frames", folder / "kinect", stride=POSES_APART)
+    assert isinstance(data, DepthFrames)
+    intrinsics = data.intrinsics.clone()
+    intrinsics[:2] /= PIXEL_STRIDE
+
+    def points_of(depth: Tensor, pose: Tensor) -> Tensor:
+        return back_project(depth, intrinsics) @ pose[:3, :3].T + pose[:3, 3]
+
+    frames = []
+    for depth, pose in (data.image(i) for i in range(len(data))):
+        thinned = depth[::PIXEL_STRIDE, ::PIXEL_STRIDE].contiguous()
+        to_points = partial(points_of, pose=pose)
+        frames.append(Frame(Scan(to_points(thinned), pose[:3, 3]), thinned, to_points))
+    return frames
+
+
+def hall(folder: Path) -> list[Frame]:
+    return [Frame(scan) for scan in datasets.load("scan_folder", folder / "hall", stride=3)]
+
+
+def simulated() -> list[Frame]:
+    """A depth camera on a walk through the warehouse, a metre from frame to frame, looking ahead."""
+    world, camera = MeshWorld(warehouse(SEED)), DepthCamera()
+    places = world.tour(N_POSES, stride=1)
+    ahead = places.roll(-1, 0) - places
+    ahead[-1] = ahead[-2]
+    generator = torch.Generator().manual_seed(SEED)
+
+    def points_of(depth: Tensor, pose: Tensor) -> Tensor:
+        seen = depth.flatten() > 0
+        turn, away = camera.directions[seen], depth.flatten()[seen, None]
+        cos, sin = float(pose[3].cos()), float(pose[3].sin())
+        turned = torch.stack([turn[:, 0] * cos - turn[:, 1] * sin, turn[:, 0] * sin + turn[:, 1] * cos], 1)
+        return pose[:3] + torch.cat([turned, turn[:, 2:]], 1) * (away / turn[:, :1])
+
+    frames = []
+    for place, heading in zip(places, torch.atan2(ahead[:, 1], ahead[:, 0]), strict=True):
+        pose = torch.cat([place, heading[None]])
+        taken = camera.sense(world, pose, torch.zeros(0, 3), 0.0, generator)
+        depth = torch.nan_to_num(camera.image(taken), nan=0.0, posinf=0.0)
+        frames.append(Frame(Scan(taken.ends[taken.is_hit], place), depth, partial(points_of, pose=pose)))
+    return frames
+
+
+@cache
+def material(name: str, folder: Path | None, n_frames: int | None) -> tuple[list[Frame], Queries]:
+    """The frames to be sent, and the questions that the held-out ones answer."""
+    frames = simulated() if name == "warehouse" else {"kinect": kinect, "hall": hall}[name](folder or Path())
+    frames = frames[:n_frames]
+    train, test = split_indices(len(frames), TEST_EVERY)
+    beams = test_beams([frames[i].scan for i in test], MAX_BEAMS, SEED)
+    return [frames[i] for i in train], hit_and_free(*beams, "uniform", RESOLUTIONS[name], SEED)
+
+
+# -- codecs of points --------------------------------------------------------------------------------------
+
+
+def point_settings(name: str) -> dict[str, list[float]]:
+    """The knob of each codec, in metres: side of cells, Draco's error, step of depth; or every n-th pixel."""
+    r = RESOLUTIONS[name]
+    settings = {
+        "raw": [0.0],
+        "quantized": [c * r for c in (4, 1, 0.25)],
+        "octree": [c * r for c in (8, 4, 2, 1, 0.5, 0.25)],
+        "draco": [c * r for c in (2, 1, 0.5, 0.25)],
+    }
+    if name != "hall":  # its scans are no images
+        settings["depth_image"] = [c * r for c in (2, 0.5, 0.2, 0.02)]
+        settings["depth_image_thinned"] = [16.0, 8.0, 4.0, 2.0]
+    return settings
+
+
+def point_messages(task: Task, frames: Sequence[Frame]) -> tuple[list[bytes], list[Tensor]]:
+    if not task.codec.startswith("depth_image"):
+        makers: dict[str, Callable[[float], PointCodec]] = {
+            "raw": lambda _: RawPoints(),
+            "quantized": QuantizedPoints,
+            "octree": Octree,
+            "draco": Draco,
+        }
+        codec = makers[task.codec](task.setting)
+        data = [codec.encode(frame.scan.points) for frame in frames]
+        return data, [codec.decode(message) for message in data]
+    thinned = task.codec == "depth_image_thinned"
+    every = int(task.setting) if thinned else 1
+    images = DepthImage(step=0.2 * RESOLUTIONS[task.dataset] if thinned else task.setting)
+    data, points = [], []
+    for frame in frames:
+        assert frame.depth is not None
+        assert frame.points_of is not None
+        data.append(images.encode(frame.depth[::every, ::every]))
+        whole = torch.zeros_like(frame.depth)
+        whole[::every, ::every] = images.decode(data[-1])
+        points.append(frame.points_of(whole))
+    return data, points
+
+
+def measure_points(task: Task) -> Rows:
+    frames, asked = material(task.dataset, task.folder, task.n_frames)
+    data, points = point_messages(task, frames)
+    scans = [Scan(cloud, frame.scan.origin) for cloud, frame in zip(points, frames, strict=True)]
+    r = RESOLUTIONS[task.dataset]
+    own = {"octree": 1.0, "quantized": 1.0, "draco": 2.0}.get(task.codec, 0.0) * task.setting
+    scores = {}
+    for cell in sorted({r, 2 * r, 4 * r, max(r, own)}):
+        scores |= answers(filled(OccupancyGrid(cell), scans), asked, "grid", [cell])
+    scores |= answers(filled(GaussianMap(), scans), asked, "mixture", [r, 2 * r])
+    return [row(task, data, frames, points, scores)]
+
+
+def filled(built: OccupancyMap, scans: Sequence[Scan]) -> OccupancyMap:
+    for scan in scans:
+        built.insert(scan)
+    return built
+
+
+# -- mixtures ----------------------------------------------------------------------------------------------
+
+MIXTURES = {  # how the same components are written, and for how many of them it is measured
+    "ours": COMPONENTS,
+    "thesis": COMPONENTS[::2],
+    "ours_without_counts": (32, 128),
+    "float": (32, 128),
+}
+
+
+def measure_mixtures(task: Task) -> Rows:
+    """A row for each way to write the same components."""
+    frames, asked = material(task.dataset, task.folder, task.n_frames)
+    rule = IncrementalRule().fitted([frame.scan for frame in frames]).cells()
+    rule = replace(
+        rule,
+        length=rule.length / FINER,
+        cell=rule.cell / FINER,
+        window_components=int(task.setting),
+    )
+    learned = [learn(frame.scan, rule, _IDS_APART * i) for i, frame in enumerate(frames)]
+    rows = []
+    for codec in (name for name, measured in MIXTURES.items() if task.setting in measured):
+        sent = [without_counts(c) for c in learned] if codec == "ours_without_counts" else learned
+        kind = codec if codec in ("thesis", "float") else "quantized"
+        datagrams = [encode_components(components, kind) for components in sent]
+        held = [Components.concatenate([components_of(d) for d in frame]) for frame in datagrams]
+        points = [drawn(c, len(frame.scan.points)) for c, frame in zip(held, frames, strict=True)]
+        built = GaussianMap.of(compact(Components.concatenate(held), RECEIVED), cutoff=None)
+        r = RESOLUTIONS[task.dataset]
+        scores = answers(built, asked, "mixture", [r, 2 * r])
+        data = [b"".join(frame) for frame in datagrams]
+        found = row(task._replace(codec=codec), data, frames, points, scores)
+        if codec == "ours":
+            found["nbytes_zstd"] = statistics.mean(len(compressed(d, BEST_LEVEL)) for d in data)
+        rows.append(found)
+    return rows
+
+
+def learn(scan: Scan, rule: CellRule, first: int) -> Components:
+    """The components of a frame, numbered in an order that takes few bytes."""
+    found = learn_cells([scan.points.clone()], scan.origin[None], rule)
+    found = found.rearranged(spatial_order(found))
+    numbers = first + torch.arange(len(found))
+    return replace(found, ids=torch.stack([torch.zeros_like(numbers), numbers], 1))
+
+
+def without_counts(components: Components) -> Components:
+    """All stand for as many points: one number, in place of one each."""
+    same = torch.full_like(components.support, float(components.support.mean()))
+    return replace(components, support=same, seen_count=same[components.seen_by])
+
+
+def components_of(datagram: bytes) -> Components:
+    message = decode(datagram)
+    assert isinstance(message, ComponentsMessage)
+    return message.components
+
+
+def drawn(components: Components, n: int) -> Tensor:
+    """Points (n, 3) at random of a mixture weighed by support."""
+    generator = torch.Generator().manual_seed(SEED)
+    which = torch.multinomial(components.support, n, replacement=True, generator=generator)
+    normal = torch.randn(n, 3, 1, generator=generator, dtype=torch.float64)
+    factor = torch.linalg.cholesky(components.covariances)
+    return components.means[which] + (factor[which] @ normal).squeeze(2)
+
+
+# -- measuring ---------------------------------------------------------------------------------------------
+
+
+def answers(built: OccupancyMap, asked: Queries, name: str, resolutions: Sequence[float]) -> dict[str, float]:
+    """AUC of a map's answers about cells of each side (m)."""
+    scores = {}
+    for r in resolutions:
+        theta = torch.as_tensor(built.occupancy(asked.points, r))
+        scores[f"{name}, {r:g} m"] = roc(theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]).auc
+    return scores
+
+
+def row(
+    task: Task,
+    data: Sequence[bytes],
+    frames: Sequence[Frame],
+    points: Sequence[Tensor],
+    scores: dict[str, float],
+) -> dict[str, Any]:
+    """Means over the frames; PSNR2 over every other, which is most of the time."""
+    terms = [psnr_terms(f.scan.points, p) for f, p in list(zip(frames, points, strict=True))[::2]]
+    best = max(scores, key=lambda name: scores[name])
+    return {
+        "dataset": task.dataset,
+        "codec": task.codec,
+        "setting": task.setting,
+        "n_points": statistics.mean(len(frame.scan.points) for frame in frames),
+        "nbytes": statistics.mean(map(len, data)),
+        "psnr2_db": statistics.mean(map(sum, terms)),
+        "psnr_lesser_db": statistics.mean(map(min, terms)),
+        "psnr_forward_db": statistics.mean(term.forward for term in terms),
+        "psnr_backward_db": statistics.mean(term.backward for term in terms),
+        "auc": scores[best],
+        "receiver": best,
+        "auc_of_receivers": scores,
+    }
+
+
+def measure(task: Task) -> tuple[Rows, float]:
+    """Rows, and seconds of the processor."""
+    torch.set_num_threads(1)
+    begin = time.process_time()
+    rows = measure_mixtures(task) if task.codec == "ours" else measure_points(task)
+    return rows, time.process_time() - begin
+
+
+def tasks_of(name: str, folder: Path | None, n_frames: int | None) -> list[Task]:
+    """The longest first."""
+    mixtures = [Task(name, "ours", float(k), folder, n_frames) for k in reversed(COMPONENTS)]
+    points = [
+        Task(name, codec, setting, folder, n_frames)
+        for codec, settings in point_settings(name).items()
+        for setting in settings
+    ]
+    return mixtures + points
+
+
+# -- what is written ---------------------------------------------------------------------------------------
+
+
+def best_rows(rows: Rows) -> list[list[object]]:
+    """Ours at each rate, and what every other codec takes for the same quality."""
+    return [
+        [
+            r["dataset"],
+            r["codec"].replace("_", " "),
+            f"{r['setting']:g}",
+            f"{r['nbytes']:,.0f}",
+            f"{r['psnr2_db']:.1f}",
+            f"{r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f}",
+            f"{r['auc']:.4f}",
+            r["receiver"].replace("_", " "),
+        ]
+        for r in rows
+    ]
+
+
+def lead_rows(rows: Rows) -> list[list[object]]:
+    """Per data set and quality: over which rates ours is at or below every other, and who ends it."""
+    found = []
+    for name in dict.fromkeys(r["dataset"] for r in rows):
+        own = [r for r in rows if r["dataset"] == name]
+        for quality, title in QUALITIES.items():
+            cells: list[object] = [name, title]
+            for left_out in ((), ("depth_image_thinned",)):
+                lead = leads(own, quality, left_out=left_out)
+                cells.append(
+                    f"{lead.low:,.0f} to {lead.high:,.0f} B: {lead.octaves:.1f}" if lead.octaves else "none"
+                )
+                cells.append(f"{lead.most:.1f}" if lead.octaves else "")
+                cells.append(lead.ended_by.replace("_", " "))
+            found.append(cells)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--names", nargs="+", default=list(RESOLUTIONS), choices=list(RESOLUTIONS))
+    parser.add_argument("--jobs", type=int, default=2, help="processes, of a thread each")
+    parser.add_argument("--frames", type=int, help="of each data set at most, for a quick look")
+    parser.add_argument("--rows", type=Path, help="where to write all rows as JSON")
+    parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "rate_distortion.png")
+    options = parser.parse_args()
+    if options.data is None and set(options.names) - {"warehouse"}:
+        parser.error("kinect and hall need --data; --names warehouse needs none.")
+    torch.set_num_threads(1)
+    tasks = [task for name in options.names for task in tasks_of(name, options.data, options.frames)]
+    rows, seconds = [], 0.0
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        for found, taken in pool.map(measure, tasks):
+            rows += found
+            seconds += taken
+            for r in found:
+                print(*best_rows([r])[0], flush=True)
+    rows = [r if math.isfinite(r["psnr2_db"]) else {**r, "psnr2_db": None} for r in rows]
+    if options.rows:
+        write_bytes(options.rows, json.dumps(rows, indent=1).encode())
+    save_figure(figures(rows)["rate_distortion"], options.figure, dpi=100)
+    print(f"{seconds / 60:.1f} minutes of the processor")
+    if options.frames is None and set(options.names) == set(RESOLUTIONS):
+        publish("rate-distortion", text(rows))
+    else:
+        print(text(rows))
+
+
+def text(rows: Rows) -> str:
+    header = ["", "", "rates of ours: octaves", "times fewer bytes, at most", "ended by"]
+    header += ["thinned images left out: octaves", "times, at most", "ended by"]
+    mixtures = [r for r in rows if r["codec"] == "ours"]
+    own = [
+        "",
+        "",
+        "components at most",
+        "bytes a frame",
+        "PSNR2 (dB)",
+        "its terms (dB)",
+        "AUC",
+        "answered by",
+    ]
+    return f"{hardware()}\n\n{markdown(header, lead_rows(rows))}\n\n{markdown(own, best_rows(mixtures))}"
+
+
+if __name__ == "__main__":
+    main()

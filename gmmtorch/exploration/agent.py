@@ -1,0 +1,282 @@
+"""Agent: one robot of a team and its radio, as it would be alone on a machine of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError
+from gmmtorch.exploration.heartbeat import Heartbeat
+from gmmtorch.exploration.mapper import Heard, Memo, Sensed
+from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.planning import Plan, PlanningTask, Waiting
+from gmmtorch.exploration.primitives import Primitives
+from gmmtorch.exploration.retreat import retreat
+from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.stopwatch import Stopwatch
+from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.views import ViewEvaluator
+from gmmtorch.sharing.messages import PlanMessage, encode_plan, kind_of
+from gmmtorch.sharing.network import Transport
+from gmmtorch.sharing.token_bucket import TokenBucket
+from gmmtorch.simulation.depth_camera import DepthFrame
+from gmmtorch.simulation.mesh_world import MeshWorld
+
+
+class Logbook(Protocol):
+    """Where what is said and heard is kept, before it is sent or announced: see `sharing.journal`."""
+
+    def said(self, datagrams: Sequence[bytes]) -> None: ...
+    def heard(self, datagrams: Sequence[bytes]) -> None: ...
+
+
+_SEEDS = 1 << 10  # robots of a mission that draw differently
+_LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
+_TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
+
+
+class Agent:
+    """Senses, talks, and plans. All that it knows of its team is what its transport brings; who flies
+    close by, a short-range beacon tells (`traffic` in `propose`).
+
+    Args:
+        robot: what it knows and does. transport: its end of the network.
+        evaluator: of views. memo: of what datagrams say; shared by the robots of a simulation.
+        watch: times its stages.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        transport: Transport,
+        evaluator: ViewEvaluator,
+        primitives: Primitives,
+        options: TeamOptions,
+        memo: Memo,
+        watch: Stopwatch,
+    ) -> None:
+        self.robot, self.transport, self.options = robot, transport, options
+        self.n_heard = 0
+        """Datagrams that have come."""
+        self.n_damaged = 0
+        """Of them, those that say nothing that can be understood."""
+        self._evaluator, self._primitives, self._memo, self._timed = evaluator, primitives, memo, watch
+        self._logbook: Logbook | None = None
+        self.heard_at: dict[int, float] = {}
+        """When each teammate's last plan came, by this robot's own clock."""
+        self._waiting = Waiting(primitives)
+        # Of its own, so that what one robot draws does not depend on what others do.
+        seed = options.seed * _SEEDS + robot.number
+        self._generator = torch.Generator().manual_seed(seed)
+        self._surroundings: Surroundings | None = None
+        self._rests = False
+        self._plan: Plan | None = None
+        self._told: Tensor | None = None  # where it stays, as teammates were told
+        self._silent = 0
+        self._heartbeat = Heartbeat(options.announce_every)
+        self._budget = None if options.budget is None else TokenBucket(options.budget)
+
+    @property
+    def number(self) -> int:
+        return self.robot.number
+
+    @property
+    def braking(self) -> Tensor:
+        return self.robot.braking
+
+    @property
+    def stage_seconds(self) -> dict[str, float]:
+        """Wall seconds by stage; of all robots together, where they share a stopwatch."""
+        return dict(self._timed.seconds)
+
+    def digest(self) -> bytes:
+        """Equal for robots that hold the same map, and the same views."""
+        return self.robot.mapper.digest() + self.robot.library.digest()
+
+    def keep_in(self, logbook: Logbook) -> None:
+        """From now on keep what is said and heard of the map. What the logbook has restored of it is taken
+        for known."""
+        self._logbook = logbook
+        self.robot.mapper.center_on(self.robot.position)
+        self.robot.mapper.receive([])
+
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def look(self, mesh: MeshWorld, others: Tensor) -> DepthFrame:
+        """What its camera sees of a world, with teammates at (M, 3), which it knows not to map."""
+        with self._timed("rendering"):
+            return self.options.camera.sense(
+                mesh, self.robot.state[:4], others, self.options.dynamics.radius, self._generator
+            )
+
+    def learn(self, frame: DepthFrame, now: float) -> Sensed:
+        """Take in a frame, and tell the team."""
+        with self._timed("mapping"):
+            sensed = self.robot.sense(frame)
+        with self._timed("sharing"):
+            self.send(now)
+        return sensed
+
+    # -- the team ---------------------------------------------------------------------------------
+
+    def send(self, now: float) -> None:
+        """What its map has for the team, and every while what it holds."""
+        if not self.options.shares:
+            return
+        mapper, library = self.robot.mapper, self.robot.library
+        budget = None if self._budget is None else self._budget.available(now)
+        datagrams = mapper.datagrams(budget)
+        if self._budget is not None:
+            self._budget.take(sum(map(len, datagrams)))
+        if self._heartbeat.due(now, (mapper.version, library.version)):
+            datagrams += [*mapper.announcements(), *library.announcements()]
+        self._send(datagrams, now)
+
+    def tell_views(self, now: float) -> None:
+        """The team of views worth going to."""
+        with self._timed("sharing"):
+            if self.options.shares:
+                self._send(self.robot.library.datagrams(), now)
+
+    def _send(self, datagrams: Sequence[bytes], now: float) -> None:
+        if self._logbook is not None:
+            self._logbook.said(datagrams)
+        by_kind: dict[str, list[bytes]] = {}
+        for datagram in datagrams:
+            by_kind.setdefault(kind_of(datagram), []).append(datagram)
+        for kind, some in by_kind.items():
+            self.transport.send(self.number, some, now, kind)
+
+    def listen(self, now: float) -> None:
+        """Take in what has come by `now`, in an order that does not depend on who was quicker."""
+        with self._timed("sharing"):
+            heard = self._heard(now)
+        with self._timed("mapping"):
+            taken = self.robot.mapper.receive(heard)
+            if self._logbook is not None:
+                self._logbook.heard(taken)
+        for item in heard:
+            if isinstance(item.message, PlanMessage):
+                self._note_plan(item.message, now)
+            else:
+                self.robot.library.receive(item.message)
+
+    def _note_plan(self, plan: PlanMessage, now: float) -> None:
+        """Keep a teammate's plan, unless a later one has overtaken it."""
+        known = self.robot.plans.get(plan.sender)
+        if known is None or not 0 < known.number - plan.number <= _LATE:
+            self.robot.plans[plan.sender] = plan
+            self.heard_at[plan.sender] = now
+
+    def _heard(self, now: float) -> list[Heard]:
+        arrived = sorted(self.transport.deliver(self.number, now), key=lambda pair: pair[0])
+        self.n_heard += len(arrived)
+        heard = []
+        for sender, datagram in arrived:
+            try:
+                heard.append(Heard(sender, datagram, self._memo.decoded(datagram)))
+            except DataError:
+                self.n_damaged += 1
+        return heard
+
+    # -- planning ---------------------------------------------------------------------------------
+
+    def survey(self, now: float) -> None:
+        """Look at the map around: what the plan is made from, whatever comes in meanwhile."""
+        robot, options = self.robot, self.options
+        with self._timed("planning"):
+            self._surroundings = robot.surroundings(
+                options.planning_prior, options.dynamics.radius, options.window
+            )
+            self._rests = robot.rests(now)
+            robot.roadmap.update(self._surroundings)
+
+    def propose(
+        self, now: float, fixed: Collection[int], traffic: Traffic, since: float | None = None
+    ) -> Plan:
+        """A plan from the last survey, given the views of the teammates whose plans are fixed, as far as they
+        have come `since` (s); None: now."""
+        if self._surroundings is None:
+            raise RuntimeError("survey() comes before propose().")
+        with self._timed("planning"):
+            known = [
+                heard.views.to(torch.float64)
+                for number, heard in sorted(self.robot.plans.items())
+                if number in fixed and self.heard_at[number] >= (now if since is None else since)
+            ]
+            task = PlanningTask(
+                robot=self.number,
+                state=self.robot.state,
+                surroundings=self._surroundings,
+                traffic=traffic,
+                residual=self._evaluator.residual(
+                    self._surroundings, torch.cat(known) if known else torch.zeros(0, 4)
+                ),
+                library=self.robot.library,
+                roadmap=self.robot.roadmap,
+                now=now,
+                generator=self._generator,
+                trail=self.robot.trail,
+            )
+            if self._rests:
+                self._plan = self._waiting.rest(task)
+            else:
+                self._plan = retreat(self._primitives, task) or self.robot.planner.plan(task)
+        return self._plan
+
+    def settle(self) -> None:
+        """Follow the plan that was proposed last."""
+        if self._plan is not None:
+            self.robot.follow(self._plan)
+
+    def tell_plan(self, now: float, number: int) -> None:
+        """The team of the plan that was proposed last, as number so-and-so."""
+        if self._plan is None or not self.options.shares or self._stays(self._plan):
+            return
+        with self._timed("sharing"):
+            path, views = self._plan.path[:, :4], self._plan.views
+            step = self.options.dynamics.step
+            self._send(encode_plan(self.number, number, now, step, path, views), now)
+
+    def _stays(self, plan: Plan) -> bool:
+        """Whether a plan stays where the team was told lately that the robot stays."""
+        moves = bool((plan.path[:, :4] != plan.path[-1, :4]).any())
+        here = None if moves or not self._rests else plan.path[-1, :4]
+        if here is None or self._told is None or not torch.equal(here, self._told):
+            self._told, self._silent = here, 0
+            return False
+        self._silent = (self._silent + 1) % _TOLD_AGAIN
+        return self._silent != 0
+
+    # -- keeping ----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that changes, at the end of a tick."""
+        return {
+            "robot": self.robot.checkpoint(),
+            "generator": self._generator.get_state(),
+            "waiting": self._waiting.state(),
+            "told": self._told,
+            "silent": self._silent,
+            "n_heard": self.n_heard,
+            "n_damaged": self.n_damaged,
+            "heard_at": [[number, when] for number, when in self.heard_at.items()],
+            "heartbeat": self._heartbeat.state(),
+            "budget": None if self._budget is None else self._budget.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        self.robot.restore(state["robot"])
+        self._generator.set_state(state["generator"])
+        self._waiting.restore(state["waiting"])
+        self._told, self._silent = state["told"], int(state["silent"])
+        self.n_heard, self.n_damaged = int(state["n_heard"]), int(state["n_damaged"])
+        self.heard_at = {int(number): float(when) for number, when in state["heard_at"]}
+        self._heartbeat.restore(state["heartbeat"])
+        if self._budget is not None:
+            self._budget.restore(state["budget"])

@@ -1,0 +1,238 @@
+"""FlyingNode: one robot of a team in a process of its own, flying in a simulated world."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import OutputError
+from gmmtorch.exploration.agent import Agent
+from gmmtorch.exploration.collisions import collides, finely
+from gmmtorch.exploration.mixture_mapper import MixtureMapper
+from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.world import World
+from gmmtorch.files import write_npz
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.sharing.framed_transport import FramedTransport
+from gmmtorch.sharing.journal import Journal
+from gmmtorch.sharing.messages import PlanMessage
+from gmmtorch.sharing.network import HEADER_BYTES
+from gmmtorch.sharing.replica import Replica
+
+_log = logging.getLogger(__name__)
+
+
+class FlyingNode:
+    """Senses, talks, plans and flies in its own copy of a world, in which it sees none of its teammates.
+
+    By a clock (`tick`), it knows of them what they have told of their plans. In step with a simulated team
+    (`lockstep`), it is told where they are, as in a `Mission`, and does what that does.
+
+    Args:
+        agent: of a team with these options. transport: the agent's; closed with this.
+        journal: of the agent's replica; restores it.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        world: World,
+        options: TeamOptions,
+        transport: FramedTransport,
+        journal: Journal | None = None,
+    ) -> None:
+        self.agent, self.world, self.options = agent, world, options
+        self.transport, self._journal = transport, journal
+        if journal is not None:
+            agent.keep_in(_Forgiving(journal))
+        self._n_ticks = 0
+        self._flown = [agent.robot.state[:4].clone()]
+        self.times: list[float] = []
+        self.entropy_bits: list[float] = []
+
+    @property
+    def robot(self) -> int:
+        return self.agent.number
+
+    @property
+    def is_over(self) -> bool:
+        return self._n_ticks >= round(self.options.duration * self.options.rate)
+
+    # -- by a clock -------------------------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """Sense, hear, plan if it is due, and fly on, at the time `now` (s) of any clock."""
+        options = self.options
+        with torch.inference_mode():
+            self.sense(now, torch.zeros(0, 3, dtype=torch.float64))
+            self.agent.listen(now)
+            if self._n_ticks % options.ticks_per_plan == 0:
+                self._plan(now)
+            begin = (self._n_ticks % options.ticks_per_plan) * options.steps_per_tick
+            self.fly(begin, begin + options.steps_per_tick)
+
+    def listen(self, now: float) -> None:
+        """Hear, answer, and announce."""
+        with torch.inference_mode():
+            self.agent.listen(now)
+            self.agent.send(now)
+            self.agent.tell_views(now)
+
+    def _plan(self, now: float) -> None:
+        agent, options = self.agent, self.options
+        agent.survey(now)
+        plans = agent.robot.plans
+        paths = [_ahead(plan, now - agent.heard_at[number]) for number, plan in sorted(plans.items())]
+        traffic = Traffic.of(paths, 2 * options.dynamics.radius + options.margin)
+        agent.propose(now, list(plans), traffic, since=now - options.dynamics.duration)
+        agent.settle()
+        agent.tell_plan(now, self._n_ticks // options.ticks_per_plan)
+        agent.tell_views(now)
+
+    # -- step by step -----------------------------------------------------------------------------
+
+    def sense(self, now: float, others: Tensor) -> None:
+        """Look around, with teammates at (M, 3), learn, and tell."""
+        if self._n_ticks % self.options.ticks_per_sample == 0:
+            self._note(now)
+        self.agent.learn(self.agent.look(self.world.mesh, others), now)
+
+    def fly(self, begin: int, stop: int) -> Tensor:
+        """Fly on from step `begin` of the path to step `stop`; returns the positions on the way (n, 3)."""
+        robot = self.agent.robot
+        passed = torch.cat([robot.position[None], robot.advance(begin, stop)])
+        positions = finely(passed)
+        robot.collisions += int(collides(self.world.mesh, positions, self.options.dynamics.radius).any())
+        self._flown.append(robot.state[:4].clone())
+        self._n_ticks += 1
+        return positions
+
+    def _note(self, now: float) -> None:
+        self.times.append(now)
+        self.entropy_bits.append(self.agent.robot.mapper.belief.entropy_bits)
+
+    # -- what there is to say ---------------------------------------------------------------------
+
+    def status(self) -> str:
+        belief, mapper = self.agent.robot.mapper.belief, self.agent.robot.mapper
+        left = belief.entropy_bits / max(1.0, belief.observable_bits)
+        sent = self.transport.traffic()
+        return (
+            f"{left:.1%} of the entropy left, {mapper.held.size:,} records, {sent.bytes / 1e3:,.0f} kB sent"
+        )
+
+    def scalars(self) -> dict[str, float]:
+        """What changes as it flies: numbers for a plot."""
+        robot, sent = self.agent.robot, self.transport.traffic()
+        return {
+            "entropy_bits": robot.mapper.belief.entropy_bits,
+            "records": float(robot.mapper.held.size),
+            "bytes_sent": float(sent.bytes),
+            "wire_bytes_sent": float(self._wire_bytes()),
+            "datagrams_sent": float(sent.datagrams),
+            "datagrams_heard": float(self.agent.n_heard),
+            "refused": float(sum(self.transport.refused.values())),
+            "path_length": robot.path_length,
+            "collisions": float(robot.collisions),
+        }
+
+    def _wire_bytes(self) -> int:
+        """Of all that was broadcast, each once, with the headers of the frame, UDP and IPv4."""
+        sent = self.transport.traffic()
+        return sent.bytes + (self.transport.overhead + HEADER_BYTES) * sent.datagrams
+
+    def row(self) -> dict[str, Any]:
+        """What the robot leaves in results.json."""
+        robot, transport = self.agent.robot, self.transport
+        belief, shared = robot.mapper.belief, getattr(robot.mapper, "shared", None)
+        components = robot.mapper.components()
+        kinds = sorted({"components", "counts", "points", "plans", "views", "announcements"})
+        return {
+            "robot": self.robot,
+            "digest": robot.mapper.digest().hex(),
+            "views_digest": robot.library.digest().hex(),
+            "incarnation": getattr(shared, "incarnation", None),
+            "times": self.times,
+            "entropy_bits": self.entropy_bits,
+            "entropy_bits_left": belief.entropy_bits,
+            "observable_bits": belief.observable_bits,
+            "n_components": None if components is None else len(components),
+            "n_records": robot.mapper.held.size,
+            "bytes_sent": transport.traffic().bytes,
+            "datagrams": transport.traffic().datagrams,
+            "bytes_by_kind": {k: n for k in kinds if (n := transport.traffic(kind=k).bytes)},
+            "wire_bytes": self._wire_bytes(),
+            "socket_bytes": transport.sent.bytes,
+            "socket_datagrams": transport.sent.datagrams,
+            "heard": self.agent.n_heard,
+            "damaged": self.agent.n_damaged,
+            "refused": transport.refused,
+            "not_merged": dict(getattr(shared, "refused", {})),
+            "failures": dict(transport.failures),
+            "dropped": transport.n_dropped,
+            "path_length": robot.path_length,
+            "collisions": robot.collisions,
+            "stage_seconds": self.agent.stage_seconds,
+        }
+
+    @property
+    def twin(self) -> str | None:
+        """What is said of another robot of this number, if there is one."""
+        named = self.transport.namesakes.get(self.robot)
+        shared = getattr(self.agent.robot.mapper, "shared", None)
+        if named is None and not (isinstance(shared, Replica) and shared.conflicts[self.robot]):
+            return None
+        whence = "" if named is None else f" ({named})"
+        return (
+            f"Another robot says that it is robot {self.robot}{whence}: give each a number of its own, id=…"
+        )
+
+    def save(self, folder: Path) -> dict[str, Path]:
+        """The map, and where the robot flew."""
+        paths = {"trajectory": write_npz(folder / "trajectory.npz", poses=torch.stack(self._flown).numpy())}
+        mapper = self.agent.robot.mapper
+        if isinstance(mapper, MixtureMapper) and len(components := mapper.components()):
+            paths["map"] = folder / "map.gmm"
+            GaussianMap.of(components, robot=self.robot).save(paths["map"])
+        return paths
+
+    def close(self) -> None:
+        """Close the journal and the transport."""
+        if self._journal is not None:
+            self._journal.close()
+        self.transport.close()
+
+
+class _Forgiving:
+    """A journal without which a robot goes on, if its disk fails: teammates have what it said."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self.n_failed = 0
+
+    def said(self, datagrams: Sequence[bytes]) -> None:
+        self._keep(self._journal.said, datagrams)
+
+    def heard(self, datagrams: Sequence[bytes]) -> None:
+        self._keep(self._journal.heard, datagrams)
+
+    def _keep(self, keep: Callable[[Sequence[bytes]], None], datagrams: Sequence[bytes]) -> None:
+        try:
+            keep(datagrams)
+        except OutputError as error:
+            self.n_failed += 1
+            if self.n_failed == 1:
+                _log.warning("The map is no longer kept on disk, and the robot goes on: %s", error)
+
+
+def _ahead(plan: PlanMessage, age: float) -> Tensor:
+    """Where a teammate is now and will be (S, 3), by a plan that was heard so many seconds ago."""
+    passed = min(max(math.floor(age / plan.step), 0), len(plan.path) - 1)
+    return plan.path[passed:, :3].to(torch.float64)

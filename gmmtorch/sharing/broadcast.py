@@ -1,0 +1,174 @@
+"""Broadcast: components and counts said once, in any codec; what is lost stays lost (thesis 4.2)."""
+
+from __future__ import annotations
+
+import bisect
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import check_whole
+from gmmtorch.mapping.components import Components, packed, unpacked
+from gmmtorch.mapping.updating import summed
+from gmmtorch.sharing.changes import Changes
+from gmmtorch.sharing.envelope import check_codec
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import (
+    ComponentsMessage,
+    CountsMessage,
+    Message,
+    decode,
+    encode_components,
+    encode_counts,
+)
+
+
+class Broadcast:
+    """A `Replica` that does not care what others have: for networks that lose nothing, and to compare.
+
+    The sender holds what its datagrams decode to. Components that come twice count once. Counts count whenever
+    they come, as nothing tells them apart, and of components that have not come they are left out.
+    """
+
+    def __init__(self, robot: int, codec: str = "thesis") -> None:
+        self.robot = check_whole("robot", robot, 0)
+        self.codec = check_codec(codec)
+        self.refused: Counter[str] = Counter()
+        """How many messages were not taken in: "other" (none of components or counts), "unfit" (components
+        that are not in 3D, or not numbered one after another)."""
+        self.version = 0
+        self._n_numbered = 0
+        self._batches: list[Components] = []
+        self._firsts: dict[int, list[tuple[int, int]]] = {}  # by robot: first sequence, row in `_batches`
+        self._gained: list[Components] = []
+        self._n_told = 0
+        self._fresh: list[Components] = []  # of `_gained`
+        self._due: list[bytes] = []
+
+    @property
+    def held(self) -> Intervals:
+        """Nothing is asked for again, so nobody need know."""
+        return Intervals.empty()
+
+    def add(self, new: Components) -> Tensor:
+        """New components of this robot; returns their ids (K, 2)."""
+        numbers = self._n_numbered + torch.arange(len(new))
+        self._n_numbered += len(new)
+        ids = torch.stack([torch.full_like(numbers, self.robot), numbers], 1)
+        self._say(encode_components(replace(new, ids=ids), self.codec))
+        return ids
+
+    def count(self, gains: Mapping[tuple[int, int], float]) -> None:
+        """Points that components (robot, sequence), of whomever, have gained since the last call."""
+        self._say(encode_counts(self.robot, dict(gains), self.codec))
+
+    def _say(self, datagrams: list[bytes]) -> None:
+        for datagram in datagrams:
+            self.receive(datagram)
+        self._due += datagrams
+
+    def receive(self, datagram: bytes, message: Message | None = None) -> bool:
+        """Take in what a datagram says, if it is of components or counts. Raises `DataError` for a damaged
+        one. message: what `decode` makes of it, for those who have that already."""
+        message = decode(datagram) if message is None else message
+        if isinstance(message, ComponentsMessage) and not _is_fit(message.components):
+            self.refused["unfit"] += 1
+            return False
+        if isinstance(message, ComponentsMessage):
+            self._enter(message.components)
+        elif isinstance(message, CountsMessage):
+            self._gain(message)
+        else:
+            self.refused["other"] += 1
+            return False
+        return True
+
+    def _enter(self, batch: Components) -> None:
+        """Take in a batch, unless any of it is here already."""
+        if len(batch) == 0:
+            return
+        robot, first = batch.ids[0].tolist()
+        if any(
+            known + len(self._batches[row]) > first
+            for known, row in self._near(robot, first + len(batch) - 1)
+        ):
+            return
+        bisect.insort(self._firsts.setdefault(robot, []), (first, len(self._batches)))
+        self._batches.append(batch)
+        self.version += 1
+
+    def _near(self, robot: int, number: int) -> list[tuple[int, int]]:
+        """The batch, if any, that begins last of those up to a number."""
+        entries = self._firsts.get(robot, [])
+        at = bisect.bisect_right(entries, number, key=lambda entry: entry[0])
+        return entries[max(at - 1, 0) : at]
+
+    def _gain(self, message: CountsMessage) -> None:
+        rows = []
+        for (robot, number), count in message.counts.items():
+            for first, which in self._near(robot, number):
+                batch = self._batches[which]
+                if number - first < len(batch):
+                    one = batch.selected(torch.tensor([number - first]))
+                    support = torch.full_like(one.support, count)
+                    rows.append(replace(one, support=support, seen_count=support[one.seen_by]))
+        if rows:
+            self._gained.append(Components.concatenate(rows))
+            self._fresh.append(self._gained[-1])
+            self.version += 1
+
+    def changes(self) -> Changes:
+        """What has come since the last call: see `Replica.changes`."""
+        added, self._n_told = self._batches[self._n_told :], len(self._batches)
+        gained = Components.concatenate(self._fresh) if self._fresh else Components.empty(3)
+        self._fresh = []
+        return Changes(added, gained, False)
+
+    def datagrams(self, *, budget: int | None = None) -> list[bytes]:
+        """What is due, in so many bytes; what does not fit waits."""
+        n, left = 0, float("inf") if budget is None else budget
+        while n < len(self._due) and len(self._due[n]) <= left:
+            left -= len(self._due[n])
+            n += 1
+        sent, self._due = self._due[:n], self._due[n:]
+        return sent
+
+    def announcements(self) -> list[bytes]:
+        """None: nobody would send again what is missing."""
+        return []
+
+    def components(self) -> Components:
+        """All components with all their counts, in the order of their ids."""
+        parts = [*self._batches, *self._gained]
+        return summed(Components.concatenate(parts)) if parts else Components.empty(3)
+
+    def digest(self) -> bytes:
+        """None: what two robots hold may differ for good."""
+        return b""
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs, once `changes` have been asked for."""
+        return {
+            "n_numbered": self._n_numbered,
+            "batches": packed(self._batches),
+            "gained": packed(self._gained),
+            "due": [torch.frombuffer(bytearray(datagram), dtype=torch.uint8) for datagram in self._due],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a state; all of it has been told."""
+        for batch in unpacked(state["batches"]):
+            self._enter(batch)
+        self._gained = list(unpacked(state["gained"]))
+        self._n_told, self._n_numbered = len(self._batches), int(state["n_numbered"])
+        self._due = [data.numpy().tobytes() for data in state["due"]]
+
+
+def _is_fit(batch: Components) -> bool:
+    """Whether components are what a broadcaster numbers together, and can be found by the first."""
+    following = batch.ids[:1] + torch.stack([torch.zeros(len(batch)), torch.arange(len(batch))], 1).long()
+    return batch.dim == 3 and torch.equal(batch.ids, following)

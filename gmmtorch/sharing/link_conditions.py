@@ -1,0 +1,163 @@
+"""LinkConditions: what the links of a simulated network do to datagrams, and when they are cut."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import InitVar, dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+
+
+class Partition(NamedTuple):
+    """From `begin` until before `end` (s), robots of different groups do not hear each other.
+
+    groups: numbers of robots. Those that no group names make up one more.
+    """
+
+    begin: float
+    end: float
+    groups: tuple[tuple[int, ...], ...]
+
+    def divides(self, robot: int, other: int) -> bool:
+        """Whether two robots are in different groups."""
+        return self._group(robot) != self._group(other)
+
+    def _group(self, robot: int) -> int:
+        return next((number for number, group in enumerate(self.groups) if robot in group), -1)
+
+
+@dataclass(frozen=True)
+class LinkConditions:
+    """Of all links of a network.
+
+    latency: seconds from when a datagram has left its sender to when it arrives, at least. jitter: mean
+    (s) of what is added to that, drawn for each receiver and each copy from an exponential distribution.
+    bandwidth: bytes a second of each sender; None: no limit. loss: share of the datagrams that each
+    receiver misses, [0, 1). duplication: share of those not lost that come twice, [0, 1]. reach: metres
+    that two robots may be apart to hear each other; None: any. partitions: each a `Partition`, or a
+    mapping or triple of its fields; any number may be in force at once. names: what errors call fields,
+    where a user knows them by other names.
+
+    Raises `InvalidArgumentError` for values that cannot be.
+    """
+
+    latency: float = 0.05
+    jitter: float = 0.0
+    bandwidth: float | None = None
+    loss: float = 0.0
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: tuple[Partition, ...] = ()
+    names: InitVar[Mapping[str, str] | None] = None
+
+    def __post_init__(self, names: Mapping[str, str] | None) -> None:
+        names = names or {}
+        for field, (holds, demand) in _DEMANDS.items():
+            value = getattr(self, field)
+            if value is None and field in _UNLIMITED:
+                continue
+            if not (_is_number(value) and holds(value)):
+                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {demand}.")
+            object.__setattr__(self, field, float(value))
+        name = names.get("partitions", "partitions")
+        if not isinstance(self.partitions, Sequence):
+            raise InvalidArgumentError(f"{name}={self.partitions!r} must be a list of partitions.")
+        partitions = tuple(_partition(f"{name}[{i}]", value) for i, value in enumerate(self.partitions))
+        object.__setattr__(self, "partitions", partitions)
+
+    def check_team(self, n_robots: int, names: Mapping[str, str] | None = None) -> None:
+        """Raises `InvalidArgumentError` unless the partitions are of so many robots. names: as above."""
+        name = (names or {}).get("partitions", "partitions")
+        for i, partition in enumerate(self.partitions):
+            named = [robot for group in partition.groups for robot in group]
+            if max(named) >= n_robots:
+                raise InvalidArgumentError(
+                    f"{name}[{i}].groups={partition.groups} names robot {max(named)}; there are {n_robots}, "
+                    "numbered from 0."
+                )
+            if len(partition.groups) + (len(named) < n_robots) < 2:
+                raise InvalidArgumentError(
+                    f"{name}[{i}].groups={partition.groups} puts all {n_robots} robots into one group, and "
+                    "so cuts nobody off; leave it out, or name two groups."
+                )
+
+    def cut(self, sender: int, receiver: int, begin: float, end: float) -> bool:
+        """Whether a datagram that is on the air from `begin` to `end` (s), both included, is cut off."""
+        return any(
+            partition.begin <= end and begin < partition.end and partition.divides(sender, receiver)
+            for partition in self.partitions
+        )
+
+    def draw_losses(self, n: int, generator: torch.Generator) -> list[bool]:
+        """Of so many receivers, who loses a datagram."""
+        if self.loss == 0:
+            return [False] * n
+        drawn = torch.rand(n, generator=generator, dtype=torch.float64) < self.loss
+        return [bool(lost) for lost in drawn]
+
+    def draw_delays(self, n: int, generator: torch.Generator) -> list[list[float]]:
+        """After what times (s) a datagram comes to each of so many receivers: one, or two."""
+        if self.jitter == self.duplication == 0:
+            return [[self.latency]] * n
+        first, second, chance = torch.rand(3, n, generator=generator, dtype=torch.float64).tolist()
+        return [
+            [self.latency - self.jitter * math.log1p(-u) for u in ((a, b) if c < self.duplication else (a,))]
+            for a, b, c in zip(first, second, chance, strict=True)
+        ]
+
+
+_UNLIMITED = ("bandwidth", "reach")  # if None
+_DEMANDS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "latency": (lambda s: 0 <= s < math.inf, "a time of zero seconds or more, and finite"),
+    "jitter": (lambda s: 0 <= s < math.inf, "a mean time of zero seconds or more, and finite"),
+    "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes a second, and finite, or None"),
+    "loss": (lambda share: 0 <= share < 1, "a share of the datagrams in [0, 1)"),
+    "duplication": (lambda share: 0 <= share <= 1, "a share of the datagrams in [0, 1]"),
+    "reach": (lambda metres: 0 < metres < math.inf, "above zero metres, and finite, or None"),
+}
+
+
+def _partition(name: str, value: Any) -> Partition:
+    """What somebody gave as a partition, checked."""
+    if isinstance(value, Mapping) and set(value) == set(Partition._fields):
+        fields = [value[field] for field in Partition._fields]
+    else:
+        fields = list(value) if _is_list(value) else []
+    if (
+        len(fields) != 3
+        or not (_is_number(fields[0]) and _is_number(fields[1]))
+        or not -math.inf < fields[0] < fields[1] < math.inf
+        or not _are_groups(fields[2])
+    ):
+        raise InvalidArgumentError(
+            f"{name}={value!r} must have begin and end, finite seconds, the first before the second, and "
+            "groups, lists of robots that are each in one: {begin: 60, end: 120, groups: [[0], [1, 2]]}."
+        )
+    begin, end, groups = fields
+    return Partition(
+        float(begin), float(end), tuple(tuple(int(robot) for robot in group) for group in groups)
+    )
+
+
+def _are_groups(value: Any) -> bool:
+    if not (_is_list(value) and value and all(_is_list(group) and group for group in value)):
+        return False
+    robots: list[Any] = [robot for group in value for robot in group]
+    return all(map(_is_robot, robots)) and len(set(robots)) == len(robots)
+
+
+def _is_robot(value: Any) -> bool:
+    return _is_number(value) and isinstance(value, numbers.Integral) and int(value) >= 0
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)

@@ -1,0 +1,156 @@
+"""Zenoh sessions: opened with a team's endpoints, with errors that say what to do."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+
+if TYPE_CHECKING:
+    import zenoh
+
+_IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
+_ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
+_LARGEST_MESSAGE = 1 << 16
+"""Bytes that Zenoh puts together from parts; unasked, it would take a gigabyte from whoever connects."""
+_KEY_REMEDY = "give key=TeamKey.from_file(…), or say insecure=True to let anybody read and write."
+_REMEDIES = {
+    "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
+    "assign requested": "this machine has no such address. `ip address` shows those it has.",
+    "denied": "ports below 1024 are for the system. Give one above.",
+}
+
+
+def load_zenoh() -> Any:
+    """The package; `GmmTorchError` where it is not installed."""
+    try:
+        import zenoh
+    except ImportError as error:
+        raise GmmTorchError(
+            f"Zenoh is spoken by the package eclipse-zenoh, which does not load ({error}); "
+            "pip install 'gmmtorch[zenoh]'."
+        ) from error
+    return zenoh
+
+
+def open_session(
+    listen: Sequence[str],
+    connect: Sequence[str],
+    scouting: bool | None,
+    config: str | Path | None,
+    is_local: bool,
+) -> zenoh.Session:
+    """A session of Zenoh. Who is not reached now is tried again for as long as it is open.
+
+    Args:
+        listen: endpoints, such as 'tcp/10.0.0.3:7447'; where there are none, those of `config`.
+        connect: endpoints of others, or of routers; likewise.
+        scouting: whether others are looked for by multicast; None: as `config` says, else not.
+        config: a file of Zenoh's own settings (JSON5), or None.
+        is_local: whether it keeps to this machine: to endpoints on loopback, and to those that are given.
+
+    Raises `InvalidArgumentError` for endpoints that are none, or cannot be listened on, `MissingDataError`
+    and `DataError` for a file that is not there, or is no configuration.
+    """
+    if is_local and (scouting or config is not None):
+        given = "scouting=True" if scouting else f"config={str(config)!r}"
+        raise InvalidArgumentError(f"{given} may reach other machines, and there is no key: {_KEY_REMEDY}")
+    if not (listen or connect or scouting or config is not None):
+        raise InvalidArgumentError("Nobody is reached: give listen, connect, scouting=True, or config.")
+    settings = _settings(
+        _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
+    )
+    if is_local:
+        settings["scouting/gossip/enabled"] = False  # neighbours may know of others elsewhere
+    zenoh = load_zenoh()
+    whole = zenoh.Config() if config is None else _read(zenoh, Path(config))
+    try:
+        for name, value in settings.items():
+            whole.insert_json5(name, json.dumps(value))
+        return zenoh.open(whole)
+    except zenoh.ZError as error:
+        cause = _cause(error)
+        remedies = (remedy for sign, remedy in _REMEDIES.items() if sign in cause)
+        raise InvalidArgumentError(
+            f"listen={list(listen)}, connect={list(connect)}, config={str(config)!r} cannot be used by Zenoh "
+            f"({cause}): {next(remedies, 'give what it knows.')}"
+        ) from error
+
+
+def _settings(
+    listen: list[str], connect: list[str], scouting: bool | None, config: str | Path | None
+) -> dict[str, Any]:
+    """What is said to Zenoh, above what is in the file, by the names of its settings."""
+    settings: dict[str, Any] = {
+        "connect/exit_on_failure": False,
+        "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
+        "transport/shared_memory/enabled": False,  # too little to gain with datagrams, for one more way in
+    }
+    if listen or (config is None and not scouting):  # Zenoh itself would listen everywhere
+        settings["listen/endpoints"] = listen
+    if connect:
+        settings["connect/endpoints"] = connect
+    if config is None or scouting is not None:
+        settings["scouting/multicast/enabled"] = bool(scouting)
+    return settings
+
+
+def _read(zenoh: Any, path: Path) -> zenoh.Config:
+    if not path.is_file():
+        raise MissingDataError(f"config={str(path)!r} is no file; give a configuration of Zenoh, or None.")
+    try:
+        config = zenoh.Config.from_file(path)
+        mode = json.loads(config.get_json("mode"))
+    except (zenoh.ZError, ValueError) as error:
+        raise DataError(f"config={str(path)!r} is no configuration of Zenoh: {_cause(error)}.") from error
+    if mode == "client":
+        raise DataError(
+            f"config={str(path)!r} has mode 'client', which gives up where the router is away at the start. "
+            "Say mode: 'router', which waits for it, and passes on what others say."
+        )
+    return config
+
+
+def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: bool) -> list[str]:
+    """Endpoints, if they are some: Zenoh itself would try for ever to connect to what is none."""
+    if isinstance(endpoints, str):
+        raise InvalidArgumentError(f"{name}={endpoints!r} must be a list of endpoints: [{endpoints!r}].")
+    for endpoint in endpoints:
+        host = _host(name, endpoint, least_port)
+        if is_local and not _is_loopback(host):
+            raise InvalidArgumentError(
+                f"{name}={endpoint!r} reaches other machines, and there is no key: take 127.0.0.1, "
+                f"{_KEY_REMEDY}"
+            )
+    return list(endpoints)
+
+
+def _host(name: str, endpoint: str, least_port: int) -> str:
+    """Of an endpoint 'protocol/host:port?metadata#config'; '' where the protocol is not one of IP."""
+    protocol, _, rest = endpoint.partition("/") if isinstance(endpoint, str) else ("", "", "")
+    if protocol and rest and protocol not in _IP_PROTOCOLS:
+        return ""
+    found = _ADDRESS.fullmatch(re.split("[?#]", rest, maxsplit=1)[0])
+    if found is None or not least_port <= int(found[3]) <= 65535:
+        raise InvalidArgumentError(
+            f"{name}={endpoint!r} must be an endpoint: a protocol ({', '.join(_IP_PROTOCOLS)}), a host, and "
+            f"a port {least_port} … 65535, such as 'tcp/10.0.0.3:7447'."
+        )
+    return found[1] or found[2]
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _cause(error: Exception) -> str:
+    """What Zenoh says, in a line, without the lines of its source that it names."""
+    return " ".join(re.sub(r" at /\S+", "", str(error)).split()).rstrip(" .")[:300]

@@ -1,0 +1,326 @@
+"""Replica.changes: who follows them has the map, whatever the order in which it came."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+from sharing.replica_model import rows
+from sharing.schedules import act, components
+
+from gmmtorch.errors import DataError
+from gmmtorch.mapping.components import Components
+from gmmtorch.sharing import authorship, changes
+from gmmtorch.sharing.announce_messages import SupersessionMessage, TotalsMessage, encode_record
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import decode
+from gmmtorch.sharing.replica import Replica
+
+seeds = st.integers(0, 10**6)
+
+
+class Follower:
+    """Who makes a map of its own of changes: of each component its mean, support, and counts by origin."""
+
+    def __init__(self) -> None:
+        self.shapes: dict[int, tuple] = {}
+        self.support: dict[int, float] = {}
+        self.counts: dict[tuple, float] = {}
+        self.rebuilt = 0
+        self.batches: list[Components] = []
+
+    def follow(self, replica: Replica) -> None:
+        new = replica.changes()
+        if new.rebuilt:
+            assert not new.added
+            assert not len(new.gained)
+            self.shapes, self.support, self.counts = {}, {}, {}
+            self.rebuilt += 1
+            self._enter(replica.components())
+            return
+        for batch in new.added:
+            assert len(batch)
+            assert not rows(batch).keys() & self.shapes.keys()  # nothing comes twice
+            self._enter(batch)
+        self.batches += new.added
+        assert (new.gained.support > 0).all()
+        for key, (mean, _, gain, _, seen) in rows(new.gained).items():
+            assert self.shapes[key][0] == mean
+            self.support[key] += gain
+            for origin, count in seen:
+                self.counts[key, origin] += count
+
+    def _enter(self, batch: Components) -> None:
+        for key, (mean, covariance, support, flag, seen) in rows(batch).items():
+            self.shapes[key], self.support[key] = (mean, covariance, flag), support
+            self.counts |= {(key, origin): count for origin, count in seen}
+
+    def agrees(self, replica: Replica) -> bool:
+        expected = rows(replica.components())
+        counts = {(key, origin): n for key, row in expected.items() for origin, n in row[4]}
+        return (
+            self.shapes
+            == {key: (mean, covariance, flag) for key, (mean, covariance, _, flag, _) in expected.items()}
+            and self.support == pytest.approx({key: row[2] for key, row in expected.items()}, rel=1e-9)
+            and self.counts == pytest.approx(counts, rel=1e-9, abs=1e-12)
+        )
+
+
+def growth(seed: int, n_acts: int = 14) -> list[bytes]:
+    """All that three robots have said that only add and count; totals are written anew as soon as can be."""
+    rng = random.Random(seed)
+    robots = [Replica(robot, incarnation=rng.getrandbits(24)) for robot in range(3)]
+    said: list[bytes] = []
+    for _ in range(n_acts):
+        robot = rng.choice(robots)
+        known = robot.components().ids.tolist()
+        if not known or rng.random() < 0.4:
+            robot.add(components(rng, rng.randint(1, 5)))
+        else:
+            chosen = rng.sample(known, rng.randint(1, min(4, len(known))))
+            robot.count({tuple(row): rng.uniform(0.0, 500.0) for row in chosen})
+        for datagram in robot.datagrams():
+            said.append(datagram)
+            for other in robots:
+                if other is not robot and rng.random() < 0.7:
+                    other.receive(datagram)
+    return said
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=seeds, order=st.randoms(use_true_random=False))
+def test_what_is_added_and_gained_is_the_map(seed, order):
+    """Whatever the order, the loss and the repetition, and however often one asks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(authorship, "_SLACK", 1)
+        patch.setattr(authorship, "_MOST_SHORT", 2)
+        said = growth(seed)
+    heard = [datagram for datagram in said if order.random() < 0.9]
+    heard += order.sample(heard, len(heard) // 3)
+    order.shuffle(heard)
+    replica, follower = Replica(9), Follower()
+    for datagram in heard:
+        assert replica.receive(datagram)
+        if order.random() < 0.3:
+            follower.follow(replica)
+            assert follower.agrees(replica)
+    follower.follow(replica)
+    assert follower.agrees(replica)
+    assert not follower.rebuilt  # that totals are written anew changes nothing of the map
+    nothing = replica.changes()
+    assert (nothing.added, len(nothing.gained), nothing.rebuilt) == ([], 0, False)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=seeds)
+def test_who_starts_over_when_told_to_has_the_map(seed):
+    rng = random.Random(seed)
+    robots, followers = [Replica(robot, incarnation=robot) for robot in range(2)], [Follower(), Follower()]
+    late: list[bytes] = []
+    for _ in range(20):
+        which = rng.randrange(2)
+        act(rng, robots[which])
+        late += [datagram for datagram in robots[which].datagrams() for _ in range(rng.choice([0, 1, 1, 2]))]
+        rng.shuffle(late)
+        for datagram in [late.pop() for _ in range(rng.randint(0, len(late)))]:
+            robots[rng.randrange(2)].receive(datagram)
+        for replica, follower in zip(robots, followers, strict=True):
+            if rng.random() < 0.6:
+                follower.follow(replica)
+                assert follower.agrees(replica)
+
+
+def test_batches_are_those_of_the_datagrams_at_all_robots():
+    one, other = Replica(0), Replica(1)
+    for seed, k in enumerate((30, 300, 1)):
+        one.add(random_components(3, k=k, seed=seed))
+    datagrams = one.datagrams()
+    for datagram in datagrams:
+        other.receive(datagram, decode(datagram))
+    own, heard = one.changes().added, other.changes().added
+    assert len(own) == len(heard) == len(datagrams) > 4
+    for mine, theirs, datagram in zip(own, heard, datagrams, strict=True):
+        sent = decode(datagram).components
+        for name, value in vars(mine).items():
+            assert torch.equal(value, getattr(theirs, name)), name
+            assert torch.equal(value, getattr(sent, name)), name
+
+
+def test_what_is_counted_to_components_that_are_not_here_waits_for_them():
+    one, other = Replica(0), Replica(1)
+    ids = [tuple(row) for row in one.add(random_components(3, k=3)).tolist()]
+    shapes = one.datagrams()
+    one.count({ids[0]: 64.0, ids[1]: 8.0})
+    for datagram in one.datagrams():
+        other.receive(datagram)
+    assert len(other.changes().gained) == 0
+    for datagram in shapes:
+        other.receive(datagram)
+    new = other.changes()
+    assert len(new.added) == 1
+    gained = {
+        tuple(row): float(gain) for row, gain in zip(new.gained.ids.tolist(), new.gained.support, strict=True)
+    }
+    assert gained == {ids[0]: 64.0, ids[1]: 8.0}
+    assert float(new.gained.seen_count.sum()) == pytest.approx(72.0)
+    one.count({ids[1]: 8.0})
+    for datagram in one.datagrams():
+        other.receive(datagram)
+    assert [float(gain) for gain in other.changes().gained.support] == [8.0]
+
+
+def test_what_had_no_points_gains_them_alike():
+    one = Replica(0)
+    bare = random_components(3, k=1, seed=3, n_origins=4, max_sightings=1)
+    bare = Components(
+        **{
+            **vars(bare),
+            "support": torch.zeros(1, dtype=torch.float64),
+            "seen_by": torch.zeros(2, dtype=torch.int64),
+            "seen_from": torch.arange(2),
+            "seen_count": torch.zeros(2, dtype=torch.float64),
+        }
+    )
+    name = tuple(one.add(bare)[0].tolist())
+    one.count({name: 16.0})
+    assert one.changes().gained.seen_count.tolist() == one.components().seen_count.tolist() == [8.0, 8.0]
+
+
+def test_only_what_changes_the_map_starts_it_over():
+    one, follower = Replica(0), Follower()
+    ids = one.add(random_components(3, k=4))
+    one.add(random_components(3, k=0), supersedes=ids[:1])
+    follower.follow(one)
+    assert not follower.rebuilt  # nobody had been told of it
+    one.add(random_components(3, k=2, seed=1), supersedes=ids[1:2])
+    follower.follow(one)
+    assert follower.rebuilt == 1
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[0, 3] = 2.0
+    one.correct(0, motion, ids[2:])
+    follower.follow(one)
+    assert follower.rebuilt == 2
+    assert follower.agrees(one)
+    late = Replica(1)
+    late.changes()
+    for datagram in one.datagrams():  # what is superseded, and what is corrected, is so when it comes
+        late.receive(datagram)
+    assert late.digest() == one.digest()
+
+
+def test_components_that_come_after_their_correction_come_where_it_puts_them():
+    one, other, follower = Replica(0), Replica(1), Follower()
+    ids = one.add(random_components(3, k=4))
+    shapes = one.datagrams()
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[0, 3] = 2.0
+    one.correct(0, motion, ids)
+    follower.follow(other)
+    for datagram in [*one.datagrams(), *shapes]:
+        other.receive(datagram)
+        follower.follow(other)
+    assert not follower.rebuilt
+    assert follower.agrees(other)
+
+
+def test_totals_that_fall_start_it_over():
+    """No robot of ours says less than it did; whoever does is believed, as everywhere."""
+    one, other, follower = Replica(0), Replica(5, incarnation=2), Follower()
+    key = one.add(random_components(3, k=1))[0].tolist()
+    other.count({tuple(key): 64.0})
+    for datagram in other.datagrams():
+        one.receive(datagram)
+    follower.follow(one)
+    first = 5 << 52 | 2 << 28
+    less = TotalsMessage(first + 1, np.array([key[1]], np.int64), np.array([8], np.int64))
+    assert one.receive(encode_record(less))
+    old, new = (
+        Intervals.span(first, first + 1),
+        Intervals.span(first + 1, first + 2),
+    )
+    assert one.receive(encode_record(SupersessionMessage(first + 2, old, new)))
+    follower.follow(one)
+    assert follower.rebuilt == 1
+    assert follower.agrees(one)
+
+
+# -- keeping -----------------------------------------------------------------------------------------------
+
+
+def tell(replica: Replica, seed: int) -> None:
+    ids = replica.add(random_components(3, k=5, seed=seed))
+    replica.count({tuple(row): 9.0 + seed for row in ids[:2].tolist()})
+    known = replica.components().ids
+    replica.count({tuple(known[0].tolist()): 100.0 * 2**seed})
+
+
+@pytest.mark.parametrize("asked", [0, 1, 2])
+def test_a_saved_position_is_gone_on_from(asked):
+    """The changes after a restart are those of a replica that was not restarted."""
+    one = Replica(0, incarnation=3)
+    for seed in range(asked):
+        tell(one, seed)
+        one.changes()
+    tell(one, 7)
+    tell(one, 8)
+    again = Replica(0, incarnation=3)
+    again.restore(one.state())
+    for replica in (one, again):
+        tell(replica, 9)
+    plain, restored = one.changes(), again.changes()
+    assert not restored.rebuilt
+    assert len(plain.added) == len(restored.added) == 3
+    for mine, theirs in zip([*plain.added, plain.gained], [*restored.added, restored.gained], strict=True):
+        assert rows(mine) == rows(theirs)
+    again.restore(one.state())
+    assert again.changes().added == []
+
+
+def test_another_life_starts_over():
+    one = Replica(0, incarnation=3)
+    tell(one, 1)
+    one.changes()
+    again, follower = Replica(0, incarnation=4), Follower()
+    again.restore(one.state())
+    follower.follow(again)
+    assert follower.rebuilt == 1
+    assert follower.agrees(again)
+    tell(again, 2)
+    follower.follow(again)
+    assert follower.rebuilt == 1
+    assert follower.agrees(again)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("keys", torch.tensor([5])),
+        ("sizes", torch.tensor([1, 2])),
+        ("sums", torch.tensor([-1.0])),
+        ("told", None),
+    ],
+)
+def test_a_damaged_position_is_refused(name, value):
+    one = Replica(0, incarnation=3)
+    tell(one, 1)
+    state = one.state()
+    state["records"]["journal"][name] = value
+    with pytest.raises(DataError):
+        Replica(0, incarnation=3).restore(state)
+
+
+def test_who_does_not_ask_costs_no_memory(monkeypatch):
+    monkeypatch.setattr(changes, "_MOST_NAMED", 4)
+    one, follower = Replica(0), Follower()
+    ids = [tuple(row) for row in one.add(random_components(3, k=6)).tolist()]
+    follower.follow(one)
+    for step in range(8):
+        one.count({ids[step % 6]: 50.0})
+    assert one._records._journal._named is None
+    follower.follow(one)
+    assert follower.agrees(one)

@@ -1,0 +1,562 @@
+"""Zenoh: real sessions on loopback, without scouting, and all that can go wrong with them."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import json
+import random
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from sharing.schedules import components
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.sharing.network import Network, Traffic, Transport
+from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.security import Sealer
+from gmmtorch.sharing.team_key import TeamKey
+from gmmtorch.sharing.zenoh_transport import ZenohTransport
+
+zenoh = pytest.importorskip("zenoh")
+KEY = TeamKey(bytes(range(32)))
+Opening = Callable[..., ZenohTransport]
+Heard = list[tuple[int, bytes]]
+
+
+@pytest.fixture
+def opening() -> Iterator[Opening]:
+    """Opens transports that are closed after the test."""
+    with ExitStack() as stack:
+        yield lambda robot, *a, **options: stack.enter_context(ZenohTransport(robot, *a, **options))
+
+
+@pytest.fixture
+def stranger() -> Iterator[Callable[[str], zenoh.Session]]:
+    """Opens sessions of somebody else, connected to an endpoint."""
+    with ExitStack() as stack:
+        yield lambda endpoint: stack.enter_context(zenoh.open(plain("client", connect=[endpoint])))
+
+
+def plain(mode: str, **endpoints: list[str]) -> zenoh.Config:
+    """Of a session that has none of our code."""
+    config = zenoh.Config()
+    settings = {"mode": mode, "scouting/multicast/enabled": False}
+    settings |= {f"{name}/endpoints": value for name, value in endpoints.items()}
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def endpoint(protocol: str = "tcp") -> str:
+    """With a port that is free."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def team(opening: Opening, endpoints: list[str], **options: object) -> list[ZenohTransport]:
+    """Transports of robots 0 … n − 1, each connected to all before it; all have heard one another."""
+    transports = [
+        opening(robot, listen=[where], connect=endpoints[:robot], **options)
+        for robot, where in enumerate(endpoints)
+    ]
+    meet(transports)
+    return transports
+
+
+def greet(transports: list[ZenohTransport]) -> None:
+    """Until each has heard all others."""
+    met: dict[int, set[int]] = {transport.robot: set() for transport in transports}
+
+    def all_met() -> bool:
+        for transport in transports:
+            transport.send(transport.robot, [b"hello"], 0.0, "greetings")
+            met[transport.robot] |= {who for who, _ in transport.deliver(transport.robot, 0.0)}
+        return all(len(others) == len(transports) - 1 for others in met.values())
+
+    until(all_met)
+
+
+def meet(transports: list[ZenohTransport]) -> None:
+    """Until each has heard all others, and all that was said for that: links keep the order."""
+    greet(transports)
+    for transport in transports:
+        transport.send(transport.robot, [b"met"], 0.0, "greetings")
+    for transport in transports:
+        said: Heard = []
+        until(lambda t=transport, s=said: s.extend(t.deliver(t.robot, 0.0)) or ends(s, len(transports) - 1))
+
+
+def ends(said: Heard, n: int) -> bool:
+    return sum(what == b"met" for _, what in said) == n
+
+
+def until(is_done: Callable[[], bool]) -> None:
+    """Sessions, threads and processes take their time; a test that fails takes a minute."""
+    end = time.monotonic() + 60
+    while not is_done():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def heard(transport: ZenohTransport, n: int) -> Heard:
+    """The next n datagrams."""
+    found: Heard = []
+    until(lambda: len(found.extend(transport.deliver(transport.robot, 0.0)) or found) >= n)
+    return found
+
+
+# -- what is sent, heard, and counted ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("key", "protocol"), [(KEY, "tcp"), (None, "tcp"), (KEY, "udp")])
+def test_all_others_hear_a_datagram_once_and_in_order(opening, key, protocol):
+    transports: Sequence[Transport] = team(opening, [endpoint(protocol) for _ in range(3)], key=key)
+    sent = [bytes([i]) * (i * 40) for i in range(31)]
+    for i, datagram in enumerate(sent):
+        transports[1].send(1, [datagram], 0.0, ("components", "plans", "announcements", "counts")[i % 4])
+    for robot in (0, 2):
+        assert heard(transports[robot], 31) == [(1, datagram) for datagram in sent]
+        assert transports[robot].deliver(robot, 1.0) == []
+    assert transports[1].deliver(1, 1.0) == []
+
+
+@pytest.mark.parametrize("key", [KEY, None])
+def test_the_books_say_what_a_stranger_measures(opening, stranger, key):
+    """Against a plain session that listens in, and against `Network` given the same."""
+    where = endpoint()
+    a = opening(0, listen=[where], key=key)
+    sizes: list[int] = []
+    stranger(where).declare_subscriber("gmmtorch/team/0", lambda sample: sizes.append(len(sample.payload)))
+    until(lambda: a.send(0, [b"hello"], 0.0, "greetings") or len(sizes) > 0)
+    a.send(0, [bytes(1000)], 0.0, "greetings")
+    until(lambda: sizes[-1] == 1000 + a.overhead)
+    before, n_before = a.sent, len(sizes)
+    network, rng = Network(2), random.Random(0)
+    for turn in range(20):
+        datagrams = [rng.randbytes(rng.randrange(1201)) for _ in range(rng.randrange(4))]
+        kind = rng.choice(["maps", "plans"])
+        a.send(0, datagrams, float(turn), kind)
+        network.send(0, datagrams, float(turn), kind)
+    for kind in ("maps", "plans"):
+        assert a.traffic(0, kind) == a.traffic(kind=kind) == network.traffic(0, kind)
+    assert a.traffic(1) == Traffic()
+    n = network.n_datagrams
+    assert a.overhead == (31 if key else 15)
+    until(lambda: len(sizes) == n_before + n)
+    measured = sum(sizes[n_before:])
+    assert measured == network.n_bytes + a.overhead * n
+    assert a.sent == Traffic(before.datagrams + n, before.bytes + measured)
+    assert (a.received, a.failures) == (Traffic(), {})
+
+
+def test_replicas_converge_and_one_that_comes_late_catches_up(opening):
+    endpoints = [endpoint() for _ in range(3)]
+    first, second = team(opening, endpoints[:2], key=KEY)
+    replicas = {first: Replica(0), second: Replica(1)}
+
+    def exchange() -> None:
+        for transport, replica in replicas.items():
+            for _, datagram in transport.deliver(transport.robot, 0.0):
+                replica.receive(datagram)
+            transport.send(transport.robot, replica.datagrams(), 0.0, "components")
+            transport.send(transport.robot, replica.announcements(), 0.0, "announcements")
+
+    def agree() -> bool:
+        exchange()
+        return len({replica.digest() for replica in replicas.values()}) == 1
+
+    replicas[first].add(components(random.Random(0), 300))
+    replicas[second].add(components(random.Random(1), 200))
+    until(agree)
+    assert replicas[first].n_components == 500
+    third = opening(2, listen=endpoints[2:], connect=endpoints[:2], key=KEY)
+    replicas[third] = Replica(2)
+    until(agree)
+    assert replicas[third].n_components == 500
+
+
+def test_a_team_finds_one_another_through_one_that_all_know(opening):
+    endpoints = [endpoint() for _ in range(3)]
+    transports = [
+        opening(robot, listen=[where], connect=endpoints[:1], key=KEY)
+        for robot, where in enumerate(endpoints)
+    ]
+    meet(transports)
+    assert [transport.n_neighbours for transport in transports] == [2, 2, 2]
+
+
+def test_robots_pass_on_what_those_out_of_reach_say(opening, tmp_path):
+    """In a row: the outer two are connected to the one in the middle, and listen nowhere."""
+    (tmp_path / "relay.json5").write_text("{ mode: 'router', listen: { endpoints: [] } }")
+    where, options = endpoint(), {"config": tmp_path / "relay.json5", "key": KEY}
+    left, right = (opening(robot, connect=[where], **options) for robot in (0, 2))  # before there is anybody
+    middle = opening(1, listen=[where], **options)
+    greet([left, middle, right])
+    assert [each.n_neighbours for each in (left, middle, right)] == [1, 2, 1]
+
+
+def test_teams_of_other_names_do_not_hear_one_another(opening):
+    where = endpoint()
+    middle = opening(0, listen=[where], key=KEY)
+    others = opening(1, "others", connect=[where], key=KEY)
+    mate = opening(2, connect=[where], key=KEY)
+    until(lambda: others.n_neighbours == 1)
+    meet([middle, mate])
+    assert others.received == Traffic()
+    others.send(1, [b"x"], 0.0, "maps")
+    mate.send(2, [b"y"], 0.0, "maps")
+    assert heard(middle, 1) == [(2, b"y")]
+
+
+# -- what else comes in ------------------------------------------------------------------------------------
+
+
+def test_another_key_is_counted_and_said_once(opening, caplog):
+    where = endpoint()
+    a = opening(0, listen=[where], key=KEY)
+    b = opening(1, connect=[where], key=TeamKey.generate())
+    c = opening(2, connect=[where], insecure=True)
+    until(
+        lambda: b.send(1, [b"x"], 0.0, "maps") or c.send(2, [b"x"], 0.0, "maps") or a.received.datagrams > 20
+    )
+    assert a.refused["wrong_key"] == a.received.datagrams
+    assert a.deliver(0, 0.0) == []
+    lines = [line for line in caplog.messages if "same team key" in line]
+    assert 1 <= len(lines) <= 2
+    assert all("gmmtorch/team/" in line for line in lines)
+
+
+def test_whatever_strangers_send_is_counted_and_the_team_goes_on(opening, stranger):
+    where = endpoint()
+    a = opening(0, listen=[where], key=KEY)
+    b = opening(1, connect=[where], key=KEY)
+    frames: list[bytes] = []
+    session = stranger(where)
+    session.declare_subscriber("gmmtorch/team/1", lambda sample: frames.append(sample.payload.to_bytes()))
+    meet([a, b])
+    until(lambda: b.send(1, [b"one"], 0.0, "maps") or len(frames) > 0)
+    b.send(1, [b"two"], 0.0, "maps")
+    until(lambda: (1, b"two") in a.deliver(0, 0.0))
+    rng, frame = random.Random(0), frames[0]
+    hostile = {
+        "foreign": [b"", b"hello", b"\x11" + rng.randbytes(1199)],
+        "oversized": [rng.randbytes(1232), bytes(60000)],
+        "version": [b"\xf3" + rng.randbytes(99)],
+        "malformed": [frame[:30], b"\xf1"],
+        "wrong_key": [
+            frame[:-1],
+            frame[:-1] + b"?",
+            Sealer(5, TeamKey.generate()).seal(b"x"),
+            Sealer(5).seal(b"x"),
+        ],
+        "replayed": [frame, frame],
+    }
+    before = a.received
+    waits = {"congestion_control": zenoh.CongestionControl.BLOCK}
+    for number, payloads in enumerate(hostile.values()):
+        for payload in payloads:
+            session.put(f"gmmtorch/team/{number}", payload, **waits)
+    session.delete("gmmtorch/team/7", **waits)
+    session.put("gmmtorch/team/\n\u2028" + "x" * 3000, b"hello", **waits)
+    session.put("gmmtorch/team/7", bytes(10_000_000), **waits)
+    session.put("gmmtorch/team/7", Sealer(7, KEY).seal(b"by one who has the key"), **waits)
+    until(lambda: (7, b"by one who has the key") in a.deliver(0, 0.0))
+    counts = {reason: len(payloads) for reason, payloads in hostile.items()}
+    counts["foreign"] += 2  # what was deleted is empty
+    assert {reason: n for reason, n in a.refused.items() if n} == counts
+    assert a.received.datagrams - before.datagrams == sum(counts.values()) + 1
+    b.send(1, [b"three"], 0.0, "maps")
+    assert heard(a, 1) == [(1, b"three")]
+
+
+def test_replays_are_refused(opening, stranger):
+    where = endpoint()
+    a, session = opening(0, listen=[where], key=KEY), stranger(where)
+    frame = Sealer(7, KEY).seal(b"x")
+    until(lambda: session.put("gmmtorch/team/7", frame) or a.refused["replayed"] >= 3)
+    assert a.deliver(0, 0.0) == [(7, b"x")]
+
+
+def test_of_too_many_that_wait_the_newest_are_kept(opening):
+    a, b = team(opening, [endpoint(), endpoint()], key=KEY, max_waiting=100)
+    before = b.received.datagrams
+    for i in range(250):
+        a.send(0, [i.to_bytes(2, "little")], 0.0, "maps")
+    until(lambda: b.received.datagrams == before + 250)
+    assert b.deliver(1, 0.0) == [(0, i.to_bytes(2, "little")) for i in range(150, 250)]
+    assert b.n_dropped == 150
+
+
+def test_two_robots_with_one_number_are_found(opening):
+    where = endpoint()
+    a = opening(0, listen=[where], key=KEY)
+    twins = [opening(3, connect=[where], key=KEY) for _ in range(2)]
+    until(lambda: any(twin.send(3, [b"x"], 0.0, "maps") for twin in twins) or a.refused["namesake"] > 0)
+    assert set(a.namesakes) == {3}
+
+
+# -- who comes and goes ------------------------------------------------------------------------------------
+
+
+def test_a_robot_that_is_alone_goes_on_and_is_heard_when_others_come(opening):
+    endpoints = [endpoint(), endpoint()]
+    a = opening(0, listen=endpoints[:1], connect=endpoints[1:], key=KEY)
+    a.send(0, [b"nobody hears this"], 0.0, "maps")
+    assert (a.n_neighbours, a.deliver(0, 0.0), a.failures) == (0, [], {})
+    b = opening(1, listen=endpoints[1:], key=KEY)
+    meet([a, b])
+    a.send(0, [b"this is heard"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"this is heard")]
+
+
+def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
+    endpoints = [endpoint(), endpoint()]
+    a, b = team(opening, endpoints, key=KEY)
+    b.close()
+    until(lambda: a.n_neighbours == 0)
+    a.send(0, [b"nobody hears this"], 0.0, "maps")
+    again = opening(1, listen=endpoints[1:], connect=endpoints[:1], key=KEY)
+    meet([a, again])
+    again.send(1, [b"after"] * 5, 0.0, "maps")
+    assert heard(a, 5) == [(1, b"after")] * 5
+    assert sum(a.refused.values()) == 0
+
+
+OTHER_ROBOT = """
+import json, os, sys, time, zenoh
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+aead = ChaCha20Poly1305(bytes(range(32)))
+config = zenoh.Config()
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+session, life, number = zenoh.open(config), os.urandom(8), 0
+subscriber = session.declare_subscriber("gmmtorch/team/0")
+for sample in subscriber:
+    frame = sample.payload.to_bytes()
+    datagram = aead.decrypt(frame[3:15], frame[15:], frame[:15])
+    header = b"\\xf1" + (7).to_bytes(2, "little") + life + number.to_bytes(4, "little")
+    session.put("gmmtorch/team/7", header + aead.encrypt(header[3:], datagram[::-1], header))
+    number += 1
+    if datagram == b"end":
+        break
+session.close()
+"""
+
+
+def test_another_process_that_knows_the_format_takes_part(opening):
+    """Written from docs/network.md alone: it has none of our code."""
+    where = endpoint()
+    a = opening(0, listen=[where], key=KEY)
+    with subprocess.Popen([sys.executable, "-c", OTHER_ROBOT, where]) as other:
+        until(lambda: a.send(0, [b"hello"], 0.0, "maps") or len(a.deliver(0, 0.0)) > 0)
+        sent = [f"datagram {i}".encode() for i in range(50)]
+        a.send(0, [*sent, b"end"], 0.0, "maps")
+        answers = [datagram for datagram in said_until(a, b"dne") if datagram != b"olleh"]
+        assert answers == [datagram[::-1] for datagram in [*sent, b"end"]]
+        assert other.wait(20) == 0
+
+
+def said_until(transport: ZenohTransport, last: bytes) -> list[bytes]:
+    said: list[bytes] = []
+    until(lambda: said.extend(d for _, d in transport.deliver(transport.robot, 0.0)) or said[-1:] == [last])
+    return said
+
+
+FORGETFUL = """
+import sys
+from gmmtorch.sharing.zenoh_transport import ZenohTransport
+transport = ZenohTransport(1, connect=[sys.argv[1]])
+while not transport.deliver(1, 0.0):
+    transport.send(1, [b"x"], 0.0, "maps")
+sys.exit(5)
+"""
+
+
+def test_a_process_that_forgets_to_close_ends(opening):
+    where = endpoint()
+    a = opening(0, listen=[where])
+    with subprocess.Popen([sys.executable, "-c", FORGETFUL, where]) as other:
+        until(lambda: a.send(0, [b"x"], 0.0, "maps") or other.poll() is not None)
+        assert other.returncode == 5
+    assert (1, b"x") in a.deliver(0, 0.0)
+    until(lambda: a.n_neighbours == 0)
+
+
+def test_closing_gives_back_port_and_thread_and_can_be_done_twice():
+    n_threads, where = threading.active_count(), endpoint()
+    with ZenohTransport(0, listen=[where]) as transport:
+        assert threading.active_count() == n_threads + 1
+        assert "0" in threading.enumerate()[-1].name
+    transport.close()
+    assert threading.active_count() == n_threads
+    assert transport.n_neighbours == 0
+    for use in (lambda: transport.send(0, [b"x"], 0.0, "maps"), lambda: transport.deliver(0, 0.0)):
+        with pytest.raises(GmmTorchError, match="closed"):
+            use()
+    ZenohTransport(1, listen=[where]).close()
+
+
+def test_what_zenoh_does_not_take_is_counted_and_the_robot_goes_on(opening, caplog):
+    a = opening(0, listen=[endpoint()], key=KEY)
+    a._session.close()
+    for _ in range(3):
+        a.send(0, [b"x", b"y"], 0.0, "maps")
+    assert a.failures == {"ZError": 6}
+    assert (a.sent, a.traffic()) == (Traffic(), Traffic(6, 6))
+    assert len(caplog.messages) == 1
+
+
+# -- where it may go, and Zenoh's own settings -------------------------------------------------------------
+
+
+def test_without_a_key_nobody_outside_is_spoken_to_by_accident(opening, tmp_path):
+    (tmp_path / "zenoh.json5").write_text("{ listen: { endpoints: ['tcp/0.0.0.0:0'] } }")
+    for options in (
+        {"listen": ["tcp/0.0.0.0:0"]},
+        {"listen": ["tcp/[::]:0"]},
+        {"listen": ["udp/224.0.0.224:7446"]},
+        {"connect": ["tcp/127.0.0.1:7447", "tcp/198.51.100.7:7447"]},
+        {"connect": ["tls/localhost.example:7447"]},
+        {"connect": ["serial/dev/ttyUSB0"]},
+        {"scouting": True},
+        {"config": tmp_path / "zenoh.json5"},
+    ):
+        with pytest.raises(InvalidArgumentError, match=r"no key.*insecure=True"):
+            opening(0, **options)
+    for options in ({"key": KEY}, {"insecure": True}):
+        opening(0, listen=["tcp/0.0.0.0:0"], **options)
+        opening(0, config=tmp_path / "zenoh.json5", **options)
+    opening(0, connect=["tcp/127.0.0.2:7447", "udp/[::1]:7447", "tcp/localhost:7447"])
+
+
+def test_a_port_in_use_is_named_with_what_to_do(opening):
+    where = endpoint()
+    opening(0, listen=[where])
+    with pytest.raises(InvalidArgumentError, match=rf"{where}.*another process.*another port"):
+        opening(1, listen=[where])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot": -1}, "sender=-1"),
+        ({"robot": 65536}, "sender=65536"),
+        ({"team": ""}, "team=''"),
+        ({"team": "a/b"}, "team='a/b'"),
+        ({"team": "*"}, "team="),
+        ({"listen": "tcp/127.0.0.1:0"}, "list of endpoints"),
+        ({"listen": ["127.0.0.1:7447"]}, "must be an endpoint"),
+        ({"listen": [7447]}, "listen=7447"),
+        ({"listen": ["tcp/127.0.0.1"]}, "must be an endpoint"),
+        ({"listen": ["tcp/127.0.0.1:65536"]}, "65535"),
+        ({"listen": ["tcp/198.51.100.7:0"], "key": KEY}, "no such address"),
+        ({"listen": ["pigeon/home"], "key": KEY}, "pigeon"),
+        ({"connect": ["tcp/127.0.0.1:0"]}, "port 1"),
+        ({"connect": [""]}, "connect=''"),
+        ({"listen": []}, "Nobody is reached"),
+        ({"max_waiting": 0}, "max_waiting=0"),
+    ],
+)
+def test_options_that_cannot_be_are_named(options, message):
+    n_threads = threading.active_count()
+    with pytest.raises(InvalidArgumentError, match=message):
+        ZenohTransport(**{"robot": 0, "listen": ["tcp/127.0.0.1:0"], **options})
+    assert threading.active_count() == n_threads
+
+
+def test_configurations_that_are_none_are_named(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere"):
+        ZenohTransport(0, config=tmp_path / "nowhere.json5", key=KEY)
+    for text, message in (
+        ("{ mode: 'peer'", "no configuration"),
+        ("{ mode: 'peer', wings: 2 }", "wings"),
+        ("{ mode: 'client' }", "mode 'client'.*router"),
+    ):
+        (tmp_path / "zenoh.json5").write_text(text)
+        with pytest.raises(DataError, match=message):
+            ZenohTransport(0, config=tmp_path / "zenoh.json5", key=KEY)
+
+
+def test_links_may_be_of_tls_by_zenohs_own_configuration(opening, tmp_path):
+    certify(tmp_path)
+    names = {"root_ca_certificate": "cert.pem", "enable_mtls": True}
+    for side in ("listen", "connect"):
+        names |= {f"{side}_certificate": "cert.pem", f"{side}_private_key": "key.pem"}
+    tls = {name: value if value is True else str(tmp_path / value) for name, value in names.items()}
+    (tmp_path / "zenoh.json5").write_text(json.dumps({"transport": {"link": {"tls": tls}}}))
+    where = endpoint("tls")
+    a = opening(0, listen=[where], config=tmp_path / "zenoh.json5", key=KEY)
+    b = opening(1, connect=[where], config=tmp_path / "zenoh.json5", key=KEY)
+    meet([a, b])
+    assert {link.dst.partition("/")[0] for link in b._session.info.links()} == {"tls"}
+    with socket.create_connection(("127.0.0.1", int(where.rpartition(":")[2]))) as without_certificate:
+        without_certificate.sendall(b"hello")
+    a.send(0, [b"x"], 0.0, "maps")
+    assert heard(b, 1) == [(0, b"x")]
+
+
+def certify(folder: Path) -> None:
+    """A key, and a certificate that it has signed itself, for 127.0.0.1."""
+    x509 = pytest.importorskip("cryptography.x509")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    private, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.timezone.utc)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "robots")])
+    address = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
+    builder = x509.CertificateBuilder(
+        name, name, private.public_key(), 1, now, now + datetime.timedelta(days=1)
+    )
+    certificate = builder.add_extension(address, critical=False).sign(private, hashes.SHA256())
+    (folder / "cert.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    (folder / "key.pem").write_bytes(
+        private.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+
+
+class Listening:
+    """A publisher that remembers what it was given."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self.reliability, self.frames = publisher.reliability, list[bytes]()
+        self.put = self.frames.append
+
+
+def test_only_what_comes_again_soon_is_best_effort(opening):
+    a = opening(0, listen=[endpoint()])
+    ways = a._best_effort, a._reliable = Listening(a._best_effort), Listening(a._reliable)
+    for kind in ("plans", "announcements", "components", "counts", "points", "views", "anything"):
+        a.send(0, [kind.encode()], 0.0, kind)
+    said = {str(way.reliability): [frame[a.overhead :] for frame in way.frames] for way in ways}
+    assert said == {
+        str(zenoh.Reliability.BEST_EFFORT): [b"plans", b"announcements"],
+        str(zenoh.Reliability.RELIABLE): [b"components", b"counts", b"points", b"views", b"anything"],
+    }
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(GmmTorchError, match=r"pip install 'gmmtorch\[zenoh\]'"):
+        ZenohTransport(0, listen=["tcp/127.0.0.1:0"])
+
+
+def test_only_its_own_robot_sends_and_hears_through_it(opening):
+    a = opening(0, listen=[endpoint()])
+    with pytest.raises(InvalidArgumentError, match="sender=1 must be 0"):
+        a.send(1, [b"x"], 0.0, "maps")
+    with pytest.raises(InvalidArgumentError, match="robot=1 must be 0"):
+        a.deliver(1, 0.0)
+    with pytest.raises(InvalidArgumentError, match="1201 bytes"):
+        a.send(0, [b"", bytes(1201)], 0.0, "maps")
+    assert a.sent == a.traffic() == Traffic()
