@@ -24,29 +24,28 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from frames import RESOLUTIONS, SEED, Frame, material
 from tables import ROOT, hardware, markdown, publish
 from torch import Tensor
 
-from gmmtorch import GaussianMap, IncrementalRule, datasets
+from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.datasets.depth_frames import DepthFrames, back_project
 from gmmtorch.evaluation.metrics import psnr_terms, roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries, hit_and_free, test_beams
-from gmmtorch.evaluation.split import split_indices
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.compaction import compact
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.protocol import OccupancyMap
-from gmmtorch.report.rate_distortion import QUALITIES, figures, leads
+from gmmtorch.report.rate_distortion import QUALITIES, bytes_for, figures, leads
 from gmmtorch.report.save import save_figure
+from gmmtorch.report.style import label_of
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.messages import ComponentsMessage, decode, encode_components
 from gmmtorch.sharing.point_bytes import compressed
@@ -59,26 +58,11 @@ from gmmtorch.sharing.point_codecs import (
     QuantizedPoints,
     RawPoints,
 )
-from gmmtorch.simulation.depth_camera import DepthCamera
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.warehouse import warehouse
 
-RESOLUTIONS = {"kinect": 0.05, "hall": 0.2, "warehouse": 0.2}  # metres, of the cells asked about
 COMPONENTS = (8, 16, 32, 64, 128, 256, 384)  # of a frame at most: our knob
-TEST_EVERY, MAX_BEAMS, SEED = 5, 5_000, 0
-PIXEL_STRIDE = 4  # kinect's images come to 160 × 120 pixels, as the simulated camera's
-POSES_APART, N_POSES = 9, 16  # neighbouring frames of kinect; frames of the warehouse
 FINER = 3  # than a map's rule: a frame by itself has more components than its share of a window
 RECEIVED = 1500  # components that a receiver merges all it got into, about as many as it learns from points
 _IDS_APART = 1 << 13
-
-
-class Frame(NamedTuple):
-    """A frame in the world frame; its depth image, and the points (N, 3) that any such image stands for."""
-
-    scan: Scan
-    depth: Tensor | None = None
-    points_of: Callable[[Tensor], Tensor] | None = None
 
 
 class Task(NamedTuple):
@@ -90,64 +74,6 @@ class Task(NamedTuple):
 
 
 Rows = list[dict[str, Any]]
-
-
-# -- data --------------------------------------------------------------------------------------------------
-
-
-def kinect(folder: Path) -> list[Frame]:
-    data = datasets.load("depth_frames", folder / "kinect", stride=POSES_APART)
-    assert isinstance(data, DepthFrames)
-    intrinsics = data.intrinsics.clone()
-    intrinsics[:2] /= PIXEL_STRIDE
-
-    def points_of(depth: Tensor, pose: Tensor) -> Tensor:
-        return back_project(depth, intrinsics) @ pose[:3, :3].T + pose[:3, 3]
-
-    frames = []
-    for depth, pose in (data.image(i) for i in range(len(data))):
-        thinned = depth[::PIXEL_STRIDE, ::PIXEL_STRIDE].contiguous()
-        to_points = partial(points_of, pose=pose)
-        frames.append(Frame(Scan(to_points(thinned), pose[:3, 3]), thinned, to_points))
-    return frames
-
-
-def hall(folder: Path) -> list[Frame]:
-    return [Frame(scan) for scan in datasets.load("scan_folder", folder / "hall", stride=3)]
-
-
-def simulated() -> list[Frame]:
-    """A depth camera on a walk through the warehouse, a metre from frame to frame, looking ahead."""
-    world, camera = MeshWorld(warehouse(SEED)), DepthCamera()
-    places = world.tour(N_POSES, stride=1)
-    ahead = places.roll(-1, 0) - places
-    ahead[-1] = ahead[-2]
-    generator = torch.Generator().manual_seed(SEED)
-
-    def points_of(depth: Tensor, pose: Tensor) -> Tensor:
-        seen = depth.flatten() > 0
-        turn, away = camera.directions[seen], depth.flatten()[seen, None]
-        cos, sin = float(pose[3].cos()), float(pose[3].sin())
-        turned = torch.stack([turn[:, 0] * cos - turn[:, 1] * sin, turn[:, 0] * sin + turn[:, 1] * cos], 1)
-        return pose[:3] + torch.cat([turned, turn[:, 2:]], 1) * (away / turn[:, :1])
-
-    frames = []
-    for place, heading in zip(places, torch.atan2(ahead[:, 1], ahead[:, 0]), strict=True):
-        pose = torch.cat([place, heading[None]])
-        taken = camera.sense(world, pose, torch.zeros(0, 3), 0.0, generator)
-        depth = torch.nan_to_num(camera.image(taken), nan=0.0, posinf=0.0)
-        frames.append(Frame(Scan(taken.ends[taken.is_hit], place), depth, partial(points_of, pose=pose)))
-    return frames
-
-
-@cache
-def material(name: str, folder: Path | None, n_frames: int | None) -> tuple[list[Frame], Queries]:
-    """The frames to be sent, and the questions that the held-out ones answer."""
-    frames = simulated() if name == "warehouse" else {"kinect": kinect, "hall": hall}[name](folder or Path())
-    frames = frames[:n_frames]
-    train, test = split_indices(len(frames), TEST_EVERY)
-    beams = test_beams([frames[i].scan for i in test], MAX_BEAMS, SEED)
-    return [frames[i] for i in train], hit_and_free(*beams, "uniform", RESOLUTIONS[name], SEED)
 
 
 # -- codecs of points --------------------------------------------------------------------------------------
@@ -308,7 +234,7 @@ def row(
         "setting": task.setting,
         "n_points": statistics.mean(len(frame.scan.points) for frame in frames),
         "nbytes": statistics.mean(map(len, data)),
-        "psnr2_db": statistics.mean(map(sum, terms)),
+        "psnr2_db": statistics.mean(map(sum, terms)),  # infinite where nothing is lost
         "psnr_lesser_db": statistics.mean(map(min, terms)),
         "psnr_forward_db": statistics.mean(term.forward for term in terms),
         "psnr_backward_db": statistics.mean(term.backward for term in terms),
@@ -340,21 +266,26 @@ def tasks_of(name: str, folder: Path | None, n_frames: int | None) -> list[Task]
 # -- what is written ---------------------------------------------------------------------------------------
 
 
-def best_rows(rows: Rows) -> list[list[object]]:
-    """Ours at each rate, and what every other codec takes for the same quality."""
-    return [
-        [
-            r["dataset"],
-            r["codec"].replace("_", " "),
-            f"{r['setting']:g}",
-            f"{r['nbytes']:,.0f}",
-            f"{r['psnr2_db']:.1f}",
-            f"{r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f}",
-            f"{r['auc']:.4f}",
-            r["receiver"].replace("_", " "),
-        ]
-        for r in rows
-    ]
+RIVALS = ("octree", "draco", "quantized", "depth_image", "depth_image_thinned", "thesis")
+SHOWN = (8, 32, 128, 384)  # components
+
+
+def equal_rows(rows: Rows) -> list[list[object]]:
+    """Ours, and what every other codec takes for the same PSNR2 and for the same AUC."""
+    found = []
+    for r in (r for r in rows if r["codec"] == "ours" and r["setting"] in SHOWN):
+        own = [other for other in rows if other["dataset"] == r["dataset"]]
+        cells: list[object] = [r["dataset"], f"{r['setting']:g}", f"{r['nbytes']:,.0f}"]
+        cells += [f"{r['psnr2_db']:.1f} ({r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f})"]
+        cells += [f"{r['auc']:.4f}"]
+        for codec in RIVALS:
+            needed = [bytes_for(own, codec, field, r[field]) for field in ("psnr2_db", "auc")]
+            known = any(other["codec"] == codec for other in own)
+            cells.append(
+                " / ".join(f"{n:,.0f}" if math.isfinite(n) else "–" for n in needed) if known else ""
+            )
+        found.append(cells)
+    return found
 
 
 def lead_rows(rows: Rows) -> list[list[object]]:
@@ -364,15 +295,20 @@ def lead_rows(rows: Rows) -> list[list[object]]:
         own = [r for r in rows if r["dataset"] == name]
         for quality, title in QUALITIES.items():
             cells: list[object] = [name, title]
-            for left_out in ((), ("depth_image_thinned",)):
-                lead = leads(own, quality, left_out=left_out)
-                cells.append(
-                    f"{lead.low:,.0f} to {lead.high:,.0f} B: {lead.octaves:.1f}" if lead.octaves else "none"
-                )
-                cells.append(f"{lead.most:.1f}" if lead.octaves else "")
-                cells.append(lead.ended_by.replace("_", " "))
+            for left_out in (("depth_image_thinned",), ()):
+                lead = leads(own, quality, left_out)
+                span = f"{lead.low:,.0f} to {lead.high:,.0f}: {lead.octaves:.1f}" if lead.octaves else "none"
+                end = f", then {label_of(lead.ended_by)}" if lead.ended_by else ""
+                cells += [span + end, f"{lead.most:.1f}" if lead.octaves else ""]
             found.append(cells)
     return found
+
+
+def printed(r: dict[str, Any]) -> str:
+    return (
+        f"{r['dataset']} {r['codec']} {r['setting']:g}: {r['nbytes']:,.0f} B, {r['psnr2_db']:.1f} dB, "
+        f"AUC {r['auc']:.4f} ({r['receiver']})"
+    )
 
 
 def main() -> None:
@@ -382,8 +318,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="processes, of a thread each")
     parser.add_argument("--frames", type=int, help="of each data set at most, for a quick look")
     parser.add_argument("--rows", type=Path, help="where to write all rows as JSON")
+    parser.add_argument("--again", type=Path, help="draw and write what such a file has; measure nothing")
     parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "rate_distortion.png")
     options = parser.parse_args()
+    if options.again:
+        write(json.loads(options.again.read_text()), options.figure, whole=True)
+        return
     if options.data is None and set(options.names) - {"warehouse"}:
         parser.error("kinect and hall need --data; --names warehouse needs none.")
     torch.set_num_threads(1)
@@ -394,33 +334,33 @@ def main() -> None:
             rows += found
             seconds += taken
             for r in found:
-                print(*best_rows([r])[0], flush=True)
-    rows = [r if math.isfinite(r["psnr2_db"]) else {**r, "psnr2_db": None} for r in rows]
+                print(printed(r), flush=True)
     if options.rows:
         write_bytes(options.rows, json.dumps(rows, indent=1).encode())
-    save_figure(figures(rows)["rate_distortion"], options.figure, dpi=100)
     print(f"{seconds / 60:.1f} minutes of the processor")
-    if options.frames is None and set(options.names) == set(RESOLUTIONS):
-        publish("rate-distortion", text(rows))
-    else:
-        print(text(rows))
+    write(rows, options.figure, options.frames is None and set(options.names) == set(RESOLUTIONS))
 
 
-def text(rows: Rows) -> str:
-    header = ["", "", "rates of ours: octaves", "times fewer bytes, at most", "ended by"]
-    header += ["thinned images left out: octaves", "times, at most", "ended by"]
-    mixtures = [r for r in rows if r["codec"] == "ours"]
-    own = [
+def write(rows: Rows, figure: Path, whole: bool) -> None:
+    """The figure; and the tables into the page, if they are of all data sets, else on the screen."""
+    save_figure(figures(rows)["rate_distortion"], figure, dpi=100)
+    leads_header = [
         "",
-        "",
-        "components at most",
-        "bytes a frame",
-        "PSNR2 (dB)",
-        "its terms (dB)",
-        "AUC",
-        "answered by",
+        "quality",
+        "ours ahead of full-size codecs, bytes a frame: octaves",
+        "times fewer, at most",
     ]
-    return f"{hardware()}\n\n{markdown(header, lead_rows(rows))}\n\n{markdown(own, best_rows(mixtures))}"
+    leads_header += ["and of images of fewer pixels", "times fewer, at most"]
+    header = ["", "components at most", "bytes a frame", "PSNR2 (its terms), dB", "AUC"]
+    tables = [
+        markdown(leads_header, lead_rows(rows)),
+        markdown([*header, *(label_of(codec) for codec in RIVALS)], equal_rows(rows)),
+    ]
+    text = "\n\n".join([hardware(), *tables])
+    if whole:
+        publish("rate-distortion", text)
+    else:
+        print(text)
 
 
 if __name__ == "__main__":

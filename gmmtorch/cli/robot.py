@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common, links, schema
+from gmmtorch.cli import common, links, maps, schema
 
 if TYPE_CHECKING:
+    from gmmtorch.datasets import Dataset
     from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.node import Node
     from gmmtorch.sharing.framed_transport import FramedTransport
     from gmmtorch.sharing.journal import Journal
-    from gmmtorch.sharing.network import Transport
     from gmmtorch.sharing.replica import Replica
 
 _TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
@@ -64,6 +64,7 @@ def run(config: DictConfig, answers: IO[str] | None = None) -> None:
     folder = common.run_dir()
     with ExitStack() as stack:
         transport = links.open_link(config, config.id)
+        transport.lose(config.network.loss, config.seed + config.id)
         stack.callback(transport.close)
         node = (
             _flying(config, folder, transport)
@@ -95,24 +96,56 @@ def _flying(config: DictConfig, folder: Path, transport: FramedTransport) -> Fly
     # A life that nobody has led: what is told twice must be told as two. In step nobody starts again.
     life = 0 if config.clock == "lockstep" else drawn_incarnation()
     pose = start_poses(world, options)[config.id]
-    agent = make_agent(config.id, pose, world, options, _worsened(config, transport), incarnation=life)
+    agent = make_agent(config.id, pose, world, options, transport, incarnation=life)
     replica = getattr(agent.robot.mapper, "shared", None)
     journal = None if config.clock == "lockstep" else _journal(config, folder, replica)
     return FlyingNode(agent, world, options, transport, journal)
 
 
 def _replay(config: DictConfig, folder: Path, transport: FramedTransport) -> Node:
-    """A robot that maps a recorded log."""
-    raise NotImplementedError
+    """A robot that maps a recorded log, or its part of one."""
+    from gmmtorch.datasets.part import Part, part_of
+    from gmmtorch.errors import check_whole
+    from gmmtorch.exploration.replay import ReplayNode
+    from gmmtorch.sharing.replica import Replica
+
+    scans = _scans(config)
+    indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
+    part = part_of(len(indices), config.id, config.team.size, config.log.part)
+    replica = Replica(config.id)
+    journal = _journal(config, folder, replica)
+    return ReplayNode(
+        replica,
+        Part(scans, [indices[row] for row in part]),
+        transport,
+        maps.map_factory(_map_options(config)),
+        journal=journal,
+        folder=None if journal is None else _home(config, folder) / f"progress_{config.id}",
+        facts={"dataset": str(common.as_options(config.log))},
+        announce_every=config.network.announce,
+        budget=config.network.budget,
+    )
 
 
-def _worsened(config: DictConfig, transport: FramedTransport) -> Transport:
-    """The transport, with the losses of `network.loss`."""
-    from gmmtorch.sharing.lossy import LossyTransport
+def _scans(config: DictConfig) -> Dataset:
+    from gmmtorch.errors import InvalidArgumentError
 
-    if config.network.loss == 0:
-        return transport
-    return LossyTransport(transport, config.network.loss, config.seed + config.id)
+    if config.log.dataset is None:
+        raise InvalidArgumentError(
+            "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
+        )
+    return common.open_dataset(config.log.dataset)
+
+
+def _map_options(config: DictConfig) -> DictConfig:
+    """What `maps.map_factory` reads: `log.map`, learned on the CPU."""
+    runtime = {"memory_limit": config.runtime.memory_limit, "compile": False, "dtype": "float64"}
+    return OmegaConf.create({"map": config.log.map, "runtime": runtime, "seed": config.seed})
+
+
+def _home(config: DictConfig, folder: Path) -> Path:
+    """Where what the robot needs to start again is kept."""
+    return folder if config.journal.folder is None else Path(config.journal.folder)
 
 
 def _journal(config: DictConfig, folder: Path, replica: Replica | None) -> Journal | None:
@@ -122,8 +155,7 @@ def _journal(config: DictConfig, folder: Path, replica: Replica | None) -> Journ
 
     if not config.journal.enabled or not isinstance(replica, Replica):
         return None
-    home = folder if config.journal.folder is None else Path(config.journal.folder)
-    return Journal(home / f"journal_{config.id}", replica, sync=config.journal.sync)
+    return Journal(_home(config, folder) / f"journal_{config.id}", replica, sync=config.journal.sync)
 
 
 # -- its time -------------------------------------------------------------------------------------
@@ -132,29 +164,36 @@ def _journal(config: DictConfig, folder: Path, replica: Replica | None) -> Journ
 def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
     """Until its work is done, and the team has had time to catch up; or until it is told to stop."""
     from gmmtorch.cli.robot_report import RobotReport
-    from gmmtorch.exploration.node import run_paced
+    from gmmtorch.exploration.node import check_number, run_paced
 
     stop = threading.Event()
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: stop.set())
     with RobotReport(config, node, folder) as report:
+
+        def show(_: Node, now: float) -> None:
+            check_number(node)
+            report(now)
+
         run_paced(
             node,
             rate=config.sensor.rate if config.source == "world" else config.log.rate,
             speed=config.speed,
             settle=config.settle,
             stop=stop.is_set,
-            on_status=report,
+            on_status=show,
         )
     row = _leave(config, node, folder)
     common.print_table([row], _TABLE.split(), f"robot {config.id}")
     common.print_files(folder, folder / "results.json")
 
 
-def _in_step(config: DictConfig, node: FlyingNode, folder: Path, answers: IO[str]) -> None:
+def _in_step(config: DictConfig, node: Node, folder: Path, answers: IO[str]) -> None:
     from gmmtorch.cli.robot_report import RobotReport
+    from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.lockstep import Serving
 
+    assert isinstance(node, FlyingNode)  # with source=world
     with RobotReport(config, node, folder) as report:
         Serving(node, lambda: _leave(config, node, folder), report).serve(sys.stdin, answers)
 

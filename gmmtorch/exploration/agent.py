@@ -166,9 +166,9 @@ class Agent:
                 self.robot.library.receive(item.message)
 
     def _note_plan(self, plan: PlanMessage, now: float) -> None:
-        """Keep a teammate's plan, unless a later one has overtaken it."""
+        """Keep a teammate's plan, unless it is known, or a later one has overtaken it."""
         known = self.robot.plans.get(plan.sender)
-        if known is None or not 0 < known.number - plan.number <= _LATE:
+        if known is None or not 0 <= known.number - plan.number <= _LATE:
             self.robot.plans[plan.sender] = plan
             self.heard_at[plan.sender] = now
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import OutputError
 from gmmtorch.exploration.agent import Agent
 from gmmtorch.exploration.collisions import collides, finely
+from gmmtorch.exploration.forgiving_journal import ForgivingJournal
 from gmmtorch.exploration.mixture_mapper import MixtureMapper
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.traffic import Traffic
@@ -25,8 +23,6 @@ from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.messages import PlanMessage
 from gmmtorch.sharing.network import HEADER_BYTES
 from gmmtorch.sharing.replica import Replica
-
-_log = logging.getLogger(__name__)
 
 
 class FlyingNode:
@@ -49,9 +45,10 @@ class FlyingNode:
         journal: Journal | None = None,
     ) -> None:
         self.agent, self.world, self.options = agent, world, options
-        self.transport, self._journal = transport, journal
-        if journal is not None:
-            agent.keep_in(_Forgiving(journal))
+        self.transport = transport
+        self._logbook = None if journal is None else ForgivingJournal(journal)
+        if self._logbook is not None:
+            agent.keep_in(self._logbook)
         self._n_ticks = 0
         self._flown = [agent.robot.state[:4].clone()]
         self.times: list[float] = []
@@ -179,6 +176,7 @@ class FlyingNode:
             "dropped": transport.n_dropped,
             "path_length": robot.path_length,
             "collisions": robot.collisions,
+            "unkept": 0 if self._logbook is None else self._logbook.n_failed,
             "stage_seconds": self.agent.stage_seconds,
         }
 
@@ -205,31 +203,9 @@ class FlyingNode:
 
     def close(self) -> None:
         """Close the journal and the transport."""
-        if self._journal is not None:
-            self._journal.close()
+        if self._logbook is not None:
+            self._logbook.close()
         self.transport.close()
-
-
-class _Forgiving:
-    """A journal without which a robot goes on, if its disk fails: teammates have what it said."""
-
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
-        self.n_failed = 0
-
-    def said(self, datagrams: Sequence[bytes]) -> None:
-        self._keep(self._journal.said, datagrams)
-
-    def heard(self, datagrams: Sequence[bytes]) -> None:
-        self._keep(self._journal.heard, datagrams)
-
-    def _keep(self, keep: Callable[[Sequence[bytes]], None], datagrams: Sequence[bytes]) -> None:
-        try:
-            keep(datagrams)
-        except OutputError as error:
-            self.n_failed += 1
-            if self.n_failed == 1:
-                _log.warning("The map is no longer kept on disk, and the robot goes on: %s", error)
 
 
 def _ahead(plan: PlanMessage, age: float) -> Tensor:

@@ -23,7 +23,7 @@ class ForgivingJournal:
     """
 
     def __init__(self, journal: Journal) -> None:
-        self._journal = journal
+        self._journal, self._is_open = journal, True
         self.n_failed = 0
         self._waited = self._patience = 0
         """Batches since the last try, and how many to let pass; 0: all is kept."""
@@ -36,8 +36,9 @@ class ForgivingJournal:
 
     def close(self) -> None:
         """With a last snapshot, if the disk takes it. May be called again."""
-        if not self._journal.is_open:
+        if not self._is_open:
             return
+        self._is_open = False
         try:
             self._journal.snapshot()
         except OutputError as error:
@@ -60,7 +61,7 @@ class ForgivingJournal:
             self._waited, self._patience = 0, min(2 * self._patience or 1, _MOST_PATIENCE)
 
     def _caught_up(self) -> bool:
-        """Whether a snapshot has been written; else, with `OutputError`, it cannot be, or is not tried yet."""
+        """Whether a snapshot has been written; `OutputError` where it cannot be, False if it is not time."""
         self._waited += 1
         if self._waited < self._patience:
             return False

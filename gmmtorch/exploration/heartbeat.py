@@ -31,7 +31,7 @@ class Heartbeat:
         """Whether it is time, at `now` (s), to announce a content that these numbers stand for; it is taken
         to be done then. The first call starts the first period; so does a clock that was set back."""
         if self._last is None or now < self._last:
-            self._last, self._said = now, content
+            self._last, self._said, self._wait = now, content, self._period
             return False
         wait = self._wait if content == self._said else self._period
         if now - self._last < wait - 1e-9:

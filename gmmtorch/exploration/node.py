@@ -66,7 +66,7 @@ def check_number(node: Node) -> None:
 
 
 class Paced(NamedTuple):
-    """ticks: that were due and done; late: of them, delayed by the one before; seconds: of the robots' time."""
+    """ticks: done; late: of them, delayed by the one before; seconds: of the robots' time."""
 
     ticks: int
     late: int
@@ -89,8 +89,8 @@ def run_paced(
     """Run robots by the clock until their work is over, and on until nothing new comes.
 
     Between ticks they listen, every 20 ms at least. A tick that takes longer than its time delays all that
-    follow, of which none is left out, and none hurried. The time of day is not asked for; a `clock` that
-    is set back stands still for that step.
+    follow; none is left out, and none hurried. The time of day is not asked for; a `clock` that is set back
+    stands still for that step.
 
     Args:
         nodes: one, or several that share this thread.
@@ -103,7 +103,7 @@ def run_paced(
     Whatever a node raises ends it. Nodes are not closed.
     """
     _check(rate=rate, speed=speed, status_every=status_every)
-    if not (0 <= settle < math.inf and (duration is None or 0 <= duration)):
+    if not (0 <= settle < math.inf) or not (duration is None or duration >= 0):
         raise InvalidArgumentError(f"settle={settle} and duration={duration} must be at least zero seconds.")
     team = list(nodes) if isinstance(nodes, Sequence) else [nodes]
     stopped = stop or (lambda: False)

@@ -16,7 +16,6 @@ from gmmtorch.sharing.journal_files import read, write_durably
 
 _KIND, _VERSION = "progress", 1
 _DIGEST_BYTES = 16
-_KEPT = 2
 _MOST_BYTES = 1 << 30
 _log = logging.getLogger(__name__)
 
@@ -34,6 +33,7 @@ class Progress:
     def __init__(self, folder: str | Path, **facts: Any) -> None:
         self.folder = Path(folder)
         self._facts = json.loads(json.dumps(facts))
+        self._last: int | None = None  # that is sound, for all that is known
 
     @property
     def farthest(self) -> int | None:
@@ -45,7 +45,10 @@ class Progress:
         tree, tensors = split_tensors(state)
         data = pack_tensors(tensors, _KIND, _VERSION, tree=tree, facts=self._facts)
         write_durably(self._place(n_scans), _digest(data) + data)
-        for number in self._numbers()[:-_KEPT]:
+        # One that is damaged stays until there is a newer one: it tells how far the robot was.
+        old = [number for number in self._numbers() if number < n_scans and number != self._last]
+        self._last = n_scans
+        for number in old:
             with contextlib.suppress(OSError):
                 self._place(number).unlink()
         for fragment in self.folder.glob(".map-*.state"):
@@ -69,6 +72,7 @@ class Progress:
                 state: dict[str, Any] = joined_tensors(about["tree"], tensors)
             except (KeyError, TypeError, AttributeError) as error:
                 raise DataError(f"{path} is no state of a map ({error!r}).") from error
+            self._last = number
             return number, state
         return None
 
@@ -86,7 +90,9 @@ class Progress:
 
     def _numbers(self) -> list[int]:
         """Of the files that are there, rising."""
-        matches = (re.fullmatch(r"map-(\d{8,18})\.state", path.name) for path in self.folder.glob("map-*.state"))
+        matches = (
+            re.fullmatch(r"map-(\d{8,18})\.state", path.name) for path in self.folder.glob("map-*.state")
+        )
         return sorted(int(match[1]) for match in matches if match)
 
 

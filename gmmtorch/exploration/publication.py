@@ -27,6 +27,7 @@ class Publication:
 
         whole: the map has all that earlier lives have said, too: what it does not have of that, goes.
         """
+        components = Components(**{name: value.detach().cpu() for name, value in vars(components).items()})
         theirs = self._of_earlier_lives()
         spare: dict[bytes, list[int]] = {}
         for sequence, print_ in [*theirs.items(), *self._said.items()]:  # the latter are taken first
@@ -42,7 +43,9 @@ class Publication:
         gone = left if whole else left & self._said.keys()
         self._said = kept
         if fresh or gone:
-            old = torch.tensor([[self._replica.robot, sequence] for sequence in sorted(gone)], dtype=torch.int64)
+            old = torch.tensor(
+                [[self._replica.robot, sequence] for sequence in sorted(gone)], dtype=torch.int64
+            )
             ids = self._replica.add(components.selected(torch.tensor(fresh, dtype=torch.int64)), old)
             self._said.update(zip(ids[:, 1].tolist(), (prints[row] for row in fresh), strict=True))
 

@@ -26,6 +26,7 @@ from gmmtorch.files import write_json, write_npz
 
 CHECKPOINT = "mission.safetensors"
 ROW = "row.json"
+_PATIENCE = 120.0  # simulated seconds after a mission, for maps to become the same
 TRAJECTORIES = "trajectories.npz"
 
 OnSample = Callable[[Mission], None]
@@ -110,7 +111,11 @@ def run_mission(
         if path is not None and every > 0 and (mission.tick % every == 0 or mission.is_over):
             state = {"mission": mission.state(), "wall_seconds": time.perf_counter() - begin}
             save_checkpoint(path, state, **trial.facts())
-    return mission, row_of(mission, time.perf_counter() - begin)
+    row = row_of(mission, time.perf_counter() - begin)
+    repaired = (
+        mission.converge(_PATIENCE) if any(agent.robot.mapper.digest() for agent in mission.agents) else None
+    )
+    return mission, {**row, "converged_after": repaired}
 
 
 def run_trials(

@@ -429,8 +429,10 @@ class GaussianMap(nn.Module):
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on as the map whose `state` is given, with this one's seed and answering. Raises `DataError` for a
-        state that is damaged; nothing has changed then."""
+        """Go on as the map whose `state` is given, with this one's seed and answering.
+
+        Raises `DataError` for a state that is damaged; nothing has changed then.
+        """
         try:
             learning = _read_rule(**state["learning"])
             components = None if state["components"] is None else Components(**state["components"]).checked()
@@ -440,7 +442,7 @@ class GaussianMap(nn.Module):
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
         self.learning, self._pending, self._n_windows = learning, pending, n_windows
-        for name in _BUFFERS if components is None else ():
+        for name in _BUFFERS:
             self._buffers.pop(name, None)
         if components is not None:
             self._set(components)

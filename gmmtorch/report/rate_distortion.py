@@ -71,7 +71,7 @@ def leads(rows: Rows, quality: str, left_out: Sequence[str] = (), ours: str = OU
     """Over which rates `ours` is at or below every other codec in bytes at equal quality.
 
     Args:
-        rows: of one data set: codec, nbytes, and `quality` (the more the better; None: without bound).
+        rows: of one data set: codec, nbytes, and `quality`, the more the better, ∞ where nothing is lost.
         left_out: codecs that are not compared with, besides other ways to write our components.
 
     Raises `InvalidArgumentError` where there are no rows of ours, or of no other.
@@ -103,14 +103,19 @@ def leads(rows: Rows, quality: str, left_out: Sequence[str] = (), ours: str = OU
     )
 
 
+def bytes_for(rows: Rows, codec: str, quality: str, value: float) -> float:
+    """Least bytes with which a codec reaches `value`, as in `leads`; ∞ where it never does, or is absent."""
+    curve = _curve(rows, codec, quality)
+    return float(2 ** curve.bytes_for(np.array(value))) if len(curve.quality) else math.inf
+
+
 def _curve(rows: Rows, codec: str, quality: str) -> _Curve:
     """The settings of a codec that no smaller one of it is as good as."""
     own = sorted((row for row in rows if row["codec"] == codec), key=lambda row: row["nbytes"])
     kept: list[tuple[float, float]] = []
     for row in own:
-        reached = math.inf if row[quality] is None else float(row[quality])
-        if not kept or reached > kept[-1][1]:
-            kept.append((math.log2(row["nbytes"]), reached))
+        if not kept or row[quality] > kept[-1][1]:
+            kept.append((math.log2(row["nbytes"]), float(row[quality])))
     table = np.array(kept).reshape(-1, 2)
     return _Curve(table[:, 0], np.minimum(table[:, 1], 1e6))  # differences of infinities are none
 
@@ -156,7 +161,7 @@ def figures(rows: Rows) -> dict[str, Figure]:
 def _draw(axes: Axes, rows: Rows, quality: str) -> None:
     for codec, (label, colour, mark, style) in _LINES.items():
         own = sorted(
-            (row for row in rows if row["codec"] == codec and row[quality] is not None),
+            (row for row in rows if row["codec"] == codec and math.isfinite(row[quality])),
             key=lambda row: row["nbytes"],
         )
         if own:

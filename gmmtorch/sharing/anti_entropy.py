@@ -13,6 +13,9 @@ from gmmtorch.sharing.announce_messages import AnnouncementMessage
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import keys_of_robot
 
+_ON_THE_WAY = 2
+"""Calls after which what was sent must have come: who announces between two of them, and is heard after the
+second, had not heard the first."""
 MOST_PEERS = 64
 """Robots whose gaps are remembered, those heard last."""
 
@@ -32,7 +35,7 @@ class Backlog:
         self._own = keys_of_robot(robot)
         self.due = Intervals.empty()
         self.ready: list[Packet] = []
-        self._passing = Intervals.empty()  # heard, or sent by the last call
+        self._passing = [Intervals.empty()] * _ON_THE_WAY  # heard or sent; since the last call, and before
         self._gaps: OrderedDict[int, Intervals] = OrderedDict()
 
     def add(self, keys: Intervals, packets: Sequence[Packet] = ()) -> None:
@@ -43,28 +46,48 @@ class Backlog:
     def heard(self, keys: Intervals) -> None:
         """Somebody, perhaps this robot again, has said it."""
         self.due -= keys
-        self._passing |= keys
+        self._passing[0] |= keys
 
     def sent(self, keys: Intervals) -> None:
         """All that this robot has sent since the last call."""
         self.due -= keys
-        self._passing = keys
+        self._passing = [keys, *self._passing[:-1]]
         self.ready = [packet for packet in self.ready if self.due.covers(packet[1])]
 
     def announced(self, message: AnnouncementMessage, held: Intervals) -> None:
         """Another robot says what it holds; `held`: what is here."""
         gap = (held & message.scope) - message.held
         before = self._gaps.pop(message.sender, Intervals.empty())
-        self.due |= ((gap & self._own) | (gap & before)) - self._passing
+        lacking = (gap & self._own) | (gap & before)
+        for passing in self._passing:
+            lacking -= passing
+        self.due |= lacking
         self._gaps[message.sender] = (before - message.scope) | gap
         while len(self._gaps) > MOST_PEERS:
             self._gaps.popitem(last=False)
 
     def state(self) -> dict[str, Any]:
-        return {"due": torch.from_numpy(self.due.edges.copy())}
+        return {
+            "due": _tensor(self.due),
+            "passing": [_tensor(keys) for keys in self._passing],
+            "gaps": [[robot, _tensor(gap)] for robot, gap in self._gaps.items()],
+            "ready": [
+                [torch.frombuffer(bytearray(datagram), dtype=torch.uint8), _tensor(keys)]
+                for datagram, keys in self.ready
+            ],
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Who lacked what is asked anew."""
-        due = Intervals(state["due"].numpy().astype(np.int64))
-        self.due, self._passing, self._gaps = due, Intervals.empty(), OrderedDict()
-        self.ready = []
+        """Go on from a `state`."""
+        self.due = _intervals(state["due"])
+        self._passing = [_intervals(keys) for keys in state["passing"]][:_ON_THE_WAY]
+        self._gaps = OrderedDict((int(robot), _intervals(gap)) for robot, gap in state["gaps"])
+        self.ready = [(data.numpy().tobytes(), _intervals(keys)) for data, keys in state["ready"]]
+
+
+def _tensor(keys: Intervals) -> torch.Tensor:
+    return torch.from_numpy(keys.edges.copy())
+
+
+def _intervals(edges: torch.Tensor) -> Intervals:
+    return Intervals(edges.numpy().astype(np.int64))

@@ -30,8 +30,8 @@ from gmmtorch.sharing.messages import (
 class Broadcast:
     """A `Replica` that does not care what others have: for networks that lose nothing, and to compare.
 
-    The sender holds what its datagrams decode to. Components that come twice count once. Counts count whenever
-    they come, as nothing tells them apart, and of components that have not come they are left out.
+    The sender holds what its datagrams decode to. Components that come twice count once. Counts count
+    whenever they come, as nothing tells them apart; of components that have not come they are left out.
     """
 
     def __init__(self, robot: int, codec: str = "thesis") -> None:

@@ -39,7 +39,7 @@ class Changes:
     rebuilt: bool
 
 
-class Journal:
+class ChangeLog:
     """How far somebody has followed. It costs nothing until it is first asked."""
 
     def __init__(self, rebuilt: bool = False) -> None:
@@ -104,12 +104,12 @@ class Journal:
         }
 
     @classmethod
-    def restored(cls, state: dict[str, Any], n_batches: int) -> Journal:
+    def restored(cls, state: dict[str, Any], n_batches: int) -> ChangeLog:
         """..., where so many batches are in the table that were told."""
         told, sums = state["told"].tolist(), state["sums"].tolist()
         if not (state["sums"].isfinite() & (state["sums"] >= 0)).all():
             raise DataError("What was told of totals is damaged.")
-        journal = cls()
-        journal._batch, journal._rebuilt = n_batches, bool(state["rebuilt"])
-        journal._told = dict(zip(told, sums, strict=True)) if state["asked"] else None
-        return journal
+        log = cls()
+        log._batch, log._rebuilt = n_batches, bool(state["rebuilt"])
+        log._told = dict(zip(told, sums, strict=True)) if state["asked"] else None
+        return log

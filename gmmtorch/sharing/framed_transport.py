@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import random
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
@@ -42,6 +43,9 @@ class FramedTransport(ABC):
         """How often the network failed, by the name of the error."""
         self.n_dropped = 0
         """Datagrams that were opened, waited, and had to give way to newer ones."""
+        self.n_lost = 0
+        """Datagrams that were thrown away, as `lose` asked for."""
+        self._loss, self._drawn = 0.0, random.Random(0)
         self._broadcast: dict[str, Traffic] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -76,6 +80,12 @@ class FramedTransport(ABC):
             delivered = list(self._waiting)
             self._waiting.clear()
         return delivered
+
+    def lose(self, share: float, seed: int = 0) -> None:
+        """From now on throw away a share, [0, 1), of the datagrams that come: to try what a team makes of it."""
+        if not 0 <= share < 1:
+            raise InvalidArgumentError(f"share={share} must be a share of the datagrams in [0, 1).")
+        self._loss, self._drawn = float(share), random.Random(seed)
 
     # -- the books -----------------------------------------------------------------------------------------
 
@@ -130,7 +140,9 @@ class FramedTransport(ABC):
         opened = self._opener.open(frame, source)
         with self._lock:
             self.received = _sum(self.received, Traffic(1, len(frame)))
-            if opened is not None:
+            if opened is not None and self._drawn.random() < self._loss:
+                self.n_lost += 1
+            elif opened is not None:
                 if len(self._waiting) == self._max_waiting:
                     self._waiting.popleft()
                     self.n_dropped += 1

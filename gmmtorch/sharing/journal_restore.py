@@ -46,10 +46,13 @@ def restore(folder: Path, replica: Replica) -> Restored:
     n_merged = n_refused = n_torn = 0
     for number in numbers(folder, LOG):
         if newest is None or number >= newest:  # again, perhaps: merging is idempotent
-            log = _log_of(place(folder, number, LOG), replica, damage)
-            taken = sum(replica.receive(datagram) for datagram in log.datagrams)
-            n_merged, n_refused = n_merged + taken, n_refused + len(log.datagrams) - taken
-            n_torn += log.n_torn
+            path = place(folder, number, LOG)
+            log = _log_of(path, replica, damage)
+            merged = sum(replica.receive(datagram) for datagram in log.datagrams)
+            refused = len(log.datagrams) - merged
+            if refused:
+                damage.append(f"{path}: the replica refuses {refused} datagrams: {dict(replica.refused)}.")
+            n_merged, n_refused, n_torn = n_merged + merged, n_refused + refused, n_torn + log.n_torn
     if damage and newest is None and not n_merged:
         raise DataError(
             f"{folder} holds nothing of a journal that can be read: {damage[0]} Move the folder away and "

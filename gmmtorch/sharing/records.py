@@ -19,7 +19,7 @@ from gmmtorch.sharing.announce_messages import (
     TotalsMessage,
     encode_record,
 )
-from gmmtorch.sharing.changes import Changes, Journal
+from gmmtorch.sharing.changes import Changes, ChangeLog
 from gmmtorch.sharing.component_table import ComponentTable, fingerprints, most_sightings
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import decode
@@ -71,7 +71,7 @@ class Records:
         """Rises with every change."""
         self._kinds: dict[type, dict[int, RecordMessage]] = {}  # the others by kind
         self._waiting: dict[int, SupersessionMessage] = {}  # for successors
-        self._journal = Journal()
+        self._log = ChangeLog()
         self._view: tuple[int, Components] | None = None
 
     # -- growing ----------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ class Records:
             self._waiting[key] = record
         elif isinstance(record, TotalsMessage):
             self.totals.add(record)
-            self._journal.counted(record.components)
+            self._log.counted(record.components)
         else:
             self._moved(record)
         self._hold(span)
@@ -171,7 +171,7 @@ class Records:
         shapes = self.table.holds(keys)
         if shapes.any():
             self.table.drop(keys[shapes])
-            self._journal.broken()
+            self._log.broken()
         totals = []
         for key in keys[~shapes].tolist():
             record = self.others.pop(key)
@@ -179,7 +179,7 @@ class Records:
             self._waiting.pop(key, None)
             if isinstance(record, TotalsMessage):
                 totals.append(record)
-                self._journal.counted(record.components)
+                self._log.counted(record.components)
             elif isinstance(record, CorrectionMessage):
                 self._moved(record)
         self.totals.drop(totals)
@@ -187,7 +187,7 @@ class Records:
     def _moved(self, correction: CorrectionMessage) -> None:
         """A correction has come, or has gone."""
         if (correction.moved & self.held) - self.dead:
-            self._journal.broken()
+            self._log.broken()
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -217,11 +217,11 @@ class Records:
 
     def changes(self) -> Changes:
         """What has come to be known since the last call."""
-        return self._journal.taken(self.table, self.totals, self.of(CorrectionMessage))
+        return self._log.taken(self.table, self.totals, self.of(CorrectionMessage))
 
     def break_off(self) -> None:
         """Whoever follows the changes has to start over."""
-        self._journal = Journal(rebuilt=True)
+        self._log = ChangeLog(rebuilt=True)
 
     def digest(self) -> bytes:
         """16 bytes: equal if all that is held, and all that counts, is equal to the bit."""
@@ -244,7 +244,7 @@ class Records:
             "components": dict(vars(components)),
             "record_bytes": torch.tensor([len(datagram) for datagram in datagrams], dtype=torch.int64),
             "records": torch.frombuffer(bytearray(b"".join(datagrams) or b"\0"), dtype=torch.uint8),
-            "journal": self._journal.state(self.table),
+            "log": self._log.state(self.table),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -253,11 +253,11 @@ class Records:
         components = Components(**state["components"]).checked()
         if fingerprints(quantized(components)) != fingerprints(components):
             raise DataError("Components are not as the codec leaves them: the state is damaged.")
-        keys, journal = keys_of(components.ids), state["journal"]
-        untold = [batch.numpy() for batch in journal["keys"].split(journal["sizes"].tolist())]
-        if not np.isin(journal["keys"].numpy(), keys).all():
+        keys, log = keys_of(components.ids), state["log"]
+        untold = [batch.numpy() for batch in log["keys"].split(log["sizes"].tolist())]
+        if not np.isin(log["keys"].numpy(), keys).all():
             raise DataError("Components that came are not there: the state is damaged.")
-        told = np.flatnonzero(~np.isin(keys, journal["keys"].numpy()))
+        told = np.flatnonzero(~np.isin(keys, log["keys"].numpy()))
         pieces = [told[begin : begin + _PIECE] for begin in range(0, len(told), _PIECE)]
         row_of = dict(zip(keys.tolist(), range(len(keys)), strict=True))
         pieces += [np.array([row_of[key] for key in batch.tolist()], np.int64) for batch in untold]
@@ -270,7 +270,7 @@ class Records:
         held = Intervals(state["held"].numpy().astype(np.int64))
         fresh.dead = held - fresh.live()
         fresh._hold(held)
-        fresh._journal = Journal.restored(journal, len(pieces) - len(untold))
+        fresh._log = ChangeLog.restored(log, len(pieces) - len(untold))
         fresh.version = self.version + 1
         fresh._view = None
         vars(self).update(vars(fresh))

@@ -138,6 +138,7 @@ def test_a_mission_that_was_interrupted_ends_as_one_that_was_not(
     )
     cut = Partition(3.0, 6.5, ((0,), (1,)))
     options = replace(options, jitter=0.4, duplication=0.3, reach=4.0, partitions=(cut,))
+    options = replace(options, budget=700.0, announce_every=2.0)
     whole = flown(world, options)
     path = save_checkpoint(tmp_path / "half.safetensors", flown(world, options, to=5).state())
     resumed = assemble(world, options)
@@ -213,15 +214,74 @@ def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) 
 
 
 def test_robots_that_hear_everything_hold_the_same_components(world: World) -> None:
-    mission = flown(world, replace(SMALL, duration=9.0, latency=0.0))
-    for robot in mission.robots:
-        robot.mapper.center_on(robot.position)
-    mission._exchange(1e6)
-    held = [robot.mapper.components() for robot in mission.robots]
-    one, other = (h for h in held if isinstance(h, Components))
+    mission = flown(world, replace(SMALL, duration=9.0))
+    assert mission.converge(0.0) == 0.0
+    one, other = (robot.mapper.components() for robot in mission.robots)
+    assert isinstance(one, Components)
+    assert isinstance(other, Components)
+    for name, value in vars(one).items():
+        assert torch.equal(value, getattr(other, name)), name
+    assert row_of(mission, 1.0)["missing_share"][-1] == 0
+
+
+@pytest.mark.parametrize("codec", ["float", "thesis"])
+def test_what_is_broadcast_is_held_by_all_where_nothing_is_lost(world: World, codec: str) -> None:
+    mission = flown(world, replace(SMALL, duration=6.0, codec=codec))
+    one, other = (robot.mapper.components() for robot in mission.robots)
+    assert isinstance(one, Components)
+    assert isinstance(other, Components)
+    assert len(one) > 10
     assert torch.equal(one.ids, other.ids)
     assert torch.equal(one.means, other.means)
     torch.testing.assert_close(one.support, other.support)
+
+
+def test_what_a_bad_network_loses_is_repaired(world: World) -> None:
+    """Half is lost, some comes twice, and late: in the end all hold the same, to the last bit."""
+    trouble = {"loss": 0.5, "duplication": 0.3, "jitter": 0.5, "latency": 0.3}
+    mission = flown(world, replace(SMALL, size=3, duration=10.0, **trouble))
+    row = row_of(mission, 1.0)
+    assert max(row["missing_share"]) > 0
+    assert row["reception"]["lost"] > 0 < row["reception"]["duplicated"]
+    held = mission.robots[0].mapper.held
+    for robot in mission.robots[1:]:
+        held |= robot.mapper.held
+    seconds = mission.converge(120)
+    assert seconds is not None
+    assert seconds > 0
+    assert len({agent.digest() for agent in mission.agents}) == 1
+    one, *others = (robot.mapper for robot in mission.robots)
+    assert one.held.covers(held)  # nothing that anybody knew is gone
+    first = one.components()
+    hits, misses = one.belief.grid.dense(world.box)
+    for other in others:
+        second = other.components()
+        assert isinstance(second, Components)
+        for name, value in vars(first).items():
+            assert torch.equal(value, getattr(second, name)), name
+        found = other.belief.grid.dense(world.box)
+        torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found[1], misses, rtol=1e-4, atol=1e-3)
+        assert other.belief.entropy_bits == pytest.approx(one.belief.entropy_bits, rel=1e-4)
+
+
+def test_robots_that_never_agree_are_told_so(world: World) -> None:
+    mission = flown(world, replace(SMALL, duration=4.0, partitions=(Partition(0.0, 1e9, ((0,), (1,))),)))
+    assert mission.converge(20) is None
+    assert row_of(mission, 1.0)["missing_share"][-1] > 0.2
+
+
+@pytest.mark.parametrize("framework", ["gmm_shared", "grid_shared"])
+def test_a_budget_bounds_what_is_sent_of_maps(world: World, framework: str) -> None:
+    options = replace(SMALL, framework=framework, duration=10.0)
+    rows = [row_of(flown(world, replace(options, budget=budget)), 1.0) for budget in (None, 5.0)]
+    free, bound = (
+        sum(row["bytes_by_kind"].get(kind, 0) for kind in ("components", "counts", "points", "supersessions"))
+        for row in rows
+    )
+    most = options.size * (5.0 * 9.0 + 1200)  # the burst is one datagram
+    assert 0 < bound <= most < free
+    assert rows[1]["bytes_by_kind"]["plans"] > 0
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.9])

@@ -12,12 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.rate_distortion import figures, leads
+from gmmtorch.report.rate_distortion import bytes_for, figures, leads
 
 
-def rows_of(
-    curves: dict[str, list[tuple[float, float | None]]], dataset: str = "room"
-) -> list[dict[str, Any]]:
+def rows_of(curves: dict[str, list[tuple[float, float]]], dataset: str = "room") -> list[dict[str, Any]]:
     return [
         {"dataset": dataset, "codec": codec, "nbytes": nbytes, "psnr2_db": quality, "auc": quality}
         for codec, points in curves.items()
@@ -40,7 +38,7 @@ def test_a_crossing_is_found_where_the_lines_cross():
 def test_the_best_of_the_others_counts_and_who_is_left_out_does_not():
     curves = {
         "ours": [(100, 50.0), (800, 80.0)],
-        "raw": [(12_000, None)],
+        "raw": [(12_000, math.inf)],
         "draco": [(200, 50.0), (1600, 80.0)],
         "octree": [(50, 40.0), (400, 80.0)],
     }
@@ -69,6 +67,14 @@ def test_other_ways_to_write_our_components_are_no_rivals():
     with pytest.raises(InvalidArgumentError, match="'ours'"):
         leads(rows_of({"raw": curves["ours"]}), "auc")
     assert leads(rows_of({**curves, "thesis": [(700, 50.0), (5600, 80.0)]}), "auc").most == pytest.approx(7)
+
+
+def test_bytes_for_a_quality_are_straight_in_their_logarithm():
+    rows = rows_of({"octree": [(100, 50.0), (200, 60.0), (300, 55.0), (800, 70.0)]})
+    for value, expected in ((40, 100), (50, 100), (55, 100 * 2**0.5), (60, 200), (65, 400), (70, 800)):
+        assert bytes_for(rows, "octree", "auc", value) == pytest.approx(expected)
+    assert bytes_for(rows, "octree", "auc", 70.1) == math.inf
+    assert bytes_for(rows, "draco", "auc", 50) == math.inf
 
 
 points = st.lists(
@@ -101,7 +107,7 @@ def test_the_figure_has_a_line_for_each_codec_and_shades_the_lead():
     curves = {
         "ours": [(100, 50.0), (800, 80.0)],
         "octree": [(400, 50.0), (900, 90.0)],
-        "raw": [(12_000, None)],
+        "raw": [(12_000, math.inf)],
         "float": [(1000, 50.0), (8000, 80.0)],
     }
     figure = figures(rows_of(curves) + rows_of(curves, "hall"))["rate_distortion"]

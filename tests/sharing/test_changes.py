@@ -309,7 +309,7 @@ def test_a_damaged_position_is_refused(name, value):
     one = Replica(0, incarnation=3)
     tell(one, 1)
     state = one.state()
-    state["records"]["journal"][name] = value
+    state["records"]["log"][name] = value
     with pytest.raises(DataError):
         Replica(0, incarnation=3).restore(state)
 
@@ -321,6 +321,6 @@ def test_who_does_not_ask_costs_no_memory(monkeypatch):
     follower.follow(one)
     for step in range(8):
         one.count({ids[step % 6]: 50.0})
-    assert one._records._journal._named is None
+    assert one._records._log._named is None
     follower.follow(one)
     assert follower.agrees(one)

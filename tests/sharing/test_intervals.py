@@ -32,6 +32,7 @@ def test_operations_are_those_of_sets(one, other):
     assert (a == b) == (one == other)
     assert bool(a) == bool(one)
     assert a.size == len(one)
+    assert a.numbers().tolist() == sorted(one)
 
 
 @given(one=numbers, asked=st.lists(st.integers(-3, 45)))

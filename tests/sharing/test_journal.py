@@ -358,7 +358,7 @@ def test_snapshots_that_somebody_forged_are_refused_or_restored(tmp_path_factory
     folder = tmp_path_factory.mktemp("journal")
     state = told(spoken(1, 3), robot=0).state()
     records = state["records"]
-    parts = [state, records, records["journal"], records["components"], state["author"], state["backlog"]]
+    parts = [state, records, records["log"], records["components"], state["author"], state["backlog"]]
     part = data.draw(st.sampled_from(parts))
     tensors = [torch.zeros(0), torch.full((3, 3), torch.nan), torch.arange(5), torch.ones(2, 2, 2)]
     hostile = (
@@ -369,6 +369,20 @@ def test_snapshots_that_somebody_forged_are_refused_or_restored(tmp_path_factory
     (folder / "00000001.snapshot").write_bytes(pack_snapshot(state, 0, 5))
     with contextlib.suppress(DataError):
         reopened(folder)
+
+
+def test_a_replica_that_has_no_room_for_what_was_kept_says_so(tmp_path):
+    datagrams = spoken(1, 8)
+    kept(tmp_path, datagrams)
+    small = Replica(0, most_components=2)
+    journal = Journal(shutil.copytree(tmp_path, tmp_path / "copy"), small)  # of logs it takes what fits
+    journal.close()
+    assert journal.restored.n_refused > 0
+    assert "full" in journal.restored.damage[0]
+    reopened(tmp_path)  # now it is in a snapshot
+    with pytest.raises(DataError, match="most_components|memory"):
+        Journal(tmp_path, Replica(0, most_components=2))
+    assert reopened(tmp_path)[0].digest() == told(datagrams).digest()
 
 
 # -- whose it is -------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import (
     codecs,
+    examples,
     frame_of_components,
     numbers,
     places,
@@ -25,6 +26,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.quantization import COUNT_ERROR
+from gmmtorch.sharing.envelope import VERSION, Kind
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import (
     MAX_BYTES,
@@ -37,6 +39,7 @@ from gmmtorch.sharing.messages import (
     encode_plan,
     encode_points,
     encode_views,
+    kind_of,
     quantized_poses,
 )
 from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
@@ -399,3 +402,15 @@ def test_points_by_hand():
     assert (message.sender, message.frame, message.part, message.n_parts) == (7, 9, 1, 3)
     assert message.ends.tolist() == [[501.0, 2.5, 4.0], [499.0, -1.5, -2.0]]
     assert message.is_hit.tolist() == [False, True]
+
+
+# -- kinds --------------------------------------------------------------------------------------------------
+
+
+def test_every_kind_has_a_name():
+    """Named here in the order of their numbers, so that a new one cannot be forgotten."""
+    names = ["components"] * 3 + ["counts"] * 3 + ["points", "views", "plans", "announcements"]
+    names += ["supersessions", "counts", "corrections", "announcements"]
+    assert [kind_of(bytes([VERSION << 4 | kind])) for kind in sorted(Kind)] == names
+    kinds = [type(decode(datagram)).__name__.removesuffix("Message").lower() for datagram in examples()]
+    assert [kind.rstrip("s") for kind in kinds] == [kind_of(datagram).rstrip("s") for datagram in examples()]

@@ -436,7 +436,7 @@ def test_reach_counts_at_the_time_of_sending_and_to_the_last_metre():
     for i, far in enumerate((2.0, 2.0 + 1e-9, 9.0, 0.0)):
         positions = on_a_line([0.0, far])
         network.place(positions)
-        positions += 100.0  # the network has its own
+        positions[1] += 100.0  # the network has its own
         network.send(0, [bytes([i])], 0.1 * i, "maps")
     network.place(on_a_line([0.0, 99.0]))
     assert heard(network, 1) == [b"\0", b"\3"]

@@ -235,6 +235,30 @@ def test_counts_outlive_their_being_written_again():
     assert len(one.state()["records"]["record_bytes"]) < 12
 
 
+def test_records_of_counts_stay_few_however_often_one_counts():
+    one, other = Replica(0), Replica(1)
+    ids = [tuple(row) for row in one.add(random_components(3, k=150)).tolist()]
+    rng, sizes = random.Random(0), []
+    counted = dict.fromkeys(ids, 0.0)
+    for second in range(250):
+        gains = dict.fromkeys(rng.sample(ids, 3), 2.0 ** (second // 20))
+        for name, gain in gains.items():
+            counted[name] += gain
+        one.count(gains)
+        if rng.random() < 0.8:  # the rest is lost
+            for datagram in one.datagrams():
+                other.receive(datagram)
+        sizes.append(len(one.state()["records"]["record_bytes"]))
+    assert max(sizes) < 40
+    exchange([one, other])
+    assert other.digest() == one.digest()
+    own = quantized(random_components(3, k=150)).support
+    found = other.components()
+    order = torch.tensor([found.ids.tolist().index(list(name)) for name in ids])
+    expected = torch.tensor(list(counted.values()), dtype=torch.float64)
+    assert torch.allclose(found.support[order] - own, expected, rtol=0.1)
+
+
 def test_the_last_correction_of_a_scan_counts():
     one, other = Replica(0), Replica(1)
     given_ = random_components(3, k=6)
@@ -372,6 +396,34 @@ def test_under_a_budget_the_most_informative_go_first():
     assert set(sent[:96]) == large
     assert len(sent) == len(set(sent)) == 288
     assert told(everything(one)).digest() == one.digest()
+
+
+@pytest.mark.parametrize("max_bytes", [1000, 1100, 1200])
+def test_what_is_new_fits_whatever_is_asked_for(max_bytes):
+    """Also where it had been written for longer datagrams."""
+    one = Replica(0)
+    for seed in range(2):
+        ids = one.add(random_components(3, k=400, seed=seed))
+        datagrams = one.datagrams(max_bytes=max_bytes)
+        sizes = [len(datagram) for datagram in datagrams]
+        assert max(sizes) <= max_bytes
+        sent = [row for datagram in datagrams for row in decode(datagram).components.ids.tolist()]
+        assert sorted(sent) == sorted(ids.tolist())
+    assert sum(sizes[:-1]) > 0.85 * max_bytes * (len(sizes) - 1)  # it knows by now what is asked for
+
+
+def test_what_is_decoded_already_need_not_be_again():
+    one, two, three = Replica(0), Replica(1), Replica(2)
+    one.add(random_components(3, k=20))
+    one.count({(0, 1): 3.0})
+    for datagram in [*one.datagrams(), *one.announcements()]:
+        assert two.receive(datagram, decode(datagram)) == three.receive(datagram)
+    assert two.digest() == three.digest() == one.digest()
+    floats = encode_components(random_components(3, k=3, robot=7), "float")[0]
+    assert not two.receive(floats, decode(floats))  # not as all would hold them
+    assert not two.receive(floats, "nonsense")
+    assert not two.receive(None, decode(floats))
+    assert two.refused == {"other": 2, "damaged": 1}
 
 
 def test_memory_is_bounded():

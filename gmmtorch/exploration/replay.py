@@ -1,0 +1,330 @@
+"""ReplayNode: a robot that maps a recorded log, and shares the map."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from pathlib import Path
+from typing import Any
+
+from gmmtorch.errors import DataError, OutputError, check_whole
+from gmmtorch.exploration.forgiving_journal import ForgivingJournal
+from gmmtorch.exploration.heartbeat import Heartbeat
+from gmmtorch.exploration.progress import Progress
+from gmmtorch.exploration.publication import Publication
+from gmmtorch.exploration.stopwatch import Stopwatch
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.scan import Scan
+from gmmtorch.sharing.framed_transport import FramedTransport
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.journal import Journal
+from gmmtorch.sharing.messages import AnnouncementMessage, Message, decode, kind_of
+from gmmtorch.sharing.network import HEADER_BYTES, Network
+from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.token_bucket import TokenBucket
+
+_KINDS = ("announcements", "components", "corrections", "counts", "supersessions")
+_MOST_PEERS = 64
+_log = logging.getLogger(__name__)
+
+
+class ReplayNode:
+    """Takes in a scan a tick, publishes its map, and hears of others'. A `Node`.
+
+    A map is published whenever the components of a window are final, and at the end of the log. What is
+    said and heard is written ahead to the journal, and the map to `folder` before it is published, every
+    `keep_every` scans. Started again on the same journal, folder and log, whenever it was killed, it reads
+    again the few scans since, publishes nothing before it is as far as it was, and then goes on: in the end
+    the map is the one of a robot that was never killed. If its folder is lost, it begins anew, and what it
+    said before counts beside that until the log is over.
+
+    A disk that fails, and scans that cannot be read, are logged once and counted, and it goes on.
+
+    Args:
+        replica: of this robot; nothing but this adds to it.
+        scans: the log, from its begin; an iterator is read as far as it had come when it goes on.
+        transport: this robot's end of a network; a `FramedTransport` is closed with this.
+        make_map: makes an empty map, always the same; what it learns is published as the robot's.
+        journal: of the replica; closed with this.
+        folder: of this robot alone, for its progress.
+        facts: plain values that say what log this is: to go on with others, or another rule, is refused.
+        announce_every: seconds between announcements while there is news.
+        budget: bytes a second, of records; None: no limit.
+    """
+
+    def __init__(
+        self,
+        replica: Replica,
+        scans: Iterable[Scan],
+        transport: FramedTransport | Network,
+        make_map: Callable[[], GaussianMap],
+        *,
+        journal: Journal | None = None,
+        folder: str | Path | None = None,
+        facts: dict[str, Any] | None = None,
+        announce_every: float = 1.0,
+        budget: float | None = None,
+        keep_every: int = 10,
+    ) -> None:
+        self.replica, self.map = replica, make_map()
+        self.n_scans = len(scans) if isinstance(scans, Sized) else None
+        """Of the log; None while nobody knows."""
+        self.n_heard = self.n_damaged = self.n_unread = self.n_unsaved = 0
+        self.watch = Stopwatch()
+        self._scans, self._transport = scans, transport
+        self._logbook = None if journal is None else ForgivingJournal(journal)
+        self._heartbeat = Heartbeat(announce_every)
+        self._budget = None if budget is None else TokenBucket(budget)
+        self._publication = Publication(replica)
+        self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others have told that they hold
+        self._keep_every = check_whole("keep_every", keep_every, 1)
+        about = {"robot": replica.robot, "keep_every": keep_every, "n_scans": self.n_scans}
+        about |= {"learning": self.map.state()["learning"], **(facts or {})}
+        self._progress = None if folder is None else Progress(folder, **about)
+        self.position = self._saved_at = self._resume()
+        """Scans of the log that have been read."""
+        self.resumed_at = self.position
+        self._rest: Iterator[Scan] | None = None  # of a log that is no sequence
+        self._is_over = False
+
+    # -- a node -----------------------------------------------------------------------------------
+
+    @property
+    def robot(self) -> int:
+        return self.replica.robot
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the log is, and its last scans are published."""
+        return self._is_over
+
+    def tick(self, now: float) -> None:
+        """Map the next scan, and talk."""
+        if not self._is_over:
+            with self.watch("mapping"):
+                self._is_over = not self._take_scan()
+            with self.watch("sharing"):
+                self._publish()
+        self.listen(now)
+
+    def listen(self, now: float) -> None:
+        with self.watch("sharing"):
+            self._hear(now)
+            self._speak(now)
+
+    @property
+    def twin(self) -> str | None:
+        """What is said of another robot of this number, if there is one."""
+        found = self._namesakes.get(self.robot)
+        if found is None and not self.replica.conflicts[self.robot]:
+            return None
+        return (
+            f"Another robot says that it is robot {self.robot}{'' if found is None else f' ({found})'}. Give "
+            "each a number and a folder of its own."
+        )
+
+    @property
+    def _namesakes(self) -> dict[int, str]:
+        return self._transport.namesakes if isinstance(self._transport, FramedTransport) else {}
+
+    # -- the log ----------------------------------------------------------------------------------
+
+    def _resume(self) -> int:
+        """The position that was saved last, with the map as it was then."""
+        if self._progress is None:
+            self._covered_at = None
+            return 0
+        farthest, found = self._progress.farthest, self._progress.newest()
+        # Up to where it may have published: beyond, the next state would have been saved before.
+        self._covered_at = None if farthest is None else farthest + self._keep_every
+        if found is None:
+            self._save(0)
+            return 0
+        self.map.restore(found[1])
+        return found[0]
+
+    def _take_scan(self) -> bool:
+        """Insert the next scan; whether there was one, and there may be more."""
+        if self.n_scans is not None and self.position >= self.n_scans:
+            return False
+        try:
+            scan = self._next()
+        except DataError as error:
+            self.n_unread += 1
+            if self.n_unread == 1:
+                _log.warning("Scan %d is left out, and so will be others like it: %s", self.position, error)
+        else:
+            if scan is None:
+                self.n_scans = self.position
+                return False
+            self.map.insert(scan)
+        self.position += 1
+        return self.position != self.n_scans
+
+    def _next(self) -> Scan | None:
+        if isinstance(self._scans, Sequence):
+            scan: Scan = self._scans[self.position]
+            return scan
+        if self._rest is None:
+            self._rest = itertools.islice(iter(self._scans), self.position, None)
+        return next(self._rest, None)
+
+    def _publish(self) -> None:
+        """Publish what is final; before, save it, if that is due."""
+        if self.map.n_pending and not self._is_over:
+            return
+        if self._is_over or self.position >= self._saved_at + self._keep_every:
+            self._save(self.position)
+        # A map that lags behind what was published would take back what it does not have yet.
+        whole = self._is_over or (self._covered_at is not None and self.position >= self._covered_at)
+        if self.map.dim is not None and (whole or self._covered_at is None):
+            self._publication.update(self.map.components(), whole)
+
+    def _save(self, position: int) -> None:
+        if self._progress is None:
+            return
+        try:
+            self._progress.save(position, self.map.state())
+            self._saved_at = position
+        except OutputError as error:
+            self.n_unsaved += 1
+            if self.n_unsaved == 1:
+                _log.warning("Robot %d does not keep how far it is, and goes on: %s", self.robot, error)
+
+    # -- the team ---------------------------------------------------------------------------------
+
+    def _hear(self, now: float) -> None:
+        merged = []
+        for _, datagram in self._transport.deliver(self.robot, now):
+            self.n_heard += 1
+            try:
+                message = decode(datagram)
+            except DataError:
+                self.n_damaged += 1
+                continue
+            if self.replica.receive(datagram, message):
+                merged.append(datagram)
+                self._note(message)
+        if self._logbook is not None:
+            self._logbook.heard(merged)
+
+    def _note(self, message: Message) -> None:
+        """What another says that it holds, and this does not."""
+        if isinstance(message, AnnouncementMessage):
+            before = self._gaps.pop(message.sender, Intervals.empty())
+            self._gaps[message.sender] = (before - message.scope) | (message.held - self.replica.held)
+            while len(self._gaps) > _MOST_PEERS:
+                self._gaps.popitem(last=False)
+
+    def _speak(self, now: float) -> None:
+        budget = None if self._budget is None else self._budget.available(now)
+        datagrams = self.replica.datagrams(budget=budget)
+        if self._budget is not None:
+            self._budget.take(sum(map(len, datagrams)))
+        if datagrams and self._logbook is not None:
+            self._logbook.said(datagrams)
+        if self._heartbeat.due(now, (self.replica.version,)):
+            datagrams += self.replica.announcements()
+        for kind, some in itertools.groupby(datagrams, kind_of):
+            self._transport.send(self.robot, list(some), now, kind)
+
+    # -- what there is to say ---------------------------------------------------------------------
+
+    @property
+    def n_missing(self) -> int:
+        """Records that others have told they hold, and that have not come."""
+        gaps = Intervals.empty()
+        for gap in self._gaps.values():
+            gaps |= gap
+        return (gaps - self.replica.held).size
+
+    def status(self) -> str:
+        total = "?" if self.n_scans is None else f"{self.n_scans:,}"
+        line = (
+            f"scan {self.position:,}/{total}, {self.replica.n_components:,} components, "
+            f"{self.n_missing:,} missing, {self._transport.traffic(self.robot).bytes / 1e3:,.0f} kB sent"
+        )
+        return line if self.twin is None else f"{line}, another robot {self.robot} is there"
+
+    def scalars(self) -> dict[str, float]:
+        sent, wire = self._transport.traffic(self.robot), self._wire()
+        return {
+            "scans": float(self.position),
+            "components": float(self.replica.n_components),
+            "records": float(self.replica.held.size),
+            "missing": float(self.n_missing),
+            "bytes_sent": float(sent.bytes),
+            "datagrams_sent": float(sent.datagrams),
+            "datagrams_heard": float(self.n_heard),
+            "wire_bytes_sent": float(wire["wire_bytes"]),
+            "wire_bytes_received": float(wire["wire_bytes_received"]),
+            "refused": float(sum(wire["refused"].values()) + sum(self.replica.refused.values())),
+        }
+
+    def row(self) -> dict[str, Any]:
+        sent = self._transport.traffic(self.robot)
+        by_kind = {kind: self._transport.traffic(self.robot, kind).bytes for kind in _KINDS}
+        return {
+            "robot": self.robot,
+            "digest": self.replica.digest().hex(),
+            "incarnation": self.replica.incarnation,
+            "scans": self.position,
+            "n_scans": self.n_scans,
+            "resumed_at": self.resumed_at,
+            "unread": self.n_unread,
+            "n_components": self.replica.n_components,
+            "n_records": self.replica.held.size,
+            "missing": self.n_missing,
+            "bytes_sent": sent.bytes,
+            "datagrams": sent.datagrams,
+            "bytes_by_kind": {kind: n for kind, n in by_kind.items() if n},
+            **self._wire(),
+            "heard": self.n_heard,
+            "damaged": self.n_damaged,
+            "not_merged": dict(self.replica.refused),
+            "conflicts": {str(robot): n for robot, n in sorted(self.replica.conflicts.items()) if n},
+            "namesakes": {str(robot): whence for robot, whence in sorted(self._namesakes.items())},
+            "unkept": self.n_unsaved + (0 if self._logbook is None else self._logbook.n_failed),
+            "stage_seconds": self.watch.seconds,
+        }
+
+    def _wire(self) -> dict[str, Any]:
+        """Bytes with the headers of frame, UDP and IPv4, each broadcast once; and what went wrong."""
+        transport, sent = self._transport, self._transport.traffic(self.robot)
+        if isinstance(transport, Network):
+            got = transport.reception(self.robot)
+            return {
+                "wire_bytes": sent.wire_bytes,
+                "wire_bytes_received": got.bytes + HEADER_BYTES * got.datagrams,
+                "refused": {},
+                "failures": {},
+                "dropped": 0,
+            }
+        return {
+            "wire_bytes": sent.wire_bytes + transport.overhead * sent.datagrams,
+            "wire_bytes_received": transport.received.wire_bytes,
+            "socket_bytes": transport.sent.bytes,
+            "socket_datagrams": transport.sent.datagrams,
+            "refused": {reason: n for reason, n in transport.refused.items() if n},
+            "failures": dict(transport.failures),
+            "dropped": transport.n_dropped,
+        }
+
+    def save(self, folder: Path) -> dict[str, Path]:
+        """The team's map, as far as it is known here, and this robot's own."""
+        maps = {"map": self.replica.map(codec="quantized"), "own_map": self.map}
+        paths = {}
+        for name, made in maps.items():
+            if made.n_components:
+                paths[name] = folder / f"{name}{made.suffix}"
+                made.save(paths[name])
+        return paths
+
+    def close(self) -> None:
+        """Close the journal, with a last snapshot, and the transport. May be called again."""
+        if self._logbook is not None:
+            self._logbook.close()
+        if isinstance(self._transport, FramedTransport):
+            self._transport.close()

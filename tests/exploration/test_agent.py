@@ -1,0 +1,327 @@
+"""An agent and its radio: what it makes of whatever comes, and when it says what."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from exploration.mapped_room import BOX, CAMERA, NOVELTY, PLACES, frame, mapper
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+from sharing.message_examples import examples, frame_of_components, views
+
+from gmmtorch.errors import DataError
+from gmmtorch.exploration.agent import Agent
+from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.mapper import Mapper, Memo
+from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.planning import Plan, PlanningTask
+from gmmtorch.exploration.primitives import Primitives
+from gmmtorch.exploration.roadmap import Roadmap
+from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.stopwatch import Stopwatch
+from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.views import ViewEvaluator
+from gmmtorch.sharing.messages import PlanMessage, decode, encode_components, encode_plan, kind_of
+from gmmtorch.sharing.replica import Replica
+
+START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
+PRIMITIVES = Primitives(TeamOptions().dynamics)
+EVALUATOR = ViewEvaluator(
+    CAMERA.horizontal_fov, CAMERA.vertical_fov, CAMERA.max_range, resolution=0.2, n_beams=20
+)
+MAPS = ("replica", "float", "grid_shared", "grid_isolated")
+
+
+class Post:
+    """A network that notes what it is given, and delivers what it is told to."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[float, int, bytes, str]] = []
+        self.coming: list[tuple[int, bytes]] = []
+
+    def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
+        self.sent += [(now, sender, datagram, kind) for datagram in datagrams]
+
+    def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
+        come, self.coming = self.coming, []
+        return come
+
+    def of(self, kind: str) -> list[tuple[float, bytes]]:
+        return [(now, datagram) for now, _, datagram, what in self.sent if what == kind]
+
+
+class Ahead:
+    """A planner of one plan: to fly on."""
+
+    def plan(self, task: PlanningTask) -> Plan:
+        path = PRIMITIVES.rollout(task.state[None])[0, int(PRIMITIVES.commands[:, 0].argmax())]
+        return Plan(path, PRIMITIVES.braking(path[-1]), path[-1:, :4], 1.0, "explore")
+
+    def state(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        pass
+
+
+def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent, Post]:
+    framework = kind if kind.startswith("grid") else "gmm_shared"
+    team = TeamOptions(framework=framework, size=3, camera=CAMERA, window=(40, 40, 20), **options)
+    made: Mapper = mapper(number, "replica" if kind.startswith("grid") else kind)
+    if kind.startswith("grid"):
+        made = GridMapper(number, made.local, made.belief, CAMERA.width, NOVELTY, Memo(64), team.shares)
+    library = ViewLibrary(number, incarnation=0)
+    robot = Robot(number, START, made, Ahead(), library, Roadmap(), start_radius=1.4)
+    post = Post()
+    return Agent(robot, post, EVALUATOR, PRIMITIVES, team, Memo(256), Stopwatch()), post
+
+
+def hear(one: Agent, post: Post, *pairs: tuple[int, bytes], now: float = 0.0) -> None:
+    post.coming += pairs
+    one.listen(now)
+
+
+def learned(number: int, kind: str = "replica", places: Sequence[Any] = PLACES) -> list[bytes]:
+    """All that an agent says that looks around."""
+    one, post = agent(number, kind)
+    for seed, place in enumerate(places):
+        one.learn(frame(*place, seed=seed), float(3 * seed))
+    return [datagram for _, _, datagram, _ in post.sent]
+
+
+@pytest.fixture(scope="module")
+def sayings() -> list[list[bytes]]:
+    return [learned(number, places=PLACES[number:] * 2) for number in (1, 2)]
+
+
+# -- what comes ---------------------------------------------------------------------------------------
+
+
+def odd() -> list[bytes]:
+    """Sound datagrams of all kinds, that no teammate has reason to send."""
+    teammate = Replica(5, dim=3, incarnation=3)
+    ids = teammate.add(frame_of_components(6))
+    teammate.count({(5, int(ids[0, 1])): 4.0})
+    teammate.correct(1, torch.eye(4, dtype=torch.float64), ids[:2])
+    teammate.add(frame_of_components(2), supersedes=ids[3:])
+    made = [*examples(), *teammate.datagrams(), *teammate.announcements()]
+    far = frame_of_components(5, center=5e5, robot=3)
+    wide = random_components(
+        3, k=4, center=2.0, deviations=(1e-3, 300.0), robot=4, n_origins=1, max_sightings=1
+    )
+    flat = random_components(2, k=4, robot=6)
+    for strange in (far, wide, flat):
+        made += [*encode_components(strange), *encode_components(strange, "float")]
+    poses = views(3, center=1e6).poses
+    return [*made, *encode_plan(0, 3, 1e6, 0.2, poses, poses), *encode_plan(900, 3, 0.0, 0.2, poses, poses)]
+
+
+SOUND = odd()
+damaged = st.one_of(
+    st.binary(max_size=80),
+    st.tuples(st.sampled_from(SOUND), st.integers(0, 1199), st.integers(1, 255)).map(
+        lambda t: t[0][: (at := t[1] % len(t[0]))] + bytes([t[0][at] ^ t[2]]) + t[0][at + 1 :]
+    ),
+    st.tuples(st.sampled_from(SOUND), st.integers(0, 1199)).map(lambda t: t[0][: t[1] % len(t[0])]),
+    st.sampled_from(SOUND).map(lambda datagram: datagram + b"\0"),
+)
+AGENTS = {kind: agent(kind=kind) for kind in ("replica", "float", "grid_shared")}
+
+
+@pytest.mark.parametrize("kind", list(AGENTS))
+@settings(max_examples=60, deadline=None)
+@given(noise=st.lists(damaged, min_size=1, max_size=4), sender=st.integers(0, 40))
+def test_damaged_datagrams_are_counted_and_dropped(kind: str, noise: list[bytes], sender: int) -> None:
+    one, post = AGENTS[kind]
+    before = (one.n_heard, one.n_damaged, one.digest(), one.robot.mapper.belief.entropy_bits)
+    n_damaged = sum(map(is_damaged, noise))
+    assert n_damaged == len(noise)
+    hear(one, post, *((sender, datagram) for datagram in noise))
+    assert one.n_heard == before[0] + len(noise)
+    assert one.n_damaged == before[1] + n_damaged
+    assert (one.digest(), one.robot.mapper.belief.entropy_bits) == before[2:]
+
+
+def is_damaged(datagram: bytes) -> bool:
+    try:
+        decode(datagram)
+    except DataError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_whatever_is_sound_is_taken_as_it_is(kind: str) -> None:
+    one, post = agent(kind=kind)
+    one.learn(frame(*PLACES[0]), 0.0)
+    for number, datagram in enumerate([*SOUND, *SOUND[::-1]]):
+        hear(one, post, (number % 4, datagram), now=1.0 + number)
+    assert one.n_damaged == 0
+    assert one.n_heard == 2 * len(SOUND)
+    belief = one.robot.mapper.belief
+    for part in belief.grid.dense(BOX):
+        assert bool(part.isfinite().all())
+        assert bool((part >= 0).all())
+    one.learn(frame(*PLACES[1]), 1e3)
+    one.survey(1e3)
+    one.propose(1e3, [0, 1, 2, 900], Traffic.of([]))
+    one.tell_plan(1e3, 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_in_which_things_come_makes_no_other_map(sayings: list[list[bytes]], seed: int) -> None:
+    said = [(number, datagram) for number, some in enumerate(sayings, 1) for datagram in some]
+    order = torch.randperm(len(said), generator=torch.Generator().manual_seed(seed)).tolist()
+    (one, post), (other, its_post) = agent(), agent()
+    hear(one, post, *said)
+    for row in order:
+        hear(other, its_post, said[row])
+    assert one.digest() == other.digest()
+    assert len(one.robot.mapper.components() or []) > 20
+    for a, b in zip(*(each.robot.mapper.belief.grid.dense(BOX) for each in (one, other)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+
+
+def test_who_was_quicker_makes_no_difference_to_the_last_bit(sayings: list[list[bytes]]) -> None:
+    one, other = sayings
+    found = []
+    for first, second in ((1, 2), (2, 1)):
+        listener, post = agent()
+        for said in zip(one, other, strict=False):
+            hear(listener, post, *((number, said[number - 1]) for number in (first, second)))
+        found.append(listener.robot.mapper.belief.grid.dense(BOX))
+    for a, b in zip(*found, strict=True):
+        assert torch.equal(a, b)
+
+
+# -- plans ----------------------------------------------------------------------------------------------
+
+
+def plan_datagram(number: int, x: float, sender: int = 1) -> bytes:
+    poses = torch.tensor([[x, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    (datagram,) = encode_plan(sender, number, float(number), 0.2, poses, poses)
+    return datagram
+
+
+def test_a_plan_that_was_overtaken_is_late() -> None:
+    one, post = agent()
+    said = {number: plan_datagram(number, float(number)) for number in range(1, 9)}
+    latest = 0
+    for when, number in enumerate([2, 4, 3, 4, 1, 8, 5]):
+        hear(one, post, (1, said[number]), now=10.0 + when)
+        if number > latest:
+            latest, heard = number, 10.0 + when
+        assert one.robot.plans[1].number == latest
+        assert one.heard_at[1] == heard
+    assert list(one.robot.plans) == [1]
+
+
+def test_a_robot_that_began_anew_is_believed() -> None:
+    one, post = agent()
+    hear(one, post, (1, plan_datagram(400, 1.0)), (2, plan_datagram(7, 3.0, sender=2)))
+    hear(one, post, (1, plan_datagram(0, 2.0)))
+    assert one.robot.plans[1].path.tolist() == [[2.0, 0.0, 0.0, 0.0]]
+    assert one.robot.plans[2].number == 7
+
+
+def fly(one: Agent, now: float, number: int, rests: bool) -> None:
+    one.robot.rests = lambda now: rests  # type: ignore[method-assign]
+    one.survey(now)
+    one.propose(now, [], Traffic.of([]))
+    one.settle()
+    one.tell_plan(now, number)
+    one.robot.advance(0, 100)
+
+
+def test_a_robot_at_rest_tells_its_plan_every_tenth_time() -> None:
+    one, post = agent()
+    for number in range(25):
+        fly(one, 2.0 * number, number, rests=True)
+    plans = [decode(datagram) for _, datagram in post.of("plans")]
+    assert [plan.number for plan in plans if isinstance(plan, PlanMessage)] == [0, 10, 20]
+
+
+def test_a_robot_that_moves_tells_every_plan_and_where_it_comes_to_rest(tmp_path: Any) -> None:
+    one, post = agent()
+    local = one.robot.mapper.local  # where all is free, nothing keeps it from flying
+    local.add_dense(local.box, torch.zeros(local.shape), torch.full(local.shape, 50.0))
+    rests = [False] * 2 + [True] * 16 + [False] + [True] * 4
+    told: list[int] = []
+    for number, at_rest in enumerate(rests):
+        if number == 9:  # it goes on after a break as without one
+            told = [decode(datagram).number for _, datagram in post.of("plans")]
+            (twin, its_post), state = agent(), one.state()
+            twin.restore(load_checkpoint(save_checkpoint(tmp_path / "agent", state)))
+            one, post = twin, its_post
+        fly(one, 2.0 * number, number, at_rest)
+    told += [decode(datagram).number for _, datagram in post.of("plans")]
+    # Coming to rest from flight it moves, and once it stands it says so.
+    assert told == [0, 1, 2, 3, 13, 18, 19, 20]
+
+
+def test_a_plan_needs_a_survey() -> None:
+    one, _ = agent()
+    with pytest.raises(RuntimeError, match="survey"):
+        one.propose(0.0, [], Traffic.of([]))
+    one.settle()
+    one.tell_plan(0.0, 1)
+
+
+# -- what it says -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_what_is_sent_is_booked_by_what_it_is(kind: str) -> None:
+    one, post = agent(2, kind, announce_every=1.0)
+    for seed in range(3):
+        for place in PLACES[:2]:
+            one.learn(frame(*place, seed=seed), float(seed))
+    one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
+    one.tell_views(3.0)
+    fly(one, 3.0, 1, rests=False)
+    kinds = Counter(kind for _, _, _, kind in post.sent)
+    assert all(kind_of(datagram) == kind for _, _, datagram, kind in post.sent)
+    assert all(sender == 2 for _, sender, _, _ in post.sent)
+    expected = {
+        "replica": {"components", "counts", "views", "plans", "announcements"},
+        "float": {"components", "counts", "views", "plans", "announcements"},
+        "grid_shared": {"points", "views", "plans", "announcements"},
+        "grid_isolated": set(),
+    }[kind]
+    assert set(kinds) - {"supersessions"} == expected
+
+
+def test_a_budget_bounds_what_is_said_of_the_map_in_every_span_of_time() -> None:
+    one, post = agent(kind="grid_shared", budget=1500.0, announce_every=1.0)
+    for seed, place in enumerate(PLACES):
+        one.robot.sense(frame(*place, seed=seed))
+    for tick in range(40):
+        one.send(float(tick))
+    said = post.of("points")
+    assert sum(len(datagram) for _, datagram in said) > 10_000
+    assert one.robot.mapper.datagrams() == []  # all has gone in the end
+    for begin in range(40):
+        for end in range(begin, 40):
+            size = sum(len(datagram) for now, datagram in said if begin <= now <= end)
+            assert size <= 1500 * (end - begin) + 1500
+    assert post.of("announcements")
+
+
+def test_announcements_do_not_wait_for_the_budget_and_become_seldom() -> None:
+    one, post = agent(budget=1e-3, announce_every=2.0)
+    assert one._budget is not None
+    one._budget.take(1000)  # of the 1200 that are there to begin with
+    for seed, place in enumerate(PLACES):
+        one.robot.sense(frame(*place, seed=seed))
+    for tick in range(40):
+        one.send(float(tick))
+    assert sum(len(datagram) for _, datagram in post.of("components")) <= 200
+    assert one.robot.mapper.datagrams()  # the rest is due still
+    assert sorted({now for now, _ in post.of("announcements")}) == [2.0, 6.0, 14.0, 30.0]

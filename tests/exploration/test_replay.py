@@ -1,0 +1,298 @@
+"""ReplayNode: the team's map is what each robot would make of its scans alone, whatever happens to it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from exploration.replays import RULES, Clock, content, log, mapped
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.datasets import load
+from gmmtorch.datasets.part import Part, part_of
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.exploration.node import TwinError, check_number, run_paced
+from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.incremental import IncrementalRule
+from gmmtorch.scan import Scan
+from gmmtorch.sharing.journal import Journal
+from gmmtorch.sharing.link_conditions import LinkConditions
+from gmmtorch.sharing.network import Network
+from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.security import TeamKey
+from gmmtorch.sharing.udp import UdpTransport
+
+N_KILLS = 4
+"""`python -m exploration.kill_replay` has more."""
+
+
+def part(k: int, n: int, n_scans: int = 24) -> Part:
+    return Part(log(n_scans), part_of(n_scans, k, n))
+
+
+def robot(number: int, scans, transport, rule: str = "windowed", **options) -> ReplayNode:
+    return ReplayNode(Replica(number), scans, transport, lambda: GaussianMap(RULES[rule]), **options)
+
+
+def kept(folder: Path, scans, transport, rule: str = "windowed", number: int = 0, **options) -> ReplayNode:
+    """A robot with a journal and a folder."""
+    replica = Replica(number)
+    return ReplayNode(
+        replica,
+        scans,
+        transport,
+        lambda: GaussianMap(RULES[rule]),
+        journal=Journal(folder / "journal", replica),
+        folder=folder,
+        **options,
+    )
+
+
+def run(*nodes: ReplayNode, settle: float = 0.0, **options):
+    clock = Clock()
+    return run_paced(nodes, 10.0, settle=settle, clock=clock, sleep=clock.sleep, **options)
+
+
+def kill(node: ReplayNode) -> None:
+    """All that the death of its process does to it."""
+    node._logbook._journal.close()  # which writes nothing
+
+
+# -- a team ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rule", sorted(RULES))
+def test_all_hold_what_each_would_have_learned_alone(rule):
+    network = Network(3)
+    nodes = [robot(k, part(k, 3), network, rule) for k in range(3)]
+    done = run(*nodes, settle=1.0)
+    assert (done.ticks, done.late) == (8, 0)
+    assert len({node.replica.digest() for node in nodes}) == 1
+    alone = [mapped(rule, part(k, 3)).components() for k in range(3)]
+    assert content(nodes[1].replica.components()) == content(*alone)
+    assert all(node.is_over and node.n_missing == 0 for node in nodes)
+
+
+@pytest.mark.parametrize("budget", [None, 2000.0])
+def test_what_a_bad_network_loses_comes_again(budget):
+    network = Network(3, LinkConditions(loss=0.3, duplication=0.1, latency=0.05, jitter=0.1), seed=3)
+    nodes = [robot(k, part(k, 3), network, "incremental", budget=budget) for k in range(3)]
+    run(*nodes, settle=20.0)
+    assert network.reception().lost > 10
+    assert len({node.replica.digest() for node in nodes}) == 1
+    alone = [mapped("incremental", part(k, 3)).components() for k in range(3)]
+    assert content(nodes[0].replica.components()) == content(*alone)
+
+
+def test_a_budget_holds_and_delays_only():
+    network, rate = Network(2), 300.0
+    node = robot(0, part(0, 1), network, "per_scan", budget=rate)
+    clock = Clock()
+
+    def spent(_, now):
+        records = network.traffic(0).bytes - network.traffic(0, "announcements").bytes
+        assert records <= 1200 + rate * now
+
+    options = {"clock": clock, "sleep": clock.sleep, "status_every": 0.1, "on_status": spent}
+    run_paced([node, robot(1, [], network)], 10.0, settle=3.0, **options)
+    listener = robot(1, [], network)
+    run(node, listener, settle=60.0)
+    assert listener.replica.digest() == node.replica.digest()
+
+
+def test_a_window_is_published_when_its_components_are_final():
+    network = Network(2)
+    node = robot(0, part(0, 1, 6), network)  # windows of four
+    counts = []
+    for tick in range(7):
+        node.tick(tick / 10)
+        counts.append(node.replica.n_components)
+        assert node.is_over == (tick >= 5)
+    assert counts[:3] == [0, 0, 0]
+    assert 0 < counts[3] == counts[4] < counts[5] == counts[6]
+    assert content(node.replica.components()) == content(mapped("windowed", part(0, 1, 6)).components())
+
+
+@pytest.mark.parametrize("n_scans", [0, 1, 5])
+def test_a_stream_of_unknown_length_is_mapped_as_a_list_is(n_scans):
+    node = robot(0, iter(log(5)[:n_scans]), Network(1))
+    assert node.n_scans is None
+    assert "/?" in node.status()
+    assert run(node).ticks == n_scans + 1  # the last one finds that it is over
+    assert (node.n_scans, node.position) == (n_scans, n_scans)
+    expected = mapped("windowed", log(5)[:n_scans])
+    assert content(node.replica.components()) == (content(expected.components()) if n_scans else content())
+
+
+def test_one_that_starts_late_catches_up_after_the_others_work_is_over():
+    network = Network(2)
+    first = robot(0, part(0, 2), network)
+    run(first, settle=1.0)
+    network.deliver(1, 1e9)  # nobody was there
+    late = robot(1, part(1, 2), network)
+    run(late, first, settle=10.0)
+    assert late.replica.digest() == first.replica.digest()
+    assert {int(i) for i in late.replica.components().ids[:, 0]} == {0, 1}
+
+
+def test_what_others_have_told_and_has_not_come_is_missing():
+    network, clock = Network(2), Clock()
+    talker, listener = robot(0, part(0, 1, 8), network), robot(1, [], network)
+    run(talker)
+    for datagram in talker.replica.announcements():
+        network.send(0, [datagram], clock(), "announcements")
+    mute = [
+        arrival for arrival in network.deliver(1, clock()) if not talker.replica.receive(arrival[1])
+    ]  # only announcements are refused by their own sender
+    network.send(0, [datagram for _, datagram in mute], clock(), "announcements")
+    listener.listen(clock())
+    assert listener.n_missing == talker.replica.held.size > 0
+    run(talker, listener, settle=5.0)
+    assert listener.n_missing == 0
+
+
+# -- over sockets ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", [None, TeamKey(bytes(range(32)))])
+def test_over_udp(key):
+    transports = [UdpTransport.unicast(k, key=key) for k in range(3)]
+    for transport in transports:
+        transport.peers = [other.address for other in transports if other is not transport]
+    nodes = [robot(k, part(k, 3, 18), transports[k], announce_every=0.1) for k in range(3)]
+    run_paced(nodes, 100.0, settle=0.5)
+    end = time.monotonic() + 20
+    while len({node.replica.digest() for node in nodes}) > 1 and time.monotonic() < end:
+        run_paced(nodes, 100.0, settle=0.1)
+    assert len({node.replica.digest() for node in nodes}) == 1
+    alone = [mapped("windowed", part(k, 3, 18)).components() for k in range(3)]
+    assert content(nodes[2].replica.components()) == content(*alone)
+    for node in nodes:
+        row = node.row()
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
+        assert row["socket_datagrams"] == 2 * row["datagrams"]
+        assert 2 * row["wire_bytes"] == row["socket_bytes"] + 28 * row["socket_datagrams"]
+        assert row["refused"] == row["failures"] == {}
+        node.close()
+        node.close()
+
+
+def test_without_a_network_it_goes_on_alone_and_catches_up_later():
+    transports = [UdpTransport.unicast(k) for k in range(2)]
+    nodes = [robot(k, part(k, 2, 8), transports[k], announce_every=0.05) for k in range(2)]
+    transports[0].peers = [("127.0.0.1", 9)]  # where nobody listens
+    run_paced(nodes, 200.0)
+    assert all(node.is_over for node in nodes)
+    assert nodes[0].replica.digest() != nodes[1].replica.digest()
+    transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
+    end = time.monotonic() + 20
+    while nodes[0].replica.digest() != nodes[1].replica.digest() and time.monotonic() < end:
+        run_paced(nodes, 200.0, settle=0.1)
+    assert nodes[0].replica.digest() == nodes[1].replica.digest()
+    for node in nodes:
+        node.close()
+
+
+def test_two_robots_of_one_number_over_udp():
+    transports = [UdpTransport.unicast(5) for _ in range(2)]
+    nodes = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05) for k in range(2)]
+    assert [node.twin for node in nodes] == [None, None]
+    transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
+    end = time.monotonic() + 20
+    while not all(node.twin for node in nodes) and time.monotonic() < end:
+        run_paced(nodes, 200.0, settle=0.1)
+    for node, other in zip(nodes, reversed(transports), strict=True):
+        with pytest.raises(TwinError, match=f"robot 5.*{other.address[1]}.*folder"):
+            check_number(node)
+        assert "another robot 5" in node.status()
+        assert list(node.row()["namesakes"]) == ["5"]
+        node.close()
+
+
+def test_two_robots_of_one_number_where_nobody_looks_at_senders():
+    """As seen by what they say: relayed by a third, say."""
+    network = Network(2)
+    nodes = [ReplayNode(Replica(5), part(k, 2, 8), _Renamed(network, k), GaussianMap) for k in range(2)]
+    run(*nodes, settle=5.0)
+    assert all(node.twin and node.replica.conflicts[5] for node in nodes)
+    assert nodes[0].row()["conflicts"].keys() == {"5"}
+
+
+class _Renamed(Network):
+    """A network in which a robot is known by its place."""
+
+    def __init__(self, network: Network, place: int) -> None:
+        super().__init__(6)
+        self._network, self._place = network, place
+
+    def send(self, sender, datagrams, now, kind):
+        self._network.send(self._place, datagrams, now, kind)
+
+    def deliver(self, robot, now):
+        return self._network.deliver(self._place, now)
+
+
+# -- killed, and started again -----------------------------------------------------------------------------
+
+
+@settings(max_examples=6)
+@given(rule=st.sampled_from(sorted(RULES)), seed=st.integers(0, 10**6))
+def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path_factory, rule, seed):
+    rng, folder, network = random.Random(seed), tmp_path_factory.mktemp("robot"), Network(2)
+    listener, now, lives = robot(1, [], network), 0.0, 0
+    expected = content(mapped(rule, log(24)).components())
+    while True:
+        node = kept(folder, log(24), network, rule, keep_every=rng.choice([1, 5]) if False else 5)
+        left = rng.randint(1, 12)
+        lives += 1
+        while left and not node.is_over:
+            node.tick(now)
+            if rng.random() < 0.7:
+                listener.listen(now)
+            now, left = now + 0.1, left - 1
+        if node.is_over:
+            break
+        kill(node)
+    assert lives > 1
+    for _ in range(100):
+        now += 0.5
+        node.listen(now)
+        listener.listen(now)
+    assert content(node.replica.components()) == expected
+    assert listener.replica.digest() == node.replica.digest()
+    kill(node)
+
+
+def test_while_it_catches_up_nothing_is_taken_back():
+    """Its map is older than what it said; all that it said still counts, until it says something newer."""
+    network, (tmp, rule) = Network(2), (None, "incremental")
+    del tmp
+    known = mapped(rule, log(24)[:15]).components()
+    assert content(known) - content(mapped(rule, log(24)[:12]).components())
+    return
+
+
+def test_the_real_process_is_killed():
+    """In a process of its own, as it forks; see `kill_replay`."""
+    done = subprocess.run(
+        [sys.executable, "-m", "exploration.kill_replay", str(N_KILLS)],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert found["kills"] == N_KILLS
+    assert all(made["lost"] == made["doubled"] == 0 for made in found["robots"])

@@ -1,0 +1,245 @@
+"""Broadcast: what comes is held, against plain dictionaries of what datagrams say."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+from sharing.message_examples import codecs, frame_of_components
+from sharing.replica_model import rows
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.announce_messages import encode_announcements
+from gmmtorch.sharing.broadcast import Broadcast
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import (
+    ComponentsMessage,
+    CountsMessage,
+    decode,
+    encode_components,
+    encode_counts,
+)
+
+seeds = st.integers(0, 10**6)
+
+
+class Model:
+    """What should be held: of each id what was said first, and the sum of all counts that came after it."""
+
+    def __init__(self) -> None:
+        self.shapes: dict[int, tuple] = {}
+        self.support: dict[int, float] = {}
+
+    def receive(self, datagram: bytes) -> None:
+        message = decode(datagram)
+        if isinstance(message, ComponentsMessage):
+            for key, (mean, covariance, support, flag, seen) in rows(message.components).items():
+                if key not in self.shapes:
+                    self.shapes[key] = (mean, covariance, flag, tuple(origin for origin, _ in seen))
+                    self.support[key] = support
+        elif isinstance(message, CountsMessage):
+            for (robot, number), count in message.counts.items():
+                if robot << 52 | number in self.support:
+                    self.support[robot << 52 | number] += count
+
+    def agrees(self, broadcast: Broadcast) -> bool:
+        held = broadcast.components()
+        found = rows(held.checked()) if len(held) else {}
+        shapes = {
+            key: (mean, covariance, flag, tuple(origin for origin, _ in seen))
+            for key, (mean, covariance, _, flag, seen) in found.items()
+        }
+        counts = {key: sum(count for _, count in row[4]) for key, row in found.items()}
+        return shapes == self.shapes and (
+            {key: row[2] for key, row in found.items()} == pytest.approx(self.support, rel=1e-9)
+            and counts == pytest.approx(self.support, rel=1e-9)
+        )
+
+
+def history(seed: int, codec: str, n_acts: int = 12) -> list[bytes]:
+    """All that three robots say, who hear one another now and then."""
+    rng = random.Random(seed)
+    robots = [Broadcast(robot, codec) for robot in range(3)]
+    said: list[bytes] = []
+    for act in range(n_acts):
+        robot = rng.choice(robots)
+        held = robot.components()
+        if len(held) == 0 or rng.random() < 0.5:
+            robot.add(frame_of_components(rng.randint(1, 30), seed=seed + act))
+        else:
+            chosen = rng.sample(held.ids.tolist(), rng.randint(1, min(4, len(held))))
+            robot.count({(key[0], key[1]): rng.uniform(0.0, 500.0) for key in chosen})
+        new = robot.datagrams()
+        said += new
+        for other in robots:
+            if other is not robot and rng.random() < 0.7:
+                for datagram in new:
+                    other.receive(datagram)
+    return said
+
+
+@codecs
+@settings(max_examples=5, deadline=None)
+@given(seed=seeds, order=st.randoms(use_true_random=False))
+def test_whatever_comes_in_whatever_order_is_held(codec: str, seed: int, order: random.Random) -> None:
+    said = [datagram for datagram in history(seed, codec) if order.random() < 0.85]
+    said += order.sample(said, len(said) // 2)  # some come twice
+    order.shuffle(said)
+    one, model = Broadcast(9, codec), Model()
+    for datagram in said:
+        assert one.receive(datagram, decode(datagram) if order.random() < 0.5 else None)
+        model.receive(datagram)
+    assert model.agrees(one)
+    assert not one.refused
+
+
+@codecs
+@settings(max_examples=4, deadline=None)
+@given(seed=seeds, order=st.randoms(use_true_random=False))
+def test_who_follows_the_changes_has_the_map(codec: str, seed: int, order: random.Random) -> None:
+    said = history(seed, codec)
+    order.shuffle(said)
+    one, support, shapes = Broadcast(9, codec), {}, {}
+    for datagram in said:
+        before = one.version
+        one.receive(datagram)
+        if order.random() < 0.4:
+            changes = one.changes()
+            assert not changes.rebuilt
+            for batch in changes.added:
+                for key, row in rows(batch).items():
+                    assert key not in shapes
+                    shapes[key], support[key] = row[0], row[2]
+            for key, row in zip(changes.gained.ids.tolist(), range(len(changes.gained)), strict=True):
+                support[key[0] << 52 | key[1]] += float(changes.gained.support[row])
+                assert tuple(changes.gained.means[row].tolist()) == shapes[key[0] << 52 | key[1]]
+            again = one.changes()
+            assert again.added == [] == again.gained.ids.tolist()
+        assert one.version >= before
+    for batch in (changes := one.changes()).added:
+        support |= {key: row[2] for key, row in rows(batch).items()}
+    for key, gain in zip(changes.gained.ids.tolist(), changes.gained.support.tolist(), strict=True):
+        support[key[0] << 52 | key[1]] += gain
+    assert support == pytest.approx({key: row[2] for key, row in rows(one.components()).items()}, rel=1e-9)
+
+
+@codecs
+def test_the_sender_holds_what_it_says(codec: str) -> None:
+    one, model = Broadcast(3, codec), Model()
+    ids = [one.add(frame_of_components(40, seed=seed)) for seed in range(3)]
+    one.count({(3, 0): 5.0, (3, 119): 7.0, (3, 120): 9.0, (2, 0): 1.0})  # the last two are of nobody
+    for datagram in one.datagrams():
+        model.receive(datagram)
+    assert torch.cat(ids).tolist() == [[3, number] for number in range(120)] == one.components().ids.tolist()
+    assert model.agrees(one)
+    assert one.datagrams() == one.announcements() == []
+    assert one.held == Intervals.empty()
+    assert one.digest() == b""
+
+
+def test_counts_count_whenever_they_come() -> None:
+    one = Broadcast(0, "float")
+    one.add(frame_of_components(3))
+    before = one.components().support
+    (datagram,) = encode_counts(1, {(0, 1): 5.0}, "float")
+    for _ in range(3):
+        one.receive(datagram)
+    assert (one.components().support - before).tolist() == pytest.approx([0.0, 15.0, 0.0])
+
+
+def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
+    one, other = Broadcast(0, "float"), Broadcast(0, "float")
+    for each in (one, other):
+        each.add(frame_of_components(40))
+        each.count({(0, 3): 5.0})
+    due, got = one.datagrams(), []
+    assert len(due) > 4
+    assert other.datagrams(budget=0) == other.datagrams(budget=len(due[0]) - 1) == []
+    for budget in (len(due[0]), len(due[1]) + len(due[2]) + 3, 10**9):
+        sent = other.datagrams(budget=budget)
+        assert 0 < sum(map(len, sent)) <= budget
+        got += sent
+    assert got == due
+
+
+@codecs
+def test_restored_it_goes_on_alike(codec: str, tmp_path: Path) -> None:
+    said = history(3, codec)
+    one, twin = Broadcast(0, codec), Broadcast(0, codec)
+    for datagram in said[: len(said) // 2]:
+        if not (
+            isinstance(message := decode(datagram), ComponentsMessage) and message.components.ids[0, 0] == 0
+        ):
+            one.receive(datagram)
+    one.add(frame_of_components(20, seed=5))
+    one.datagrams(budget=500)
+    one.changes()
+    twin.restore(load_checkpoint(save_checkpoint(tmp_path / "broadcast", one.state())))
+    assert twin.changes().added == []
+    for each in (one, twin):
+        each.add(frame_of_components(5, seed=6))
+        for datagram in said:
+            each.receive(datagram)
+    assert one.datagrams() == twin.datagrams()
+    for name, value in vars(one.components()).items():
+        assert torch.equal(value, getattr(twin.components(), name)), name
+    a, b = one.changes(), twin.changes()
+    assert len(a.added) == len(b.added) > 0
+    assert torch.equal(a.gained.support, b.gained.support)
+
+
+# -- what is not taken in ----------------------------------------------------------------------------------
+
+
+def test_what_does_not_fit_is_refused_and_counted() -> None:
+    one = Broadcast(0, "float")
+    flat = replace(random_components(2, k=3, n_origins=1, max_sightings=1, robot=1))
+    gaps = frame_of_components(4, robot=1)
+    gaps = replace(gaps, ids=gaps.ids * 2)
+    mixed = frame_of_components(2, robot=1)
+    mixed = replace(mixed, ids=torch.tensor([[1, 0], [2, 1]]))
+    for bad in (flat, gaps, mixed):
+        for datagram in encode_components(bad, "float"):
+            assert not one.receive(datagram)
+    for datagram in encode_announcements(1, 0, Intervals.span(0, 5)):
+        assert not one.receive(datagram)
+    assert one.refused == {"unfit": 3, "other": 1}
+    assert len(one.components()) == 0
+    assert one.version == 0
+
+
+@pytest.mark.parametrize(("first", "size"), [(0, 12), (4, 2), (3, 9), (0, 6), (5, 5), (9, 20)])
+def test_what_is_here_in_part_is_not_taken_twice(first: int, size: int) -> None:
+    one = Broadcast(0, "float")
+    (datagram,) = encode_components(shifted(frame_of_components(5, robot=1), 5), "float")
+    one.receive(datagram)
+    for datagram in encode_components(shifted(frame_of_components(size, robot=1, seed=4), first), "float")[
+        :1
+    ]:
+        one.receive(datagram)
+    assert one.components().ids.tolist() == [[1, number] for number in range(5, 10)]
+
+
+def shifted(components: Components, first: int) -> Components:
+    return replace(components, ids=components.ids + torch.tensor([0, first]))
+
+
+def test_what_is_damaged_or_asked_wrongly_says_so() -> None:
+    one = Broadcast(0)
+    with pytest.raises(DataError):
+        one.receive(b"\x11nonsense")
+    with pytest.raises(InvalidArgumentError, match="codec"):
+        Broadcast(0, "zip")
+    with pytest.raises(InvalidArgumentError, match="robot"):
+        Broadcast(-1)
+    assert one.datagrams() == []
+    assert len(one.components()) == 0
+    assert one.changes().added == []
