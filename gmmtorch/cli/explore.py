@@ -122,9 +122,10 @@ def _variants(config: DictConfig) -> list[dict[str, Any]]:
                 f"study.variants has {sorted(set(variant) - known)}; a variant may set "
                 f"{', '.join(sorted(known))}."
             )
-        prior = variant.get("planning_prior", 0.0)
-        if not isinstance(prior, int | float):
-            raise InvalidArgumentError(f"study.variants has planning_prior={prior!r}, which is no number.")
+        for key in ("planning_prior", *_OF_ROBOTS):
+            value = variant.get(key, 0.0)
+            if not (isinstance(value, int | float) or (key == "budget" and value is None)):
+                raise InvalidArgumentError(f"study.variants has {key}={value!r}, which is no number.")
     if not variants or not config.study.seeds:
         raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
     return variants

@@ -20,7 +20,6 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.mapper import Heard, Mapper, Memo, Sensed, novel_beams
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
-from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components, packed, unpacked
 from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
@@ -35,6 +34,7 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
+_FRAMES_PER_COUNT = 5  # few large messages, and few looks at what they change
 _EMPTY_LENGTH = 0.8
 _EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
 _EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
@@ -104,7 +104,9 @@ class MixtureMapper(Mapper):
         self.shared = shared
         self.tiles = MixtureTiles()
         self._rule = rule
-        self._gained: dict[tuple[int, int], float] = {}  # counts not sent yet, by id
+        self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
+        self._due: dict[tuple[int, int], float] = {}  # those that have
+        self._n_frames = 0
         self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
 
     # -- sensing ----------------------------------------------------------------------------------
@@ -118,26 +120,28 @@ class MixtureMapper(Mapper):
         # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
-        gains = self._counted(frame, ~novel)
+        self._count(frame, ~novel)
         self.shared.add(self._learned(frame, novel))
-        self.shared.count(gains)
+        self._n_frames += 1
+        if self._n_frames % _FRAMES_PER_COUNT == 0:
+            self.shared.count(self._due)
+            self._due = {}
         return Sensed(self._follow(), novel)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
-        """The components of the novel beams, in an order that takes few bytes."""
+        """The components of the novel beams."""
         origin, rule = frame.origin[None], self._rule
         surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
         empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
         parts = [surfaces, empty]
-        found = Components.concatenate([part for part in parts if len(part)] or parts[:1])
-        return found.rearranged(spatial_order(found)) if len(found) else found
+        return Components.concatenate([part for part in parts if len(part)] or parts[:1])
 
-    def _counted(self, frame: DepthFrame, known: Tensor) -> dict[tuple[int, int], float]:
-        """Counts that are due to be sent, once the beams (N,) that told nothing new are counted."""
+    def _count(self, frame: DepthFrame, known: Tensor) -> None:
+        """Count the beams (N,) that told nothing new, and what has grown enough as due to be told."""
         nearby = self._seen_from_near(frame.origin)
         chosen = known.nonzero().squeeze(1)[:: self._rule.update_stride]
         if nearby is None or len(chosen) == 0:
-            return {}
+            return
         weight = float(self._rule.update_stride)
         counted = nearby
         for max_range in (False, True):
@@ -146,15 +150,13 @@ class MixtureMapper(Mapper):
                 counted, ends, frame.origin, self._novelty.distance, None, max_range, weight
             ).components
         gain = counted.support - nearby.support
-        due = {}
         for row in (gain > 0).nonzero().squeeze(1).tolist():
             key = (int(nearby.ids[row, 0]), int(nearby.ids[row, 1]))
             total = self._gained.pop(key, 0.0) + float(gain[row])
             if total >= (self._rule.update_at - 1) * float(nearby.support[row]):
-                due[key] = total
+                self._due[key] = self._due.get(key, 0.0) + total
             else:
                 self._gained[key] = total
-        return due
 
     def _seen_from_near(self, origin: Tensor) -> Components | None:
         """Components with all their counts, of batches seen from close to a place (3,)."""
@@ -232,26 +234,27 @@ class MixtureMapper(Mapper):
         surfaces, empty = (
             batch.selected((batch.max_range == kind).nonzero().squeeze(1)) for kind in (False, True)
         )
-        parts = [
-            component_evidence(
-                surfaces,
-                resolution,
-                box,
-                rays_per_cell=rule.rays,
-                shell=rule.shell,
-                hits_per_ray=_HITS_PER_RAY,
-                thinned=True,
-            ),
-            component_evidence(
-                empty,
-                resolution,
-                box,
-                rays_per_cell=_EMPTY_RAYS * rule.rays,
-                cutoff=_EMPTY_CUTOFF,
-                thinned=True,
-            ),
-        ]
-        return united(parts)
+        parts = []
+        if len(surfaces):
+            parts.append(
+                component_evidence(
+                    surfaces,
+                    resolution,
+                    box,
+                    rays_per_cell=rule.rays,
+                    shell=rule.shell,
+                    hits_per_ray=_HITS_PER_RAY,
+                    thinned=True,
+                )
+            )
+        if len(empty):
+            rays = _EMPTY_RAYS * rule.rays
+            parts.append(
+                component_evidence(
+                    empty, resolution, box, rays_per_cell=rays, cutoff=_EMPTY_CUTOFF, thinned=True
+                )
+            )
+        return united(parts) if parts else CellEvidence.empty()
 
     # -- the whole --------------------------------------------------------------------------------
 
@@ -265,6 +268,8 @@ class MixtureMapper(Mapper):
             "shared": self.shared.state(),
             "batches": packed([batch for _, batch in self.tiles.items()]),
             "gained": [[*key, count] for key, count in self._gained.items()],
+            "due": [[*key, count] for key, count in self._due.items()],
+            "n_frames": self._n_frames,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -272,7 +277,11 @@ class MixtureMapper(Mapper):
         self.shared.restore(state["shared"])
         for batch in unpacked(state["batches"]):
             self._keep(batch)
-        self._gained = {(int(robot), int(number)): count for robot, number, count in state["gained"]}
+        self._gained, self._due = (
+            {(int(robot), int(number)): count for robot, number, count in state[name]}
+            for name in ("gained", "due")
+        )
+        self._n_frames = int(state["n_frames"])
 
 
 def _name(batch: Components) -> bytes:

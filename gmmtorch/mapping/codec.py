@@ -141,8 +141,8 @@ def _write_means(writer: BitWriter, places: Lattice) -> None:
     least, extent = _box(cells)
     writer.number(exponent)
     for axis in range(places.dim):
-        writer.number(least[axis])
-        writer.number(extent[axis])
+        writer.number(int(least[axis]))
+        writer.number(int(extent[axis]))
     writer.column(_raster(cells, least, extent))
     width = np.maximum(exponent - _ints(_world_exponents(places)), 0)
     within = _ints(_by_world_axis(places, places.mean)) & ((np.int64(1) << width) - 1)
@@ -180,10 +180,14 @@ def _cell_exponent(places: Lattice, in_order: bool) -> int:
         return 0
     rising = np.sort(exponents, axis=None)
     first = int((rising[(len(rising) - 1) // 2] + rising[len(rising) // 2]) / 2)
-    while first < LARGEST_SIDE and _is_wide(places, first):
+    while True:
+        tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
+        cells = _cells(places, tried)
+        least, extent = _box(cells)
+        if first == LARGEST_SIDE or not _too_many(extent[0]):
+            break
         first += 1
-    tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
-    rasters = np.stack([_raster(cells, *_box(cells)) for cells in _cells(places, tried)])
+    rasters = _raster(cells, least, extent)
     within = np.maximum(tried[:, None, None] - exponents, 0).sum((1, 2))
     sizes = fewest_bits(rasters if in_order else np.sort(rasters, axis=1)) + within
     best = 0
@@ -195,24 +199,25 @@ def _cell_exponent(places: Lattice, in_order: bool) -> int:
     return int(tried[best])
 
 
-def _is_wide(places: Lattice, exponent: int) -> bool:
-    """Whether cells of this side are too many to be numbered."""
-    return bool(math.prod(_box(_cells(places, np.array([exponent]))[0])[1]) >> RASTER_BITS)
+def _box(cells: Ints) -> tuple[Ints, Ints]:
+    """Least cell (…, D) of (…, K, D), and the number of cells on each axis."""
+    if not cells.shape[-2]:
+        shape = (*cells.shape[:-2], cells.shape[-1])
+        return np.zeros(shape, np.int64), np.ones(shape, np.int64)
+    least = cells.min(-2)
+    return least, cells.max(-2) - least + 1
 
 
-def _box(cells: Ints) -> tuple[list[int], list[int]]:
-    """Least cell and number of cells on each axis."""
-    if not len(cells):
-        return [0] * cells.shape[1], [1] * cells.shape[1]
-    least = cells.min(0)
-    return least.tolist(), (cells.max(0) - least + 1).tolist()
+def _too_many(extent: Ints) -> bool:
+    """Whether a box (D,) has more cells than are numbered."""
+    return bool(math.prod(extent.tolist()) >> RASTER_BITS)
 
 
-def _raster(cells: Ints, least: list[int], extent: list[int]) -> Ints:
-    """Row-major numbers (K,) of cells in their box."""
-    number = np.zeros(len(cells), np.int64)
-    for axis, n in enumerate(extent):
-        number = number * n + (cells[:, axis] - least[axis])
+def _raster(cells: Ints, least: Ints, extent: Ints) -> Ints:
+    """Row-major numbers (…, K) of cells in their box."""
+    number = cells[..., 0] - least[..., None, 0]
+    for axis in range(1, cells.shape[-1]):
+        number = number * extent[..., None, axis] + (cells[..., axis] - least[..., None, axis])
     return number
 
 

@@ -123,10 +123,12 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     exact, rows = _exact(means, covariances)
     if len(rows) == len(means):
         return exact
-    rounded = _rounded(means, covariances, _pivots(covariances))
+    order = _pivots(covariances)
+    rounded = _rounded(means, covariances, order)
     # Of several axis orders that restore the same component the first is taken, whatever order the
     # component came in with: so the bytes of what was rounded before are the same again.
-    return _replaced(_replaced(rounded, *_exact(*rounded.restored())), exact, rows)
+    earlier = _exact(*rounded.restored(), before=order)
+    return _replaced(_replaced(rounded, *earlier), exact, rows)
 
 
 def shear_exponents(deviation: Tensor) -> Tensor:
@@ -162,15 +164,18 @@ def _check(means: Tensor, covariances: Tensor) -> None:
             )
 
 
-def _exact(means: Tensor, covariances: Tensor) -> tuple[Lattice, Tensor]:
+def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> tuple[Lattice, Tensor]:
     """Those components that are on the lattice as they are, in the first axis order in which they are; and
-    their rows (J,), rising."""
+    their rows (J,), rising. Only axis orders before some (K,) are tried, if they are given."""
     k, dim = means.shape
     # The first axis of such an order has a variance that the lattice has: of most components few do.
     variances = covariances.diagonal(dim1=1, dim2=2)
     least, largest = LEAST_DEVIATION, LARGEST_DEVIATION
     steps = (torch.log2(variances.clamp_min(1e-300)) * (PER_OCTAVE / 2)).round().long().clamp(least, largest)
-    row, order = (power(2 * steps) == variances)[:, AXIS_ORDERS[dim][:, 0]].nonzero(as_tuple=True)
+    fits = (power(2 * steps) == variances)[:, AXIS_ORDERS[dim][:, 0]]  # (K, orders)
+    if before is not None:
+        fits &= torch.arange(fits.shape[1]) < before[:, None]
+    row, order = fits.nonzero(as_tuple=True)
     if not len(row):
         none = order.new_zeros(0, dim)
         return Lattice(order, none, order.new_zeros(0, dim * (dim - 1) // 2), none), order

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
+from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.components import Components, packed, unpacked
 from gmmtorch.mapping.updating import summed
 from gmmtorch.sharing.changes import Changes
@@ -55,7 +56,9 @@ class Broadcast:
         return Intervals.empty()
 
     def add(self, new: Components) -> Tensor:
-        """New components of this robot; returns their ids (K, 2)."""
+        """New components of this robot; returns the ids (K, 2) that they get, in the order in which they go."""
+        if len(new):
+            new = new.rearranged(spatial_order(new))  # takes fewer bytes
         numbers = self._n_numbered + torch.arange(len(new))
         self._n_numbered += len(new)
         ids = torch.stack([torch.full_like(numbers, self.robot), numbers], 1)

@@ -81,16 +81,22 @@ class Intervals:
 
     def __or__(self, other: Intervals) -> Intervals:
         large, small = (self, other) if len(self) >= len(other) else (other, self)
+        if not small:
+            return large
         begin, end = large._reach(small)
         places, here, there = large._part(begin, end)._against(small)
         joined = _where(places, here | there).edges
         return Intervals(np.concatenate([large.edges[:begin], joined, large.edges[end:]]))
 
     def __and__(self, other: Intervals) -> Intervals:
+        if not (self and other):
+            return Intervals.empty()
         places, here, there = self._near(other)._against(other._near(self))
         return _where(places, here & there)
 
     def __sub__(self, other: Intervals) -> Intervals:
+        if not (self and other):
+            return self
         begin, end = self._reach(other)
         places, here, there = self._part(begin, end)._against(other._near(self))
         left = _where(places, here & ~there).edges
@@ -105,9 +111,7 @@ class Intervals:
         return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
 
     def _reach(self, other: Intervals) -> tuple[int, int]:
-        """From which edge to which the intervals lie that may meet or touch the other set."""
-        if not other:
-            return 0, 0
+        """From which edge to which the intervals lie that may meet or touch the other set, which is not empty."""
         begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
         end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
         return begin - begin % 2, end + end % 2

@@ -98,9 +98,9 @@ class Records:
             components = components.selected(torch.from_numpy(np.flatnonzero(fresh)))
         self.check_room(len(components), int(keys[0]))
         added = Intervals.of(keys[fresh])
-        self._check_held(added)
+        held = self._with(added)
         self.table.add(keys[fresh], components)
-        self._hold(added)
+        self._hold(held)
         self.dim = components.dim
         return added if fresh.all() else Intervals.of(keys)
 
@@ -122,7 +122,7 @@ class Records:
             isinstance(record, SupersessionMessage) and len(record.old) > room
         ):
             raise _full(key)
-        self._check_held(span)
+        held = self._with(span)
         self.others[key], self.datagrams[key] = record, datagram
         self._kinds.setdefault(type(record), {})[key] = record
         if isinstance(record, SupersessionMessage):
@@ -132,7 +132,7 @@ class Records:
             self._log.counted(record.components)
         else:
             self._moved(record)
-        self._hold(span)
+        self._hold(held)
         return span
 
     def check_room(self, n: int, key: int) -> None:
@@ -140,9 +140,12 @@ class Records:
         if len(self.table) + n > self._most:
             raise _full(key)
 
-    def _check_held(self, added: Intervals) -> None:
-        if len(self.held | added) > max(len(self.held), MOST_INTERVALS):
+    def _with(self, added: Intervals) -> Intervals:
+        """What is held then, if there is room."""
+        held = self.held | added
+        if len(held) > max(len(self.held), MOST_INTERVALS):
             raise _full(added.pairs()[0][0])
+        return held
 
     def _check_same(self, keys: Ints, again: Components) -> None:
         """Components of keys (K,) that are held already have come again."""
@@ -150,8 +153,8 @@ class Records:
             if key in self.others or (key in self.table and self.table.print_of(key) != print_):
                 raise _conflict(key)
 
-    def _hold(self, added: Intervals) -> None:
-        held = self.held | added
+    def _hold(self, held: Intervals) -> None:
+        """Hold what was held and more, and forget what is superseded by it."""
         if held == self.held:
             return
         self.version += 1

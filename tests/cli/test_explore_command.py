@@ -263,13 +263,15 @@ def test_options_reach_the_mission(run):
     cut = {"begin": 1.0, "end": 3.0, "groups": [[0], [1]]}
     options += ["network.jitter=0.02", "network.duplication=0.5", "network.reach=15", "network.delay=0.1"]
     options += ["network.partitions=[{begin: 1, end: 3, groups: [[0], [1]]}]"]
+    options += ["network.announce=1.5", "network.budget=2000"]
     options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]", "planner.prior=0.5"]
     done = succeeded(run(*options))
     (row,) = done.results()["rows"]
     names = ["information", "coordination", "loss", "resolution", "planning_prior"]
     assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25, 0.5]
-    names = ["delay", "jitter", "duplication", "reach", "partitions"]
-    assert [row[name] for name in names] == [0.1, 0.02, 0.5, 15.0, [cut]]
+    names = ["delay", "jitter", "duplication", "reach", "partitions", "announce", "budget"]
+    assert [row[name] for name in names] == [0.1, 0.02, 0.5, 15.0, [cut], 1.5, 2000.0]
+    assert row["bytes_by_kind"]["announcements"] > 0
     assert row["reception"]["cut_off"] > 0
     assert 0 < row["bytes_octree"] < row["bytes_raw_points"]
     with np.load(done.folder / "trajectories.npz") as kept:
@@ -440,6 +442,8 @@ def test_without_checkpoints_none_is_written(run):
         ("network.partitions=[{begin:0,end:1,groups:[[0,2]]}]", "network.partitions[0].groups= 2"),
         ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= nobody"),
         ("network.partitions=[cut]", "network.partitions[0]='cut'"),
+        ("network.announce=0", "announce_every=0.0 seconds"),
+        ("network.budget=0", "budget=0.0 bytes"),
         ("map.window=[8,8]", "map.window=[8, three"),
         ("map.window=[8,8,8]", "map.window=[8, sensor.max_range"),
         ("map.rays=0", "rays=0.0"),
@@ -485,11 +489,12 @@ def test_a_bad_value_is_found_before_anything_is_flown(run, steps):
         "checkpoint.every=nan",
         "experiment=fig4_4_entropy study.seeds=[]",
         "experiment=fig4_4_entropy study.variants=[{loss:high}]",
+        "experiment=fig4_4_entropy study.variants=[{budget:high}]",
     ],
 )
 def test_a_value_of_the_wrong_kind_is_named_in_one_line(options, run):
     name = options.split()[-1].split("=")[0].split(".")[-1]
-    assert name in refused(run(*options.split(), "study.seeds=[0]" if "loss" in options else "seed=0"))
+    assert name in refused(run(*options.split(), "study.seeds=[0]" if "high" in options else "seed=0"))
 
 
 def test_a_bad_variant_is_found_before_the_first_is_flown(run, steps):
@@ -500,12 +505,12 @@ def test_a_bad_variant_is_found_before_the_first_is_flown(run, steps):
 
 def test_variants_that_differ_in_an_option_alone_are_kept_apart(run, steps, tmp_path):
     cut = "partitions:[{begin:0,end:1,groups:[[0]]}]"
-    variants = f"study.variants=[{{loss:0.5}},{{planning_prior:0.5}},{{{cut}}},{{delay:0.2}}]"
+    variants = f"study.variants=[{{loss:0.5}},{{planning_prior:0.5}},{{{cut}}},{{delay:0.2}},{{budget:9}}]"
     options = ["experiment=fig4_4_entropy", "study.seeds=[0]", variants, "duration=2"]
     options.append(f"checkpoint.folder={tmp_path / 'kept'}")
     succeeded(run(*options))
     succeeded(run(*options, name="again"))
-    assert len(steps) == 4 * 2
+    assert len(steps) == 5 * 2
 
 
 def test_a_mesh_that_was_not_given_is_asked_for(monkeypatch, tmp_path):

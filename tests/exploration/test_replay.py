@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 from exploration.replays import RULES, Clock, content, log, mapped
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -253,7 +252,7 @@ def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path
     listener, now, lives = robot(1, [], network), 0.0, 0
     expected = content(mapped(rule, log(24)).components())
     while True:
-        node = kept(folder, log(24), network, rule, keep_every=rng.choice([1, 5]) if False else 5)
+        node = kept(folder, log(24), network, rule, keep_every=5)
         left = rng.randint(1, 12)
         lives += 1
         while left and not node.is_over:
@@ -274,13 +273,108 @@ def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path
     kill(node)
 
 
-def test_while_it_catches_up_nothing_is_taken_back():
-    """Its map is older than what it said; all that it said still counts, until it says something newer."""
-    network, (tmp, rule) = Network(2), (None, "incremental")
-    del tmp
-    known = mapped(rule, log(24)[:15]).components()
-    assert content(known) - content(mapped(rule, log(24)[:12]).components())
-    return
+def test_while_it_catches_up_what_it_said_still_counts(tmp_path):
+    """Its map is older than what it said: it says nothing before it is as far as it was."""
+    network, options = Network(1), {"rule": "incremental", "keep_every": 6}  # windows of three
+    first = kept(tmp_path, log(24), network, **options)
+    for tick in range(17):
+        first.tick(tick / 10)
+    kill(first)
+    node = kept(tmp_path, log(24), network, **options)
+    assert node.resumed_at == node.row()["resumed_at"] == 12
+    assert node.row()["incarnation"] != first.row()["incarnation"]
+    for position in range(13, 22):
+        node.tick(position / 10)
+        learned = 15 if position < 18 else position - position % 3
+        assert content(node.replica.components()) == content(
+            mapped("incremental", log(24)[:learned]).components()
+        )
+    kill(node)
+
+
+def test_if_the_newest_map_has_rotted_the_one_before_will_do(tmp_path):
+    first = kept(tmp_path, log(24), Network(1), "incremental", keep_every=6)
+    for tick in range(17):
+        first.tick(tick / 10)
+    kill(first)
+    (tmp_path / "map-00000012.state").write_bytes(b"rotten")
+    node = kept(tmp_path, log(24), Network(1), "incremental", keep_every=6)
+    assert node.resumed_at == 6
+    said = content(mapped("incremental", log(24)[:15]).components())
+    for position in range(7, 18):
+        node.tick(position / 10)
+        assert content(node.replica.components()) == said
+    run(node)
+    assert content(node.replica.components()) == content(mapped("incremental", log(24)).components())
+    kill(node)
+
+
+def test_one_that_lost_its_disk_begins_anew_and_nothing_is_lost_or_there_twice_in_the_end(tmp_path):
+    network = Network(2)
+    first, teammate = kept(tmp_path / "a", log(24), network, "incremental"), robot(1, [], network)
+    run(first, teammate, settle=1.0, duration=1.6)
+    kill(first)
+    said = content(teammate.replica.components())
+    assert said
+    node = kept(tmp_path / "b", log(24), network, "incremental", announce_every=0.2)
+    run(teammate, node, settle=3.0, duration=0.0)
+    assert content(node.replica.components()) == said  # what it said comes back
+    now = 100.0
+    while not node.is_over:
+        now += 0.1
+        node.tick(now)
+        assert node.is_over or not said - content(node.replica.components())
+    run(node, teammate, settle=5.0)
+    for each in (node, teammate):
+        assert content(each.replica.components()) == content(mapped("incremental", log(24)).components())
+    kill(node)
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_stopped_and_started_again_it_goes_on(tmp_path, over):
+    node = kept(tmp_path, log(6), Network(1), "per_scan", keep_every=1)
+    run(node, duration=None if over else 0.3)
+    node.close()
+    again = kept(tmp_path, log(6), Network(1), "per_scan", keep_every=1)
+    assert again.resumed_at == (6 if over else 3)
+    assert again.replica.digest() == node.replica.digest()
+    run(again)
+    assert content(again.replica.components()) == content(mapped("per_scan", log(6)).components())
+    assert (again.replica.digest() == node.replica.digest()) == over  # nothing is said again
+    again.close()
+
+
+def test_a_stream_goes_on_where_it_was(tmp_path):
+    node = kept(tmp_path, iter(log(9)), Network(1), "per_scan", keep_every=2)
+    run(node, duration=0.5)
+    node.close()
+    again = kept(tmp_path, iter(log(9)), Network(1), "per_scan", keep_every=2)
+    assert again.resumed_at == 4
+    run(again)
+    assert content(again.replica.components()) == content(mapped("per_scan", log(9)).components())
+    again.close()
+
+
+def test_to_go_on_with_another_log_rule_or_number_is_refused(tmp_path):
+    run(node := kept(tmp_path, log(6), Network(1), facts={"dataset": "intel"}))
+    node.close()
+
+    def opened(scans=log(6), rule="windowed", number=0, dataset="intel"):
+        replica = Replica(number)
+        options = {"folder": tmp_path, "facts": {"dataset": dataset}}
+        return ReplayNode(replica, scans, Network(9), lambda: GaussianMap(RULES[rule]), **options)
+
+    opened()
+    for options, named in (
+        ({"scans": log(7)}, "n_scans"),
+        ({"rule": "per_scan"}, "learning"),
+        ({"number": 3}, "robot"),
+        ({"dataset": "aces"}, "dataset"),
+    ):
+        with pytest.raises(DataError, match=named):
+            opened(**options)
+    with pytest.raises(DataError, match="robot 0"):
+        Journal(tmp_path / "journal", Replica(3))
 
 
 def test_the_real_process_is_killed():
@@ -296,3 +390,127 @@ def test_the_real_process_is_killed():
     found = json.loads(done.stdout)
     assert found["kills"] == N_KILLS
     assert all(made["lost"] == made["doubled"] == 0 for made in found["robots"])
+
+
+# -- trouble -----------------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_is_said_once_and_all_is_kept_again_when_there_is_room(tmp_path, caplog):
+    """The kernel refuses what would make a file longer."""
+    network = Network(2)
+    node, listener = kept(tmp_path, log(24), network, "per_scan", keep_every=2), robot(1, [], network)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, limits[1]))
+    try:
+        with caplog.at_level(logging.WARNING):
+            run(node, listener, settle=1.0, duration=1.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert listener.replica.digest() == node.replica.digest()
+    assert node.row()["unkept"] > 3
+    assert caplog.text.count("no longer kept") == 1
+    assert caplog.text.count("how far it is") == 1
+    run(node, listener, settle=1.0)
+    assert "kept on disk again" in caplog.text
+    kill(node)
+    again = kept(tmp_path, log(24), Network(1), "per_scan", keep_every=2)
+    assert again.replica.digest() == node.replica.digest()
+    assert again.resumed_at == 24
+    again.close()
+
+
+def test_a_scan_that_cannot_be_read_is_left_out_and_said_once(caplog):
+    class Damaged(Part):
+        def __getitem__(self, index):
+            if index in (2, 5):
+                raise DataError(f"scan {index} is damaged")
+            return super().__getitem__(index)
+
+    node = robot(0, Damaged(log(8), range(8)), Network(1), "per_scan")
+    run(node)
+    assert (node.row()["unread"], node.row()["scans"]) == (2, 8)
+    assert caplog.text.count("is damaged") == 1
+    whole = [scan for index, scan in enumerate(log(8)) if index not in (2, 5)]
+    assert content(node.replica.components()) == content(mapped("per_scan", whole).components())
+
+
+def test_scans_that_are_no_neighbours_are_an_error():
+    node = robot(0, [*log(4), Scan([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0])], Network(1), "per_scan")
+    with pytest.raises(InvalidArgumentError, match="3-dimensional"):
+        run(node)
+    assert content(node.replica.components()) == content(mapped("per_scan", log(4)).components())
+
+
+def test_datagrams_that_say_nothing_are_counted():
+    network = Network(2)
+    node = robot(0, log(4), network)
+    network.send(1, [b"", b"nonsense", b"\x11" * 1200], 0.0, "noise")
+    network.send(1, robot(1, [], network).replica.announcements(), 0.0, "announcements")
+    run(node)
+    assert (node.row()["heard"], node.row()["damaged"]) == (4, 3)
+
+
+def test_clocks_that_jump_change_nothing_that_is_learned():
+    network, rng = Network(2), random.Random(0)
+    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    for _ in range(60):
+        now = rng.choice([0.0, 1e9, rng.uniform(0, 100)])
+        for node in nodes:
+            node.tick(now) if not node.is_over else node.listen(now)
+    for tick in range(200):
+        for node in nodes:
+            node.listen(1e9 + tick)
+    assert nodes[0].replica.digest() == nodes[1].replica.digest()
+
+
+@pytest.mark.parametrize("options", [{"announce_every": 0.0}, {"budget": 0.0}, {"keep_every": 0}])
+def test_bad_options(options):
+    with pytest.raises(InvalidArgumentError, match=next(iter(options))):
+        robot(0, [], Network(1), **options)
+
+
+# -- what it leaves ----------------------------------------------------------------------------------------
+
+
+def test_its_books_are_those_of_the_network():
+    network = Network(2, LinkConditions(loss=0.2))
+    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    run(*nodes, settle=3.0)
+    for k, node in enumerate(nodes):
+        row, scalars, sent = node.row(), node.scalars(), network.traffic(k)
+        assert row["bytes_sent"] == scalars["bytes_sent"] == sent.bytes
+        assert sum(row["bytes_by_kind"].values()) == sent.bytes
+        assert row["wire_bytes"] == scalars["wire_bytes_sent"] == sent.bytes + 28 * sent.datagrams
+        assert row["heard"] == network.reception(k).datagrams
+        assert row["digest"] == node.replica.digest().hex()
+        assert row["n_components"] == scalars["components"] == len(node.replica.components())
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
+        assert all(isinstance(value, float) for value in scalars.values())
+        assert "scan 4/4" in node.status()
+
+
+def test_its_maps_are_files(tmp_path):
+    network = Network(2)
+    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    run(*nodes, settle=2.0)
+    paths = nodes[0].save(tmp_path)
+    assert content(GaussianMap.load(paths["map"]).components()) == content(nodes[1].replica.components())
+    assert content(GaussianMap.load(paths["own_map"]).components()) == content(nodes[0].map.components())
+    assert robot(0, [], Network(1)).save(tmp_path) == {}
+
+
+@pytest.mark.real_data
+def test_a_real_log(real_data, tmp_path):
+    scans = load("carmen", real_data / "laser2d" / "intel.log.gz")
+    network = Network(3, LinkConditions(loss=0.3))
+    rule, parts = IncrementalRule(window=5), [Part(scans, list(part_of(30, k, 3))) for k in range(3)]
+    nodes = [ReplayNode(Replica(k), parts[k], network, lambda: GaussianMap(rule)) for k in range(3)]
+    run(*nodes, settle=15.0)
+    assert len({node.replica.digest() for node in nodes}) == 1
+    alone = []
+    for scans_of_one in parts:
+        made = GaussianMap(rule)
+        for scan in scans_of_one:
+            made.insert(scan)
+        alone.append(made.components())
+    assert content(nodes[0].replica.components()) == content(*alone)

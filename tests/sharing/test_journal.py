@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -351,15 +352,20 @@ def test_versions_to_come_are_refused_and_left(tmp_path):
     assert log.exists()
 
 
+def tables_of(state: dict) -> Iterator[dict]:
+    yield state
+    for value in state.values():
+        if isinstance(value, dict):
+            yield from tables_of(value)
+
+
 @settings(max_examples=40)
 @given(data=st.data())
 def test_snapshots_that_somebody_forged_are_refused_or_restored(tmp_path_factory, data):
     """With a digest that is right, and any part of the state replaced."""
     folder = tmp_path_factory.mktemp("journal")
     state = told(spoken(1, 3), robot=0).state()
-    records = state["records"]
-    parts = [state, records, records["log"], records["components"], state["author"], state["backlog"]]
-    part = data.draw(st.sampled_from(parts))
+    part = data.draw(st.sampled_from(list(tables_of(state))))
     tensors = [torch.zeros(0), torch.full((3, 3), torch.nan), torch.arange(5), torch.ones(2, 2, 2)]
     hostile = (
         st.none() | st.integers() | st.floats() | st.text(max_size=3) | st.lists(st.integers(), max_size=3)
@@ -380,7 +386,7 @@ def test_a_replica_that_has_no_room_for_what_was_kept_says_so(tmp_path):
     assert journal.restored.n_refused > 0
     assert "full" in journal.restored.damage[0]
     reopened(tmp_path)  # now it is in a snapshot
-    with pytest.raises(DataError, match="most_components|memory"):
+    with pytest.raises(DataError, match="most_components"):
         Journal(tmp_path, Replica(0, most_components=2))
     assert reopened(tmp_path)[0].digest() == told(datagrams).digest()
 
