@@ -379,7 +379,7 @@ class TeamMap:
     rays: float = 4.0
     shell: float = 0.5
     update_at: float = 2.0
-    update_stride: int = 9
+    update_stride: int = 16
 
 
 @dataclass

@@ -57,6 +57,7 @@ class Mission:
             "entropy_bits": [],
             "entropy_bits_per_robot": [[] for _ in agents],
             "bytes_over_time": [],
+            "wire_bytes_over_time": [],
             "missing_share": [],
             "raw_points_bytes_over_time": [],
             **{f"{name}_bytes_over_time": [] for name in options.codecs},
@@ -198,6 +199,7 @@ class Mission:
         for curve, robot in zip(s["entropy_bits_per_robot"], self.robots, strict=True):
             curve.append(robot.mapper.belief.entropy_bits)
         s["bytes_over_time"].append(self.network.n_bytes)
+        s["wire_bytes_over_time"].append(self.network.n_wire_bytes)
         s["missing_share"].append(self._missing_share())
         for name, size in self._raw.items():
             s[f"{name}_bytes_over_time"].append(size)

@@ -11,6 +11,7 @@ import torch
 from gmmtorch.evaluation.trials import time_to_share
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.scoring import accuracy, disagreement, overlap
+from gmmtorch.exploration.variants import variant_of
 
 
 def row_of(mission: Mission, wall_seconds: float) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     final: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
-        final.setdefault(_variant(row), []).append(row["entropy_reduction_bits"])
+        final.setdefault(variant_of(row), []).append(row["entropy_reduction_bits"])
     means = {variant: sum(bits) / len(bits) for variant, bits in final.items()}
     of_grids = [bits for variant, bits in means.items() if variant[0] == "grid_shared"]
     reference = max(of_grids or means.values(), default=0.0)
@@ -92,17 +93,6 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         }
         timed.append({**row, "reference_bits": reference, **times})
     return timed
-
-
-_VARIANT = (
-    *("framework", "planner", "information", "coordination", "planning_prior", "codec"),
-    *("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions", "announce", "budget"),
-)
-
-
-def _variant(row: dict[str, Any]) -> tuple[Any, ...]:
-    """What the seeds of a variant have in common, to be counted by; the framework first."""
-    return tuple(str(value) if isinstance(value, list) else value for value in map(row.get, _VARIANT))
 
 
 def _finite(value: float) -> float | None:

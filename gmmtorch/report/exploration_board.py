@@ -10,6 +10,7 @@ import torch
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
+from gmmtorch.exploration.variants import differing
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.board import Board
 from gmmtorch.report.style import as_array, colour
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 _SERIES = (
     "entropy_bits",
     "bytes_over_time",
+    "wire_bytes_over_time",
+    "missing_share",
     "raw_points_bytes_over_time",
     "octree_bytes_over_time",
     "draco_bytes_over_time",
@@ -59,8 +62,9 @@ def write_exploration_board(
 ) -> None:
     """Trials and their pictures into one TensorBoard run.
 
-    By framework and seed, entropy (bits, and the share left of the observable), the robots' own entropies
-    and cumulative bytes over simulated seconds, and every number of the row at its end.
+    By framework, options in which the rows differ, and seed: entropy (bits, and the share left of the
+    observable), the robots' own entropies, cumulative bytes and the share of records missing over simulated
+    seconds, and every number of the row at its end.
 
     Args:
         board: the run; who opened it closes it.
@@ -69,9 +73,9 @@ def write_exploration_board(
         components: the final mixture, shown as ellipsoids; beams without return are left out.
         trajectories: of each robot, poses (T, ≥ 3), world metres, shown as a cloud in their colours.
     """
-    several = len({_variant(row) for row in rows}) > 1
+    fields = differing(rows, without=["framework"])
     for row in rows:
-        tag = f"{row['framework']}/{_variant(row) + '/' if several else ''}seed_{row['seed']}"
+        tag = f"{row['framework']}/{_variant(row, fields)}seed_{row['seed']}"
         _write_series(board, row, tag)
         board.scalars(row, tag, step=int(row["times"][-1]))
     for name, figure in figures.items():
@@ -82,8 +86,19 @@ def write_exploration_board(
     board.cloud("paths", *_path_cloud(trajectories))
 
 
-def _variant(row: Mapping[str, Any]) -> str:
-    return "_".join(str(row.get(key)) for key in ("planner", "information", "coordination", "planning_prior"))
+def _variant(row: Mapping[str, Any], fields: Sequence[str]) -> str:
+    """A part of a tag: each field with its value, as planner_mcts_loss_0.3; empty if there is none."""
+    parts = [f"{field}_{_short(row.get(field))}" for field in fields]
+    return "_".join(parts) + "/" if parts else ""
+
+
+def _short(value: Any) -> str:
+    """A value in a tag; of partitions, when and who: 60-120_0_1.2."""
+    if not isinstance(value, list):
+        return str(value)
+    cuts = [(f"{cut['begin']:g}-{cut['end']:g}", cut["groups"]) for cut in value]
+    names = ["_".join([when, *(".".join(map(str, group)) for group in groups)]) for when, groups in cuts]
+    return "_".join(names) or "none"
 
 
 def _write_series(board: Board, row: Mapping[str, Any], tag: str) -> None:

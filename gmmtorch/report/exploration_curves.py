@@ -29,6 +29,7 @@ from gmmtorch.report.exploration_style import (
     ratio_text,
     seeds_note,
 )
+from gmmtorch.report.exploration_variants import by_variant
 from gmmtorch.report.style import (
     LABEL_SIZE,
     PALETTE,
@@ -128,8 +129,7 @@ def bandwidth_figure(rows: Rows, title: str | None = None) -> Figure:
 def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
     """Share of the observable entropy left over time, a line for each planner variant.
 
-    Variants are told apart by planner, information, coordination and planning_prior; a label names
-    those in which they differ. Means over seeds in 95 % bands. Marks at the mean t50 and t90 where every
+    Variants are told apart by every option that one may set; a label names those in which they differ. Means over seeds in 95 % bands. Marks at the mean t50 and t90 where every
     seed has one: times to 50 and 90 % of the largest mean reduction of any variant, whatever rows say
     of their own, so that all are measured alike.
 
@@ -139,7 +139,7 @@ def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
     if not rows:
         raise InvalidArgumentError("rows is empty; give the rows of one trial at least.")
     variants = {
-        name: [{**row, "reference_bits": None} for row in trials] for name, trials in _variants(rows).items()
+        name: [{**row, "reference_bits": None} for row in trials] for name, trials in by_variant(rows).items()
     }
     reference = max(_reference(trials) or 0.0 for trials in variants.values())
     figure = new_figure(9.6, 5.4)
@@ -285,22 +285,3 @@ def _byte_axis(axes: Axes, curves: Sequence[Curves]) -> None:
     axes.yaxis.set_major_locator(LogLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _variants(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    """Rows of each variant, by a name of those fields in which the variants differ."""
-    fields = ("planner", "information", "coordination", "planning_prior")
-    varying = [field for field in fields if len({str(row.get(field)) for row in rows}) > 1] or ["planner"]
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(", ".join(_variant_text(field, row.get(field)) for field in varying), []).append(
-            row
-        )
-    return groups
-
-
-def _variant_text(field: str, value: Any) -> str:
-    if field == "planning_prior":
-        return "no prior" if value is None else f"prior {value:g}"
-    shown = {"mcts": "MCTS", "csqmi": "CSQMI", "fsmi": "FSMI"}
-    return shown.get(str(value), str(value).replace("_", " "))

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import Band, mean_band, on_common_times
+from gmmtorch.exploration.variants import variant_of
 from gmmtorch.report.style import LABEL_SIZE, PALETTE, colour, label_of
 
 Rows = Sequence[Mapping[str, Any]]
@@ -138,8 +139,7 @@ def _rounded(value: float, digits: int) -> str:
 
 def _groups(rows: Rows) -> list[list[Mapping[str, Any]]]:
     """Rows that differ by seed alone."""
-    keys = ("framework", "world", "planner", "information", "coordination", "planning_prior")
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row.get(key) for key in keys), []).append(row)
+        groups.setdefault((row.get("world"), *variant_of(row)), []).append(row)
     return list(groups.values())

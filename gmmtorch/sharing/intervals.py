@@ -111,7 +111,7 @@ class Intervals:
         return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
 
     def _reach(self, other: Intervals) -> tuple[int, int]:
-        """From which edge to which the intervals lie that may meet or touch the other set, which is not empty."""
+        """From which edge to which the intervals lie that may meet or touch the other set, not empty."""
         begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
         end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
         return begin - begin % 2, end + end % 2

@@ -80,8 +80,8 @@ def _restore_snapshot(folder: Path, replica: Replica, damage: list[str]) -> int 
             replica.restore(state)
         except (DataError, ArithmeticError, LookupError) as error:
             raise DataError(
-                f"{path} cannot be restored: {error} Make the replica as it was made, or give the journal "
-                "another folder."
+                f"{path} cannot be restored: {error} Make the replica with the most_components it had, or "
+                "give the journal another folder."
             ) from error
         return number
     return None

@@ -19,7 +19,7 @@ from gmmtorch.sharing.announce_messages import (
     TotalsMessage,
     encode_record,
 )
-from gmmtorch.sharing.changes import Changes, ChangeLog
+from gmmtorch.sharing.changes import ChangeLog, Changes
 from gmmtorch.sharing.component_table import ComponentTable, fingerprints, most_sightings
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import decode
@@ -270,7 +270,7 @@ class Records:
         for n_bytes in state["record_bytes"].tolist():
             fresh.add_record(_record(data[at : at + n_bytes]))
             at += n_bytes
-        held = Intervals(state["held"].numpy().astype(np.int64))
+        held = fresh.held | Intervals(state["held"].numpy().astype(np.int64))
         fresh.dead = held - fresh.live()
         fresh._hold(held)
         fresh._log = ChangeLog.restored(log, len(pieces) - len(untold))

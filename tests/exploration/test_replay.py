@@ -146,16 +146,12 @@ def test_one_that_starts_late_catches_up_after_the_others_work_is_over():
 
 
 def test_what_others_have_told_and_has_not_come_is_missing():
-    network, clock = Network(2), Clock()
+    network = Network(2)
     talker, listener = robot(0, part(0, 1, 8), network), robot(1, [], network)
     run(talker)
-    for datagram in talker.replica.announcements():
-        network.send(0, [datagram], clock(), "announcements")
-    mute = [
-        arrival for arrival in network.deliver(1, clock()) if not talker.replica.receive(arrival[1])
-    ]  # only announcements are refused by their own sender
-    network.send(0, [datagram for _, datagram in mute], clock(), "announcements")
-    listener.listen(clock())
+    assert network.deliver(1, 1e3)  # the records, which are lost; then it says that it has them
+    network.send(0, talker.replica.announcements(), 1e3, "announcements")
+    listener.listen(2e3)
     assert listener.n_missing == talker.replica.held.size > 0
     run(talker, listener, settle=5.0)
     assert listener.n_missing == 0
@@ -245,7 +241,7 @@ class _Renamed(Network):
 # -- killed, and started again -----------------------------------------------------------------------------
 
 
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(rule=st.sampled_from(sorted(RULES)), seed=st.integers(0, 10**6))
 def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path_factory, rule, seed):
     rng, folder, network = random.Random(seed), tmp_path_factory.mktemp("robot"), Network(2)
@@ -283,9 +279,9 @@ def test_while_it_catches_up_what_it_said_still_counts(tmp_path):
     node = kept(tmp_path, log(24), network, **options)
     assert node.resumed_at == node.row()["resumed_at"] == 12
     assert node.row()["incarnation"] != first.row()["incarnation"]
-    for position in range(13, 22):
+    for position in range(13, 20):
         node.tick(position / 10)
-        learned = 15 if position < 18 else position - position % 3
+        learned = 15 if position < 18 else 18
         assert content(node.replica.components()) == content(
             mapped("incremental", log(24)[:learned]).components()
         )
@@ -315,7 +311,7 @@ def test_one_that_lost_its_disk_begins_anew_and_nothing_is_lost_or_there_twice_i
     run(first, teammate, settle=1.0, duration=1.6)
     kill(first)
     said = content(teammate.replica.components())
-    assert said
+    assert said == content(mapped("incremental", log(24)[:15]).components())
     node = kept(tmp_path / "b", log(24), network, "incremental", announce_every=0.2)
     run(teammate, node, settle=3.0, duration=0.0)
     assert content(node.replica.components()) == said  # what it said comes back
@@ -323,7 +319,9 @@ def test_one_that_lost_its_disk_begins_anew_and_nothing_is_lost_or_there_twice_i
     while not node.is_over:
         now += 0.1
         node.tick(now)
-        assert node.is_over or not said - content(node.replica.components())
+        here = content(node.replica.components())
+        assert node.position > 15 or not said - here
+        assert node.map.n_pending or not content(node.map.components()) - here
     run(node, teammate, settle=5.0)
     for each in (node, teammate):
         assert content(each.replica.components()) == content(mapped("incremental", log(24)).components())
@@ -359,10 +357,10 @@ def test_to_go_on_with_another_log_rule_or_number_is_refused(tmp_path):
     run(node := kept(tmp_path, log(6), Network(1), facts={"dataset": "intel"}))
     node.close()
 
-    def opened(scans=log(6), rule="windowed", number=0, dataset="intel"):
+    def opened(scans=None, rule="windowed", number=0, dataset="intel"):
         replica = Replica(number)
         options = {"folder": tmp_path, "facts": {"dataset": dataset}}
-        return ReplayNode(replica, scans, Network(9), lambda: GaussianMap(RULES[rule]), **options)
+        return ReplayNode(replica, scans or log(6), Network(9), lambda: GaussianMap(RULES[rule]), **options)
 
     opened()
     for options, named in (

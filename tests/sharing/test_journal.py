@@ -359,6 +359,7 @@ def tables_of(state: dict) -> Iterator[dict]:
             yield from tables_of(value)
 
 
+@pytest.mark.filterwarnings("ignore:Using a non-tuple sequence")  # torch, of lists where a tensor should be
 @settings(max_examples=40)
 @given(data=st.data())
 def test_snapshots_that_somebody_forged_are_refused_or_restored(tmp_path_factory, data):
