@@ -22,6 +22,8 @@ _TABLE = (
     "cross_entropy_bits map_disagreement coverage_per_metre path_length collisions wall_seconds"
 )
 
+_NETWORK_TABLE = "wire_bytes bits_per_byte wire_ratio t90_ratio healed_after converged_after"
+
 _STAGE = "simulated seconds"
 _OF_ROBOTS = ("announce", "budget")  # options of the network that are not of its links
 
@@ -53,7 +55,7 @@ def run(config: DictConfig) -> float | None:
     with ProgressBars(enabled=config.report.progress) as bars:
         work = _explore if config.study is None else _compare
         rows = work(config, folder, bars)
-    common.print_table(rows, _TABLE.split(), f"{rows[0]['world']}: {rows[0]['n_robots']} robots")
+    _print_rows(rows)
     common.print_files(folder, folder / "results.json")
     return float(rows[-1]["entropy_reduction_bits"])
 
@@ -61,7 +63,6 @@ def run(config: DictConfig) -> float | None:
 def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
     """One mission, shown as it goes."""
     from gmmtorch.cli.explore_pictures import MissionRecorder
-    from gmmtorch.exploration.outcome import with_times
     from gmmtorch.exploration.trials import run_mission
 
     trial = _trial(config, folder)
@@ -74,7 +75,7 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
         recorder.sample(mission)
 
     mission, row = run_mission(trial, world, on_sample)
-    rows = with_times([row])
+    rows = _compared([row])
     common.write_results("explore", config, rows, folder)
     recorder.finish(mission, rows[0])
     return rows
@@ -91,7 +92,6 @@ def _status(mission: Mission) -> str:
 def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
     """Every variant of a study with every seed."""
     from gmmtorch.cli.explore_pictures import save_comparison
-    from gmmtorch.exploration.outcome import with_times
     from gmmtorch.exploration.trials import run_trials
 
     variants = _variants(config)
@@ -101,12 +101,35 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
 
     def keep(row: dict[str, Any]) -> None:
         done.append(row)
-        common.write_results("explore", config, with_times(done), folder)
+        common.write_results("explore", config, _compared(done), folder)
 
-    rows = with_times(run_trials(trials, config.runtime.workers, keep, bars))
+    rows = _compared(run_trials(trials, config.runtime.workers, keep, bars))
     common.write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)
     return rows
+
+
+def _print_rows(rows: list[dict[str, Any]]) -> None:
+    """The table; of several variants each has a name, and what networks cost is told where they differ."""
+    from gmmtorch.exploration.variants import NETWORK, differing
+
+    columns = _TABLE.split()
+    title = f"{rows[0]['world']}: {rows[0]['n_robots']} robots"
+    if fields := differing(rows):
+        from gmmtorch.report.exploration_variants import by_variant
+
+        rows = [{"variant": name, **row} for name, group in by_variant(rows).items() for row in group]
+        named = [name for name in columns if name not in ("framework", "planner")]
+        columns = ["variant", *named, *(_NETWORK_TABLE.split() if {*fields} & {*NETWORK} else ())]
+    common.print_table(rows, columns, title)
+
+
+def _compared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with what only those beside them tell."""
+    from gmmtorch.exploration.network_outcome import with_network_costs
+    from gmmtorch.exploration.outcome import with_times
+
+    return with_network_costs(with_times(rows))
 
 
 def _variants(config: DictConfig) -> list[dict[str, Any]]:
@@ -211,7 +234,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
         announce_every=variant.get("announce", config.network.announce),
         budget=variant.get("budget", config.network.budget),
         sample_every=config.evaluation.every,
-        codecs=tuple(config.evaluation.codecs),
+        codecs=tuple(config.evaluation.get("codecs", ())),
         start=None if start is None else _poses(start),
     )
 
@@ -223,7 +246,8 @@ def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
     given = {key: value for key, value in common.as_options(config.network).items() if key not in _OF_ROBOTS}
     names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
     given |= {key: variant[key] for key in given if key in variant}
-    given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
+    if "delay" in given:  # which a real network has, whatever anybody says
+        given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
     conditions = LinkConditions(**given, names=names)
     conditions.check_team(config.team.size, names)
     return {name: getattr(conditions, name) for name in given}

@@ -152,11 +152,16 @@ class MissionRecorder:
 
 
 def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
-    """The pictures of a study: curves with bands over seeds, and bars."""
+    """The pictures of a study: curves with bands over seeds, and bars.
+
+    Where teams are flown on several networks, these are one picture, and all others are of the first.
+    """
+    from gmmtorch.exploration.variants import NETWORK, differing
     from gmmtorch.report import (
         Board,
         bandwidth_figure,
         entropy_figure,
+        loss_figure,
         planner_comparison_figure,
         profile_figure,
         stage_means,
@@ -164,20 +169,34 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
         write_exploration_board,
     )
 
-    frameworks = {row["framework"] for row in rows}
-    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(rows))}
-    if len(frameworks) > 1:
+    on_first, on_several = _by_networks(rows)
+    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(on_first))}
+    if on_several:
+        figures["loss"] = loss_figure(on_several)
+    if len({row["framework"] for row in rows}) > 1:
         figures |= {
-            "entropy": entropy_figure(rows),
-            "bandwidth": bandwidth_figure(rows),
-            "summary": summary_bars(rows),
+            "entropy": entropy_figure(on_first),
+            "bandwidth": bandwidth_figure(on_first),
+            "summary": summary_bars(on_first),
         }
-    else:
-        figures["planners"] = planner_comparison_figure(rows)
+    elif not on_several or differing(on_first, without=NETWORK):
+        figures["planners"] = planner_comparison_figure(on_first)
     common.save_figures(config, figures, folder)
     if config.report.tensorboard:
         with Board(folder / "tensorboard") as board:
             write_exploration_board(board, rows, figures)
+
+
+def _by_networks(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Of each framework the rows on the first network that it was flown on; and, of those that were flown
+    on several, all rows."""
+    from gmmtorch.exploration.variants import NETWORK, variant_of
+
+    networks: dict[str, dict[Any, None]] = {}  # in the order they come
+    for row in rows:
+        networks.setdefault(row["framework"], {})[variant_of(row, NETWORK)] = None
+    on_first = [row for row in rows if variant_of(row, NETWORK) == next(iter(networks[row["framework"]]))]
+    return on_first, [row for row in rows if len(networks[row["framework"]]) > 1]
 
 
 def _surfaces(components: Components | None) -> Components | None:

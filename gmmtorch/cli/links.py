@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import socket
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from gmmtorch.sharing.security import TeamKey
 
 TRANSPORTS = ("udp", "zenoh")
+_PATIENCE = 10.0  # seconds for robots of this machine to find one another
+_PAUSE = 0.02
 
 
 def open_link(config: DictConfig, robot: int) -> FramedTransport:
@@ -42,9 +46,38 @@ def open_link(config: DictConfig, robot: int) -> FramedTransport:
         raise InvalidArgumentError(f"transport={config.transport!r} is not one of {', '.join(TRANSPORTS)}.")
     if link["group"] is not None:
         group = address("link.group", link["group"])
+        _check_key("link.interface", link["interface"], link["insecure"], key)
         return UdpTransport.multicast(robot, group, link["interface"], link["ttl"], **common_options)
     peers = [address("link.peers", peer) for peer in link["peers"]]
-    return UdpTransport.unicast(robot, address("link.listen", link["listen"]), peers, **common_options)
+    listen = address("link.listen", link["listen"])
+    _check_key("link.listen", listen[0], link["insecure"], key)
+    return UdpTransport.unicast(robot, listen, peers, **common_options)
+
+
+def _check_key(name: str, host: str, insecure: bool, key: TeamKey | None) -> None:
+    """What transports check, too, and say in terms of Python."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    try:
+        is_local = ipaddress.IPv4Address(host).is_loopback
+    except ValueError:
+        return  # of which the transport says what is wrong
+    if key is None and not insecure and not is_local:
+        raise InvalidArgumentError(
+            f"{name}={host} reaches other machines, and there is no key: give link.key_file=FILE, take "
+            "127.0.0.1, or say link.insecure=true to let anybody read and write."
+        )
+
+
+def await_team(transport: FramedTransport, n_others: int) -> None:
+    """Wait until so many are connected; not for long, and only where there are connections."""
+    from gmmtorch.sharing.zenoh_transport import ZenohTransport
+
+    end = time.monotonic() + _PATIENCE
+    while (
+        isinstance(transport, ZenohTransport) and transport.n_neighbours < n_others and time.monotonic() < end
+    ):
+        time.sleep(_PAUSE)
 
 
 def team_key(path: str | None) -> TeamKey | None:
@@ -62,14 +95,14 @@ def address(name: str, text: str) -> tuple[str, int]:
     from gmmtorch.errors import InvalidArgumentError
 
     host, colon, port = str(text).rpartition(":")
-    if not colon or not host or not port.isdigit() or int(port) > 65535:
+    if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 65535:
         raise InvalidArgumentError(f"{name}={text!r} must be an address and a port, as in 127.0.0.1:7447.")
     return host, int(port)
 
 
-def free_addresses(n: int) -> list[str]:
+def free_addresses(n: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[str]:
     """So many addresses on loopback that nobody uses now."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
+    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(n)]
     try:
         for one in sockets:
             one.bind(("127.0.0.1", 0))

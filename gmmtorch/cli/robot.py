@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import os
 import signal
+import stat
 import sys
 import threading
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from gmmtorch.sharing.journal import Journal
     from gmmtorch.sharing.replica import Replica
 
+TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
+"""In the environment, the process that has started this one; where that ends, this does, too."""
 _TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 _SOURCES = ("world", "log")
 _CLOCKS = ("wall", "lockstep")
@@ -32,7 +36,7 @@ _CLOCKS = ("wall", "lockstep")
 def main() -> None:
     """Entry point of the command."""
     # In step with a team, standard output speaks to it: what is printed goes to standard error.
-    answers = _claim_output() if "clock=lockstep" in sys.argv else None
+    answers = _claim_output() if "clock=lockstep" in sys.argv and _is_asked() else None
     schema.register()
     command = functools.partial(_guarded, answers)
     functools.update_wrapper(command, _guarded)
@@ -43,24 +47,27 @@ def _guarded(answers: IO[str] | None, config: DictConfig) -> None:
     common.run_guarded(functools.partial(run, answers=answers), config)
 
 
+def _is_asked() -> bool:
+    """Whether another process speaks and listens to this one."""
+    return all(stat.S_ISFIFO(os.fstat(standard).st_mode) for standard in (0, 1))
+
+
 def _claim_output() -> IO[str]:
     """Standard output, for whoever has it now alone."""
-    claimed = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    claimed = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
     return claimed
 
 
 def run(config: DictConfig, answers: IO[str] | None = None) -> None:
     """One run of a robot."""
-    from gmmtorch.errors import InvalidArgumentError, check_whole
+    check_options(config)
+    if config.clock == "lockstep" and answers is None:
+        from gmmtorch.errors import InvalidArgumentError
 
-    common.set_up(config)
-    check_whole("id", config.id, 0)
-    for name, known in (("source", _SOURCES), ("clock", _CLOCKS)):
-        if config[name] not in known:
-            raise InvalidArgumentError(f"{name}={config[name]!r} is not one of {', '.join(known)}.")
-    if config.clock == "lockstep" and (answers is None or config.source != "world"):
-        raise InvalidArgumentError("clock=lockstep is for the robots of gmmtorch-team, with source=world.")
+        raise InvalidArgumentError(
+            "clock=lockstep is for the robots that gmmtorch-team starts; take clock=wall."
+        )
     folder = common.run_dir()
     with ExitStack() as stack:
         transport = links.open_link(config, config.id)
@@ -75,7 +82,43 @@ def run(config: DictConfig, answers: IO[str] | None = None) -> None:
         if answers is None:
             _by_the_clock(config, node, folder)
         else:
+            links.await_team(transport, config.team.size - 1)
             _in_step(config, node, folder, answers)
+
+
+def check_options(config: DictConfig) -> None:
+    """Raises `InvalidArgumentError` for options, of a robot or a team, that nothing else checks."""
+    from gmmtorch.errors import InvalidArgumentError, check_whole
+
+    if common.set_up(config) != "cpu":
+        raise InvalidArgumentError(
+            f"runtime.device={config.runtime.device} is not for robots, which run on the cpu."
+        )
+    for name, known in (("source", _SOURCES), ("clock", _CLOCKS), ("transport", links.TRANSPORTS)):
+        if config[name] not in known:
+            raise InvalidArgumentError(f"{name}={config[name]!r} is not one of {', '.join(known)}.")
+    size = check_whole("team.size", config.team.size, 1)
+    if check_whole("id", config.id, 0) >= size:
+        raise InvalidArgumentError(
+            f"id={config.id} must be below team.size={size}: robots are counted from 0."
+        )
+    if not 0 <= config.network.loss < 1:
+        raise InvalidArgumentError(
+            f"network.loss={config.network.loss} must be a share of the datagrams in [0, 1)."
+        )
+    if not config.evaluation.every > 0:
+        raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
+    if config.clock == "lockstep":
+        if config.source != "world":
+            raise InvalidArgumentError("clock=lockstep is for source=world; logs are replayed by the clock.")
+        if config.journal.folder is not None:
+            raise InvalidArgumentError(
+                f"journal.folder={config.journal.folder} is for clock=wall: in step no robot starts again."
+            )
+        if config.speed != 1:
+            raise InvalidArgumentError(
+                f"speed={config.speed} is for clock=wall: in step time passes as fast as robots can think."
+            )
 
 
 # -- the robot ------------------------------------------------------------------------------------
@@ -84,14 +127,11 @@ def run(config: DictConfig, answers: IO[str] | None = None) -> None:
 def _flying(config: DictConfig, folder: Path, transport: FramedTransport) -> FlyingNode:
     """A robot with a simulated camera in a simulated world."""
     from gmmtorch.cli.explore import team_options, world_options
-    from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.team import make_agent, start_poses
     from gmmtorch.sharing.record_ids import drawn_incarnation
 
     options = team_options(config, config.seed, {})
-    if config.id >= options.size:
-        raise InvalidArgumentError(f"id={config.id} must be below team.size={options.size}.")
     world = world_options(config).open(options)
     # A life that nobody has led: what is told twice must be told as two. In step nobody starts again.
     life = 0 if config.clock == "lockstep" else drawn_incarnation()
@@ -166,26 +206,38 @@ def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
     from gmmtorch.cli.robot_report import RobotReport
     from gmmtorch.exploration.node import check_number, run_paced
 
-    stop = threading.Event()
-    for name in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(name, lambda *_: stop.set())
-    with RobotReport(config, node, folder) as report:
+    with RobotReport(config, node, folder) as report, _told_to_stop() as is_told:
 
         def show(_: Node, now: float) -> None:
             check_number(node)
             report(now)
 
-        run_paced(
+        paced = run_paced(
             node,
             rate=config.sensor.rate if config.source == "world" else config.log.rate,
             speed=config.speed,
             settle=config.settle,
-            stop=stop.is_set,
+            stop=is_told,
             on_status=show,
         )
-    row = _leave(config, node, folder)
+        report.finish(paced.seconds)
+        row = _leave(config, node, folder, {**report.series, "ticks_late": paced.late, "stopped": is_told()})
     common.print_table([row], _TABLE.split(), f"robot {config.id}")
     common.print_files(folder, folder / "results.json")
+
+
+@contextmanager
+def _told_to_stop() -> Iterator[Callable[[], bool]]:
+    """Whether a signal has asked to end, or the team is no more."""
+    told, team = threading.Event(), os.environ.get(TEAM_VARIABLE)
+    handlers = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        for name in handlers:
+            signal.signal(name, lambda *_: told.set())
+        yield lambda: told.is_set() or team not in (None, str(os.getppid()))
+    finally:
+        for name, handler in handlers.items():
+            signal.signal(name, handler)
 
 
 def _in_step(config: DictConfig, node: Node, folder: Path, answers: IO[str]) -> None:
@@ -195,14 +247,23 @@ def _in_step(config: DictConfig, node: Node, folder: Path, answers: IO[str]) -> 
 
     assert isinstance(node, FlyingNode)  # with source=world
     with RobotReport(config, node, folder) as report:
-        Serving(node, lambda: _leave(config, node, folder), report).serve(sys.stdin, answers)
+
+        def finish(now: float) -> dict[str, Any]:
+            report.finish(now)
+            return _leave(config, node, folder, dict(report.series))
+
+        Serving(node, finish, report).serve(sys.stdin, answers)
 
 
-def _leave(config: DictConfig, node: Node, folder: Path) -> dict[str, Any]:
+def _leave(config: DictConfig, node: Node, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
     """Write what the robot leaves behind; its row."""
     files = node.save(folder)
-    row = {**node.row(), **{f"{name}_path": str(path) for name, path in files.items()}}
+    row = {**node.row(), **more, **{f"{name}_path": str(path) for name, path in files.items()}}
     common.write_results("robot", config, [row], folder)
+    if config.report.figures:
+        from gmmtorch.report.team_run import team_run_figure
+
+        common.save_figures(config, {"run": team_run_figure([row])}, folder)
     return row
 
 

@@ -1,4 +1,4 @@
-"""What a robot shows of itself while it works: a status line, and numbers in TensorBoard."""
+"""What a robot shows of itself: a status line, numbers in TensorBoard, and numbers over time for its row."""
 
 from __future__ import annotations
 
@@ -13,15 +13,22 @@ if TYPE_CHECKING:
     from gmmtorch.exploration.node import Node
     from gmmtorch.report import Board
 
-_EVERY = 1.0  # seconds of the robot's time between numbers
+_EVERY = 1.0  # seconds of the robot's time between what is shown
+_SERIES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
 
 
 class RobotReport:
-    """Shows a robot as `report.*` want it. Called with the robot's time, as often as one likes."""
+    """Shows a robot as `report.*` want it. Called with the robot's time, as often as one likes.
+
+    Attributes:
+        series: of the robot's row: "times" (s), at least `evaluation.every` apart, and numbers then.
+    """
 
     def __init__(self, config: DictConfig, node: Node, folder: Path) -> None:
-        self._node, self._next, self._last = node, 0.0, ""
-        self._live = config.report.progress
+        self._node, self._every = node, config.evaluation.every
+        self._shown_until = self._noted_until = 0.0
+        self._live, self._last = config.report.progress, ""
+        self.series: dict[str, list[float]] = {"times": []}
         self._board: Board | None = None
         if config.report.tensorboard:
             from gmmtorch.report import Board
@@ -29,15 +36,35 @@ class RobotReport:
             self._board = Board(folder / "tensorboard")
 
     def __call__(self, now: float) -> None:
-        """Show what there is at the time `now` (s), if there has been nothing for a while."""
-        if now < self._next:
-            return
-        self._next = now + _EVERY
+        """Show and note what there is at the time `now` (s), if there has been nothing for a while."""
+        if now >= self._shown_until:
+            self._shown_until = now + _EVERY
+            self._show(now)
+        if now >= self._noted_until - 1e-9:
+            self._noted_until = now + self._every
+            self._note(now)
+
+    def finish(self, now: float) -> None:
+        """Show and note what there is in the end."""
+        self._show(now)
+        if self.series["times"][-1:] != [now]:
+            self._note(now)
+
+    def _show(self, now: float) -> None:
+        numbers = self._node.scalars()
         if self._live:
-            self._print(f"robot {self._node.robot}  {now:6.0f} s  {self._node.status()}")
+            refused = f", {numbers['refused']:,.0f} refused" if numbers["refused"] else ""
+            self._print(f"robot {self._node.robot}  {now:6.0f} s  {self._node.status()}{refused}")
         if self._board is not None:
             # Milliseconds, so that all robots of a team have one axis.
-            self._board.scalars(self._node.scalars(), prefix="robot", step=round(1000 * now))
+            self._board.scalars(numbers, prefix="robot", step=round(1000 * now))
+
+    def _note(self, now: float) -> None:
+        numbers = self._node.scalars()
+        self.series["times"].append(now)
+        for name, title in _SERIES.items():
+            if name in numbers:
+                self.series.setdefault(title, []).append(numbers[name])
 
     def _print(self, line: str) -> None:
         """On a terminal in place of the last one; in a log below it."""

@@ -372,14 +372,14 @@ class TeamMap:
     observed: float = 0.5
     distance: float = 2.0
     noise: float = 0.03
-    length: float = 0.7
+    length: float = 0.5
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
     rays: float = 4.0
     shell: float = 0.5
     update_at: float = 2.0
-    update_stride: int = 16
+    update_stride: int = 11
 
 
 @dataclass
@@ -459,7 +459,7 @@ class Explore:
 
 @dataclass
 class Link:
-    listen: str = "127.0.0.1:0"
+    listen: str = "127.0.0.1:7400"
     peers: list[str] = field(default_factory=list)
     group: str | None = None
     interface: str = "127.0.0.1"
@@ -492,7 +492,34 @@ class LogOptions:
 
 
 @dataclass
-class RobotOptions(Explore):
+class RobotNetwork:
+    """What there is to say of a network that is real."""
+
+    loss: float = 0.0
+    announce: float = 5.0
+    budget: float | None = None
+
+
+@dataclass
+class RobotEvaluation:
+    every: float = 10.0
+
+
+@dataclass
+class RobotRuntime:
+    device: str = "cpu"
+    threads: int | None = 1
+    cache: bool = True
+    memory_limit: int = 4 << 30
+
+
+@dataclass
+class RobotOptions:
+    """Of a robot; a team has the same."""
+
+    world: Any = MISSING
+    team: Any = MISSING
+    planner: Any = MISSING
     id: int = 0
     source: str = "world"
     clock: str | None = "wall"
@@ -502,6 +529,20 @@ class RobotOptions(Explore):
     link: Link = field(default_factory=Link)
     journal: JournalOptions = field(default_factory=JournalOptions)
     log: LogOptions = field(default_factory=LogOptions)
+    duration: float = 1600.0
+    seed: int = 0
+    information: str = "csqmi"
+    coordination: str = "greedy"
+    rounds: int = 3
+    codec: str = "quantized"
+    sensor: DepthSensor = field(default_factory=DepthSensor)
+    robot: RobotBody = field(default_factory=RobotBody)
+    belief: Belief = field(default_factory=Belief)
+    map: TeamMap = field(default_factory=TeamMap)
+    network: RobotNetwork = field(default_factory=RobotNetwork)
+    evaluation: RobotEvaluation = field(default_factory=RobotEvaluation)
+    report: Report = field(default_factory=Report)
+    runtime: RobotRuntime = field(default_factory=RobotRuntime)
 
 
 def register() -> None:

@@ -24,6 +24,9 @@ from gmmtorch.sharing.messages import PlanMessage
 from gmmtorch.sharing.network import HEADER_BYTES
 from gmmtorch.sharing.replica import Replica
 
+_KINDS = ("announcements", "components", "corrections", "counts", "plans", "points", "supersessions", "views")
+_MOST_STEPS = 1000  # of a teammate's plan that are looked at
+
 
 class FlyingNode:
     """Senses, talks, plans and flies in its own copy of a world, in which it sees none of its teammates.
@@ -33,7 +36,7 @@ class FlyingNode:
 
     Args:
         agent: of a team with these options. transport: the agent's; closed with this.
-        journal: of the agent's replica; restores it.
+        journal: of the agent's replica, which it has restored; closed with this.
     """
 
     def __init__(
@@ -51,8 +54,8 @@ class FlyingNode:
             agent.keep_in(self._logbook)
         self._n_ticks = 0
         self._flown = [agent.robot.state[:4].clone()]
-        self.times: list[float] = []
-        self.entropy_bits: list[float] = []
+        self.n_late = 0
+        """Datagrams that a team in step had to go on without, as they had not come."""
 
     @property
     def robot(self) -> int:
@@ -86,7 +89,11 @@ class FlyingNode:
         agent, options = self.agent, self.options
         agent.survey(now)
         plans = agent.robot.plans
-        paths = [_ahead(plan, now - agent.heard_at[number]) for number, plan in sorted(plans.items())]
+        paths = [
+            _ahead(plan, now - agent.heard_at[number], options.dynamics.step)
+            for number, plan in sorted(plans.items())
+            if len(plan.path)
+        ]
         traffic = Traffic.of(paths, 2 * options.dynamics.radius + options.margin)
         agent.propose(now, list(plans), traffic, since=now - options.dynamics.duration)
         agent.settle()
@@ -97,8 +104,6 @@ class FlyingNode:
 
     def sense(self, now: float, others: Tensor) -> None:
         """Look around, with teammates at (M, 3), learn, and tell."""
-        if self._n_ticks % self.options.ticks_per_sample == 0:
-            self._note(now)
         self.agent.learn(self.agent.look(self.world.mesh, others), now)
 
     def fly(self, begin: int, stop: int) -> Tensor:
@@ -111,19 +116,15 @@ class FlyingNode:
         self._n_ticks += 1
         return positions
 
-    def _note(self, now: float) -> None:
-        self.times.append(now)
-        self.entropy_bits.append(self.agent.robot.mapper.belief.entropy_bits)
-
     # -- what there is to say ---------------------------------------------------------------------
 
     def status(self) -> str:
-        belief, mapper = self.agent.robot.mapper.belief, self.agent.robot.mapper
-        left = belief.entropy_bits / max(1.0, belief.observable_bits)
-        sent = self.transport.traffic()
-        return (
+        mapper, sent = self.agent.robot.mapper, self.transport.traffic()
+        left = mapper.belief.entropy_bits / max(1.0, mapper.belief.observable_bits)
+        line = (
             f"{left:.1%} of the entropy left, {mapper.held.size:,} records, {sent.bytes / 1e3:,.0f} kB sent"
         )
+        return line if self.twin is None else f"{line}, another robot {self.robot} is there"
 
     def scalars(self) -> dict[str, float]:
         """What changes as it flies: numbers for a plot."""
@@ -150,30 +151,30 @@ class FlyingNode:
         robot, transport = self.agent.robot, self.transport
         belief, shared = robot.mapper.belief, getattr(robot.mapper, "shared", None)
         components = robot.mapper.components()
-        kinds = sorted({"components", "counts", "points", "plans", "views", "announcements"})
         return {
             "robot": self.robot,
             "digest": robot.mapper.digest().hex(),
             "views_digest": robot.library.digest().hex(),
             "incarnation": getattr(shared, "incarnation", None),
-            "times": self.times,
-            "entropy_bits": self.entropy_bits,
             "entropy_bits_left": belief.entropy_bits,
             "observable_bits": belief.observable_bits,
             "n_components": None if components is None else len(components),
             "n_records": robot.mapper.held.size,
             "bytes_sent": transport.traffic().bytes,
             "datagrams": transport.traffic().datagrams,
-            "bytes_by_kind": {k: n for k in kinds if (n := transport.traffic(kind=k).bytes)},
+            "bytes_by_kind": {kind: n for kind in _KINDS if (n := transport.traffic(kind=kind).bytes)},
             "wire_bytes": self._wire_bytes(),
+            "wire_bytes_received": transport.received.wire_bytes,
             "socket_bytes": transport.sent.bytes,
             "socket_datagrams": transport.sent.datagrams,
             "heard": self.agent.n_heard,
             "damaged": self.agent.n_damaged,
-            "refused": transport.refused,
+            "refused": {reason: n for reason, n in transport.refused.items() if n},
             "not_merged": dict(getattr(shared, "refused", {})),
             "failures": dict(transport.failures),
+            "namesakes": {str(robot): whence for robot, whence in sorted(transport.namesakes.items())},
             "dropped": transport.n_dropped,
+            "late": self.n_late,
             "path_length": robot.path_length,
             "collisions": robot.collisions,
             "unkept": 0 if self._logbook is None else self._logbook.n_failed,
@@ -202,13 +203,20 @@ class FlyingNode:
         return paths
 
     def close(self) -> None:
-        """Close the journal and the transport."""
+        """Close the journal, with a last snapshot, and the transport. May be called again."""
         if self._logbook is not None:
             self._logbook.close()
         self.transport.close()
 
 
-def _ahead(plan: PlanMessage, age: float) -> Tensor:
-    """Where a teammate is now and will be (S, 3), by a plan that was heard so many seconds ago."""
-    passed = min(max(math.floor(age / plan.step), 0), len(plan.path) - 1)
-    return plan.path[passed:, :3].to(torch.float64)
+def _ahead(plan: PlanMessage, age: float, step: float) -> Tensor:
+    """Where a teammate is one step (s) from now, two, … (S, 3), by a plan that was heard `age` seconds ago.
+
+    Its pose of each time is the plan's next in time, at most half a step of the plan off, which
+    `traffic.clear_of` allows for.
+    """
+    n = len(plan.path)
+    left = n * plan.step - age
+    ahead = step * torch.arange(1, min(max(math.ceil(left / step - 1e-9), 1), _MOST_STEPS) + 1)
+    rows = ((age + ahead.double()) / plan.step).round().clamp(1, n).long() - 1
+    return plan.path[rows, :3].double()

@@ -27,7 +27,11 @@ _MOST_CHARACTERS = 1 << 24  # of a line
 
 
 class RobotLostError(GmmTorchError):
-    """The process of a robot has ended, or says nothing sensible."""
+    """The process of a robot, by its number, has ended, or says nothing sensible."""
+
+    def __init__(self, robot: int, why: str) -> None:
+        super().__init__(f"Robot {robot} is lost: {why}; see the log in its folder.")
+        self.robot = robot
 
 
 # -- the robot's side -----------------------------------------------------------------------------
@@ -37,21 +41,23 @@ class Serving:
     """A flying robot that does what it is asked, until it is asked to finish.
 
     Args:
-        finish: writes what the robot leaves behind, and returns its row. on_sense: hears the time of each
-            frame.
+        finish: given the time, writes what the robot leaves behind, and returns its row.
+        on_tick: hears the time of each tick, as it begins.
     """
 
     def __init__(
-        self, node: FlyingNode, finish: Callable[[], dict[str, Any]], on_sense: Callable[[float], None]
+        self,
+        node: FlyingNode,
+        finish: Callable[[float], dict[str, Any]],
+        on_tick: Callable[[float], None] = lambda _: None,
     ) -> None:
-        self._node, self._finish, self._on_sense = node, finish, on_sense
-        self.n_late = 0
-        """Datagrams that had not come in time."""
+        self._node, self._finish, self._on_tick = node, finish, on_tick
+        self._missing = 0  # datagrams that have been waited for in vain
 
     def serve(self, asked: IO[str], answered: IO[str]) -> None:
-        """Answer until there is nothing more to be read."""
+        """Answer until it is finished, or nobody asks any more. Raises `DataError` for what is no request."""
         while line := asked.readline(_MOST_CHARACTERS):
-            request = json.loads(line)
+            request = _request(line)
             with torch.inference_mode():
                 answer = self._answer(**request) or {}
             answer["sent"] = self._node.transport.traffic().datagrams
@@ -65,8 +71,8 @@ class Serving:
         if do == "start":
             return {"braking": agent.robot.braking.tolist(), "position": agent.robot.position.tolist()}
         if do == "sense":
+            self._on_tick(about["now"])
             node.sense(about["now"], _rows(about["others"], 3))
-            self._on_sense(about["now"])
         elif do == "listen":
             self._await(about["expected"])
             agent.listen(about["now"])
@@ -91,20 +97,39 @@ class Serving:
         elif do == "fly":
             return {"positions": node.fly(about["begin"], about["stop"]).tolist()}
         elif do == "digest":
-            return {"digest": agent.digest().hex(), "status": node.status()}
+            return {"digest": agent.digest().hex()}
         elif do == "finish":
-            return {"row": {**self._finish(), "late": self.n_late}}
+            return {"row": self._finish(about["now"])}
         else:
             raise DataError(f"do={do!r} is nothing that a robot does.")
         return None
 
     def _await(self, expected: int) -> None:
-        """Wait until so many datagrams have come in all, or those that are missing must be lost."""
-        transport = self._node.transport
+        """Wait until so many datagrams have come in all, or those that are missing must be lost.
+
+        What has been waited for once is not waited for again.
+        """
         end = time.monotonic() + _PATIENCE
-        while transport.received.datagrams < expected and time.monotonic() < end:
+        while self._arrived() < expected - self._missing and time.monotonic() < end:
             time.sleep(_PAUSE)
-        self.n_late += max(0, expected - transport.received.datagrams)
+        missing = max(0, expected - self._arrived())
+        self._node.n_late += max(0, missing - self._missing)
+        self._missing = missing
+
+    def _arrived(self) -> int:
+        """Datagrams of the team: not this robot's own, which a group brings back, nor a stranger's."""
+        transport = self._node.transport
+        return transport.received.datagrams - sum(transport.refused.values())
+
+
+def _request(line: str) -> dict[str, Any]:
+    try:
+        request = json.loads(line)
+    except ValueError:
+        request = None
+    if not isinstance(request, dict) or not isinstance(request.get("do"), str):
+        raise DataError(f"{line[:80]!r} is nothing that a robot can be asked.")
+    return request
 
 
 # -- the team's side ------------------------------------------------------------------------------
@@ -133,25 +158,36 @@ class RemotePilot:
             self._asked.write(json.dumps({"do": do, **about}, allow_nan=False) + "\n")
             self._asked.flush()
         except (OSError, ValueError) as error:
-            raise self._lost(str(error)) from error
+            raise RobotLostError(self.number, str(error)) from error
 
     def answer(self) -> dict[str, Any]:
         """What it answers to what it was asked last."""
+        line = ""
         try:
             line = self._answered.readline(_MOST_CHARACTERS)
-            answer: dict[str, Any] = json.loads(line) if line else {}
+            answer: dict[str, Any] = json.loads(line)
             self.n_sent = int(answer["sent"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise self._lost("it has ended" if not line else f"it answers {line[:80]!r}") from error
+            raise self._lost(line) from error
         return answer
 
-    def _lost(self, why: str) -> RobotLostError:
-        return RobotLostError(f"Robot {self.number} is lost: {why}; see its log in its folder.")
+    def rows(self, answer: dict[str, Any], name: str, width: int) -> Tensor:
+        """The rows (N, width) of numbers that an answer has under a name."""
+        try:
+            rows = _rows(answer[name], width)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise self._lost(str(answer)) from error
+        if not bool(torch.isfinite(rows).all()):
+            raise self._lost(str(answer))
+        return rows
 
     def do(self, do: str, **about: Any) -> dict[str, Any]:
         """Ask, and wait for the answer."""
         self.ask(do, **about)
         return self.answer()
+
+    def _lost(self, answer: str) -> RobotLostError:
+        return RobotLostError(self.number, f"it answers {answer[:80]!r}" if answer else "it has ended")
 
     # -- as a pilot -------------------------------------------------------------------------------
 
@@ -176,11 +212,11 @@ class RemotePilot:
             separation=separation,
         )
         self._plan = Plan(
-            path=_rows(answer["path"], 7),
-            braking=_rows(answer["braking"], 7),
-            views=_rows(answer["views"], 4),
-            value=float(answer["value"]),
-            kind=str(answer["kind"]),
+            path=self.rows(answer, "path", 7),
+            braking=self.rows(answer, "braking", 7),
+            views=self.rows(answer, "views", 4),
+            value=float(self.rows(answer, "value", 1)),
+            kind=str(answer.get("kind")),
         )
         return self._plan
 
@@ -197,11 +233,17 @@ class RemotePilot:
 
 
 def ask_all(
-    pilots: Sequence[RemotePilot], do: str, about: Callable[[RemotePilot], dict[str, Any]]
+    pilots: Sequence[RemotePilot],
+    do: str,
+    own: Callable[[RemotePilot], dict[str, Any]] = lambda _: {},
+    **about: Any,
 ) -> list[dict[str, Any]]:
-    """Ask all at once, so that they work at the same time; their answers."""
+    """Ask all at once, so that they work at the same time; their answers.
+
+    own: what only one of them is told.
+    """
     for pilot in pilots:
-        pilot.ask(do, **about(pilot))
+        pilot.ask(do, **about, **own(pilot))
     return [pilot.answer() for pilot in pilots]
 
 

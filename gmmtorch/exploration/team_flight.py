@@ -15,7 +15,7 @@ from gmmtorch.exploration.turns import take_turns
 
 
 class TeamFlight:
-    """What a `Mission` is, but for the map, which is the robots', and the network, which is real.
+    """What a `Mission` is, but for the maps, which are the robots' alone, and the network, which is real.
 
     Args:
         pilots: by number; their processes have started.
@@ -28,9 +28,9 @@ class TeamFlight:
         """Ticks in which a robot met another."""
         self._coordination = coordination_of(options)
         self._generator = torch.Generator().manual_seed(options.seed)
-        for pilot, answer in zip(pilots, ask_all(pilots, "start", lambda _: {}), strict=True):
-            pilot.braking = torch.tensor(answer["braking"], dtype=torch.float64)
-            pilot.position = torch.tensor(answer["position"], dtype=torch.float64)
+        for pilot, answer in zip(pilots, ask_all(pilots, "start"), strict=True):
+            pilot.braking = pilot.rows(answer, "braking", 7)
+            pilot.position = pilot.rows(answer, "position", 3)[-1]
 
     @property
     def now(self) -> float:
@@ -44,25 +44,25 @@ class TeamFlight:
     def step(self) -> None:
         """One tick: sense, exchange, plan if it is due, fly on."""
         options, now = self.options, self.now
-        there = {pilot.number: pilot.position.tolist() for pilot in self.pilots}
+        places = {pilot.number: pilot.position.tolist() for pilot in self.pilots}
         ask_all(
             self.pilots,
             "sense",
-            lambda pilot: {"now": now, "others": [p for n, p in there.items() if n != pilot.number]},
+            lambda pilot: {"others": [there for n, there in places.items() if n != pilot.number]},
+            now=now,
         )
         self._listen(now)
         if self.tick % options.ticks_per_plan == 0:
             number = self.tick // options.ticks_per_plan
             take_turns(self.pilots, self._coordination, options, now, number, self._generator)
         begin = (self.tick % options.ticks_per_plan) * options.steps_per_tick
-        leg = {"begin": begin, "stop": begin + options.steps_per_tick}
-        flown = torch.tensor(
-            [answer["positions"] for answer in ask_all(self.pilots, "fly", lambda _: leg)],
-            dtype=torch.float64,
-        )
+        answers = ask_all(self.pilots, "fly", begin=begin, stop=begin + options.steps_per_tick)
+        flown = [
+            pilot.rows(answer, "positions", 3) for pilot, answer in zip(self.pilots, answers, strict=True)
+        ]
         for pilot, positions in zip(self.pilots, flown, strict=True):
             pilot.position = positions[-1]
-        self.encounters += int(meets_others(flown, options.dynamics.radius).any(1).sum())
+        self.encounters += int(meets_others(torch.stack(flown), options.dynamics.radius).any(1).sum())
         self.tick += 1
         if self.is_over:
             self._listen(self.now)
@@ -71,16 +71,16 @@ class TeamFlight:
         """Robots go on talking where they are until all hold the same; returns for how many simulated
         seconds, at most `limit`, or None if that is not enough."""
         for tick in range(math.floor(limit * self.options.rate) + 1):
-            if len({answer["digest"] for answer in ask_all(self.pilots, "digest", lambda _: {})}) == 1:
+            if len({answer.get("digest") for answer in ask_all(self.pilots, "digest")}) == 1:
                 return tick / self.options.rate
             now = self.now + tick / self.options.rate
-            ask_all(self.pilots, "send", lambda _, now=now: {"now": now})  # type: ignore[misc]
+            ask_all(self.pilots, "send", now=now)
             self._listen(now + self.options.tick_seconds)
         return None
 
     def finish(self) -> list[dict[str, Any]]:
         """Robots write what they leave, and end; their rows."""
-        return [answer["row"] for answer in ask_all(self.pilots, "finish", lambda _: {})]
+        return [answer.get("row", {}) for answer in ask_all(self.pilots, "finish", now=self.now)]
 
     def _listen(self, now: float) -> None:
-        ask_all(self.pilots, "listen", lambda pilot: {"now": now, "expected": pilot.expected()})
+        ask_all(self.pilots, "listen", lambda pilot: {"expected": pilot.expected()}, now=now)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gmmtorch.report.exploration_curves import bandwidth_figure as bandwidth_figure
     from gmmtorch.report.exploration_curves import entropy_figure as entropy_figure
     from gmmtorch.report.exploration_curves import planner_comparison_figure as planner_comparison_figure
+    from gmmtorch.report.exploration_loss import loss_figure as loss_figure
     from gmmtorch.report.exploration_maps import TeamSnapshot as TeamSnapshot
     from gmmtorch.report.exploration_maps import team_map_figure as team_map_figure
     from gmmtorch.report.exploration_maps import trajectories_figure as trajectories_figure
@@ -55,6 +56,7 @@ _HOMES = {
     "ellipsoid_mesh": "meshes",
     "entropy_figure": "exploration_curves",
     "format_table": "table",
+    "loss_figure": "exploration_loss",
     "map_figure": "maps",
     "mixture_figure": "mixtures",
     "mixture_scene_figure": "exploration_scene",

@@ -129,9 +129,10 @@ def bandwidth_figure(rows: Rows, title: str | None = None) -> Figure:
 def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
     """Share of the observable entropy left over time, a line for each planner variant.
 
-    Variants are told apart by every option that one may set; a label names those in which they differ. Means over seeds in 95 % bands. Marks at the mean t50 and t90 where every
-    seed has one: times to 50 and 90 % of the largest mean reduction of any variant, whatever rows say
-    of their own, so that all are measured alike.
+    Variants are told apart by every option that one may set; a label names those in which they differ.
+    Means over seeds in 95 % bands. Marks at the mean t50 and t90 where every seed has one: times to 50
+    and 90 % of the largest mean reduction of any variant, whatever rows say of their own, so that all are
+    measured alike.
 
     Raises:
         InvalidArgumentError: no row, or one with nothing to observe.

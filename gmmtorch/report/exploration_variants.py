@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gmmtorch.exploration.variants import NETWORK, differing
@@ -21,15 +21,16 @@ def by_variant(rows: Rows, otherwise: str = "planner") -> dict[str, list[Mapping
     fields = differing(rows) or [otherwise]
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
-        texts = [text for field in fields if (text := _text(field, row.get(field)))]
-        if not any(field in NETWORK for field in fields) or any(
-            _text(field, row.get(field)) for field in fields if field in NETWORK
-        ):
-            pass
-        else:
-            texts.append("lossless")
-        groups.setdefault(", ".join(texts), []).append(row)
+        groups.setdefault(_name(row, fields), []).append(row)
     return groups
+
+
+def _name(row: Mapping[str, Any], fields: Sequence[str]) -> str:
+    texts = {field: _text(field, row.get(field)) for field in fields}
+    of_network = [texts[field] for field in fields if field in NETWORK]
+    if of_network and not any(of_network):
+        texts["loss"] = "lossless"
+    return ", ".join(text for text in texts.values() if text)
 
 
 def _text(field: str, value: Any) -> str:
@@ -39,7 +40,7 @@ def _text(field: str, value: Any) -> str:
             return "no prior" if value is None else f"prior {value:g}"
         case "framework", _:
             return framework_name(str(value)).split()[0]
-        case ("loss" | "duplication" | "partitions"), (None | 0 | []):
+        case (("loss" | "duplication" | "partitions"), (None | 0 | [])):
             return ""
         case "loss", _:
             return f"{100 * value:g} % lost"
@@ -47,13 +48,13 @@ def _text(field: str, value: Any) -> str:
             return f"{100 * value:g} % twice"
         case "partitions", _:
             return ", ".join(map(_cut_text, value))
-        case ("bandwidth" | "reach" | "budget"), None:
+        case (("bandwidth" | "reach" | "budget"), None):
             return _UNLIMITED[field]
-        case ("bandwidth" | "budget"), _:
+        case (("bandwidth" | "budget"), _):
             return f"{'budget ' if field == 'budget' else ''}{byte_text(value)}/s"
         case "reach", _:
             return f"reach {value:g} m"
-        case ("delay" | "jitter" | "announce"), (int() | float()):
+        case (("delay" | "jitter" | "announce"), (int() | float())):
             return f"{field} {value:g} s"
         case _:
             return _SHOWN.get(str(value), str(value).replace("_", " "))

@@ -179,8 +179,9 @@ def _draw(axes: Axes, rows: Rows, quality: str) -> None:
             )
     left_out = ("depth_image_thinned",) if quality == "psnr2_db" else ()
     lead = leads(rows, quality, left_out)
-    low = min(row[quality] for row in rows if row["codec"] in (OURS, "octree"))
-    high = max(row[quality] for row in rows if row["codec"] in ((OURS, "octree") if left_out else _LINES))
+    scale = [row for row in rows if math.isfinite(row[quality])]
+    low = min(row[quality] for row in scale if row["codec"] in (OURS, "octree"))
+    high = max(row[quality] for row in scale if row["codec"] in ((OURS, "octree") if left_out else _LINES))
     axes.set_ylim(low - 0.04 * (high - low), high + 0.22 * (high - low))
     if lead.octaves:
         axes.axvspan(lead.low, lead.high, color="#0072B2", alpha=0.09, linewidth=0, zorder=0)

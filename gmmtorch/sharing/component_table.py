@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,12 +43,15 @@ class ComponentTable:
         """Which of these (K,) are here."""
         return np.array([key in self._places for key in keys.tolist()], np.bool_)
 
-    def print_of(self, key: int) -> bytes:
-        """What the content of a component, but for its key, hashes to."""
-        batch, row = self._places[key]
-        if batch not in self._prints:
+    def prints(self, keys: Sequence[int]) -> list[bytes]:
+        """What the content of components (K,), but for their keys, hashes to."""
+        places = [self._places[key] for key in keys]
+        for batch in {batch for batch, _ in places} - self._prints.keys():
             self._prints[batch] = fingerprints(self._batches[batch][1])
-        return self._prints[batch][row]
+        return [self._prints[batch][row] for batch, row in places]
+
+    def print_of(self, key: int) -> bytes:
+        return self.prints([key])[0]
 
     def keys(self) -> Ints:
         """Of all components, rising."""

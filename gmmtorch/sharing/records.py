@@ -229,8 +229,10 @@ class Records:
     def digest(self) -> bytes:
         """16 bytes: equal if all that is held, and all that counts, is equal to the bit."""
         digest = hashlib.blake2b(self.held.edges.astype("<i8").tobytes(), digest_size=16)
-        keys = self.table.keys().tolist()
-        digest.update(b"".join(key.to_bytes(8, "little") + self.table.print_of(key) for key in keys))
+        keys = self.table.keys()
+        names = keys.astype("<i8").tobytes()
+        for row, print_ in enumerate(self.table.prints(keys.tolist())):
+            digest.update(names[8 * row : 8 * row + 8] + print_)
         for key in sorted(self.others):
             digest.update(self.datagrams[key])
         return digest.digest()

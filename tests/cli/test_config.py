@@ -158,6 +158,8 @@ def test_every_experiment_of_teams_composes_and_its_missions_can_be_flown(name, 
     assert len({trial.folder for trial in trials}) == len(trials) > 1
     for trial, variant in zip(trials, variants, strict=True):
         named = {"team": trial.team.framework, "seed": trial.team.seed, **vars(trial.team)}
+        cuts = [cut._asdict() for cut in trial.team.partitions]
+        named["partitions"] = [{**cut, "groups": list(map(list, cut["groups"]))} for cut in cuts]
         assert named["seed"] == 7
         assert {key: named[key] for key in variant} == variant
     with pytest.raises(ConfigCompositionException, match="nonsense"):

@@ -327,6 +327,24 @@ def test_a_study_of_planners_compares_them(run):
     assert {name for name in done.files() if name.endswith(".png")} == {"planners.png", "profile.png"}
 
 
+def test_a_study_of_networks_compares_them_with_the_lossless_one(run):
+    cut = "partitions:[{begin:1,end:3,groups:[[0],[1]]}]"
+    variants = f"study.variants=[{{}},{{loss:0.5}},{{{cut}}},{{team:grid_shared}}]"
+    options = ["experiment=fig4_5_bandwidth", "study.seeds=[0]", variants, "evaluation.codecs=[]"]
+    done = succeeded(run(*options, "report.figures=true", "duration=6", "evaluation.every=1"))
+    pictures = {name for name in done.files() if name.endswith(".png")}
+    assert pictures == {"loss.png", "entropy.png", "bandwidth.png", "summary.png", "profile.png"}
+    lossless, lossy, parted, grids = done.results()["rows"]
+    for row in (lossless, lossy, parted, grids):
+        assert row["bits_per_byte"] == row["entropy_reduction_bits"] / row["wire_bytes"]
+    assert lossless["wire_ratio"] == grids["wire_ratio"] == 1
+    assert lossy["wire_ratio"] == lossy["wire_bytes"] / lossless["wire_bytes"]
+    assert max(parted["missing_share"]) > max(lossless["missing_share"][2:])
+    lines = [line for line in done.stdout.splitlines() if line.startswith("E")]
+    names = ["E0, lossless", "E0, 50 % lost", "E0, partition 0 | 1, 1–3 s", "E1, lossless"]
+    assert [any(line.startswith(f"{name} ") for line in lines) for name in names] == [True] * 4
+
+
 def test_a_trial_of_a_study_is_the_mission_alone(run):
     """Which it must be for a study that went on to be worth the same."""
     (alone,) = timeless(succeeded(run("team=grid_shared", "seed=1")).results())["rows"]

@@ -243,6 +243,8 @@ def test_what_a_bad_network_loses_is_repaired(world: World) -> None:
     row = row_of(mission, 1.0)
     assert max(row["missing_share"]) > 0
     assert row["reception"]["lost"] > 0 < row["reception"]["duplicated"]
+    assert row["wire_bytes_over_time"][0] == 0
+    assert row["wire_bytes_over_time"][-1] == row["bytes_sent"] + 28 * row["datagrams"] == row["wire_bytes"]
     held = mission.robots[0].mapper.held
     for robot in mission.robots[1:]:
         held |= robot.mapper.held

@@ -167,7 +167,7 @@ def test_over_udp(key):
         transport.peers = [other.address for other in transports if other is not transport]
     nodes = [robot(k, part(k, 3, 18), transports[k], announce_every=0.1) for k in range(3)]
     run_paced(nodes, 100.0, settle=0.5)
-    end = time.monotonic() + 20
+    end = time.monotonic() + 60
     while len({node.replica.digest() for node in nodes}) > 1 and time.monotonic() < end:
         run_paced(nodes, 100.0, settle=0.1)
     assert len({node.replica.digest() for node in nodes}) == 1
@@ -191,7 +191,7 @@ def test_without_a_network_it_goes_on_alone_and_catches_up_later():
     assert all(node.is_over for node in nodes)
     assert nodes[0].replica.digest() != nodes[1].replica.digest()
     transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
-    end = time.monotonic() + 20
+    end = time.monotonic() + 60
     while nodes[0].replica.digest() != nodes[1].replica.digest() and time.monotonic() < end:
         run_paced(nodes, 200.0, settle=0.1)
     assert nodes[0].replica.digest() == nodes[1].replica.digest()
@@ -204,7 +204,7 @@ def test_two_robots_of_one_number_over_udp():
     nodes = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05) for k in range(2)]
     assert [node.twin for node in nodes] == [None, None]
     transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
-    end = time.monotonic() + 20
+    end = time.monotonic() + 60
     while not all(node.twin for node in nodes) and time.monotonic() < end:
         run_paced(nodes, 200.0, settle=0.1)
     for node, other in zip(nodes, reversed(transports), strict=True):
@@ -259,6 +259,7 @@ def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path
         if node.is_over:
             break
         kill(node)
+        assert lives < 30  # each goes on where it was, to within five scans and a window
     assert lives > 1
     for _ in range(100):
         now += 0.5

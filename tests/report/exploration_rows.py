@@ -111,3 +111,34 @@ def flights(n_robots: int = 3, n: int = 600, seed: int = 0) -> list[np.ndarray]:
         height = 2.5 + 1.2 * np.sin(np.arange(n) / 40 + i)
         paths.append(np.concatenate([flat, height[:, None], turns[:, None]], 1))
     return paths
+
+
+def networks(n_seeds: int = 3, duration: float = 600.0) -> list[dict[str, Any]]:
+    """E0 where nothing is lost, where some is, and where it is cut in two for a minute."""
+    cut = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
+    variants = [(0.0, []), (0.1, []), (0.3, []), (0.5, []), (0.0, [cut])]
+    rows = []
+    for seed in range(n_seeds):
+        lossless: dict[str, Any] = {}
+        for loss, partitions in variants:
+            row = trial("gmm_shared", seed, duration, pace=90 * (1 + 0.1 * loss), loss=loss)
+            times = np.asarray(row["times"])
+            ripple = np.random.default_rng([seed, round(10 * loss)]).uniform(0.3, 1, len(times))
+            missing = ripple * (0.4 + 3 * loss) / (10 + times)
+            if partitions:
+                apart = np.clip((times - 60) / 60, 0, 1) * 0.45
+                missing = np.where((times >= 60) & (times < 130), np.maximum(apart, missing), missing)
+            wire = 8e5 * (1 + 1.2 * loss + 0.05 * bool(partitions)) * (1 - np.exp(-times / 180))
+            row |= {
+                "partitions": partitions,
+                "missing_share": np.minimum(missing, 1).tolist(),
+                "wire_bytes_over_time": wire.astype(int).tolist(),
+                "wire_bytes": int(wire[-1]),
+                "map_disagreement": 1e-3 * loss,
+            }
+            lossless = lossless or row
+            row["t90_ratio"] = row["t90"] / lossless["t90"] if row["t90"] else None
+            row["wire_ratio"] = row["wire_bytes"] / lossless["wire_bytes"]
+            row["healed_after"] = 10.0 if partitions else None
+            rows.append(row)
+    return rows

@@ -66,6 +66,25 @@ def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
     assert sum(tag.endswith("/entropy_left") for tag in tags) == 2
 
 
+def test_variants_that_differ_by_their_network_alone_have_tags_of_their_own(tmp_path):
+    cut = {"begin": 60.0, "end": 120.5, "groups": [[0], [1, 2]]}
+    networks = [(0.0, []), (0.3, []), (0.0, [cut]), (0.0, [{**cut, "groups": [[1], [0, 2]]}])]
+    rows = [
+        trial("gmm_shared", 0, duration=20, loss=loss, partitions=cuts, missing_share=[0.0, 0.5, loss])
+        for loss, cuts in networks
+    ]
+    with Board(tmp_path) as board:
+        write_exploration_board(board, rows, {})
+    events = read(tmp_path)
+    tags = [tag for tag in events.Tags()["scalars"] if tag.endswith("/missing_share")]
+    assert len(tags) == 4
+    (lossy,) = (tag for tag in tags if "loss_0.3" in tag)
+    assert lossy == "gmm_shared/loss_0.3_partitions_none/seed_0/missing_share"
+    found = events.Scalars(lossy)
+    np.testing.assert_allclose([event.value for event in found], [0, 0.5, 0.3], rtol=1e-6)
+    assert any("partitions_60-120.5_0_1.2" in tag for tag in tags)
+
+
 def test_a_running_mission_by_its_simulated_seconds(tmp_path):
     with Board(tmp_path) as board:
         live = MissionBoard(board)

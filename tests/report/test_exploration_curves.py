@@ -131,6 +131,16 @@ def test_variants_that_differ_by_planner_alone_are_named_by_it():
     assert "CSQMI" not in said
 
 
+def test_variants_that_differ_by_their_network_alone_have_lines_of_their_own():
+    rows = [trial("gmm_shared", seed, loss=loss, partitions=[]) for seed in (0, 1) for loss in (0.0, 0.3)]
+    figure = planner_comparison_figure(rows)
+    said = texts(figure.axes[0])
+    assert "lossless\nt50" in said
+    assert "30 % lost\nt50" in said
+    assert len(figure.axes[0].collections) == 2  # a band each
+    assert "mean of 2 seeds" in figure.get_suptitle()
+
+
 def test_summary_has_a_dot_a_seed_and_paired_differences():
     rows = protocol(n_seeds=3)
     figure = summary_bars(rows)

@@ -1,0 +1,126 @@
+"""The picture of bad networks shows what the rows say; variants have the names that readers expect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from exploration_rows import OBSERVABLE_BITS, networks, trial
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.trials import mean_band
+from gmmtorch.report import loss_figure
+from gmmtorch.report.exploration_variants import by_variant
+from gmmtorch.report.style import PALETTE
+
+CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
+
+
+def texts(axes: Axes) -> str:
+    return "\n".join(text.get_text() for text in axes.texts)
+
+
+def line(axes: Axes, index: int, n_points: int) -> np.ndarray:
+    """Heights of the one curve of a colour."""
+    (found,) = (
+        np.asarray(drawn.get_ydata())
+        for drawn in axes.lines
+        if to_hex(drawn.get_color()) == to_hex(PALETTE[index]) and len(drawn.get_ydata()) == n_points
+    )
+    return found
+
+
+def test_each_panel_has_the_mean_of_each_variant_over_seeds():
+    rows = networks(n_seeds=3)
+    figure = loss_figure(rows)
+    figure.canvas.draw()
+    series = (
+        lambda row: 100 * np.array(row["entropy_bits"]) / OBSERVABLE_BITS,
+        lambda row: np.array(row["wire_bytes_over_time"]),
+        lambda row: 100 * np.array(row["missing_share"]),
+    )
+    assert len(figure.axes) == 3
+    for axes, values in zip(figure.axes, series, strict=True):
+        for index in range(5):
+            trials = np.stack([values(row) for row in rows[index::5]])
+            mean, low, high = mean_band(trials)
+            np.testing.assert_allclose(line(axes, index, len(mean)), mean)
+            corners = axes.collections[index].get_paths()[0].vertices[:, 1]
+            assert corners.max() == pytest.approx(
+                min(high.max(), 100) if axes is figure.axes[2] else high.max()
+            )
+            assert corners.min() == pytest.approx(max(low.min(), 0) if axes is figure.axes[2] else low.min())
+    assert "3 robots" in figure.get_suptitle()
+    assert "mean of 3 seeds" in figure.get_suptitle()
+
+
+def test_labels_say_times_bytes_ratios_and_how_maps_end():
+    rows = networks(n_seeds=2)
+    for k, row in enumerate(rows):
+        row |= {"t90": 200.0 + k // 5, "t90_ratio": 1.5, "wire_ratio": 2.0, "map_disagreement": 0.003}
+    rows[3]["t90"] = None  # half lost, seed 0
+    rows[2]["t90_ratio"] = None
+    figure = loss_figure(rows)
+    left, sent, lacking = (texts(axes) for axes in figure.axes)
+    assert "lossless\nt90 200 s\n" in left
+    assert "10 % lost\nt90 200 s, 1.50×" in left
+    assert "30 % lost\nt90 200 s\n" in left  # one seed has no companion
+    assert "50 % lost\nt90 in 1 of 2" in left
+    total = np.mean([rows[i]["wire_bytes_over_time"][-1] for i in (3, 8)])
+    assert f"50 % lost\n{total / 1e6:.2f} MB, 2.00×" in sent
+    assert "partition 0 | 1 2,\n60\N{EN DASH}120 s\n0.3 % of cells differ\nwhole again in 10 s" in lacking
+    assert "lossless\n0.3 % of cells differ" in lacking
+
+
+def test_a_partition_is_shaded_while_it_lasts():
+    figure = loss_figure(networks(n_seeds=1))
+    for axes in figure.axes:
+        (shade,) = axes.patches
+        assert (shade.get_x(), shade.get_width()) == (60, 60)
+        assert texts(axes).count("partition\n") + texts(axes).endswith("partition") >= 1
+    (axes, *_) = loss_figure(networks(n_seeds=1)[:4]).axes
+    assert not axes.patches
+
+
+def test_nothing_lacking_at_all_can_be_drawn():
+    row = networks(n_seeds=1)[0]
+    row |= {"missing_share": [0.0] * len(row["times"]), "map_disagreement": None, "t90": None}
+    figure = loss_figure([row])
+    figure.canvas.draw()
+    assert line(figure.axes[2], 0, len(row["times"])).max() == 0
+    assert "lossless\nt90 not reached" in texts(figure.axes[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ([{"loss": 0.0}, {"loss": 0.125}], ["lossless", "12.5 % lost"]),
+        ([{}, {"partitions": [CUT]}], ["lossless", "partition 0 | 1 2, 60\N{EN DASH}120 s"]),
+        ([{"budget": None}, {"budget": 2000.0}], ["no budget", "budget 2.00 kB/s"]),
+        ([{"bandwidth": None}, {"bandwidth": 2e4, "loss": 0.1}], ["no limit", "20.0 kB/s, 10 % lost"]),
+        ([{"reach": 15.0}, {"duplication": 0.2}], ["reach 15 m", "20 % twice, any reach"]),
+        ([{"jitter": 0.0}, {"jitter": 0.02}], ["jitter 0 s", "jitter 0.02 s"]),
+        ([{"codec": "float"}, {"codec": "thesis"}], ["float", "thesis"]),
+        ([{"framework": "grid_shared"}, {"loss": 0.1}], ["E1, lossless", "E0, 10 % lost"]),
+        ([{"planner": "mcts"}], ["MCTS"]),
+    ],
+)
+def test_names_have_what_variants_differ_in(options: list[dict[str, Any]], names: list[str]):
+    plain = {"loss": 0.0, "partitions": [], "duplication": 0.0, "reach": None, "bandwidth": None}
+    rows = [{**trial("gmm_shared", seed, 20), **plain, **option} for seed in (0, 1) for option in options]
+    groups = by_variant(rows)
+    assert list(groups) == names
+    assert [[row["seed"] for row in trials] for trials in groups.values()] == [[0, 1]] * len(names)
+
+
+def test_says_what_is_wrong():
+    with pytest.raises(InvalidArgumentError, match="rows is empty"):
+        loss_figure([])
+    with pytest.raises(InvalidArgumentError, match="wire_bytes_over_time, missing_share"):
+        loss_figure([trial("gmm_shared", 0, 20)])
+    row = {**networks(n_seeds=1)[0], "observable_bits": 0.0}
+    with pytest.raises(InvalidArgumentError, match="observable_bits above zero"):
+        loss_figure([row])
