@@ -212,6 +212,7 @@ def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
             check_number(node)
             report(now)
 
+        report(0.0)
         paced = run_paced(
             node,
             rate=config.sensor.rate if config.source == "world" else config.log.rate,

@@ -45,10 +45,13 @@ class RobotReport:
             self._note(now)
 
     def finish(self, now: float) -> None:
-        """Show and note what there is in the end."""
+        """Show and note what there is in the end, in place of what was noted a moment ago."""
         self._show(now)
-        if self.series["times"][-1:] != [now]:
-            self._note(now)
+        times = self.series["times"]
+        if times and now - times[-1] < min(_EVERY, self._every):
+            for values in self.series.values():
+                values.pop()
+        self._note(now)
 
     def _show(self, now: float) -> None:
         numbers = self._node.scalars()

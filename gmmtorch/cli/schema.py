@@ -514,7 +514,7 @@ class RobotRuntime:
 
 
 @dataclass
-class RobotOptions:
+class Robot:
     """Of a robot; a team has the same."""
 
     world: Any = MISSING
@@ -552,7 +552,7 @@ def register() -> None:
     store.store(name="fit_schema", node=Fit)
     store.store(name="export_schema", node=Export)
     store.store(name="explore_schema", node=Explore)
-    store.store(name="robot_schema", node=RobotOptions)
+    store.store(name="robot_schema", node=Robot)
     store.store(group="schema/world", name="generated", node=GeneratedWorld)
     store.store(group="schema/world", name="mesh", node=MeshWorldOptions)
     store.store(group="schema/team", name="team", node=Team)

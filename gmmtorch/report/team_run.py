@@ -8,23 +8,40 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.exploration_style import GRID, Rows, byte_text
-from gmmtorch.report.style import LABEL_SIZE, TICK_SIZE, colour, dress, figure_title, line_style, new_figure
+from gmmtorch.report.exploration_style import GRID, Rows, byte_text, label_ends
+from gmmtorch.report.style import (
+    LABEL_SIZE,
+    PALETTE,
+    TICK_SIZE,
+    colour,
+    dress,
+    figure_title,
+    line_style,
+    new_figure,
+)
 
-KINDS = ("components", "counts", "supersessions", "corrections", "points", "views", "plans", "announcements")
-"""Of datagrams, in the order in which they are drawn."""
-_HUES = dict(zip(KINDS, (0, 5, 4, 1, 6, 2, 3, 4), strict=True))
-_HATCHED = ("announcements",)
+_HUES = {
+    "components": PALETTE[0],
+    "counts": PALETTE[5],
+    "supersessions": PALETTE[4],
+    "corrections": PALETTE[1],
+    "points": PALETTE[6],
+    "views": PALETTE[2],
+    "plans": PALETTE[3],
+    "announcements": "#9a9a9a",
+}
+"""Of kinds of datagrams, in the order in which they are drawn."""
+_MOST_LABELS = 10
 
 
 def team_run_figure(rows: Rows, title: str | None = None) -> Figure:
     """Left, each robot's map over its time; right, what it sent, each datagram once, by kind.
 
     Of robots in a simulated world the left is the share of the observable entropy that their maps lack, of
-    others how many records they hold. At its end a line has the robot's number.
+    others how many records they hold. Names on the right are in the colours of the lines.
 
     Args:
         rows: of robots in `results.json`.
@@ -39,6 +56,8 @@ def team_run_figure(rows: Rows, title: str | None = None) -> Figure:
     left, right = figure.subplots(1, 2)
     _draw_maps(left, rows)
     _draw_bytes(right, rows)
+    if right.containers:
+        figure.legend(loc="outside lower center", ncols=8, frameon=False, fontsize=LABEL_SIZE)
     figure_title(figure, title or _title(rows))
     return figure
 
@@ -52,24 +71,17 @@ def _title(rows: Rows) -> str:
 
 def _draw_maps(axes: Axes, rows: Rows) -> None:
     explores = all(row.get("entropy_bits") and row.get("observable_bits") for row in rows)
+    ends = []
     for index, row in enumerate(rows):
         times, values = np.asarray(row["times"], dtype=np.float64), _values(row, explores)
         look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index)}
         axes.plot(times, values, linewidth=1.8, **look)
-        # Some lie on each other: the numbers stand side by side.
-        axes.annotate(
-            str(row["robot"]),
-            (times[-1], values[-1]),
-            (6 + 13 * index, 0),
-            textcoords="offset points",
-            va="center",
-            color=colour(index),
-            fontsize=LABEL_SIZE,
-            annotation_clip=False,
-        )
+        ends.append((float(values[-1]), f"{row['robot']}", colour(index)))
     dress(axes, "", "robot's time [s]", "entropy left [% of the observable]" if explores else "records held")
-    axes.set_ylim(bottom=0)
+    axes.set(xlim=axes.get_xlim(), ylim=(0, axes.get_ylim()[1]))
     axes.grid(color=GRID, linewidth=0.8)
+    if 1 < len(rows) <= _MOST_LABELS:
+        label_ends(axes, ends)
 
 
 def _values(row: Mapping[str, Any], explores: bool) -> np.ndarray:
@@ -79,38 +91,23 @@ def _values(row: Mapping[str, Any], explores: bool) -> np.ndarray:
 
 
 def _draw_bytes(axes: Axes, rows: Rows) -> None:
-    kinds = [kind for kind in KINDS if any(row["bytes_by_kind"].get(kind) for row in rows)]
     start = np.zeros(len(rows))
-    for kind in kinds:
+    for kind, hue in _HUES.items():
         sizes = np.array([row["bytes_by_kind"].get(kind, 0) for row in rows], dtype=np.float64)
-        axes.barh(
-            range(len(rows)),
-            sizes,
-            left=start,
-            label=kind,
-            color=colour(_HUES[kind]),
-            hatch="///" if kind in _HATCHED else None,
-            height=0.66,
-            edgecolor="white",
-            linewidth=0.8,
-        )
+        if not sizes.any():
+            continue
+        look: dict[str, Any] = {"color": hue, "height": 0.66, "edgecolor": "white", "linewidth": 0.8}
+        axes.barh(range(len(rows)), sizes, left=start, label=kind, **look)
         start += sizes
     for place, total in enumerate(start):
         axes.text(total, place, f" {byte_text(float(total))}", va="center", fontsize=TICK_SIZE)
     axes.set_yticks(range(len(rows)), [f"robot {row['robot']}" for row in rows], fontsize=LABEL_SIZE)
+    dress(axes, "", "sent, without headers", "")
     for index, label in enumerate(axes.get_yticklabels()):
-        label.set_color(colour(index))
+        label.set(color=colour(index), fontsize=LABEL_SIZE)
     axes.invert_yaxis()
     axes.set_xlim(0, 1.2 * max(float(start.max()), 1.0))
+    axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value)))
-    dress(axes, "", "sent, without headers", "")
     axes.grid(axis="x", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    if kinds:
-        axes.legend(
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.16),
-            ncols=min(len(kinds), 4),
-            fontsize=LABEL_SIZE - 1,
-            frameon=False,
-        )

@@ -13,9 +13,9 @@ from gmmtorch.sharing.announce_messages import AnnouncementMessage
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import keys_of_robot
 
-_ON_THE_WAY = 2
-"""Calls after which what was sent must have come: who announces between two of them, and is heard after the
-second, had not heard the first."""
+_ON_THE_WAY = 3
+"""Calls after which what was sent has come: a robot that sends, then hears, each tick, over a network as quick
+as that, announces before it has heard what was sent a tick ago, and is heard a tick later."""
 MOST_PEERS = 64
 """Robots whose gaps are remembered, those heard last."""
 

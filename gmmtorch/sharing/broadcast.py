@@ -56,7 +56,7 @@ class Broadcast:
         return Intervals.empty()
 
     def add(self, new: Components) -> Tensor:
-        """New components of this robot; returns the ids (K, 2) that they get, in the order in which they go."""
+        """New components of this robot; returns the ids (K, 2) that they get, rising."""
         if len(new):
             new = new.rearranged(spatial_order(new))  # takes fewer bytes
         numbers = self._n_numbered + torch.arange(len(new))

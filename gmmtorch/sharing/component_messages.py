@@ -77,7 +77,7 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
     """
     begin, n = 0, _TRIED
     while begin < len(values):
-        whole = n >= len(values)
+        whole = begin == 0 and n >= len(values)
         part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
         datagram = sealed(Kind.COMPONENTS, batches.encode_quantized(part))
         room = int(_FILL * len(part) * max_bytes / len(datagram))

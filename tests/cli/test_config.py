@@ -43,7 +43,7 @@ from gmmtorch.simulation.warehouse import warehouse
 
 CONF = Path(common.conf_dir())
 COMMANDS = ["occupancy", "fit"]
-CONFIGURED = [*COMMANDS, "explore"]  # export has options of its own only: see its tests
+CONFIGURED = [*COMMANDS, "explore", "robot", "team"]  # export has options of its own only: see its tests
 MAPS = {
     "incremental": (schema.IncrementalMap, IncrementalRule()),
     "per_scan": (schema.WindowedMap, WindowedRule(window=1, max_origins=1)),
@@ -362,13 +362,29 @@ def test_the_files_of_a_team_repeat_the_defaults_of_the_schema(choice, options):
     assert plain(composed("explore", choice)[group]) == {**asdict(options()), "name": name}
 
 
-def test_the_file_of_explore_repeats_the_defaults_of_the_schema():
-    config = composed("explore")
-    defaults = asdict(schema.Explore())
+@pytest.mark.parametrize(("command", "options"), [("explore", schema.Explore), ("robot", schema.Robot)])
+def test_the_file_of_robots_repeats_the_defaults_of_the_schema(command, options):
+    config = composed(command)
+    defaults = asdict(options())
     for group in ("world", "team", "planner"):
         del defaults[group]
+    if "log" in defaults:
+        del defaults["log"]["map"], config.log.map
     for name, value in defaults.items():
         assert OmegaConf.to_container(OmegaConf.create({name: config[name]}))[name] == value, name
+
+
+def test_robots_of_their_own_are_those_that_explore():
+    ours, theirs = asdict(schema.Robot()), asdict(schema.Explore())
+    for name in ("report", "evaluation", "network", "runtime"):
+        assert ours[name].items() <= theirs[name].items()
+    different = {"transport", "report", "evaluation", "network", "runtime"}
+    assert all(ours[name] == theirs[name] for name in (ours.keys() & theirs.keys()) - different)
+
+
+def test_a_team_is_of_robots_in_all_but_its_clock():
+    robot, team = OmegaConf.to_container(composed("robot")), OmegaConf.to_container(composed("team"))
+    assert team == {**robot, "clock": None}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -382,12 +398,13 @@ def test_the_files_repeat_the_defaults_of_the_schema(command):
 # -- documentation --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [schema.Occupancy, schema.Fit, schema.Explore])
+@pytest.mark.parametrize("options", [schema.Occupancy, schema.Fit, schema.Explore, schema.Robot])
 def test_the_configuration_file_shows_every_option(options):
     """So that --help, which prints the composed file, and the file itself say the same."""
     text = (CONF / f"{options.__name__.lower()}.yaml").read_text(encoding="utf-8")
     for name in leaves(options):
-        elsewhere = ("dataset", "world", "team", "planner") + (() if options is schema.Explore else ("map.",))
+        elsewhere = ("dataset", "world", "team", "planner", "log.dataset")
+        elsewhere += () if options in (schema.Explore, schema.Robot) else ("map.",)
         if not name.startswith(elsewhere):
             assert re.search(rf"^ *{name.split('.')[-1]}:", text, re.MULTILINE), name
 
@@ -398,6 +415,7 @@ def test_the_configuration_file_shows_every_option(options):
         schema.Occupancy,
         schema.Fit,
         schema.Explore,
+        schema.Robot,
         schema.GeneratedWorld,
         schema.MeshWorldOptions,
         schema.Team,
@@ -551,7 +569,7 @@ def test_the_commands_are_installed_under_their_names():
 
 def test_help_names_every_choice_of_every_group():
     """Each experiment is named by the command that it is for, and by that alone."""
-    of_occupancy, of_fit, of_explore = map(listed, CONFIGURED)
+    of_occupancy, of_fit, of_explore, *of_robots = map(listed, CONFIGURED)
     assert of_occupancy.keys() == {"dataset", "map", "experiment"}
     assert of_fit.keys() == {"dataset", "experiment"}
     for groups in (of_occupancy, of_fit):
@@ -560,5 +578,6 @@ def test_help_names_every_choice_of_every_group():
     assert of_explore.keys() == {"world", "team", "planner", "experiment"}
     for group in ("world", "team", "planner"):
         assert sorted(of_explore[group]) == choices(group)
+        assert all(of_robot[group] == of_explore[group] for of_robot in of_robots)
     named = [name for groups in (of_occupancy, of_fit, of_explore) for name in groups["experiment"]]
     assert sorted(named) == choices("experiment")

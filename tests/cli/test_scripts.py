@@ -19,4 +19,4 @@ def test_processes_of_a_study_import_the_script_without_running_it(script, monke
 
 
 def test_there_is_a_script_for_every_command():
-    assert {"fit", "occupancy", "explore", "export"} <= {script.stem for script in SCRIPTS}
+    assert {"fit", "occupancy", "explore", "export", "robot", "team"} <= {script.stem for script in SCRIPTS}

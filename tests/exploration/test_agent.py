@@ -98,7 +98,7 @@ def learned(number: int, kind: str = "replica", places: Sequence[Any] = PLACES) 
 
 @pytest.fixture(scope="module")
 def sayings() -> list[list[bytes]]:
-    return [learned(number, places=PLACES[number:] * 2) for number in (1, 2)]
+    return [learned(number, places=(PLACES[number:] * 5)[:10]) for number in (1, 2)]
 
 
 # -- what comes ---------------------------------------------------------------------------------------
@@ -280,12 +280,12 @@ def test_a_plan_needs_a_survey() -> None:
 @pytest.mark.parametrize("kind", MAPS)
 def test_what_is_sent_is_booked_by_what_it_is(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)
-    for seed in range(3):
+    for seed in range(5):
         for place in PLACES[:2]:
             one.learn(frame(*place, seed=seed), float(seed))
     one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
-    one.tell_views(3.0)
-    fly(one, 3.0, 1, rests=False)
+    one.tell_views(5.0)
+    fly(one, 5.0, 1, rests=False)
     kinds = Counter(kind for _, _, _, kind in post.sent)
     assert all(kind_of(datagram) == kind for _, _, datagram, kind in post.sent)
     assert all(sender == 2 for _, sender, _, _ in post.sent)

@@ -214,7 +214,7 @@ def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) 
 
 
 def test_robots_that_hear_everything_hold_the_same_components(world: World) -> None:
-    mission = flown(world, replace(SMALL, duration=9.0))
+    mission = flown(world, replace(SMALL, duration=11.0))
     assert mission.converge(0.0) == 0.0
     one, other = (robot.mapper.components() for robot in mission.robots)
     assert isinstance(one, Components)
@@ -226,7 +226,7 @@ def test_robots_that_hear_everything_hold_the_same_components(world: World) -> N
 
 @pytest.mark.parametrize("codec", ["float", "thesis"])
 def test_what_is_broadcast_is_held_by_all_where_nothing_is_lost(world: World, codec: str) -> None:
-    mission = flown(world, replace(SMALL, duration=6.0, codec=codec))
+    mission = flown(world, replace(SMALL, duration=11.0, codec=codec))
     one, other = (robot.mapper.components() for robot in mission.robots)
     assert isinstance(one, Components)
     assert isinstance(other, Components)
@@ -275,13 +275,13 @@ def test_robots_that_never_agree_are_told_so(world: World) -> None:
 
 @pytest.mark.parametrize("framework", ["gmm_shared", "grid_shared"])
 def test_a_budget_bounds_what_is_sent_of_maps(world: World, framework: str) -> None:
-    options = replace(SMALL, framework=framework, duration=10.0)
+    options = replace(SMALL, framework=framework, duration=16.0)
     rows = [row_of(flown(world, replace(options, budget=budget)), 1.0) for budget in (None, 5.0)]
     free, bound = (
         sum(row["bytes_by_kind"].get(kind, 0) for kind in ("components", "counts", "points", "supersessions"))
         for row in rows
     )
-    most = options.size * (5.0 * 9.0 + 1200)  # the burst is one datagram
+    most = options.size * (5.0 * 15.0 + 1200)  # the burst is one datagram
     assert 0 < bound <= most < free
     assert rows[1]["bytes_by_kind"]["plans"] > 0
 

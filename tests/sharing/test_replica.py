@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
-from sharing.message_examples import sealed
+from sharing.message_examples import frame_of_components, sealed
 from sharing.replica_model import Model, rows
 from sharing.schedules import act, components, run_schedule
 
@@ -544,3 +544,17 @@ def test_noise_never_raises(data):
 def test_bad_arguments_say_what_is_wrong(what, wrong):
     with pytest.raises(InvalidArgumentError, match=what):
         wrong()
+
+
+@pytest.mark.parametrize("n", [1, 127, 128, 129, 168, 200, 300, 500])
+@pytest.mark.parametrize("max_bytes", [1000, MAX_BYTES])
+def test_each_component_is_said_once(n: int, max_bytes: int) -> None:
+    # Small ones, of which more fit into a datagram than are tried at first.
+    one, other = Replica(0, dim=3), Replica(1, dim=3)
+    one.add(frame_of_components(n))
+    datagrams = one.datagrams(max_bytes)
+    assert all(len(datagram) <= max_bytes for datagram in datagrams)
+    said = [tuple(name) for datagram in datagrams for name in decode(datagram).components.ids.tolist()]
+    assert len(said) == len(set(said)) == n
+    assert all(other.receive(datagram) for datagram in datagrams)
+    assert other.digest() == one.digest()

@@ -1,0 +1,306 @@
+"""gmmtorch-robot: what a robot leaves, alone and among others, killed and started again; and bad input."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_runs import (
+    CHECKOUT,
+    COMMANDS,
+    QUIET,
+    Finished,
+    environment,
+    refused,
+    run_here,
+    succeeded,
+)
+from exploration.replays import content
+
+from gmmtorch.cli import links, robot
+from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.sharing.messages import encode_plan
+from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.security import TeamKey
+from gmmtorch.sharing.team_key import KEY_VARIABLE
+from gmmtorch.sharing.udp import UdpTransport
+
+Run = Callable[..., Finished]
+
+SMALL = ["sensor.width=48", "sensor.height=36", "runtime.cache=false"]
+LOG = [
+    "source=log",
+    "dataset@log.dataset=synthetic_building_2d",
+    "log.dataset.n_scans=12",
+    "log.dataset.stride=2",
+]
+LOG += ["map@log.map=windowed", "log.map.window=3", "settle=0"]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs a robot in this process, at an address that is free, without pictures unless told otherwise."""
+    monkeypatch.setitem(COMMANDS, "robot", robot)
+    monkeypatch.delenv(KEY_VARIABLE, raising=False)
+
+    def run_command(*options: str, name: str = "run") -> Finished:
+        chosen = {option.split("=")[0] for option in options}
+        defaults = [*QUIET, "link.listen=127.0.0.1:0", "team.size=1"]
+        kept = [option for option in defaults if option.split("=")[0] not in chosen]
+        return run_here(monkeypatch, "robot", tmp_path / name, *kept, *options)
+
+    return run_command
+
+
+@contextmanager
+def chatter(number: int, to: str, key: TeamKey | None = None) -> Iterator[UdpTransport]:
+    """Another robot, that says all the time where it flies."""
+    plan = encode_plan(number, 0, 0.0, 0.2, torch.zeros(4, 4))
+    done = threading.Event()
+    with UdpTransport.unicast(number, peers=[links.address("to", to)], key=key) as transport:
+
+        def talk() -> None:
+            while not done.wait(0.01):
+                transport.send(number, plan, 0.0, "plans")
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        try:
+            yield transport
+        finally:
+            done.set()
+            thread.join()
+
+
+# -- a robot alone --------------------------------------------------------------------------------
+
+
+def room(path: Path) -> Path:
+    """A mesh: the six walls of an empty room, two triangles each."""
+    corners = [f"v {x} {y} {z}" for x, y, z in itertools.product((0.0, 7.0), (0.0, 6.0), (0.0, 3.0))]
+    walls = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    faces = [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in walls]
+    path.write_text("\n".join([*corners, *faces, ""]))
+    return path
+
+
+def test_a_robot_flies_alone_and_shows_what_it_does(run, tmp_path):
+    world = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL]
+    shown = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
+    done = succeeded(run(*world, *shown, "duration=4", "speed=8", "settle=0", "evaluation.every=2"))
+    results = done.results()
+    (row,) = results["rows"]
+    assert results["command"] == "robot"
+    assert results["config"]["clock"] == "wall"
+    assert row["n_components"] > 0
+    assert row["collisions"] == 0
+    assert (row["robot"], row["late"], row["stopped"], row["unkept"]) == (0, 0, False, 0)
+    assert row["times"][0] == 0.0
+    assert row["times"] == sorted(set(row["times"]))
+    assert row["entropy_bits"][0] == row["observable_bits"]
+    assert {len(row["times"])} == {
+        len(row[name]) for name in ("entropy_bits", "records_over_time", "bytes_over_time")
+    }
+    assert row["entropy_bits"][-1] == row["entropy_bits_left"] < row["observable_bits"]
+    assert row["records_over_time"][-1] == row["n_records"]
+    with np.load(row["trajectory_path"]) as kept:
+        assert kept["poses"].shape == (5, 4)
+    assert GaussianMap.load(row["map_path"]).n_components == row["n_components"]
+    files = done.files()
+    assert {"run.png", "trajectory.npz"} <= files
+    assert any(name.startswith("tensorboard/events") for name in files)
+    assert any(name.startswith("journal_0/") for name in files)
+    assert "% of the entropy left" in done.stderr
+    assert row["digest"] in done.stdout
+    assert "browse    tensorboard" in done.stdout
+
+
+def test_where_nobody_listens_it_works_alone(run):
+    done = succeeded(run(*LOG, "link.peers=[127.0.0.1:9]", "log.rate=50"))
+    (row,) = done.results()["rows"]
+    assert row["scans"] == row["n_scans"] == 6
+    assert row["n_components"] > 0
+    assert row["refused"] == {}
+
+
+# -- told to stop ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "orphaned"])
+def test_told_to_stop_it_writes_what_it_has(run, monkeypatch, name):
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    ticks: list[float] = []
+    tick = ReplayNode.tick
+
+    def ended(node: ReplayNode, now: float) -> None:
+        tick(node, now)
+        ticks.append(now)
+        if len(ticks) == 2:
+            if name == "orphaned":
+                monkeypatch.setattr(os, "getppid", lambda: 1)
+            else:
+                os.kill(os.getpid(), getattr(signal, name))
+
+    monkeypatch.setattr(ReplayNode, "tick", ended)
+    monkeypatch.setenv(robot.TEAM_VARIABLE, str(os.getppid()))
+    done = succeeded(run(*LOG, "log.rate=50", "settle=1000"))
+    (row,) = done.results()["rows"]
+    assert row["stopped"] is True
+    assert row["scans"] == len(ticks) == 2
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+
+# -- among others ---------------------------------------------------------------------------------
+
+
+def test_another_robot_of_its_number_ends_it_with_the_remedy(run):
+    (here,) = links.free_addresses(1)
+    with chatter(1, here) as other:
+        said = refused(run(*LOG, "id=1", "team.size=2", f"link.listen={here}", "settle=60"))
+    assert f"robot 1 (127.0.0.1:{other.address[1]}" in said
+    assert "number" in said
+
+
+def test_another_key_is_counted_and_told_once(run, tmp_path):
+    (here,) = links.free_addresses(1)
+    own = TeamKey.generate().save(tmp_path / "own.key")
+    with chatter(1, here, TeamKey.generate()) as other:
+        options = [f"link.listen={here}", f"link.key_file={own}", "report.progress=true", "log.rate=4"]
+        done = succeeded(run(*LOG, *options, "team.size=2"))
+    (row,) = done.results()["rows"]
+    assert row["refused"].keys() == {"wrong_key"}
+    assert row["refused"]["wrong_key"] > 10
+    assert row["heard"] == 0
+    assert done.stdout.count("do not open") == 1
+    assert f"from 127.0.0.1:{other.address[1]}" in done.stdout
+    assert "same team key" in done.stdout
+    assert " refused" in done.stderr
+    assert own.read_text().strip() not in done.stdout + done.stderr + str(done.results())
+
+
+def start(*options: str, cwd: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, str(CHECKOUT / "scripts" / "robot.py"), *QUIET, *LOG, *options]
+    with (cwd / "output").open("ab") as output:
+        return subprocess.Popen(command, cwd=cwd, env=environment(), stdout=output, stderr=output)
+
+
+def test_killed_and_started_again_it_has_everything_and_the_other_catches_up(run, tmp_path):
+    log = ["log.dataset.n_scans=64", "network.announce=0.3"]
+    (here,), there = links.free_addresses(1), ("127.0.0.1", 0)
+    with UdpTransport.unicast(1, there, [links.address("here", here)]) as transport:
+        address = f"127.0.0.1:{transport.address[1]}"
+        of_team = ["team.size=1", f"link.listen={here}", f"link.peers=[{address}]", "journal.folder=kept"]
+        first = start(*log, *of_team, "log.rate=8", "hydra.run.dir=first", cwd=tmp_path)
+        states = (tmp_path / "kept" / "progress_0").glob
+        while first.poll() is None and not any(int(p.stem[4:]) for p in states("map-*.state")):
+            time.sleep(0.02)
+        first.kill()
+        assert first.wait(60) == -signal.SIGKILL, (tmp_path / "output").read_text()
+        transport.deliver(1, 0.0)  # nobody was there
+        again = start(*log, *of_team, "log.rate=50", "settle=5", "hydra.run.dir=again", cwd=tmp_path)
+        late = ReplayNode(Replica(1), [], transport, GaussianMap, announce_every=0.3)
+        while again.poll() is None:
+            late.listen(time.monotonic())
+            time.sleep(0.01)
+        assert again.returncode == 0, (tmp_path / "output").read_text()
+    (row,) = Finished(0, "", "", tmp_path / "again").results()["rows"]
+    assert 10 <= row["resumed_at"] < 32
+    assert row["scans"] == row["n_scans"] == 32
+    assert row["digest"] == late.replica.digest().hex()
+    (unharmed,) = succeeded(run(*LOG, *log, "log.rate=50")).results()["rows"]
+
+    def said(path: str) -> Counter[tuple[object, ...]]:
+        return content(GaussianMap.load(tmp_path / path).components())
+
+    assert content(late.replica.components()) == said(row["own_map_path"]) == said(unharmed["own_map_path"])
+
+
+# -- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("source=radio", "source='radio' world, log"),
+        ("clock=sun", "clock='sun' wall, lockstep"),
+        ("clock=null", "clock=None wall"),
+        ("transport=pigeon", "transport='pigeon' udp, zenoh"),
+        ("id=2 team.size=2", "id=2 team.size=2"),
+        ("id=-1", "id=-1"),
+        ("team.size=0", "team.size=0"),
+        ("network.loss=1", "network.loss=1.0"),
+        ("network.loss=nan", "network.loss=nan"),
+        ("evaluation.every=0", "evaluation.every=0.0"),
+        ("seed=-1", "seed=-1"),
+        ("runtime.device=meta", "runtime.device=meta"),
+        ("source=log", "source=log dataset@log.dataset=carmen"),
+        ("link.listen=7400", "link.listen='7400' 127.0.0.1:7447"),
+        ("link.listen=127.0.0.1:¹", "link.listen="),
+        ("link.listen=localhost:0", "localhost IPv4"),
+        ("link.peers=[127.0.0.1]", "link.peers='127.0.0.1'"),
+        ("link.listen=0.0.0.0:0", "link.listen=0.0.0.0 link.key_file link.insecure=true"),
+        ("link.group=239.71.77.7:7400 link.interface=10.1.2.3", "link.interface=10.1.2.3 link.key_file"),
+        ("link.group=10.0.0.1:7400", "10.0.0.1 multicast"),
+        ("link.key_file=/nowhere/team.key", "/nowhere/team.key openssl"),
+        ("transport=zenoh", "listen connect"),
+        ("world.size=[1,1,1]", "size"),
+        ("team.start=[[1,2]]", "team.start"),
+    ],
+)
+def test_a_bad_value_is_named_in_one_line(options, words, run):
+    line = refused(run(*options.split()))
+    for word in words.split():
+        assert word in line
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("log.rate=0", "rate=0.0"),
+        ("speed=0", "speed=0.0"),
+        ("settle=-1", "settle=-1.0"),
+        ("log.every=0", "log.every=0"),
+        ("log.part=odd", "split='odd'"),
+        ("network.announce=0", "announce_every=0.0"),
+        ("network.budget=0", "budget=0.0"),
+        ("journal.sync=never", "sync='never'"),
+    ],
+)
+def test_a_bad_value_for_a_log_is_named_in_one_line(options, words, run):
+    line = refused(run(*LOG, *options.split()))
+    for word in words.split():
+        assert word in line
+
+
+def test_a_port_in_use_is_told_with_the_remedy(run):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        line = refused(run(*LOG, f"link.listen=127.0.0.1:{port}"))
+    assert f"port={port}" in line
+    assert "another process has that port" in line
+
+
+def test_another_log_on_the_same_folder_is_refused(run, tmp_path):
+    kept = f"journal.folder={tmp_path / 'kept'}"
+    succeeded(run(*LOG, "log.rate=50", kept))
+    assert "n_scans" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
+
+
+def test_in_step_is_for_the_team_alone(run, monkeypatch):
+    monkeypatch.setattr(robot, "_is_asked", lambda: False)  # as at a terminal
+    assert "gmmtorch-team" in refused(run("clock=lockstep"))

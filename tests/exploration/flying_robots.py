@@ -1,0 +1,49 @@
+"""A small team in a small room, whose robots talk over UDP on loopback."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from gmmtorch.exploration.flying import FlyingNode
+from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.team import make_agent, start_poses
+from gmmtorch.exploration.world import World
+from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.simulation.depth_camera import DepthCamera
+from gmmtorch.simulation.solids import box
+
+TEAM = TeamOptions(
+    size=2,
+    duration=4.0,
+    camera=DepthCamera(width=48, height=36, max_range=4.0),
+    window=(64, 64, 32),
+    sample_every=2.0,
+    n_beams=40,
+    latency=0.0,
+)
+
+
+def small_room() -> World:
+    """7 by 6 by 3 metres, its walls half a cell off the lattice."""
+    walls = box((0.1, 0.1, 0.1), (7.1, 6.1, 3.1))
+    return World.from_mesh(walls, start=(2.0, 2.0, 1.3), cache=False, name="room")
+
+
+@contextmanager
+def transports(n: int, **options: Any) -> Iterator[list[UdpTransport]]:
+    """Of robots that all know one another."""
+    with ExitStack() as stack:
+        made = [stack.enter_context(UdpTransport.unicast(k, **options)) for k in range(n)]
+        for one in made:
+            one.peers = [other.address for other in made if other is not one]
+        yield made
+
+
+def flying(
+    number: int, world: World, options: TeamOptions, transport: UdpTransport, **about: Any
+) -> FlyingNode:
+    """A robot that is ready to fly. about: an incarnation."""
+    agent = make_agent(number, start_poses(world, options)[number], world, options, transport, **about)
+    return FlyingNode(agent, world, options, transport)
