@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch import datasets
 from gmmtorch.datasets.depth_frames import DepthFrames, back_project
-from gmmtorch.evaluation.queries import Queries, hit_and_free, test_beams, touched
+from gmmtorch.evaluation.queries import Queries, hit_and_free, test_beams
 from gmmtorch.evaluation.split import split_indices
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.depth_camera import DepthCamera
@@ -80,13 +80,9 @@ def simulated() -> list[Frame]:
 
 @cache
 def material(name: str, folder: Path | None, n_frames: int | None) -> tuple[list[Frame], Queries]:
-    """The frames to be sent, and questions that held-out ones answer, of space that those sent had seen."""
+    """The frames to be sent, and the questions that the held-out ones answer."""
     frames = simulated() if name == "warehouse" else {"kinect": kinect, "hall": hall}[name](folder or Path())
     frames = frames[:n_frames]
     train, test = split_indices(len(frames), TEST_EVERY)
-    sent, resolution = [frames[i] for i in train], RESOLUTIONS[name]
     beams = test_beams([frames[i].scan for i in test], MAX_BEAMS, SEED)
-    asked = hit_and_free(*beams, "uniform", resolution, SEED)
-    hits, misses = touched([frame.scan for frame in sent], 2 * resolution).evidence_at(asked.points)
-    seen = hits + misses > 0
-    return sent, Queries(asked.points[seen], asked.labels[seen])
+    return [frames[i] for i in train], hit_and_free(*beams, "uniform", RESOLUTIONS[name], SEED)

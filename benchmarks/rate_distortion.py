@@ -6,10 +6,10 @@ FOLDER holds kinect/ and hall/; the warehouse is simulated. Every frame is a mes
 decoded, and only what was decoded is measured.
 
 PSNR2: of the frame's points and those decoded, or as many drawn from the mixture decoded. AUC: every fifth
-frame is held out, and its beams are asked about in the map of all others, where those had seen anything. Each
-codec is credited with its best receiver: who has points counts their beams on a grid of once, twice or
-four times the resolution or of the codec's own cells, or learns a mixture from them; mixtures are
-asked about cubes of once or twice the resolution.
+frame is held out, and its beams are asked about in the map of all others. Each codec is credited with its
+best receiver: who has points counts their beams on a grid of once, twice or four times the resolution
+or of the codec's own cells, or learns a mixture from them; mixtures are asked about cubes of once or
+twice the resolution.
 
 Needs the extra [baselines]. Writes its table into BENCHMARKS.md and docs/images/rate_distortion.png.
 """

@@ -161,7 +161,7 @@ def _replay(config: DictConfig, folder: Path, transport: FramedTransport) -> Nod
         maps.map_factory(_map_options(config)),
         journal=journal,
         folder=None if journal is None else _home(config, folder) / f"progress_{config.id}",
-        facts={"dataset": str(common.as_options(config.log))},
+        facts=_facts(config),
         announce_every=config.network.announce,
         budget=config.network.budget,
     )
@@ -175,6 +175,14 @@ def _scans(config: DictConfig) -> Dataset:
             "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
         )
     return common.open_dataset(config.log.dataset)
+
+
+def _facts(config: DictConfig) -> dict[str, Any]:
+    """What part of what log it is: all that must be the same for a robot that goes on."""
+    dataset = common.as_options(config.log.dataset)
+    if dataset.get("path") is not None:
+        dataset["path"] = str(Path(dataset["path"]).resolve())
+    return {**dataset, **{name: config.log[name] for name in ("every", "part")}, "of": config.team.size}
 
 
 def _map_options(config: DictConfig) -> DictConfig:

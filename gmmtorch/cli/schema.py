@@ -372,13 +372,13 @@ class TeamMap:
     observed: float = 0.5
     distance: float = 2.0
     noise: float = 0.03
-    length: float = 0.5
+    length: float = 0.6
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
     rays: float = 4.0
     shell: float = 0.5
-    update_at: float = 2.0
+    update_at: float = 3.0
     update_stride: int = 11
 
 

@@ -34,8 +34,8 @@ from gmmtorch.simulation.depth_camera import DepthFrame
 
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
-_FRAMES_PER_COUNT = 5  # few large messages, and few looks at what they change
-_EMPTY_LENGTH = 0.7
+_FRAMES_PER_COUNT = 10  # few large messages, and few looks at what they change
+_EMPTY_LENGTH = 0.75
 _EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
 _EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
 
@@ -51,13 +51,13 @@ class FrameRule:
     """
 
     noise: float = 0.03
-    length: float = 0.5
+    length: float = 0.6
     cell: float = 0.15
     components: int = 200
     iterations: int = 4
     rays: float = 4.0
     shell: float = 0.5
-    update_at: float = 2.0
+    update_at: float = 3.0
     update_stride: int = 11
 
     def __post_init__(self) -> None:

@@ -249,7 +249,7 @@ def test_killed_and_started_again_it_has_everything_and_the_other_catches_up(run
         ("runtime.device=meta", "runtime.device=meta"),
         ("source=log", "source=log dataset@log.dataset=carmen"),
         ("link.listen=7400", "link.listen='7400' 127.0.0.1:7447"),
-        ("link.listen=127.0.0.1:¹", "link.listen="),
+        ("link.listen=127.0.0.1:70000", "link.listen='127.0.0.1:70000'"),
         ("link.listen=localhost:0", "localhost IPv4"),
         ("link.peers=[127.0.0.1]", "link.peers='127.0.0.1'"),
         ("link.listen=0.0.0.0:0", "link.listen=0.0.0.0 link.key_file link.insecure=true"),
@@ -298,7 +298,8 @@ def test_a_port_in_use_is_told_with_the_remedy(run):
 def test_another_log_on_the_same_folder_is_refused(run, tmp_path):
     kept = f"journal.folder={tmp_path / 'kept'}"
     succeeded(run(*LOG, "log.rate=50", kept))
-    assert "n_scans" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
+    assert "every" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
+    succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # faster or slower it may be
 
 
 def test_in_step_is_for_the_team_alone(run, monkeypatch):
