@@ -132,7 +132,8 @@ class Agent:
         datagrams = mapper.datagrams(budget)
         if self._budget is not None:
             self._budget.take(sum(map(len, datagrams)))
-        if self._heartbeat.due(now, (mapper.version, library.version)):
+        urgent = mapper.is_behind or library.differs
+        if self._heartbeat.due(now, (mapper.version, library.version), urgent):
             datagrams += [*mapper.announcements(), *library.announcements()]
         self._send(datagrams, now)
 

@@ -13,6 +13,8 @@ _SLOWEST = 16  # times the period
 class Heartbeat:
     """Due every period while what is announced changes, and ever more seldom while it does not.
 
+    Nor does it slow down while it is urgent: while something is known to be missing.
+
     An announcement that is lost must be said again, but not for ever at the same pace: a team at rest would
     send little else. After each that says nothing new the period doubles, up to sixteen times.
 
@@ -27,16 +29,17 @@ class Heartbeat:
         self._last: float | None = None
         self._said: tuple[int, ...] | None = None
 
-    def due(self, now: float, content: tuple[int, ...]) -> bool:
+    def due(self, now: float, content: tuple[int, ...], urgent: bool = False) -> bool:
         """Whether it is time, at `now` (s), to announce a content that these numbers stand for; it is taken
         to be done then. The first call starts the first period; so does a clock that was set back."""
         if self._last is None or now < self._last:
             self._last, self._said, self._wait = now, content, self._period
             return False
-        wait = self._wait if content == self._said else self._period
+        is_old = content == self._said and not urgent
+        wait = self._wait if is_old else self._period
         if now - self._last < wait - 1e-9:
             return False
-        self._wait = min(2 * wait, _SLOWEST * self._period) if content == self._said else self._period
+        self._wait = min(2 * wait, _SLOWEST * self._period) if is_old else self._period
         self._last, self._said = now, content
         return True
 

@@ -123,6 +123,11 @@ class Mapper(ABC):
         """Names of the records that the map is of, where it is of any."""
         return Intervals.empty()
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether it is known that others hold more."""
+        return False
+
     def digest(self) -> bytes:
         """Equal for robots whose maps are the same, where they can tell."""
         return b""

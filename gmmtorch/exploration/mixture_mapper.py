@@ -193,6 +193,10 @@ class MixtureMapper(Mapper):
     def held(self) -> Intervals:
         return self.shared.held
 
+    @property
+    def is_behind(self) -> bool:
+        return bool(self.shared.missing)
+
     def digest(self) -> bytes:
         return self.shared.digest()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,13 @@ from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.framed_transport import FramedTransport
-from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.messages import AnnouncementMessage, Message, decode, kind_of
+from gmmtorch.sharing.messages import decode, kind_of
 from gmmtorch.sharing.network import HEADER_BYTES, Network
 from gmmtorch.sharing.replica import Replica
 from gmmtorch.sharing.token_bucket import TokenBucket
 
 _KINDS = ("announcements", "components", "corrections", "counts", "supersessions")
-_MOST_PEERS = 64
 _log = logging.getLogger(__name__)
 
 
@@ -78,7 +75,6 @@ class ReplayNode:
         self._heartbeat = Heartbeat(announce_every)
         self._budget = None if budget is None else TokenBucket(budget)
         self._publication = Publication(replica)
-        self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others have told that they hold
         self._keep_every = check_whole("keep_every", keep_every, 1)
         about = {"robot": replica.robot, "keep_every": keep_every, "n_scans": self.n_scans}
         about |= {"learning": self.map.state()["learning"], **(facts or {})}
@@ -206,17 +202,8 @@ class ReplayNode:
                 continue
             if self.replica.receive(datagram, message):
                 merged.append(datagram)
-                self._note(message)
         if self._logbook is not None:
             self._logbook.heard(merged)
-
-    def _note(self, message: Message) -> None:
-        """What another says that it holds, and this does not."""
-        if isinstance(message, AnnouncementMessage):
-            before = self._gaps.pop(message.sender, Intervals.empty())
-            self._gaps[message.sender] = (before - message.scope) | (message.held - self.replica.held)
-            while len(self._gaps) > _MOST_PEERS:
-                self._gaps.popitem(last=False)
 
     def _speak(self, now: float) -> None:
         budget = None if self._budget is None else self._budget.available(now)
@@ -225,7 +212,7 @@ class ReplayNode:
             self._budget.take(sum(map(len, datagrams)))
         if datagrams and self._logbook is not None:
             self._logbook.said(datagrams)
-        if self._heartbeat.due(now, (self.replica.version,)):
+        if self._heartbeat.due(now, (self.replica.version,), urgent=bool(self.replica.missing)):
             datagrams += self.replica.announcements()
         for kind, some in itertools.groupby(datagrams, kind_of):
             self._transport.send(self.robot, list(some), now, kind)
@@ -235,10 +222,7 @@ class ReplayNode:
     @property
     def n_missing(self) -> int:
         """Records that others have told they hold, and that have not come."""
-        gaps = Intervals.empty()
-        for gap in self._gaps.values():
-            gaps |= gap
-        return (gaps - self.replica.held).size
+        return self.replica.missing.size
 
     def status(self) -> str:
         total = "?" if self.n_scans is None else f"{self.n_scans:,}"

@@ -149,6 +149,11 @@ class ViewLibrary:
         """Rises with every change."""
         return self._set.version
 
+    @property
+    def differs(self) -> bool:
+        """Whether a teammate, when last heard, held other views."""
+        return self._set.differs
+
     def digest(self) -> bytes:
         """8 bytes: equal for equal libraries."""
         return self._set.digest()

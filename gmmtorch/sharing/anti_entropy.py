@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
@@ -14,8 +16,8 @@ from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import keys_of_robot
 
 _ON_THE_WAY = 3
-"""Calls after which what was sent has come: a robot that sends, then hears, each tick, over a network as quick
-as that, announces before it has heard what was sent a tick ago, and is heard a tick later."""
+"""Calls after which what was sent has come: a robot that sends, then hears, each tick, over a network as
+quick as that, announces before it has heard what was sent a tick ago, and is heard a tick later."""
 MOST_PEERS = 64
 """Robots whose gaps are remembered, those heard last."""
 
@@ -36,7 +38,8 @@ class Backlog:
         self.due = Intervals.empty()
         self.ready: list[Packet] = []
         self._passing = [Intervals.empty()] * _ON_THE_WAY  # heard or sent; since the last call, and before
-        self._gaps: OrderedDict[int, Intervals] = OrderedDict()
+        self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others lack, by who said so
+        self._theirs: OrderedDict[int, Intervals] = OrderedDict()  # what others hold, and this robot lacked
 
     def add(self, keys: Intervals, packets: Sequence[Packet] = ()) -> None:
         """Something new to say; packets: of some of it, ready to be sent."""
@@ -57,20 +60,27 @@ class Backlog:
     def announced(self, message: AnnouncementMessage, held: Intervals) -> None:
         """Another robot says what it holds; `held`: what is here."""
         gap = (held & message.scope) - message.held
-        before = self._gaps.pop(message.sender, Intervals.empty())
+        before = self._gaps.get(message.sender, Intervals.empty())
         lacking = (gap & self._own) | (gap & before)
         for passing in self._passing:
             lacking -= passing
         self.due |= lacking
-        self._gaps[message.sender] = (before - message.scope) | gap
-        while len(self._gaps) > MOST_PEERS:
-            self._gaps.popitem(last=False)
+        for table, now in ((self._gaps, gap), (self._theirs, message.held - held)):
+            known = table.pop(message.sender, Intervals.empty())
+            table[message.sender] = (known - message.scope) | now
+            while len(table) > MOST_PEERS:
+                table.popitem(last=False)
+
+    def missing(self, held: Intervals) -> Intervals:
+        """What others have announced that they hold, and is not held here."""
+        return functools.reduce(operator.or_, self._theirs.values(), Intervals.empty()) - held
 
     def state(self) -> dict[str, Any]:
         return {
             "due": _tensor(self.due),
             "passing": [_tensor(keys) for keys in self._passing],
             "gaps": [[robot, _tensor(gap)] for robot, gap in self._gaps.items()],
+            "theirs": [[robot, _tensor(keys)] for robot, keys in self._theirs.items()],
             "ready": [
                 [torch.frombuffer(bytearray(datagram), dtype=torch.uint8), _tensor(keys)]
                 for datagram, keys in self.ready
@@ -81,7 +91,10 @@ class Backlog:
         """Go on from a `state`."""
         self.due = _intervals(state["due"])
         self._passing = [_intervals(keys) for keys in state["passing"]][:_ON_THE_WAY]
-        self._gaps = OrderedDict((int(robot), _intervals(gap)) for robot, gap in state["gaps"])
+        self._gaps, self._theirs = (
+            OrderedDict((int(robot), _intervals(keys)) for robot, keys in state[name])
+            for name in ("gaps", "theirs")
+        )
         self.ready = [(data.numpy().tobytes(), _intervals(keys)) for data, keys in state["ready"]]
 
 

@@ -55,6 +55,11 @@ class Broadcast:
         """Nothing is asked for again, so nobody need know."""
         return Intervals.empty()
 
+    @property
+    def missing(self) -> Intervals:
+        """Nobody knows."""
+        return Intervals.empty()
+
     def add(self, new: Components) -> Tensor:
         """New components of this robot; returns the ids (K, 2) that they get, rising."""
         if len(new):

@@ -82,7 +82,7 @@ class FramedTransport(ABC):
         return delivered
 
     def lose(self, share: float, seed: int = 0) -> None:
-        """From now on throw away a share, [0, 1), of the datagrams that come: to try what a team makes of it."""
+        """From now on throw away a share, [0, 1), of what comes: to try what a team makes of it."""
         if not 0 <= share < 1:
             raise InvalidArgumentError(f"share={share} must be a share of the datagrams in [0, 1).")
         self._loss, self._drawn = float(share), random.Random(seed)

@@ -253,6 +253,11 @@ class Replica:
         return self._records.held
 
     @property
+    def missing(self) -> Intervals:
+        """Names of the records that others have announced they hold, and that are not here."""
+        return self._backlog.missing(self._records.held)
+
+    @property
     def version(self) -> int:
         """Rises with what is held."""
         return self._records.version

@@ -78,6 +78,10 @@ class Peers:
             peer.digest = digest
         peer.heard = self._round
 
+    def differ(self) -> bool:
+        """Whether somebody, when last heard, held something else than this robot."""
+        return any(self._peers[robot].differs for robot in self._present())
+
     def lacking(self, sender: int, scope: Intervals, gap: Intervals) -> Intervals:
         """Of the keys in `scope` a robot that was just heard lacks `gap`; what of it this robot sends.
 

@@ -91,6 +91,11 @@ class ViewSet:
         return self._table.dead
 
     @property
+    def differs(self) -> bool:
+        """Whether a teammate, when last heard, held other views."""
+        return self._peers.differ()
+
+    @property
     def version(self) -> int:
         """Rises with every change, made here or heard of."""
         return self._table.version
