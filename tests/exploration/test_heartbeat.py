@@ -46,6 +46,12 @@ def test_a_change_is_told_at_once_after_a_long_pause_and_soon_again() -> None:
     assert beats(Heartbeat(5.0), [3] * 100 + [4] * 51) == [5, 15, 35, 75, 100, 105, 115, 135]
 
 
+def test_while_something_is_missing_it_does_not_slow_down() -> None:
+    heartbeat = Heartbeat(5.0)
+    due = [now for now in range(60) if heartbeat.due(float(now), (3,), urgent=now < 22 or now > 40)]
+    assert due == [5, 10, 15, 20, 25, 35, 41, 46, 51, 56]
+
+
 @given(period=st.integers(1, 6), contents=contents)
 def test_it_beats_by_the_rule(period: int, contents: list[int]) -> None:
     found = beats(Heartbeat(float(period)), contents)

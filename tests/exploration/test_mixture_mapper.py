@@ -511,14 +511,12 @@ def test_a_restored_mapper_goes_on_alike(codec: str, tmp_path: Path) -> None:
     one, _, _ = flown(codec)
     one.receive(heard(*flown(codec, robot=1)[2], sender=1))
     one.sense(frame((3.0, 2.0, 1.2), 2.0))
-    one.datagrams(1500)  # the rest of it is still due
+    # What it has learned there is still due.
     twin = mapper(codec=codec)
     twin.restore(load_checkpoint(save_checkpoint(tmp_path / "mapper", one.state())))
     assert_same_components(one.components(), twin.components())
     assert one.digest() == twin.digest()
-    for seed, place in enumerate(
-        [*PLACES, ((4.0, 4.0, 1.0), 1.0), *PLACES[:2]]
-    ):  # counts are told in the end
+    for seed, place in enumerate([*PLACES, ((4.0, 4.0, 1.0), 1.0), *PLACES[:2]]):  # then counts are told
         view = frame(*place, seed=20 + seed)
         a, b = one.sense(view), twin.sense(view)
         sent = one.datagrams()
