@@ -279,13 +279,18 @@ def equal_rows(rows: Rows) -> list[list[object]]:
         cells += [f"{r['psnr2_db']:.1f} ({r['psnr_forward_db']:.1f}, {r['psnr_backward_db']:.1f})"]
         cells += [f"{r['auc']:.4f}"]
         for codec in RIVALS:
+            sizes = [other["nbytes"] for other in own if other["codec"] == codec]
             needed = [bytes_for(own, codec, field, r[field]) for field in ("psnr2_db", "auc")]
-            known = any(other["codec"] == codec for other in own)
-            cells.append(
-                " / ".join(f"{n:,.0f}" if math.isfinite(n) else "–" for n in needed) if known else ""
-            )
+            cells.append(" / ".join(size(n, min(sizes)) for n in needed) if sizes else "")
         found.append(cells)
     return found
+
+
+def size(needed: float, coarsest: float) -> str:
+    """Bytes; "≤" where the coarsest setting is better than asked for, "–" where the finest is worse."""
+    if math.isinf(needed):
+        return "–"
+    return f"{'≤ ' if needed <= coarsest * (1 + 1e-9) else ''}{needed:,.0f}"
 
 
 def lead_rows(rows: Rows) -> list[list[object]]:
@@ -345,13 +350,8 @@ def main() -> None:
 def write(rows: Rows, figure: Path, whole: bool) -> None:
     """The figure; and the tables into the page, if they are of all data sets, else on the screen."""
     save_figure(figures(rows)["rate_distortion"], figure, dpi=100)
-    leads_header = [
-        "",
-        "quality",
-        "ours ahead of full-size codecs, bytes a frame: octaves",
-        "times fewer, at most",
-    ]
-    leads_header += ["and of images of fewer pixels", "times fewer, at most"]
+    leads_header = ["", "quality", "ours ahead, bytes a frame: octaves", "times fewer, at most"]
+    leads_header += ["of thinned depth images, too", "times fewer, at most"]
     header = ["", "components at most", "bytes a frame", "PSNR2 (its terms), dB", "AUC"]
     tables = [
         markdown(leads_header, lead_rows(rows)),
