@@ -73,11 +73,8 @@ def run(config: DictConfig, answers: IO[str] | None = None) -> None:
         transport = links.open_link(config, config.id)
         transport.lose(config.network.loss, config.seed + config.id)
         stack.callback(transport.close)
-        node = (
-            _flying(config, folder, transport)
-            if config.source == "world"
-            else _replay(config, folder, transport)
-        )
+        make = _flying if config.source == "world" else _replay
+        node = make(config, folder, transport, stack)
         stack.callback(node.close)
         if answers is None:
             _by_the_clock(config, node, folder)
@@ -124,7 +121,7 @@ def check_options(config: DictConfig) -> None:
 # -- the robot ------------------------------------------------------------------------------------
 
 
-def _flying(config: DictConfig, folder: Path, transport: FramedTransport) -> FlyingNode:
+def _flying(config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack) -> FlyingNode:
     """A robot with a simulated camera in a simulated world."""
     from gmmtorch.cli.explore import team_options, world_options
     from gmmtorch.exploration.flying import FlyingNode
@@ -138,11 +135,11 @@ def _flying(config: DictConfig, folder: Path, transport: FramedTransport) -> Fly
     pose = start_poses(world, options)[config.id]
     agent = make_agent(config.id, pose, world, options, transport, incarnation=life)
     replica = getattr(agent.robot.mapper, "shared", None)
-    journal = None if config.clock == "lockstep" else _journal(config, folder, replica)
+    journal = None if config.clock == "lockstep" else _journal(config, folder, replica, stack)
     return FlyingNode(agent, world, options, transport, journal)
 
 
-def _replay(config: DictConfig, folder: Path, transport: FramedTransport) -> Node:
+def _replay(config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack) -> Node:
     """A robot that maps a recorded log, or its part of one."""
     from gmmtorch.datasets.part import Part, part_of
     from gmmtorch.errors import check_whole
@@ -153,7 +150,7 @@ def _replay(config: DictConfig, folder: Path, transport: FramedTransport) -> Nod
     indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
     part = part_of(len(indices), config.id, config.team.size, config.log.part)
     replica = Replica(config.id)
-    journal = _journal(config, folder, replica)
+    journal = _journal(config, folder, replica, stack)
     return ReplayNode(
         replica,
         Part(scans, [indices[row] for row in part]),
@@ -196,14 +193,15 @@ def _home(config: DictConfig, folder: Path) -> Path:
     return folder if config.journal.folder is None else Path(config.journal.folder)
 
 
-def _journal(config: DictConfig, folder: Path, replica: Replica | None) -> Journal | None:
-    """What keeps the robot's map on disk, where it is one that can be kept."""
+def _journal(config: DictConfig, folder: Path, replica: Replica | None, stack: ExitStack) -> Journal | None:
+    """What keeps the robot's map on disk, where it is one that can be kept; closed with the stack."""
     from gmmtorch.sharing.journal import Journal
     from gmmtorch.sharing.replica import Replica
 
     if not config.journal.enabled or not isinstance(replica, Replica):
         return None
-    return Journal(_home(config, folder) / f"journal_{config.id}", replica, sync=config.journal.sync)
+    place = _home(config, folder) / f"journal_{config.id}"
+    return stack.enter_context(Journal(place, replica, sync=config.journal.sync))
 
 
 # -- its time -------------------------------------------------------------------------------------

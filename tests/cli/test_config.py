@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import MISSING as REQUIRED
 from dataclasses import asdict, fields, is_dataclass
@@ -554,7 +555,7 @@ def test_the_examples_of_the_help_compose():
         examples = re.findall(rf"^ +gmmtorch-{command}\b(.*)$", text, re.MULTILINE)
         assert len(examples) >= 5
         for example in examples:
-            words = example.split("(shows")[0].replace("'", "").split()
+            words = shlex.split(example.split("(shows")[0])
             overrides = [word for word in words if not word.startswith("-") and word != "job"]
             if "-m" in words:  # of a sweep, the first value of each
                 overrides = [re.sub(r"=([^,\[]*),.*", r"=\1", word) for word in overrides]

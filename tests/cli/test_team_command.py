@@ -104,7 +104,7 @@ def test_everything_is_where_it_is_said_to_be(flown):
 
 
 def test_a_log_is_replayed_by_all_and_each_ends_with_all_of_it(run):
-    options = ["log.rate=20", "settle=4", "network.announce=0.5", "network.loss=0.2"]
+    options = ["log.rate=20", "settle=2", "network.announce=0.3", "network.loss=0.2"]
     done = succeeded(run(*LOG, *options))
     summary, *rows = done.results()["rows"]
     assert done.results()["config"]["clock"] == "wall"
@@ -210,20 +210,16 @@ def test_told_to_stop_it_ends_all_robots(name, run, robots, monkeypatch):
     [
         ("id=1", "id=1 gmmtorch-robot"),
         ("link.listen=127.0.0.1:7400", "link.listen gmmtorch-robot"),
-        ("link.peers=[127.0.0.1:7400]", "link.peers gmmtorch-robot"),
         (
             "transport=zenoh link.connect_endpoints=[tcp/127.0.0.1:7447]",
             "link.connect_endpoints gmmtorch-robot",
         ),
-        ("transport=pigeon", "transport='pigeon'"),
-        ("source=radio", "source='radio'"),
         ("clock=sun", "clock='sun'"),
         ("clock=lockstep source=log", "clock=lockstep source=world"),
         ("journal.folder=kept", "journal.folder=kept clock=wall"),
         ("speed=2", "speed=2.0 clock=wall"),
         ("team.size=0", "team.size=0"),
         ("team.size=40", "team.size=40"),
-        ("network.loss=2", "network.loss=2.0"),
         ("runtime.device=meta", "runtime.device=meta"),
     ],
 )

@@ -30,7 +30,10 @@ def test_robots_in_a_world_have_lines_of_the_entropy_left():
     assert "entropy left" in left.get_ylabel()
     assert left.lines[1].get_xdata().tolist() == [0.0, 10.0, 20.0]
     assert left.lines[1].get_ydata().tolist() == [100.0, 60.0, 23.5]
-    assert [text.get_text() for text in left.texts] == ["0", "3"]
+    assert {text.get_text(): text.get_color() for text in left.texts} == {
+        "0": left.lines[0].get_color(),
+        "3": left.lines[1].get_color(),
+    }
     assert [label.get_text() for label in right.get_yticklabels()] == ["robot 0", "robot 3"]
 
 
