@@ -24,6 +24,7 @@ _TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_leng
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
 _STAGE = "seconds"
+_CONVERGENCE = 120.0  # simulated seconds after a mission, for maps to become the same
 _PAUSE = 0.2
 _TURN = 2.0  # seconds that a robot's status is shown for
 
@@ -144,7 +145,7 @@ def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars)
             flight.step()
             bars(_STAGE, round(flight.now), round(config.duration))
             bars.note(_STAGE, _status(robots))
-        converged = flight.converge(config.settle)
+        converged = flight.converge(_CONVERGENCE)
         flight.finish()
     except RobotLostError as error:
         robots[error.robot].explain()

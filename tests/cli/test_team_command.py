@@ -104,7 +104,7 @@ def test_everything_is_where_it_is_said_to_be(flown):
 
 
 def test_a_log_is_replayed_by_all_and_each_ends_with_all_of_it(run):
-    options = ["log.rate=20", "settle=2", "network.announce=0.3", "network.loss=0.2"]
+    options = ["log.rate=20", "settle=8", "network.announce=0.3", "network.loss=0.2"]
     done = succeeded(run(*LOG, *options))
     summary, *rows = done.results()["rows"]
     assert done.results()["config"]["clock"] == "wall"
