@@ -87,6 +87,12 @@ class Backlog:
             ],
         }
 
+    def forget_others(self) -> None:
+        """Ask anew who lacks what, and take nothing to be on its way: time has passed."""
+        self._passing = [Intervals.empty()] * _ON_THE_WAY
+        self._gaps.clear()
+        self._theirs.clear()
+
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`."""
         self.due = _intervals(state["due"])

@@ -293,6 +293,7 @@ class Replica:
             self._backlog.restore(state["backlog"])
             if state["author"]["incarnation"] != self.incarnation:
                 self._records.break_off()
+                self._backlog.forget_others()
         except DataError:
             raise
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:

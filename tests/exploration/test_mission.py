@@ -203,7 +203,7 @@ def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
 
 def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) -> None:
     # Nearly all that a window can bring is asked of each: the second is less, and the first was the best.
-    mission = flown(world, replace(SMALL, rest=RestRule(0.99, window=4.0), duration=44.0))
+    mission = flown(world, replace(SMALL, rest=RestRule(0.99, window=4.0), duration=64.0))
     assert all(robot.returns.rests for robot in mission.robots)
     for robot, path in zip(mission.robots, mission.trajectories, strict=True):
         assert robot.state[4:].tolist() == [0, 0, 0]

@@ -259,9 +259,11 @@ def test_what_was_just_sent_or_heard_is_on_its_way():
     backlog.sent(within(1, 0))
     backlog.announced(says(3, Intervals.empty()), held)
     assert backlog.due == within(1, 1)
-    backlog.sent(within(1, 1))
-    backlog.announced(says(3, Intervals.empty()), held)
-    assert backlog.due == within(1, 0)  # an announcement later it is missing
+    for n_calls in range(1, 4):
+        backlog.sent(within(1, 1))
+        backlog.announced(says(3, Intervals.empty()), held)
+        # Who announces may not have heard it yet; in the end it is missing.
+        assert backlog.due == (within(1, 0) if n_calls == 3 else Intervals.empty())
 
 
 def test_an_announcement_speaks_of_its_scope_alone():
@@ -285,13 +287,13 @@ def test_who_joins_late_catches_up_from_a_third_robot():
     for datagram in one.datagrams():
         relay.receive(datagram)
     sent = []
-    for _ in range(2):  # `one` is gone
+    for _ in range(4):  # `one` is gone
         for datagram in late.announcements():
             relay.receive(datagram)
         sent.append(relay.datagrams())
         for datagram in sent[-1]:
             assert late.receive(datagram)
-    assert not sent[0]
+    assert [bool(datagrams) for datagrams in sent] == [False, False, False, True]  # it might be on its way
     assert late.digest() == relay.digest() == one.digest()
     for datagram in late.announcements():
         relay.receive(datagram)

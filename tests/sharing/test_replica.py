@@ -27,7 +27,7 @@ N_SCHEDULES = int(os.environ.get("GMMTORCH_SCHEDULES", "8"))
 seeds = st.integers(0, 10**6)
 
 
-def exchange(replicas: list[Replica], rounds: int = 3) -> None:
+def exchange(replicas: list[Replica], rounds: int = 6) -> None:
     """All hear all that the others say."""
     for _ in range(rounds):
         for sender in replicas:
@@ -56,7 +56,8 @@ def history(seed: int, n_acts: int = 14) -> list[bytes]:
 
 def everything(replica: Replica) -> list[bytes]:
     """All that a replica tells somebody who holds nothing."""
-    replica.datagrams()
+    for _ in range(4):  # nothing is on its way any more
+        replica.datagrams()
     for datagram in [*Replica(1000).announcements(), *Replica(1000).announcements()]:
         replica.receive(datagram)
     return replica.datagrams()
