@@ -37,7 +37,7 @@ from gmmtorch.sharing.journal_format import (
 )
 from gmmtorch.sharing.replica import Replica
 
-N_KILLS = 10
+N_KILLS = 5
 """`scripts/soak.sh` has more."""
 HERE = Path("a.log")
 seeds = st.integers(0, 10**6)
