@@ -416,12 +416,16 @@ class ExploreReport:
 
 
 @dataclass
-class ExploreRuntime:
+class RobotRuntime:
     device: str = "cpu"
     threads: int | None = 1
-    workers: int = 2
     cache: bool = True
     memory_limit: int = 4 << 30
+
+
+@dataclass
+class ExploreRuntime(RobotRuntime):
+    workers: int = 2
 
 
 @dataclass
@@ -503,14 +507,6 @@ class RobotNetwork:
 @dataclass
 class RobotEvaluation:
     every: float = 10.0
-
-
-@dataclass
-class RobotRuntime:
-    device: str = "cpu"
-    threads: int | None = 1
-    cache: bool = True
-    memory_limit: int = 4 << 30
 
 
 @dataclass

@@ -20,11 +20,16 @@ from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.views import ViewEvaluator
-from gmmtorch.sharing.messages import PlanMessage, encode_plan, kind_of
+from gmmtorch.sharing.messages import PlanMessage, ViewsHeldMessage, ViewsMessage, encode_plan, kind_of
 from gmmtorch.sharing.network import Transport
 from gmmtorch.sharing.token_bucket import TokenBucket
 from gmmtorch.simulation.depth_camera import DepthFrame
 from gmmtorch.simulation.mesh_world import MeshWorld
+
+_SEEDS = 1 << 10  # robots of a mission that draw differently
+_LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
+_TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
+_OF_VIEWS = (ViewsMessage, ViewsHeldMessage)
 
 
 class Logbook(Protocol):
@@ -32,11 +37,6 @@ class Logbook(Protocol):
 
     def said(self, datagrams: Sequence[bytes]) -> None: ...
     def heard(self, datagrams: Sequence[bytes]) -> None: ...
-
-
-_SEEDS = 1 << 10  # robots of a mission that draw differently
-_LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
-_TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
 
 
 class Agent:
@@ -156,15 +156,17 @@ class Agent:
         """Take in what has come by `now`, in an order that does not depend on who was quicker."""
         with self._timed("sharing"):
             heard = self._heard(now)
-        with self._timed("mapping"):
-            taken = self.robot.mapper.receive(heard)
-            if self._logbook is not None:
-                self._logbook.heard(taken)
         for item in heard:
             if isinstance(item.message, PlanMessage):
                 self._note_plan(item.message, now)
-            else:
+            elif isinstance(item.message, _OF_VIEWS):
                 self.robot.library.receive(item.message)
+        with self._timed("mapping"):
+            taken = self.robot.mapper.receive(
+                [item for item in heard if not isinstance(item.message, (PlanMessage, *_OF_VIEWS))]
+            )
+            if self._logbook is not None:
+                self._logbook.heard(taken)
 
     def _note_plan(self, plan: PlanMessage, now: float) -> None:
         """Keep a teammate's plan, unless it is known, or a later one has overtaken it."""

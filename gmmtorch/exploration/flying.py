@@ -21,7 +21,6 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.framed_transport import FramedTransport
 from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.messages import PlanMessage
-from gmmtorch.sharing.network import HEADER_BYTES
 from gmmtorch.sharing.replica import Replica
 
 _KINDS = ("announcements", "components", "corrections", "counts", "plans", "points", "supersessions", "views")
@@ -133,18 +132,13 @@ class FlyingNode:
             "entropy_bits": robot.mapper.belief.entropy_bits,
             "records": float(robot.mapper.held.size),
             "bytes_sent": float(sent.bytes),
-            "wire_bytes_sent": float(self._wire_bytes()),
+            "wire_bytes_sent": float(self.transport.wire_bytes),
             "datagrams_sent": float(sent.datagrams),
             "datagrams_heard": float(self.agent.n_heard),
             "refused": float(sum(self.transport.refused.values())),
             "path_length": robot.path_length,
             "collisions": float(robot.collisions),
         }
-
-    def _wire_bytes(self) -> int:
-        """Of all that was broadcast, each once, with the headers of the frame, UDP and IPv4."""
-        sent = self.transport.traffic()
-        return sent.bytes + (self.transport.overhead + HEADER_BYTES) * sent.datagrams
 
     def row(self) -> dict[str, Any]:
         """What the robot leaves in results.json."""
@@ -163,17 +157,11 @@ class FlyingNode:
             "bytes_sent": transport.traffic().bytes,
             "datagrams": transport.traffic().datagrams,
             "bytes_by_kind": {kind: n for kind in _KINDS if (n := transport.traffic(kind=kind).bytes)},
-            "wire_bytes": self._wire_bytes(),
-            "wire_bytes_received": transport.received.wire_bytes,
-            "socket_bytes": transport.sent.bytes,
-            "socket_datagrams": transport.sent.datagrams,
+            **transport.books(),
             "heard": self.agent.n_heard,
             "damaged": self.agent.n_damaged,
-            "refused": {reason: n for reason, n in transport.refused.items() if n},
             "not_merged": dict(getattr(shared, "refused", {})),
-            "failures": dict(transport.failures),
             "namesakes": {str(robot): whence for robot, whence in sorted(transport.namesakes.items())},
-            "dropped": transport.n_dropped,
             "late": self.n_late,
             "path_length": robot.path_length,
             "collisions": robot.collisions,

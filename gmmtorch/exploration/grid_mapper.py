@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.sharing.envelope import loaded, stored, within
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import PointsMessage, encode_points
 from gmmtorch.sharing.point_messages import MOST_PARTS
@@ -85,8 +85,7 @@ class GridMapper(Mapper):
         return number not in come
 
     def datagrams(self, budget: int | None = None) -> list[bytes]:
-        total = itertools.accumulate(map(len, self._due))
-        n = len(self._due) if budget is None else sum(size <= budget for size in total)
+        n = within(self._due, budget)
         sent, self._due = self._due[:n], self._due[n:]
         return sent
 
@@ -110,16 +109,12 @@ class GridMapper(Mapper):
         return {
             **super().state(),
             "n_frames": self._n_frames,
-            "due": [_bytes(datagram) for datagram in self._due],
-            "come": [[sender, torch.from_numpy(come.edges)] for sender, come in self._come.items()],
+            "due": [stored(datagram) for datagram in self._due],
+            "come": [[sender, come.stored()] for sender, come in self._come.items()],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         super().restore(state)
         self._n_frames = int(state["n_frames"])
-        self._due = [data.numpy().tobytes() for data in state["due"]]
-        self._come = {int(sender): Intervals(edges.numpy()) for sender, edges in state["come"]}
-
-
-def _bytes(datagram: bytes) -> Tensor:
-    return torch.frombuffer(bytearray(datagram), dtype=torch.uint8)
+        self._due = [loaded(data) for data in state["due"]]
+        self._come = {int(sender): Intervals.loaded(edges) for sender, edges in state["come"]}

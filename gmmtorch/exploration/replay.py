@@ -286,15 +286,7 @@ class ReplayNode:
                 "failures": {},
                 "dropped": 0,
             }
-        return {
-            "wire_bytes": sent.wire_bytes + transport.overhead * sent.datagrams,
-            "wire_bytes_received": transport.received.wire_bytes,
-            "socket_bytes": transport.sent.bytes,
-            "socket_datagrams": transport.sent.datagrams,
-            "refused": {reason: n for reason, n in transport.refused.items() if n},
-            "failures": dict(transport.failures),
-            "dropped": transport.n_dropped,
-        }
+        return transport.books()
 
     def save(self, folder: Path) -> dict[str, Path]:
         """The team's map, as far as it is known here, and this robot's own."""

@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.lattice import FARTHEST
@@ -41,6 +41,12 @@ RECORD_BYTES = 1000
 """Longest record: so all fit where encryption takes its share of a datagram."""
 _POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
 _UNIT = 1e-9
+
+
+def check_size(max_bytes: int) -> None:
+    """Raises `InvalidArgumentError` unless datagrams of so many bytes at most hold any record."""
+    if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
+        raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")
 
 
 @dataclass(frozen=True, eq=False)

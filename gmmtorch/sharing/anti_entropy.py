@@ -8,10 +8,8 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-import torch
-
 from gmmtorch.sharing.announce_messages import AnnouncementMessage
+from gmmtorch.sharing.envelope import loaded, stored
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import keys_of_robot
 
@@ -77,14 +75,11 @@ class Backlog:
 
     def state(self) -> dict[str, Any]:
         return {
-            "due": _tensor(self.due),
-            "passing": [_tensor(keys) for keys in self._passing],
-            "gaps": [[robot, _tensor(gap)] for robot, gap in self._gaps.items()],
-            "theirs": [[robot, _tensor(keys)] for robot, keys in self._theirs.items()],
-            "ready": [
-                [torch.frombuffer(bytearray(datagram), dtype=torch.uint8), _tensor(keys)]
-                for datagram, keys in self.ready
-            ],
+            "due": self.due.stored(),
+            "passing": [keys.stored() for keys in self._passing],
+            "gaps": [[robot, gap.stored()] for robot, gap in self._gaps.items()],
+            "theirs": [[robot, keys.stored()] for robot, keys in self._theirs.items()],
+            "ready": [[stored(datagram), keys.stored()] for datagram, keys in self.ready],
         }
 
     def forget_others(self) -> None:
@@ -95,18 +90,10 @@ class Backlog:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`."""
-        self.due = _intervals(state["due"])
-        self._passing = [_intervals(keys) for keys in state["passing"]][:_ON_THE_WAY]
+        self.due = Intervals.loaded(state["due"])
+        self._passing = [Intervals.loaded(keys) for keys in state["passing"]][:_ON_THE_WAY]
         self._gaps, self._theirs = (
-            OrderedDict((int(robot), _intervals(keys)) for robot, keys in state[name])
+            OrderedDict((int(robot), Intervals.loaded(keys)) for robot, keys in state[name])
             for name in ("gaps", "theirs")
         )
-        self.ready = [(data.numpy().tobytes(), _intervals(keys)) for data, keys in state["ready"]]
-
-
-def _tensor(keys: Intervals) -> torch.Tensor:
-    return torch.from_numpy(keys.edges.copy())
-
-
-def _intervals(edges: torch.Tensor) -> Intervals:
-    return Intervals(edges.numpy().astype(np.int64))
+        self.ready = [(loaded(data), Intervals.loaded(keys)) for data, keys in state["ready"]]

@@ -16,7 +16,7 @@ from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.components import Components, packed, unpacked
 from gmmtorch.mapping.updating import summed
 from gmmtorch.sharing.changes import Changes
-from gmmtorch.sharing.envelope import check_codec
+from gmmtorch.sharing.envelope import check_codec, loaded, stored, within
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import (
     ComponentsMessage,
@@ -138,10 +138,7 @@ class Broadcast:
 
     def datagrams(self, *, budget: int | None = None) -> list[bytes]:
         """What is due, in so many bytes; what does not fit waits."""
-        n, left = 0, float("inf") if budget is None else budget
-        while n < len(self._due) and len(self._due[n]) <= left:
-            left -= len(self._due[n])
-            n += 1
+        n = within(self._due, budget)
         sent, self._due = self._due[:n], self._due[n:]
         return sent
 
@@ -164,7 +161,7 @@ class Broadcast:
             "n_numbered": self._n_numbered,
             "batches": packed(self._batches),
             "gained": packed(self._gained),
-            "due": [torch.frombuffer(bytearray(datagram), dtype=torch.uint8) for datagram in self._due],
+            "due": [stored(datagram) for datagram in self._due],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -173,7 +170,7 @@ class Broadcast:
             self._enter(batch)
         self._gained = list(unpacked(state["gained"]))
         self._n_told, self._n_numbered = len(self._batches), int(state["n_numbered"])
-        self._due = [data.numpy().tobytes() for data in state["due"]]
+        self._due = [loaded(data) for data in state["due"]]
 
 
 def _is_fit(batch: Components) -> bool:

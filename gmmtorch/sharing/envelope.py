@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
+
+import torch
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 
@@ -90,6 +94,22 @@ def split(n: int, encode: Callable[[int, int], bytes], what: str, max_bytes: int
         return parts(begin, middle) + parts(middle, end)
 
     return parts(0, n) if n else []
+
+
+def within(datagrams: Sequence[bytes], budget: int | None) -> int:
+    """How many datagrams, from the first on, take `budget` bytes at most; None: all."""
+    sizes = itertools.accumulate(map(len, datagrams))
+    return len(datagrams) if budget is None else sum(size <= budget for size in sizes)
+
+
+def stored(datagram: bytes) -> Tensor:
+    """A datagram for a file."""
+    return torch.frombuffer(bytearray(datagram), dtype=torch.uint8)
+
+
+def loaded(data: Tensor) -> bytes:
+    """What was `stored`."""
+    return data.numpy().tobytes()
 
 
 def check_codec(codec: str) -> str:

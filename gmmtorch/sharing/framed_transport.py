@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.sharing.network import Traffic
@@ -95,6 +95,24 @@ class FramedTransport(ABC):
             return Traffic()
         with self._lock:
             return _sum(*(traffic for what, traffic in self._broadcast.items() if kind in (None, what)))
+
+    @property
+    def wire_bytes(self) -> int:
+        """Of all that was broadcast, each once, with the headers of its frame, of UDP and of IPv4."""
+        said = self.traffic()
+        return said.wire_bytes + self.overhead * said.datagrams
+
+    def books(self) -> dict[str, Any]:
+        """What has passed, and what went wrong, for results."""
+        return {
+            "wire_bytes": self.wire_bytes,
+            "wire_bytes_received": self.received.wire_bytes,
+            "socket_bytes": self.sent.bytes,
+            "socket_datagrams": self.sent.datagrams,
+            "refused": {reason: n for reason, n in self.refused.items() if n},
+            "failures": dict(self.failures),
+            "dropped": self.n_dropped,
+        }
 
     @property
     def overhead(self) -> int:

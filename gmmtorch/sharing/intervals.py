@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gmmtorch.errors import InvalidArgumentError
@@ -47,6 +48,15 @@ class Intervals:
         breaks = np.flatnonzero(np.diff(rising) > 1)
         begins, lasts = rising[np.append(0, breaks + 1)], rising[np.append(breaks, len(rising) - 1)]
         return cls(np.stack([begins, lasts + 1], 1).reshape(-1).astype(np.int64))
+
+    def stored(self) -> torch.Tensor:
+        """The edges (2n,), a copy, for a file."""
+        return torch.from_numpy(self.edges.copy())
+
+    @classmethod
+    def loaded(cls, edges: torch.Tensor) -> Intervals:
+        """What was `stored`. Raises `InvalidArgumentError` for what was not."""
+        return cls(edges.numpy().astype(np.int64))
 
     def __len__(self) -> int:
         """How many intervals there are."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
+from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.mapping.codec import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.announce_messages import (
@@ -46,6 +48,21 @@ class RefusedError(DataError):
     def __init__(self, reason: str, robot: int, message: str) -> None:
         super().__init__(message)
         self.reason, self.robot = reason, robot
+
+
+def merged(take: Callable[[], None], refused: Counter[str], conflicts: Counter[int]) -> bool:
+    """Whether what came was taken in; what refuses it is counted, by reason and, of conflicts, by robot."""
+    try:
+        take()
+    except RefusedError as refusal:
+        refused[refusal.reason] += 1
+        if refusal.reason == "conflict":
+            conflicts[refusal.robot] += 1
+        return False
+    except GmmTorchError:
+        refused["damaged"] += 1
+        return False
+    return True
 
 
 class Records:
@@ -245,7 +262,7 @@ class Records:
         datagrams = [self.datagrams[key] for key in sorted(self.others)]
         return {
             "dim": self.dim,
-            "held": torch.from_numpy(self.held.edges.copy()),
+            "held": self.held.stored(),
             "components": dict(vars(components)),
             "record_bytes": torch.tensor([len(datagram) for datagram in datagrams], dtype=torch.int64),
             "records": torch.frombuffer(bytearray(b"".join(datagrams) or b"\0"), dtype=torch.uint8),
@@ -272,7 +289,7 @@ class Records:
         for n_bytes in state["record_bytes"].tolist():
             fresh.add_record(_record(data[at : at + n_bytes]))
             at += n_bytes
-        held = fresh.held | Intervals(state["held"].numpy().astype(np.int64))
+        held = fresh.held | Intervals.loaded(state["held"])
         fresh.dead = held - fresh.live()
         fresh._hold(held)
         fresh._log = ChangeLog.restored(log, len(pieces) - len(untold))

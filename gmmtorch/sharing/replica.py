@@ -15,11 +15,11 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import ArrayLike
 from gmmtorch.sharing.announce_messages import (
-    RECORD_BYTES,
     AnnouncementMessage,
     CorrectionMessage,
     SupersessionMessage,
     TotalsMessage,
+    check_size,
     encode_announcements,
 )
 from gmmtorch.sharing.anti_entropy import Backlog
@@ -36,7 +36,7 @@ from gmmtorch.sharing.record_ids import (
     ids_of,
     keys_of,
 )
-from gmmtorch.sharing.records import MOST_COMPONENTS, Records, RefusedError
+from gmmtorch.sharing.records import MOST_COMPONENTS, Records, RefusedError, merged
 
 
 class Replica:
@@ -141,7 +141,7 @@ class Replica:
             budget: bytes of all of them; what does not fit stays due. What supersedes or moves others goes
                 first, then components, the most informative first, then counts. None: no limit.
         """
-        _check_size(max_bytes)
+        check_size(max_bytes)
         self._max_bytes = max_bytes
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
@@ -164,7 +164,7 @@ class Replica:
 
     def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
         """What this robot holds: who hears it sends what is missing. Of each datagram so many bytes."""
-        _check_size(max_bytes)
+        check_size(max_bytes)
         return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
 
     def receive(self, datagram: bytes, message: Message | None = None) -> bool:
@@ -172,21 +172,12 @@ class Replica:
 
         message: what `decode` makes of it, for those who have that already.
         """
-        try:
-            if not isinstance(datagram, bytes):
-                raise RefusedError("damaged", -1, f"A datagram is {type(datagram).__name__}, not bytes.")
-            self._take(datagram, decode(datagram) if message is None else message)
-        except RefusedError as refusal:
-            self.refused[refusal.reason] += 1
-            if refusal.reason == "conflict":
-                self.conflicts[refusal.robot] += 1
-            return False
-        except GmmTorchError:
-            self.refused["damaged"] += 1
-            return False
-        return True
+        return merged(lambda: self._take(datagram, message), self.refused, self.conflicts)
 
-    def _take(self, datagram: bytes, message: Message) -> None:
+    def _take(self, datagram: bytes, message: Message | None) -> None:
+        if not isinstance(datagram, bytes):
+            raise RefusedError("damaged", -1, f"A datagram is {type(datagram).__name__}, not bytes.")
+        message = decode(datagram) if message is None else message
         if isinstance(message, AnnouncementMessage):
             self._check_sender(message)
             self._backlog.announced(message, self._records.held)
@@ -325,8 +316,3 @@ def _keys(name: str, ids: ArrayLike) -> Ints:
 
 def _on_cpu(components: Components) -> Components:
     return Components(**{name: value.detach().cpu() for name, value in vars(components).items()})
-
-
-def _check_size(max_bytes: int) -> None:
-    if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
-        raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")

@@ -6,8 +6,6 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import keys_of_robot, robot_of
 
@@ -132,7 +130,7 @@ class Peers:
         rows = []
         for robot, peer in self._peers.items():
             values = dict(vars(peer))
-            rows.append({**values, "robot": robot, "digest": peer.digest.hex(), "lacks": _tensor(peer.lacks)})
+            rows.append({**values, "robot": robot, "digest": peer.digest.hex(), "lacks": peer.lacks.stored()})
         recent = [[digest.hex(), at] for digest, at in self._recent.items()]
         return {"round": self._round, "detailed": self._detailed, "recent": recent, "peers": rows}
 
@@ -143,7 +141,7 @@ class Peers:
         for row in state["peers"]:
             numbers = {name: int(row[name]) for name in ("heard", "differs", "waited", "asked")}
             self._peers[int(row["robot"])] = _Peer(
-                **numbers, digest=bytes.fromhex(row["digest"]), lacks=Intervals(row["lacks"].numpy())
+                **numbers, digest=bytes.fromhex(row["digest"]), lacks=Intervals.loaded(row["lacks"])
             )
 
 
@@ -155,7 +153,3 @@ def _owners(keys: Intervals) -> list[int]:
     """Whose keys these are."""
     spans = {(robot_of(begin), robot_of(end - 1)) for begin, end in keys.pairs()}
     return sorted({robot for first, last in spans for robot in range(first, last + 1)})
-
-
-def _tensor(keys: Intervals) -> torch.Tensor:
-    return torch.from_numpy(keys.edges.copy())

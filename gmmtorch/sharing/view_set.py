@@ -8,11 +8,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.announce_messages import RECORD_BYTES
+from gmmtorch.sharing.announce_messages import check_size
 from gmmtorch.sharing.envelope import MAX_BYTES
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import Message, ViewsHeldMessage, ViewsMessage, encode_views
@@ -24,7 +23,7 @@ from gmmtorch.sharing.record_ids import (
     first_key,
     keys_of,
 )
-from gmmtorch.sharing.records import RefusedError
+from gmmtorch.sharing.records import RefusedError, merged
 from gmmtorch.sharing.view_announcements import PRINT_BYTES, encode_views_held
 from gmmtorch.sharing.view_peers import Peers
 from gmmtorch.sharing.view_table import View, ViewTable
@@ -138,7 +137,7 @@ class ViewSet:
             max_bytes: of each datagram, from 1000 to 1200.
             budget: bytes of all of them. None: no limit.
         """
-        _check_size(max_bytes)
+        check_size(max_bytes)
         left = math.inf if budget is None else check_whole("budget", budget, 0)
         alive, dead = self._told()
         sent: list[bytes] = []
@@ -170,7 +169,7 @@ class ViewSet:
 
         A round begins with it: see `Peers`.
         """
-        _check_size(max_bytes)
+        check_size(max_bytes)
         if not self._peers.next_round(self.digest()):
             return encode_views_held(self.robot, self.digest())
         self._n_details += 1
@@ -199,22 +198,15 @@ class ViewSet:
 
     def receive(self, message: Message) -> bool:
         """Merge what a decoded message says; whether it was taken in. Never raises."""
-        try:
-            if isinstance(message, ViewsMessage):
-                self._take_views(message)
-            elif isinstance(message, ViewsHeldMessage):
-                self._take_announcement(message)
-            else:
-                raise RefusedError("other", -1, f"{type(message).__name__} says nothing of views.")
-        except RefusedError as refusal:
-            self.refused[refusal.reason] += 1
-            if refusal.reason == "conflict":
-                self.conflicts[refusal.robot] += 1
-            return False
-        except GmmTorchError:
-            self.refused["damaged"] += 1
-            return False
-        return True
+        return merged(lambda: self._take(message), self.refused, self.conflicts)
+
+    def _take(self, message: Message) -> None:
+        if isinstance(message, ViewsMessage):
+            self._take_views(message)
+        elif isinstance(message, ViewsHeldMessage):
+            self._take_announcement(message)
+        else:
+            raise RefusedError("other", -1, f"{type(message).__name__} says nothing of views.")
 
     def _take_views(self, message: ViewsMessage) -> None:
         keys = keys_of(message.ids)
@@ -262,8 +254,8 @@ class ViewSet:
             "incarnation": self.incarnation,
             "n": self._n,
             "n_details": self._n_details,
-            "due": torch.from_numpy(self._due.edges.copy()),
-            "passing": torch.from_numpy(self._passing.edges.copy()),
+            "due": self._due.stored(),
+            "passing": self._passing.stored(),
             "table": self._table.state(),
             "peers": self._peers.state(),
         }
@@ -279,8 +271,8 @@ class ViewSet:
             fresh = ViewSet(self.robot, incarnation=self.incarnation)
             fresh._table.restore(state["table"])
             fresh._peers.restore(state["peers"])
-            fresh._due = Intervals(state["due"].numpy().astype(np.int64))
-            fresh._passing = Intervals(state["passing"].numpy().astype(np.int64))
+            fresh._due = Intervals.loaded(state["due"])
+            fresh._passing = Intervals.loaded(state["passing"])
             fresh._n_details = int(state["n_details"])
             fresh._n = int(state["n"]) if state["incarnation"] == self.incarnation else 0
             fresh.refused, fresh.conflicts = self.refused, self.conflicts
@@ -291,8 +283,3 @@ class ViewSet:
         except (GmmTorchError, LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The views of robot {self.robot} are damaged ({error}).") from error
         vars(self).update(vars(fresh))
-
-
-def _check_size(max_bytes: int) -> None:
-    if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
-        raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")

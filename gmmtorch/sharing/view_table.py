@@ -142,12 +142,12 @@ class ViewTable:
     def state(self) -> dict[str, Any]:
         message = self.message(self.alive(), self.dead)
         rows = {name: getattr(message, name) for name in ("ids", "poses", "values", "stamps")}
-        return {**rows, "dead": torch.from_numpy(self.dead.edges.copy()), "version": self.version}
+        return {**rows, "dead": self.dead.stored(), "version": self.version}
 
     def restore(self, state: dict[str, Any]) -> None:
         fresh = ViewTable()
         rows = {name: state[name] for name in ("ids", "poses", "values", "stamps")}
-        fresh.merge(ViewsMessage(**rows, removed=Intervals(state["dead"].numpy().astype(np.int64))))
+        fresh.merge(ViewsMessage(**rows, removed=Intervals.loaded(state["dead"])))
         if len(fresh.views) != len(rows["ids"]):
             raise DataError("Views are dead and alive: the state is damaged.")
         fresh.version, fresh._digest = int(state["version"]), (-1, b"")
