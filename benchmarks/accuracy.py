@@ -94,11 +94,11 @@ def brief(rows: list[dict], resolution: float) -> list[str]:
 
     pairs = [(find("occupancy_grid", kept), find("point", kept)) for kept in (1.0, 0.3, 0.1)]
     cells = [f"{grid['auc']:.3f} → {ours['auc']:.3f}" for grid, ours in pairs]
-    return [*cells, *(f"{row['nbytes'] / 1e3:,.0f} KB" for row in pairs[0])]
+    return [*cells, *(f"{row['nbytes'] / 1e3:,.0f} kB" for row in pairs[0])]
 
 
 def summary(row: dict) -> str:
-    size = f"{row['nbytes'] / 1e3:,.0f} KB"
+    size = f"{row['nbytes'] / 1e3:,.0f} kB"
     count = f"{row['n_components']:,}, " if row["n_components"] is not None else ""
     return f"{row['auc']:.4f} ± {(row['auc_high'] - row['auc_low']) / 2:.4f} ({count}{size})"
 

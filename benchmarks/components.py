@@ -87,7 +87,7 @@ def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:
         for row in of:
             header.append(f"AUC, {kept:.0%}, {row['resolution']:g} m")
             cells.append(f"{row['auc']:.4f}")
-        header += [f"components, {kept:.0%}", f"KB, {kept:.0%}"]
+        header += [f"components, {kept:.0%}", f"kB, {kept:.0%}"]
         cells += [f"{of[0]['n_components'] or '–'}", f"{of[0]['nbytes'] / 1e3:.0f}"]
     return header, cells
 

@@ -17,9 +17,9 @@ import time
 
 import torch
 
-import gmmtorch.exploration.stopwatch
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.options import TeamOptions
+from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.world import open_world
 from gmmtorch.report.table import format_table
@@ -34,8 +34,6 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=120.0)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    # The clock of the stages, read as CPU time: other work on the machine then counts less.
-    gmmtorch.exploration.stopwatch.time.perf_counter = time.process_time
     world = (
         open_world("mesh", path=options.mesh)
         if options.mesh is not None
@@ -43,7 +41,8 @@ def main() -> None:
     )
     rows = []
     for team in options.team:
-        mission = assemble(world, TeamOptions(framework=team, size=options.robots, duration=options.duration))
+        about = TeamOptions(framework=team, size=options.robots, duration=options.duration)
+        mission = assemble(world, about, Stopwatch(time.process_time))
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         for half in (1, 2):
             before = dict(mission.stages)

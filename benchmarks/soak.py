@@ -1,21 +1,26 @@
 """What the tests of sharing do briefly, for long: teams in trouble, robots killed, and hostile bytes.
 
-    python benchmarks/soak.py                                    # some 20 minutes on two cores
+    python benchmarks/soak.py                                    # half an hour on two cores
     python benchmarks/soak.py --schedules 100 --kills 50 --packets 100000
 
 Schedules lose, repeat, delay and reorder datagrams, cut robots off, crash and restart them; once the
 network works again all replicas must be equal and hold all that anybody held. Robots that keep a journal
 are killed (kill -9) at random, also half-way through writing: what was acknowledged must be there when they
 start again, and nothing else but the beginning of what was being written. Packets are noise, sound
-datagrams cut off or altered (their checksums made right again or not), and frames of a stranger: none may
-be believed, nothing raised but `DataError`, and memory must not grow. Altered ones whose checksum is right
-may say something in range.
+datagrams of all 14 kinds cut off or altered (their checksums made right again or not), datagrams made up by
+who knows the formats (zero counts, extreme numbers, checksums that are right), and frames of a stranger.
+The decoder, a replica and a set of views get them, and the opener of a team with a key. None may be
+believed, nothing raised but `DataError`, and the exit status is 1 if it was; or if memory grew: by more than
+`_ALLOWED_KB` in all that outlives a replica, which is a new one now and then, or by more than `_MOST_HELD_KB`
+in a replica and a set of views. What says something in range, which takes a checksum that is right, is
+taken in: what keeps that out is a key.
 """
 
 from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import gc
 import logging
 import random
 import sys
@@ -23,8 +28,8 @@ import tempfile
 import tracemalloc
 import zlib
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +37,16 @@ import torch
 
 from gmmtorch.errors import DataError
 from gmmtorch.report.table import format_table
+from gmmtorch.sharing.envelope import Kind
 from gmmtorch.sharing.messages import decode
 from gmmtorch.sharing.replica import Replica
 from gmmtorch.sharing.security import Opener, Sealer, TeamKey
+from gmmtorch.sharing.view_set import ViewSet
 
-_WARM = 5_000  # packets until caches are filled
+_LIFE = 20_000  # packets that a replica and a set of views hear
+_ALLOWED_KB = 256  # of growth, in each process, from the end of the first life on: caches of Python's own
+_MOST_HELD_KB = 8 * 1024  # by a replica of `_COMPONENTS` and a set of views
+_COMPONENTS = 2000
 
 
 def main() -> int:
@@ -55,13 +65,19 @@ def main() -> int:
     print(format_table([team], list(team)))
     print(format_table([killed], list(killed)))
     rows = [
-        {"what": what, **{key: sum(part[what][key] for part in parts) for key in parts[0][what]}}
-        for what in parts[0]
+        {"to": listener, **{what: sum(part.outcomes[listener][what] for part in parts) for what in _OUTCOMES}}
+        for listener in parts[0].outcomes
     ]
+    memory = {
+        "grown_kb": max(part.grown_kb for part in parts),
+        "held_kb": max(part.held_kb for part in parts),
+    }
     print(format_table(rows, list(rows[0])))
+    print(format_table([memory], list(memory)))
     sound = team["converged"] == team["complete"] == options.schedules
     sound = sound and not any(killed[what] for what in ("lost", "unequal", "damaged", "failed"))
-    return 0 if sound and not any(row["raised"] + row["believed"] for row in rows) else 1
+    sound = sound and not any(row["raised"] + row["believed"] for row in rows)
+    return 0 if sound and memory["grown_kb"] <= _ALLOWED_KB and memory["held_kb"] <= _MOST_HELD_KB else 1
 
 
 def _shares(n: int, workers: int, seed: int) -> tuple[range, list[int]]:
@@ -111,57 +127,91 @@ def _kills(seed: int, n: int) -> dict[str, int]:
         return asdict(kill_often(n, seed, Path(folder)))
 
 
-def _packets(seed: int, n: int) -> dict[str, Counter[str]]:
-    """Hostile packets to the decoder, a replica, and a transport's opener."""
+_OUTCOMES = ("packets", "refused", "in_range", "believed", "raised")
+
+
+@dataclass
+class _Heard:
+    """What came of packets, by listener; and the most memory (kB) that a listener held, or left behind."""
+
+    outcomes: dict[str, Counter[str]]
+    grown_kb: int = 0
+    held_kb: int = 0
+
+
+def _packets(seed: int, n: int) -> _Heard:
+    """Hostile packets to the decoder, a replica, a set of views, and a transport's opener."""
     from sharing.message_examples import examples
 
     rng, sound = random.Random(seed), examples()
-    replica = Replica(0, incarnation=1)
     stranger, opener = Sealer(1, TeamKey.generate()), Opener(TeamKey.generate())
-    outcomes = ("packets", "refused", "in_range", "believed", "raised")
-    found = {what: Counter(dict.fromkeys(outcomes, 0)) for what in ("decode", "open")}
+    heard = _Heard({to: Counter() for to in ("decoder", "replica", "views", "opener")})
     tracemalloc.start()
-    begun = 0
-    for number in range(n):
-        if number == min(_WARM, n // 2):
-            begun = tracemalloc.get_traced_memory()[0]
-        packet = _hostile(rng, sound)
-        found["decode"].update(packets=1, **{_decoded(packet, replica): 1})
-        frame = stranger.seal(packet[:1200]) if rng.random() < 0.3 else _framed(rng, packet)
-        found["open"].update(packets=1, **{_opened(opener, frame): 1})
-    grown = (tracemalloc.get_traced_memory()[0] - begun) // 1024
+    begun = None
+    for begin in range(0, n, _LIFE):
+        listeners = Replica(0, incarnation=1, most_components=_COMPONENTS), ViewSet(0, incarnation=1)
+        for _ in range(begin, min(begin + _LIFE, n)):
+            packet = _hostile(rng, sound)
+            frame = stranger.seal(packet[:1200]) if rng.random() < 0.3 else _framed(rng, packet)
+            for to, outcome in (*_decoded(packet, *listeners), ("opener", _opened(opener, frame))):
+                heard.outcomes[to].update(("packets", outcome))
+        held = _traced_kb()
+        del listeners
+        left = _traced_kb()
+        heard.held_kb = max(heard.held_kb, held - left)
+        begun = left if begun is None else begun
+        heard.grown_kb = max(0, left - begun)
     tracemalloc.stop()
-    found["decode"]["grown_kb"] = found["open"]["grown_kb"] = max(0, grown)
-    return found
+    return heard
+
+
+def _traced_kb() -> int:
+    """Memory that Python and NumPy hold. Of tensors it has the objects alone: enough to see them pile up."""
+    gc.collect()
+    return tracemalloc.get_traced_memory()[0] // 1024
 
 
 def _hostile(rng: random.Random, sound: list[bytes]) -> bytes:
-    """Noise, or a sound datagram that is one no more; a checksum that is right now and then."""
-    kind = rng.randrange(4)
-    if kind == 0:
+    """Noise; a sound datagram that is one no more, its checksum right now and then; or one made up."""
+    from sharing.structured_bodies import structured
+
+    choice = rng.randrange(5)
+    if choice == 0:
         return rng.randbytes(rng.randrange(1300))
+    if choice == 1:
+        return structured(rng.choice(list(Kind)), rng)
     datagram = bytearray(rng.choice(sound))
-    if kind == 1:
+    if choice == 2:
         return bytes(datagram[: rng.randrange(len(datagram))])
     for _ in range(rng.randint(1, 4)):
         datagram[rng.randrange(len(datagram))] ^= rng.randrange(1, 256)
-    if kind == 2:
+    if choice == 3:
         return bytes(datagram)
-    begin = 1 if datagram[0] & 15 == 1 else 0  # the checksum of kind 1 is its batch's own
+    begin = 1 if datagram[0] & 15 == Kind.COMPONENTS else 0  # the checksum of kind 1 is its batch's own
     return bytes(datagram[:-4]) + zlib.crc32(datagram[begin:-4]).to_bytes(4, "little")
 
 
-def _decoded(packet: bytes, replica: Replica) -> str:
-    """What came of it. An altered datagram whose checksum is right may say something else that is in range:
-    what keeps that out is a key."""
+def _decoded(packet: bytes, replica: Replica, views: ViewSet) -> list[tuple[str, str]]:
+    """What the decoder, and then a replica and a set of views, made of it."""
     try:
-        taken = replica.receive(packet)
-        decode(packet)
+        message = decode(packet)
     except DataError:
-        return "believed" if taken else "refused"
+        taken = _outcome(lambda: replica.receive(packet))
+        return [("decoder", "refused"), ("replica", "believed" if taken == "in_range" else taken)]
+    except Exception:
+        return [("decoder", "raised")]
+    return [
+        ("decoder", "in_range"),
+        ("replica", _outcome(lambda: replica.receive(packet, message))),
+        ("views", _outcome(lambda: views.receive(message))),
+    ]
+
+
+def _outcome(take: Callable[[], bool]) -> str:
+    try:
+        return "in_range" if take() else "refused"
     except Exception:
         return "raised"
-    return "in_range"
 
 
 def _framed(rng: random.Random, packet: bytes) -> bytes:

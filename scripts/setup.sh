@@ -7,8 +7,8 @@ PYTHON="${PYTHON:-python3}"
 STAMP=.venv/.gmmtorch-setup
 PACKAGES="libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libgomp1"
 
-if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2])'; then
-  echo "setup: $("$PYTHON" --version) is too old; set PYTHON to a Python of 3.10 or newer." >&2
+if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2])'; then
+  echo "setup: $("$PYTHON" --version) is too old; set PYTHON to a Python of 3.11 or newer." >&2
   exit 1
 fi
 if [ ! -x .venv/bin/python ]; then

@@ -50,3 +50,19 @@ def real_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"{path} is not there")
     return path
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The ticks that missions of this process step from."""
+    from gmmtorch.exploration.mission import Mission
+
+    ticks: list[int] = []
+    step = Mission.step
+
+    def noted(mission: Mission) -> None:
+        ticks.append(mission.tick)
+        step(mission)
+
+    monkeypatch.setattr(Mission, "step", noted)
+    return ticks

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -102,6 +105,27 @@ def test_third_parties_are_known_to_their_own_room_only():
             if third_party == "open3d" and not inside:
                 violations.append(f"{place} outside a function")
     assert not violations, "\n".join(violations)
+
+
+def test_what_modules_import_is_declared():
+    """And not merely there because another package wants it."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    wanted = [
+        *project["dependencies"],
+        *(entry for name in extras if name != "dev" for entry in extras[name]),
+    ]
+    declared = {re.split(r"[<>=\[]", entry)[0].lower() for entry in wanted} | {"omegaconf"}  # a part of Hydra
+    homes = packages_distributions()
+    missing = []
+    for path, _ in modules():
+        for name, line, inside in imported_names(path):
+            root = name.split(".")[0]
+            if inside or root == "gmmtorch" or root in sys.stdlib_module_names:
+                continue
+            if not declared & {home.lower() for home in homes.get(root, [root])}:
+                missing.append(f"{path.relative_to(PACKAGE)}:{line} imports {name}")
+    assert not missing, "\n".join(missing)
 
 
 def loaded_by(statement: str) -> set[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import read_tensors, write_bytes

@@ -169,17 +169,6 @@ class OctoMapMap(BaselineMap):
 
     # -- keeping ----------------------------------------------------------------------------------
 
-    @property
-    def nbytes_binary(self) -> int:
-        """Bytes of OctoMap's .bt file: occupied or free alone, one bit each; 0 for an empty map.
-
-        It does not answer the same queries: probabilities are gone.
-        """
-        if self.dim is None:
-            return 0
-        copy = _read_tree(_written(self._tree.write()))  # writing it rounds the octree's probabilities
-        return len(_written(copy.writeBinary()))
-
     def _serialized(self) -> bytes:
         """OctoMap's .ot file, with one comment line of what it leaves out, and a check sum."""
         facts = {

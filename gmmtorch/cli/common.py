@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
+_ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
 
 
 def conf_dir() -> str:
@@ -40,6 +43,26 @@ def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any
     except KeyboardInterrupt:
         print("gmmtorch: interrupted; nothing half-written is left.", file=sys.stderr)
         sys.exit(130)
+
+
+@contextmanager
+def naming(options: Mapping[str, str]) -> Iterator[None]:
+    """Within it, errors call arguments what the user does: `noise=-1`, which may be many things, becomes
+    `sensor.noise=-1`.
+
+    options: the option that each argument was given as.
+    """
+    from gmmtorch.errors import InvalidArgumentError, MissingDataError
+
+    def renamed(error: Exception) -> str:
+        return re.sub(_ARGUMENT, lambda name: options.get(name[0], name[0]), str(error))
+
+    try:
+        yield
+    except InvalidArgumentError as error:
+        raise InvalidArgumentError(renamed(error)) from error
+    except MissingDataError as error:
+        raise MissingDataError(renamed(error)) from error
 
 
 def as_options(node: DictConfig) -> dict[str, Any]:
@@ -81,7 +104,7 @@ def use_runtime(runtime: DictConfig) -> str:
         if runtime.threads < 1:
             raise InvalidArgumentError(f"runtime.threads={runtime.threads} must be at least 1, or null.")
         torch.set_num_threads(runtime.threads)
-    if runtime.memory_limit < 1:
+    if runtime.get("memory_limit", 1) < 1:  # not all commands have one
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
     try:
         torch.zeros(1, device=runtime.device).item()  # "meta" can be named, but holds no numbers

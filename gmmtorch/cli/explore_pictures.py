@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from gmmtorch.exploration.mission import Mission
     from gmmtorch.exploration.world import World
     from gmmtorch.mapping.components import Components
-    from gmmtorch.report import TeamSnapshot, TopView
+    from gmmtorch.report.exploration_maps import TeamSnapshot
     from gmmtorch.report.exploration_recording import RecordedMap
+    from gmmtorch.report.exploration_top_view import TopView
 
 _SHOWN_AT = (0.05, 0.2, 0.5, 1.0)  # shares of the duration at which the team's map is drawn
 _HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
@@ -24,17 +25,19 @@ _OCCUPIED = 0.65
 class MissionRecorder:
     """Notes what the pictures of one mission need while it runs, and draws them at its end.
 
-    Numbers go to TensorBoard as they come. The map is noted at a few times; where a mission went on from a
-    checkpoint, at those that were still to come.
+    Numbers go to TensorBoard as they come. The map is noted at a few times, the end among them; where a
+    mission went on from a checkpoint, at those that were still to come.
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
-        from gmmtorch.report import Board, MissionBoard
+        from gmmtorch.report.board import Board
+        from gmmtorch.report.exploration_board import MissionBoard
 
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
         self._live = MissionBoard(self._board) if self._board is not None else None
         self._noted = 0
+        self._components: Components | None = None  # as they were noted last
         self._snapshots: list[TeamSnapshot] = []
         self._maps: list[RecordedMap] = []
 
@@ -45,8 +48,8 @@ class MissionRecorder:
             robots = curves.pop("entropy_bits_per_robot")
             numbers = {name: curve[-1] for name, curve in curves.items() if name != "times"}
             for robot, curve in zip(mission.robots, robots, strict=True):
-                numbers[f"robot_{robot.number + 1}/entropy_bits"] = curve[-1]
-                numbers[f"robot_{robot.number + 1}/path_length"] = robot.path_length
+                numbers[f"robot_{robot.number}/entropy_bits"] = curve[-1]
+                numbers[f"robot_{robot.number}/path_length"] = robot.path_length
             self._live.step(mission.now, numbers)
         reached = mission.now / mission.options.duration
         due = sum(reached >= share - 1e-9 for share in _SHOWN_AT)
@@ -55,22 +58,26 @@ class MissionRecorder:
             self._note(mission)
 
     def finish(self, mission: Mission, row: dict[str, Any]) -> None:
-        """Draw everything, save the mixture, and close TensorBoard."""
+        """Draw everything, save the mixture, and close TensorBoard.
+
+        The mixture is that of the mission's end, as its row is: since then robots may have told one another
+        more.
+        """
         import torch
 
         from gmmtorch.exploration.trials import TRAJECTORIES, save_trajectories
-        from gmmtorch.report import write_exploration_board
+        from gmmtorch.report.exploration_board import write_exploration_board
 
         paths = [torch.stack(path).numpy() for path in mission.trajectories]
 
         save_trajectories(mission, self._folder / TRAJECTORIES)
-        components = mission.robots[0].mapper.components()
+        components = self._components
         if components is not None and len(components):
             _save_mixture(components, self._world.resolution, self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
         common.save_figures(self._config, figures, self._folder)
         if self._board is not None:
-            write_exploration_board(self._board, [row], figures, _surfaces(components), paths)
+            write_exploration_board(self._board, [row], figures)
             self._board.close()
         if self._config.report.recording:
             from gmmtorch.report.exploration_recording import record_rerun
@@ -85,13 +92,17 @@ class MissionRecorder:
             )
 
     def _note(self, mission: Mission) -> None:
-        """The team's map, from above and, for the recording, as cells and components."""
+        """The team's map: from above, in 3D for TensorBoard, as cells and components for the recording."""
         import torch
 
-        from gmmtorch.report import TeamSnapshot
+        from gmmtorch.report.exploration_maps import TeamSnapshot
         from gmmtorch.report.exploration_recording import RecordedMap
 
-        surfaces = _surfaces(mission.robots[0].mapper.components())
+        paths = [torch.stack(path) for path in mission.trajectories]
+        self._components = mission.robots[0].mapper.components()
+        if self._live is not None:
+            self._live.scene(mission.now, self._components, paths)
+        surfaces = _surfaces(self._components)
         mixture: dict[str, Any] = {}
         shown: dict[str, Any] = {}
         if surfaces is not None:
@@ -105,7 +116,7 @@ class MissionRecorder:
             TeamSnapshot(
                 mission.now,
                 _team_view(mission),
-                [torch.stack(path) for path in mission.trajectories],
+                paths,
                 caption=f"{gone:.0%} of the entropy gone",
                 **shown,
             )
@@ -118,15 +129,10 @@ class MissionRecorder:
     def _figures(
         self, mission: Mission, row: dict[str, Any], paths: list[Any], components: Components | None
     ) -> dict[str, Any]:
-        from gmmtorch.report import (
-            bandwidth_figure,
-            entropy_figure,
-            mixture_scene_figure,
-            profile_figure,
-            stage_means,
-            team_map_figure,
-            trajectories_figure,
-        )
+        from gmmtorch.report.exploration_bars import profile_figure, stage_means
+        from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure
+        from gmmtorch.report.exploration_maps import team_map_figure, trajectories_figure
+        from gmmtorch.report.exploration_scene import mixture_scene_figure
 
         if not (self._config.report.figures or self._config.report.tensorboard):
             return {}
@@ -152,23 +158,20 @@ class MissionRecorder:
 
 
 def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
-    """The pictures of a study: curves with bands over seeds, and bars.
+    """A study's summary, and its pictures: curves with bands over seeds, and bars.
 
     Where teams are flown on several networks, these are one picture, and all others are of the first.
     """
     from gmmtorch.exploration.variants import NETWORK, differing
-    from gmmtorch.report import (
-        Board,
-        bandwidth_figure,
-        entropy_figure,
-        loss_figure,
-        planner_comparison_figure,
-        profile_figure,
-        stage_means,
-        summary_bars,
-        write_exploration_board,
-    )
+    from gmmtorch.files import write_bytes
+    from gmmtorch.report.board import Board
+    from gmmtorch.report.exploration_bars import profile_figure, stage_means, summary_bars
+    from gmmtorch.report.exploration_board import write_exploration_board
+    from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
+    from gmmtorch.report.exploration_loss import loss_figure
+    from gmmtorch.report.study_summary import study_summary
 
+    write_bytes(folder / "summary.md", study_summary(rows).encode())
     on_first, on_several = _by_networks(rows)
     figures: dict[str, Any] = {"profile": profile_figure(*stage_means(on_first))}
     if on_several:
@@ -210,17 +213,7 @@ def _save_mixture(components: Components, resolution: float, path: Path) -> None
     """The mixture as a map that the other commands read."""
     from gmmtorch.mapping.gaussian_map import GaussianMap
 
-    first = components.seen_from.new_zeros(len(components))
-    first[components.seen_by] = components.seen_from  # each was seen from one place
-    GaussianMap.from_components(
-        components.means,
-        components.covariances,
-        components.support,
-        components.origins[first],
-        components.max_range,
-        resolution=resolution,
-        codec="quantized",
-    ).save(path)
+    GaussianMap.of(components, resolution=resolution, codec="quantized").save(path)
 
 
 def _band(mission: Mission) -> tuple[float, float]:
@@ -237,7 +230,7 @@ def _layers(mission: Mission) -> tuple[int, int]:
 
 
 def _view(mission: Mission, probability: Any) -> TopView:
-    from gmmtorch.report import top_view
+    from gmmtorch.report.exploration_top_view import top_view
 
     low = mission.world.box.low.clone()
     low[2] += _layers(mission)[0]

@@ -90,7 +90,10 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
         return
     from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
     from gmmtorch.evaluation.fitting import in_use
-    from gmmtorch.report import Board, comparison_figure, convergence_figure, mixture_figure
+    from gmmtorch.report.board import Board
+    from gmmtorch.report.comparison import comparison_figure
+    from gmmtorch.report.curves import convergence_figure
+    from gmmtorch.report.mixtures import mixture_figure
     from gmmtorch.report.style import label_of
 
     likelihoods = {name: b for name, b in outcome.lower_bounds.items() if name not in NO_LIKELIHOODS}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import socket
 import time
@@ -18,6 +17,25 @@ if TYPE_CHECKING:
     from gmmtorch.sharing.security import TeamKey
 
 TRANSPORTS = ("udp", "zenoh")
+_NAMES = {"key": "link.key_file", "insecure": "link.insecure"}
+_ZENOH_NAMES = {
+    **_NAMES,
+    "listen": "link.listen_endpoints",
+    "connect": "link.connect_endpoints",
+    "scouting": "link.scouting",
+    "config": "link.zenoh_config",
+    "team": "link.team",
+}
+_UDP_NAMES = {
+    **_NAMES,
+    "host": "link.listen",
+    "address": "link.listen",
+    "peers": "link.peers",
+    "group": "link.group",
+    "interface": "link.interface",
+    "ttl": "link.ttl",
+}
+"""Options by the names of the arguments that they become."""
 _PATIENCE = 10.0  # seconds for robots of this machine to find one another
 _PAUSE = 0.02
 
@@ -25,48 +43,45 @@ _PAUSE = 0.02
 def open_link(config: DictConfig, robot: int) -> FramedTransport:
     """A robot's end of the network of `transport` and `link.*`."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.sharing.udp import UdpTransport
 
+    if config.transport not in TRANSPORTS:
+        raise InvalidArgumentError(f"transport={config.transport!r} is not one of {', '.join(TRANSPORTS)}.")
     link = common.as_options(config.link)
     key = team_key(link.pop("key_file"))
-    common_options: dict[str, Any] = {"key": key, "insecure": link["insecure"]}
     if config.transport == "zenoh":
-        from gmmtorch.sharing.zenoh_transport import ZenohTransport
+        with common.naming(_ZENOH_NAMES):
+            return _zenoh(robot, link, key)
+    with common.naming(_UDP_NAMES):
+        return _udp(robot, link, key)
 
-        return ZenohTransport(
-            robot,
-            link["team"],
-            listen=link["listen_endpoints"],
-            connect=link["connect_endpoints"],
-            scouting=link["scouting"],
-            config=link["zenoh_config"],
-            **common_options,
-        )
-    if config.transport != "udp":
-        raise InvalidArgumentError(f"transport={config.transport!r} is not one of {', '.join(TRANSPORTS)}.")
+
+def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
+    from gmmtorch.sharing.zenoh_transport import ZenohTransport
+
+    return ZenohTransport(
+        robot,
+        link["team"],
+        listen=link["listen_endpoints"],
+        connect=link["connect_endpoints"],
+        scouting=link["scouting"],
+        config=link["zenoh_config"],
+        key=key,
+        insecure=link["insecure"],
+    )
+
+
+def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
+    from gmmtorch.sharing.udp import UdpTransport
+
+    insecure = link["insecure"]
     if link["group"] is not None:
         group = address("link.group", link["group"])
-        _check_key("link.interface", link["interface"], link["insecure"], key)
-        return UdpTransport.multicast(robot, group, link["interface"], link["ttl"], **common_options)
-    peers = [address("link.peers", peer) for peer in link["peers"]]
-    listen = address("link.listen", link["listen"])
-    _check_key("link.listen", listen[0], link["insecure"], key)
-    return UdpTransport.unicast(robot, listen, peers, **common_options)
-
-
-def _check_key(name: str, host: str, insecure: bool, key: TeamKey | None) -> None:
-    """What transports check, too, and say in terms of Python."""
-    from gmmtorch.errors import InvalidArgumentError
-
-    try:
-        is_local = ipaddress.IPv4Address(host).is_loopback
-    except ValueError:
-        return  # of which the transport says what is wrong
-    if key is None and not insecure and not is_local:
-        raise InvalidArgumentError(
-            f"{name}={host} reaches other machines, and there is no key: give link.key_file=FILE, take "
-            "127.0.0.1, or say link.insecure=true to let anybody read and write."
+        return UdpTransport.multicast(
+            robot, group, link["interface"], link["ttl"], key=key, insecure=insecure
         )
+    listen = address("link.listen", link["listen"])
+    peers = [address("link.peers", peer) for peer in link["peers"]]
+    return UdpTransport.unicast(robot, listen, peers, key=key, insecure=insecure)
 
 
 def await_team(transport: FramedTransport, n_others: int) -> None:

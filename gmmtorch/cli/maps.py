@@ -60,11 +60,14 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
     if dtype not in SOFTMAX_DTYPES:  # of an incremental map it is checked alone
         raise InvalidArgumentError(f"runtime.dtype={dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
     options = {**common.as_options(config.map), **changes}
+    names = {name: f"map.{name}" for name in options}
     answering = {key: options.pop(key) for key in _ANSWERING}
-    rule = _rule(options, dtype)
+    with common.naming(names):
+        rule = _rule(options, dtype)
 
     def make() -> GaussianMap:
-        return GaussianMap(rule, **answering, **limits(config))
+        with common.naming(names):
+            return GaussianMap(rule, **answering, **limits(config))
 
     make()  # a bad option must not wait for the grids to be built
     return make

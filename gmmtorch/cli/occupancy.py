@@ -83,14 +83,11 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     import torch
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.report import (
-        MapPanel,
-        auc_against_kept_figure,
-        map_figure,
-        mixture_figure,
-        roc_figure,
-    )
-    from gmmtorch.report.raster import busiest_regions, robust_bounds
+    from gmmtorch.report.curves import roc_figure
+    from gmmtorch.report.maps import map_figure
+    from gmmtorch.report.mixtures import mixture_figure
+    from gmmtorch.report.raster import MapPanel, busiest_regions, robust_bounds
+    from gmmtorch.report.sparsity import auc_against_kept_figure
 
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
@@ -120,6 +117,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
                 components.means[surface],
                 components.covariances[surface],
                 components.support[surface],
+                title="The map's surfaces",
             )
             break
     return figures
@@ -129,7 +127,7 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     """The reliability diagram of the maps at one resolution."""
     from gmmtorch.evaluation.calibration import reliability
     from gmmtorch.evaluation.queries import OCCUPIED
-    from gmmtorch.report import reliability_figure
+    from gmmtorch.report.calibration import reliability_figure
 
     curves = {}
     for built in shown:
@@ -146,7 +144,9 @@ def _coarser(shown: Sequence[Built]) -> dict[str, Any]:
 
 
 def _label(built: Built) -> str:
-    return str(built.row["method"])
+    from gmmtorch.report.style import label_of
+
+    return label_of(built.row["method"])
 
 
 def _write_board(
@@ -156,7 +156,7 @@ def _write_board(
 
     from gmmtorch.evaluation.queries import OCCUPIED
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.report import Board
+    from gmmtorch.report.board import Board
 
     with Board(folder) as board:
         # Steps are per cent of the data kept; TensorBoard takes a step back for a restart.

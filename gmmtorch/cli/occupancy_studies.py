@@ -55,7 +55,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> Rows:
     shown = found.rows if found.shown is None else found.shown
     common.save_figures(config, found.figures, folder)
     if config.report.tensorboard:
-        from gmmtorch.report import Board
+        from gmmtorch.report.board import Board
 
         with Board(folder / "tensorboard") as board:
             for step, row in enumerate(shown):

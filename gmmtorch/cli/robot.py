@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common, links, maps, schema
+from gmmtorch.cli import common, links, maps, missions, schema
 
 if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
@@ -31,6 +31,11 @@ TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 _TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 _SOURCES = ("world", "log")
 _CLOCKS = ("wall", "lockstep")
+_NO_RESTART = (
+    "A robot of team=%s with codec=%s cannot be started again while its team goes on: it would number what "
+    "it says from 0 again, and be taken for one that repeats itself. With team=gmm_shared codec=quantized it "
+    "can."
+)
 
 
 def main() -> None:
@@ -61,6 +66,27 @@ def _claim_output() -> IO[str]:
 
 def run(config: DictConfig, answers: IO[str] | None = None) -> None:
     """One run of a robot."""
+    with common.naming(_names(config)):
+        _run(config, answers)
+
+
+def _names(config: DictConfig) -> dict[str, str]:
+    """Options by the names of the arguments that they become."""
+    kept = {"sync": "journal.sync"}
+    if config.source == "world":
+        return {**missions.NAMES, **kept}
+    return {
+        **{argument: f"network.{option}" for option, argument in missions.OF_ROBOTS.items()},
+        **{f"map.{name}": f"log.map.{name}" for name in config.log.map},
+        **kept,
+        "rate": "log.rate",
+        "split": "log.part",
+        "dataset": "dataset@log.dataset",
+        "dataset.path": "log.dataset.path",
+    }
+
+
+def _run(config: DictConfig, answers: IO[str] | None) -> None:
     check_options(config)
     if config.clock == "lockstep" and answers is None:
         from gmmtorch.errors import InvalidArgumentError
@@ -73,6 +99,7 @@ def run(config: DictConfig, answers: IO[str] | None = None) -> None:
         transport = links.open_link(config, config.id)
         transport.lose(config.network.loss, config.seed + config.id)
         stack.callback(transport.close)
+        _know_former(config, folder, transport)
         make = _flying if config.source == "world" else _replay
         node = make(config, folder, transport, stack)
         stack.callback(node.close)
@@ -123,19 +150,21 @@ def check_options(config: DictConfig) -> None:
 
 def _flying(config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack) -> FlyingNode:
     """A robot with a simulated camera in a simulated world."""
-    from gmmtorch.cli.explore import team_options, world_options
     from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.team import make_agent, start_poses
     from gmmtorch.sharing.record_ids import drawn_incarnation
+    from gmmtorch.sharing.replica import Replica
 
-    options = team_options(config, config.seed, {})
-    world = world_options(config).open(options)
+    options = missions.team_options(config, config.seed, {})
+    world = missions.open_world(missions.world_options(config), options)
     # A life that nobody has led: what is told twice must be told as two. In step nobody starts again.
     life = 0 if config.clock == "lockstep" else drawn_incarnation()
     pose = start_poses(world, options)[config.id]
     agent = make_agent(config.id, pose, world, options, transport, incarnation=life)
     replica = getattr(agent.robot.mapper, "shared", None)
     journal = None if config.clock == "lockstep" else _journal(config, folder, replica, stack)
+    if config.clock != "lockstep" and options.shares and not isinstance(replica, Replica):
+        common.logger.warning(_NO_RESTART, config.team.name, config.codec)
     return FlyingNode(agent, world, options, transport, journal)
 
 
@@ -202,6 +231,15 @@ def _journal(config: DictConfig, folder: Path, replica: Replica | None, stack: E
         return None
     place = _home(config, folder) / f"journal_{config.id}"
     return stack.enter_context(Journal(place, replica, sync=config.journal.sync))
+
+
+def _know_former(config: DictConfig, folder: Path, transport: FramedTransport) -> None:
+    """What the robot said before it was started again is no other robot's, though it has the same number."""
+    from gmmtorch.sharing.former_sessions import former_sessions
+
+    if config.journal.enabled and config.clock == "wall":
+        kept = _home(config, folder) / f"sessions_{config.id}"
+        transport.disown(former_sessions(kept, transport.session))
 
 
 # -- its time -------------------------------------------------------------------------------------

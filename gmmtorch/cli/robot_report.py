@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.node import Node
-    from gmmtorch.report import Board
+    from gmmtorch.report.board import Board
 
 _EVERY = 1.0  # seconds of the robot's time between what is shown
 _SERIES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
@@ -31,7 +31,7 @@ class RobotReport:
         self.series: dict[str, list[float]] = {"times": []}
         self._board: Board | None = None
         if config.report.tensorboard:
-            from gmmtorch.report import Board
+            from gmmtorch.report.board import Board
 
             self._board = Board(folder / "tensorboard")
 

@@ -416,16 +416,20 @@ class ExploreReport:
 
 
 @dataclass
-class RobotRuntime:
+class WorldRuntime:
     device: str = "cpu"
     threads: int | None = 1
     cache: bool = True
-    memory_limit: int = 4 << 30
 
 
 @dataclass
-class ExploreRuntime(RobotRuntime):
+class ExploreRuntime(WorldRuntime):
     workers: int = 2
+
+
+@dataclass
+class RobotRuntime(WorldRuntime):
+    memory_limit: int = 4 << 30  # of a log's map
 
 
 @dataclass

@@ -75,7 +75,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[
 def _write_board(
     config: DictConfig, study: Study, table: Sequence[Row], figures: dict[str, Any], folder: Path
 ) -> None:
-    from gmmtorch.report import Board
+    from gmmtorch.report.board import Board
 
     with Board(folder) as board:
         for row in sorted(table, key=lambda row: row[study.step]):

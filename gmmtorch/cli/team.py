@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, links, schema
+from gmmtorch.cli import common, links, missions, schema
 from gmmtorch.cli.robot import check_options
 from gmmtorch.cli.robot_process import RobotProcess, end_all
 
@@ -63,12 +63,11 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """What all robots would otherwise make, each for itself at the same time; and errors, said once."""
-    from gmmtorch.cli.explore import team_options, world_options
     from gmmtorch.exploration.team import start_poses
 
     if config.source == "world":
-        options = team_options(config, config.seed, {})
-        start_poses(world_options(config).open(options, bars), options)
+        options = missions.team_options(config, config.seed, {})
+        start_poses(missions.open_world(missions.world_options(config), options, bars), options)
 
 
 # -- the processes --------------------------------------------------------------------------------
@@ -132,7 +131,6 @@ def _endpoints(config: DictConfig) -> list[list[str]]:
 
 def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars) -> dict[str, Any]:
     """Fly the mission, tick by tick."""
-    from gmmtorch.cli.explore import team_options
     from gmmtorch.exploration.lockstep import RemotePilot, RobotLostError
     from gmmtorch.exploration.team_flight import TeamFlight
 
@@ -140,7 +138,7 @@ def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars)
     for robot in robots:
         pilots.append(RemotePilot(robot.number, *robot.pipes, pilots))
     try:
-        flight = TeamFlight(pilots, team_options(config, config.seed, {}))
+        flight = TeamFlight(pilots, missions.team_options(config, config.seed, {}))
         while not flight.is_over:
             flight.step()
             bars(_STAGE, round(flight.now), round(config.duration))
@@ -185,7 +183,7 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
     """The picture of the run: as a file, and in TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report import Board
+    from gmmtorch.report.board import Board
     from gmmtorch.report.team_run import team_run_figure
 
     figure = team_run_figure(rows)

@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any, Protocol
+from collections import Counter
+from collections.abc import Collection
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError
-from gmmtorch.exploration.heartbeat import Heartbeat
-from gmmtorch.exploration.mapper import Heard, Memo, Sensed
+from gmmtorch.exploration.mapper import Memo, Sensed
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.planning import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.primitives import Primitives
+from gmmtorch.exploration.radio import Logbook, Radio
 from gmmtorch.exploration.retreat import retreat
 from gmmtorch.exploration.robot import Robot
 from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.views import ViewEvaluator
-from gmmtorch.sharing.messages import PlanMessage, ViewsHeldMessage, ViewsMessage, encode_plan, kind_of
+from gmmtorch.sharing.messages import MAX_BYTES, PlanMessage, ViewsHeldMessage, ViewsMessage, encode_plan
 from gmmtorch.sharing.network import Transport
-from gmmtorch.sharing.token_bucket import TokenBucket
 from gmmtorch.simulation.depth_camera import DepthFrame
 from gmmtorch.simulation.mesh_world import MeshWorld
 
 _SEEDS = 1 << 10  # robots of a mission that draw differently
 _LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
 _TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
+_PATIENCE = 15  # plans in a row that lead nowhere: at a start, to find a way out takes up to six
 _OF_VIEWS = (ViewsMessage, ViewsHeldMessage)
-
-
-class Logbook(Protocol):
-    """Where what is said and heard is kept, before it is sent or announced: see `sharing.journal`."""
-
-    def said(self, datagrams: Sequence[bytes]) -> None: ...
-    def heard(self, datagrams: Sequence[bytes]) -> None: ...
 
 
 class Agent:
@@ -59,16 +52,16 @@ class Agent:
         memo: Memo,
         watch: Stopwatch,
     ) -> None:
-        self.robot, self.transport, self.options = robot, transport, options
-        self.n_heard = 0
-        """Datagrams that have come."""
-        self.n_damaged = 0
-        """Of them, those that say nothing that can be understood."""
-        self._evaluator, self._primitives, self._memo, self._timed = evaluator, primitives, memo, watch
-        self._logbook: Logbook | None = None
+        self.robot, self.options = robot, options
+        self.radio = Radio(
+            robot.number, transport, options.announce_every, options.budget, decode=memo.decoded
+        )
+        self._evaluator, self._primitives, self._timed = evaluator, primitives, watch
         self.heard_at: dict[int, float] = {}
         """When each teammate's last plan came, by this robot's own clock."""
-        self._waiting = Waiting(primitives)
+        self.refused: Counter[str] = Counter()
+        """How many plans were not believed: "stranger" (of no teammate, or not of the one who sent it)."""
+        self._waiting = Waiting(primitives, _PATIENCE)
         # Of its own, so that what one robot draws does not depend on what others do.
         seed = options.seed * _SEEDS + robot.number
         self._generator = torch.Generator().manual_seed(seed)
@@ -77,8 +70,6 @@ class Agent:
         self._plan: Plan | None = None
         self._told: Tensor | None = None  # where it stays, as teammates were told
         self._silent = 0
-        self._heartbeat = Heartbeat(options.announce_every)
-        self._budget = None if options.budget is None else TokenBucket(options.budget)
 
     @property
     def number(self) -> int:
@@ -100,7 +91,7 @@ class Agent:
     def keep_in(self, logbook: Logbook) -> None:
         """From now on keep what is said and heard of the map. What the logbook has restored of it is taken
         for known."""
-        self._logbook = logbook
+        self.radio.logbook = logbook
         self.robot.mapper.center_on(self.robot.position)
         self.robot.mapper.receive([])
 
@@ -128,63 +119,53 @@ class Agent:
         if not self.options.shares:
             return
         mapper, library = self.robot.mapper, self.robot.library
-        budget = None if self._budget is None else self._budget.available(now)
-        datagrams = mapper.datagrams(budget)
-        if self._budget is not None:
-            self._budget.take(sum(map(len, datagrams)))
+        datagrams = self.radio.within_budget(mapper.datagrams, now)
         urgent = mapper.is_behind or library.differs
-        if self._heartbeat.due(now, (mapper.version, library.version), urgent):
+        if self.radio.announces(now, (mapper.version, library.version), urgent):
             datagrams += [*mapper.announcements(), *library.announcements()]
-        self._send(datagrams, now)
+        self.radio.tell(datagrams, now)
 
     def tell_views(self, now: float) -> None:
-        """The team of views worth going to."""
+        """The team of views worth going to, as far as the map has left of the budget."""
+        library = self.robot.library
         with self._timed("sharing"):
             if self.options.shares:
-                self._send(self.robot.library.datagrams(), now)
-
-    def _send(self, datagrams: Sequence[bytes], now: float) -> None:
-        if self._logbook is not None:
-            self._logbook.said(datagrams)
-        by_kind: dict[str, list[bytes]] = {}
-        for datagram in datagrams:
-            by_kind.setdefault(kind_of(datagram), []).append(datagram)
-        for kind, some in by_kind.items():
-            self.transport.send(self.number, some, now, kind)
+                views = self.radio.within_budget(
+                    lambda budget: library.datagrams(budget=budget), now, spare=MAX_BYTES
+                )
+                self.radio.tell(views, now)
 
     def listen(self, now: float) -> None:
         """Take in what has come by `now`, in an order that does not depend on who was quicker."""
         with self._timed("sharing"):
-            heard = self._heard(now)
+            heard = self.radio.hear(now)
         for item in heard:
             if isinstance(item.message, PlanMessage):
-                self._note_plan(item.message, now)
+                self._note_plan(item.sender, item.message, now)
             elif isinstance(item.message, _OF_VIEWS):
-                self.robot.library.receive(item.message)
+                self.robot.library.receive(item.message, now)
         with self._timed("mapping"):
             taken = self.robot.mapper.receive(
                 [item for item in heard if not isinstance(item.message, (PlanMessage, *_OF_VIEWS))]
             )
-            if self._logbook is not None:
-                self._logbook.heard(taken)
+            self.radio.keep(taken)
 
-    def _note_plan(self, plan: PlanMessage, now: float) -> None:
-        """Keep a teammate's plan, unless it is known, or a later one has overtaken it."""
-        known = self.robot.plans.get(plan.sender)
-        if known is None or not 0 <= known.number - plan.number <= _LATE:
-            self.robot.plans[plan.sender] = plan
-            self.heard_at[plan.sender] = now
+    def _note_plan(self, sender: int, plan: PlanMessage, now: float) -> None:
+        """Keep a teammate's plan, unless it is known, or a later one has overtaken it.
 
-    def _heard(self, now: float) -> list[Heard]:
-        arrived = sorted(self.transport.deliver(self.number, now), key=lambda pair: pair[0])
-        self.n_heard += len(arrived)
-        heard = []
-        for sender, datagram in arrived:
-            try:
-                heard.append(Heard(sender, datagram, self._memo.decoded(datagram)))
-            except DataError:
-                self.n_damaged += 1
-        return heard
+        One whose number is not higher is of a robot that began anew, if it is much lower, or comes when the
+        path that is known has been flown.
+        """
+        if plan.sender != sender or plan.sender == self.number or plan.sender >= self.options.size:
+            self.refused["stranger"] += 1
+            return
+        known = self.robot.plans.get(sender)
+        if known is not None:
+            is_flown = now - self.heard_at[sender] >= known.step * len(known.path)
+            if 0 <= known.number - plan.number <= _LATE and not is_flown:
+                return
+        self.robot.plans[sender] = plan
+        self.heard_at[sender] = now
 
     # -- planning ---------------------------------------------------------------------------------
 
@@ -228,7 +209,11 @@ class Agent:
             if self._rests:
                 self._plan = self._waiting.rest(task)
             else:
-                self._plan = retreat(self._primitives, task) or self.robot.planner.plan(task)
+                self._plan = (
+                    retreat(self._primitives, task)
+                    or self._waiting.boxed_in(task)
+                    or self.robot.planner.plan(task)
+                )
         return self._plan
 
     def settle(self) -> None:
@@ -243,7 +228,7 @@ class Agent:
         with self._timed("sharing"):
             path, views = self._plan.path[:, :4], self._plan.views
             step = self.options.dynamics.step
-            self._send(encode_plan(self.number, number, now, step, path, views), now)
+            self.radio.tell(encode_plan(self.number, number, now, step, path, views), now)
 
     def _stays(self, plan: Plan) -> bool:
         """Whether a plan stays where the team was told lately that the robot stays."""
@@ -265,11 +250,8 @@ class Agent:
             "waiting": self._waiting.state(),
             "told": self._told,
             "silent": self._silent,
-            "n_heard": self.n_heard,
-            "n_damaged": self.n_damaged,
             "heard_at": [[number, when] for number, when in self.heard_at.items()],
-            "heartbeat": self._heartbeat.state(),
-            "budget": None if self._budget is None else self._budget.state(),
+            "radio": self.radio.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -278,8 +260,5 @@ class Agent:
         self._generator.set_state(state["generator"])
         self._waiting.restore(state["waiting"])
         self._told, self._silent = state["told"], int(state["silent"])
-        self.n_heard, self.n_damaged = int(state["n_heard"]), int(state["n_damaged"])
         self.heard_at = {int(number): float(when) for number, when in state["heard_at"]}
-        self._heartbeat.restore(state["heartbeat"])
-        if self._budget is not None:
-            self._budget.restore(state["budget"])
+        self.radio.restore(state["radio"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.messages import PlanMessage
 from gmmtorch.sharing.replica import Replica
 
-_KINDS = ("announcements", "components", "corrections", "counts", "plans", "points", "supersessions", "views")
 _MOST_STEPS = 1000  # of a teammate's plan that are looked at
 
 
@@ -52,6 +52,7 @@ class FlyingNode:
         if self._logbook is not None:
             agent.keep_in(self._logbook)
         self._n_ticks = 0
+        self._listened = self._views_wait = 0.0  # when, by the clock; seconds since views were told
         self._flown = [agent.robot.state[:4].clone()]
         self.n_late = 0
         """Datagrams that a team in step had to go on without, as they had not come."""
@@ -78,11 +79,18 @@ class FlyingNode:
             self.fly(begin, begin + options.steps_per_tick)
 
     def listen(self, now: float) -> None:
-        """Hear, answer, and announce."""
+        """Hear, answer, and announce; views as often as they are told where it plans."""
+        self._views_wait += max(0.0, now - self._listened)  # a clock that is set back stands still
+        self._listened = now
         with torch.inference_mode():
             self.agent.listen(now)
             self.agent.send(now)
-            self.agent.tell_views(now)
+            if self._views_wait >= self.options.dynamics.duration:
+                self._tell_views(now)
+
+    def _tell_views(self, now: float) -> None:
+        self._views_wait = 0.0
+        self.agent.tell_views(now)
 
     def _plan(self, now: float) -> None:
         agent, options = self.agent, self.options
@@ -97,7 +105,7 @@ class FlyingNode:
         agent.propose(now, list(plans), traffic, since=now - options.dynamics.duration)
         agent.settle()
         agent.tell_plan(now, self._n_ticks // options.ticks_per_plan)
-        agent.tell_views(now)
+        self._tell_views(now)
 
     # -- step by step -----------------------------------------------------------------------------
 
@@ -134,7 +142,7 @@ class FlyingNode:
             "bytes_sent": float(sent.bytes),
             "wire_bytes_sent": float(self.transport.wire_bytes),
             "datagrams_sent": float(sent.datagrams),
-            "datagrams_heard": float(self.agent.n_heard),
+            "datagrams_heard": float(self.agent.radio.n_heard),
             "refused": float(sum(self.transport.refused.values())),
             "path_length": robot.path_length,
             "collisions": float(robot.collisions),
@@ -145,6 +153,9 @@ class FlyingNode:
         robot, transport = self.agent.robot, self.transport
         belief, shared = robot.mapper.belief, getattr(robot.mapper, "shared", None)
         components = robot.mapper.components()
+        refused = Counter(self.agent.refused)
+        for part in (robot.mapper, shared):
+            refused.update(getattr(part, "refused", {}))
         return {
             "robot": self.robot,
             "digest": robot.mapper.digest().hex(),
@@ -154,14 +165,10 @@ class FlyingNode:
             "observable_bits": belief.observable_bits,
             "n_components": None if components is None else len(components),
             "n_records": robot.mapper.held.size,
-            "bytes_sent": transport.traffic().bytes,
-            "datagrams": transport.traffic().datagrams,
-            "bytes_by_kind": {kind: n for kind in _KINDS if (n := transport.traffic(kind=kind).bytes)},
-            **transport.books(),
-            "heard": self.agent.n_heard,
-            "damaged": self.agent.n_damaged,
-            "not_merged": dict(getattr(shared, "refused", {})),
-            "namesakes": {str(robot): whence for robot, whence in sorted(transport.namesakes.items())},
+            **transport.books(self.robot),
+            "heard": self.agent.radio.n_heard,
+            "damaged": self.agent.radio.n_damaged,
+            "not_merged": dict(refused),
             "late": self.n_late,
             "path_length": robot.path_length,
             "collisions": robot.collisions,
@@ -172,22 +179,17 @@ class FlyingNode:
     @property
     def twin(self) -> str | None:
         """What is said of another robot of this number, if there is one."""
-        named = self.transport.namesakes.get(self.robot)
         shared = getattr(self.agent.robot.mapper, "shared", None)
-        if named is None and not (isinstance(shared, Replica) and shared.conflicts[self.robot]):
-            return None
-        whence = "" if named is None else f" ({named})"
-        return (
-            f"Another robot says that it is robot {self.robot}{whence}: give each a number of its own, id=…"
-        )
+        return self.agent.radio.twin(shared.conflicts[self.robot] if isinstance(shared, Replica) else 0)
 
     def save(self, folder: Path) -> dict[str, Path]:
         """The map, and where the robot flew."""
         paths = {"trajectory": write_npz(folder / "trajectory.npz", poses=torch.stack(self._flown).numpy())}
         mapper = self.agent.robot.mapper
         if isinstance(mapper, MixtureMapper) and len(components := mapper.components()):
-            paths["map"] = folder / "map.gmm"
-            GaussianMap.of(components, robot=self.robot).save(paths["map"])
+            made = GaussianMap.of(components, robot=self.robot)
+            paths["map"] = folder / f"map{made.suffix}"
+            made.save(paths["map"])
         return paths
 
     def close(self) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mapper import Heard, Mapper, Memo, Sensed, novel_beams
+from gmmtorch.exploration.mapper import Mapper, Memo, Sensed, novel_beams
+from gmmtorch.exploration.radio import Heard
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
@@ -19,12 +22,22 @@ from gmmtorch.sharing.messages import PointsMessage, encode_points
 from gmmtorch.sharing.point_messages import MOST_PARTS
 from gmmtorch.simulation.depth_camera import DepthFrame
 
+MOST_INTERVALS = 1 << 14
+"""Of the parts of a teammate's frames that have come; of more, the oldest gaps count as closed."""
+
 
 class GridMapper(Mapper):
     """The map of one robot of a team with voxel grids.
 
     Its own frames count in full; `shared`: teammates are sent, and count, the beams that were novel to
-    the sender. The grid behind the window is `belief.grid`.
+    the sender. The grid behind the window is `belief.grid`. `size`: robots of the team.
+
+    Frames are numbered from 0 in each life of a robot: one that starts again is not heard until it is past
+    what it said before.
+
+    Attributes:
+        refused: how many messages of points were not taken in: "stranger" (of no teammate), "repeated" (come
+            before, or so late that nobody remembers).
     """
 
     def __init__(
@@ -36,9 +49,11 @@ class GridMapper(Mapper):
         novelty: NoveltyRule,
         memo: Memo,
         shared: bool,
+        size: int,
     ) -> None:
         super().__init__(robot, local, belief, width, novelty, memo)
-        self._shared = shared
+        self._shared, self._size = shared, size
+        self.refused: Counter[str] = Counter()
         self._n_frames = 0
         self._due: list[bytes] = []
         self._come: dict[int, Intervals] = {}  # parts of teammates' frames, by sender
@@ -78,11 +93,17 @@ class GridMapper(Mapper):
         return [datagram for datagrams in frames.values() for datagram in datagrams]
 
     def _is_new(self, message: PointsMessage) -> bool:
-        """Whether this part of a frame has not come before; it has, from now on."""
+        """Whether this part of a teammate's frame has not come before; it has, from now on."""
+        if message.sender == self._robot or message.sender >= self._size:
+            self.refused["stranger"] += 1
+            return False
         number = message.frame * MOST_PARTS + message.part
-        part, come = Intervals.span(number, number + 1), self._come.get(message.sender, Intervals.empty())
-        self._come[message.sender] = come | part
-        return number not in come
+        come = self._come.get(message.sender, Intervals.empty())
+        if number in come:
+            self.refused["repeated"] += 1
+            return False
+        self._come[message.sender] = _recent(come | Intervals.span(number, number + 1))
+        return True
 
     def datagrams(self, budget: int | None = None) -> list[bytes]:
         n = within(self._due, budget)
@@ -118,3 +139,9 @@ class GridMapper(Mapper):
         self._n_frames = int(state["n_frames"])
         self._due = [loaded(data) for data in state["due"]]
         self._come = {int(sender): Intervals.loaded(edges) for sender, edges in state["come"]}
+
+
+def _recent(numbers: Intervals) -> Intervals:
+    """The same set, with its first gaps closed where it has more than `MOST_INTERVALS` intervals."""
+    excess = max(0, len(numbers) - MOST_INTERVALS)
+    return Intervals(np.concatenate([numbers.edges[:1], numbers.edges[1 + 2 * excess :]]))

@@ -15,8 +15,6 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 
-BITS_PER_NAT = 1 / math.log(2)
-
 _NEGLIGIBLE = 1e-5
 """Of the kernel: readings less alike than this count as unlike."""
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
+from gmmtorch.exploration.radio import Heard
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
@@ -33,14 +34,6 @@ class Sensed(NamedTuple):
 
     evidence: list[CellEvidence]
     novel: Tensor
-
-
-class Heard(NamedTuple):
-    """A datagram as it arrived, and what it says."""
-
-    sender: int
-    datagram: bytes
-    message: Message
 
 
 class Memo:

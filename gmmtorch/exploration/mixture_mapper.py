@@ -17,7 +17,8 @@ from typing import Any
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.mapper import Heard, Mapper, Memo, Sensed, novel_beams
+from gmmtorch.exploration.mapper import Mapper, Memo, Sensed, novel_beams
+from gmmtorch.exploration.radio import Heard
 from gmmtorch.exploration.scoring import BeliefMap
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.component_rays import component_evidence

@@ -103,8 +103,10 @@ def run_paced(
     Whatever a node raises ends it. Nodes are not closed.
     """
     _check(rate=rate, speed=speed, status_every=status_every)
-    if not (0 <= settle < math.inf) or not (duration is None or duration >= 0):
-        raise InvalidArgumentError(f"settle={settle} and duration={duration} must be at least zero seconds.")
+    if not 0 <= settle < math.inf:
+        raise InvalidArgumentError(f"settle={settle} must be at least zero seconds, and finite.")
+    if duration is not None and not duration >= 0:
+        raise InvalidArgumentError(f"duration={duration} must be at least zero seconds.")
     team = list(nodes) if isinstance(nodes, Sequence) else [nodes]
     stopped = stop or (lambda: False)
     watch = _Watch(clock, speed)

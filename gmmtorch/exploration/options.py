@@ -39,7 +39,7 @@ class TeamOptions:
     occupancy that the planner expects of unknown cells. rest: when a robot has seen enough. codec: of
     components, see `sharing.messages`; others than quantized are not repaired after losses. latency …
     partitions: of the network, see `LinkConditions`. announce_every (s): see `Heartbeat`. budget: bytes a
-    second that a robot sends of its map; None: no limit.
+    second that a robot sends of its map and views; None: no limit.
     sample_every: simulated seconds between the numbers kept. codecs: what the novel points are also
     encoded with, to compare. margin: metres that robots keep between them. start: (size, 4) poses; None:
     chosen by the world.
@@ -89,6 +89,7 @@ class TeamOptions:
         if self.size > _MOST_ROBOTS:
             raise InvalidArgumentError(f"team.size={self.size} is more than the {_MOST_ROBOTS} there may be.")
         check_whole("seed", self.seed, 0)
+        check_whole("n_beams", self.n_beams, 1)
         check_codec(self.codec)
         for name in ("duration", "rate", "sample_every"):
             if not 0 < getattr(self, name) < math.inf:

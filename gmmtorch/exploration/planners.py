@@ -14,7 +14,8 @@ from gmmtorch.exploration.frontier import FrontierPlanner
 from gmmtorch.exploration.planning import Plan, Planner, PlanningTask, Waiting, options
 from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.travel import Journey
-from gmmtorch.exploration.tree_search import Found, Memory, SearchRule, TreeSearch
+from gmmtorch.exploration.tree_search import Found, SearchRule, TreeSearch
+from gmmtorch.exploration.view_memory import Memory
 from gmmtorch.exploration.views import ViewEvaluator
 
 __all__ = [

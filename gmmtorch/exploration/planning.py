@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -15,6 +15,9 @@ from gmmtorch.exploration.safety import feasible
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.view_library import ViewLibrary
+
+LEAST = 0.05
+"""Metres of a way that leads anywhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,7 @@ class Plan:
     """path: (S, 7), the states of the next primitive. braking: (B, 7), how the robot comes to rest after it.
 
     views: (n, 4), poses from which it means to look on its way. value: the return that it expects.
-    kind: "explore", "travel", "wait" or "retreat".
+    kind: "explore", "travel", "wait", "retreat" or "boxed_in".
     """
 
     path: Tensor
@@ -93,6 +96,13 @@ def options(
     return Options(paths, braking, safe)
 
 
+def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
+    """Whether nothing that leads anywhere is feasible; to turn in place always is, for a robot at rest."""
+    here = options(primitives, task.state[None].double(), task, may_escape=True)
+    leads = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
+    return not bool((here.feasible[0] & leads).any())
+
+
 class Waiting:
     """What to do where nothing is feasible: come to rest, and after some plans at rest look around.
 
@@ -117,6 +127,14 @@ class Waiting:
         else:
             return self.rest(task)
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
+
+    def boxed_in(self, task: PlanningTask) -> Plan | None:
+        """A look around for a robot that stands, boxed in for longer than its patience; else None."""
+        if bool(task.state[4:6].any()) or not is_boxed_in(self._primitives, task):
+            self.over()
+            return None
+        plan = self.plan(task)
+        return replace(plan, kind="boxed_in") if self._count > self._patience else None
 
     def rest(self, task: PlanningTask) -> Plan:
         """Come to rest and stay there: there is nothing to do, for now."""

@@ -10,20 +10,17 @@ from typing import Any
 
 from gmmtorch.errors import DataError, OutputError, check_whole
 from gmmtorch.exploration.forgiving_journal import ForgivingJournal
-from gmmtorch.exploration.heartbeat import Heartbeat
 from gmmtorch.exploration.progress import Progress
 from gmmtorch.exploration.publication import Publication
+from gmmtorch.exploration.radio import Radio
 from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.framed_transport import FramedTransport
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.messages import decode, kind_of
-from gmmtorch.sharing.network import HEADER_BYTES, Network
+from gmmtorch.sharing.network import Network
 from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.token_bucket import TokenBucket
 
-_KINDS = ("announcements", "components", "corrections", "counts", "supersessions")
 _log = logging.getLogger(__name__)
 
 
@@ -68,12 +65,11 @@ class ReplayNode:
         self.replica, self.map = replica, make_map()
         self.n_scans = len(scans) if isinstance(scans, Sized) else None
         """Of the log; None while nobody knows."""
-        self.n_heard = self.n_damaged = self.n_unread = self.n_unsaved = 0
+        self.radio = Radio(replica.robot, transport, announce_every, budget)
+        self.n_unread = self.n_unsaved = 0
         self.watch = Stopwatch()
         self._scans, self._transport = scans, transport
-        self._logbook = None if journal is None else ForgivingJournal(journal)
-        self._heartbeat = Heartbeat(announce_every)
-        self._budget = None if budget is None else TokenBucket(budget)
+        self._logbook = self.radio.logbook = None if journal is None else ForgivingJournal(journal)
         self._publication = Publication(replica)
         self._keep_every = check_whole("keep_every", keep_every, 1)
         about = {"robot": replica.robot, "keep_every": keep_every, "n_scans": self.n_scans}
@@ -113,17 +109,7 @@ class ReplayNode:
     @property
     def twin(self) -> str | None:
         """What is said of another robot of this number, if there is one."""
-        found = self._namesakes.get(self.robot)
-        if found is None and not self.replica.conflicts[self.robot]:
-            return None
-        return (
-            f"Another robot says that it is robot {self.robot}{'' if found is None else f' ({found})'}. Give "
-            "each a number and a folder of its own."
-        )
-
-    @property
-    def _namesakes(self) -> dict[int, str]:
-        return self._transport.namesakes if isinstance(self._transport, FramedTransport) else {}
+        return self.radio.twin(self.replica.conflicts[self.robot])
 
     # -- the log ----------------------------------------------------------------------------------
 
@@ -192,30 +178,16 @@ class ReplayNode:
     # -- the team ---------------------------------------------------------------------------------
 
     def _hear(self, now: float) -> None:
-        merged = []
-        for _, datagram in self._transport.deliver(self.robot, now):
-            self.n_heard += 1
-            try:
-                message = decode(datagram)
-            except DataError:
-                self.n_damaged += 1
-                continue
-            if self.replica.receive(datagram, message):
-                merged.append(datagram)
-        if self._logbook is not None:
-            self._logbook.heard(merged)
+        heard = self.radio.hear(now)
+        self.radio.keep(
+            [item.datagram for item in heard if self.replica.receive(item.datagram, item.message)]
+        )
 
     def _speak(self, now: float) -> None:
-        budget = None if self._budget is None else self._budget.available(now)
-        datagrams = self.replica.datagrams(budget=budget)
-        if self._budget is not None:
-            self._budget.take(sum(map(len, datagrams)))
-        if datagrams and self._logbook is not None:
-            self._logbook.said(datagrams)
-        if self._heartbeat.due(now, (self.replica.version,), urgent=bool(self.replica.missing)):
+        datagrams = self.radio.within_budget(lambda budget: self.replica.datagrams(budget=budget), now)
+        if self.radio.announces(now, (self.replica.version,), urgent=bool(self.replica.missing)):
             datagrams += self.replica.announcements()
-        for kind, some in itertools.groupby(datagrams, kind_of):
-            self._transport.send(self.robot, list(some), now, kind)
+        self.radio.tell(datagrams, now)
 
     # -- what there is to say ---------------------------------------------------------------------
 
@@ -233,23 +205,23 @@ class ReplayNode:
         return line if self.twin is None else f"{line}, another robot {self.robot} is there"
 
     def scalars(self) -> dict[str, float]:
-        sent, wire = self._transport.traffic(self.robot), self._wire()
+        """What changes as it maps: numbers for a plot."""
+        books = self._transport.books(self.robot)
         return {
             "scans": float(self.position),
             "components": float(self.replica.n_components),
             "records": float(self.replica.held.size),
             "missing": float(self.n_missing),
-            "bytes_sent": float(sent.bytes),
-            "datagrams_sent": float(sent.datagrams),
-            "datagrams_heard": float(self.n_heard),
-            "wire_bytes_sent": float(wire["wire_bytes"]),
-            "wire_bytes_received": float(wire["wire_bytes_received"]),
-            "refused": float(sum(wire["refused"].values()) + sum(self.replica.refused.values())),
+            "bytes_sent": float(books["bytes_sent"]),
+            "datagrams_sent": float(books["datagrams"]),
+            "datagrams_heard": float(self.radio.n_heard),
+            "wire_bytes_sent": float(books["wire_bytes"]),
+            "wire_bytes_received": float(books["wire_bytes_received"]),
+            "refused": float(sum(books["refused"].values()) + sum(self.replica.refused.values())),
         }
 
     def row(self) -> dict[str, Any]:
-        sent = self._transport.traffic(self.robot)
-        by_kind = {kind: self._transport.traffic(self.robot, kind).bytes for kind in _KINDS}
+        """What the robot leaves in results.json."""
         return {
             "robot": self.robot,
             "digest": self.replica.digest().hex(),
@@ -261,32 +233,14 @@ class ReplayNode:
             "n_components": self.replica.n_components,
             "n_records": self.replica.held.size,
             "missing": self.n_missing,
-            "bytes_sent": sent.bytes,
-            "datagrams": sent.datagrams,
-            "bytes_by_kind": {kind: n for kind, n in by_kind.items() if n},
-            **self._wire(),
-            "heard": self.n_heard,
-            "damaged": self.n_damaged,
+            **self._transport.books(self.robot),
+            "heard": self.radio.n_heard,
+            "damaged": self.radio.n_damaged,
             "not_merged": dict(self.replica.refused),
             "conflicts": {str(robot): n for robot, n in sorted(self.replica.conflicts.items()) if n},
-            "namesakes": {str(robot): whence for robot, whence in sorted(self._namesakes.items())},
             "unkept": self.n_unsaved + (0 if self._logbook is None else self._logbook.n_failed),
             "stage_seconds": self.watch.seconds,
         }
-
-    def _wire(self) -> dict[str, Any]:
-        """Bytes with the headers of frame, UDP and IPv4, each broadcast once; and what went wrong."""
-        transport, sent = self._transport, self._transport.traffic(self.robot)
-        if isinstance(transport, Network):
-            got = transport.reception(self.robot)
-            return {
-                "wire_bytes": sent.wire_bytes,
-                "wire_bytes_received": got.bytes + HEADER_BYTES * got.datagrams,
-                "refused": {},
-                "failures": {},
-                "dropped": 0,
-            }
-        return transport.books()
 
     def save(self, folder: Path) -> dict[str, Path]:
         """The team's map, as far as it is known here, and this robot's own."""

@@ -7,12 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.planning import Plan, PlanningTask, options
+from gmmtorch.exploration.planning import LEAST, Plan, PlanningTask, is_boxed_in
 from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.traffic import clear_of
 
 _METRES = 0.8  # of the way, in one plan
-_LEAST = 0.05
 
 
 def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
@@ -24,9 +23,7 @@ def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
     """
     if bool(task.state[4:].any()) or bool(task.surroundings.is_passable(task.state[:3])):
         return None
-    here = options(primitives, task.state[None].double(), task, may_escape=True)
-    moves = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > _LEAST
-    if bool((here.feasible[0] & moves).any()):
+    if not is_boxed_in(primitives, task):
         return None
     dynamics = primitives.dynamics
     longest = dynamics.acceleration * 2 * (dynamics.duration / math.pi) ** 2
@@ -54,7 +51,7 @@ def _back(trail: Tensor, metres: float) -> Tensor | None:
     """The last so many metres of a trail (N, 3), from its end backwards; None where it is no way at all."""
     way = trail.flip(0)
     length = torch.cumsum((way[1:] - way[:-1]).norm(dim=1), 0)
-    if len(length) == 0 or float(length[-1]) < _LEAST:
+    if len(length) == 0 or float(length[-1]) < LEAST:
         return None
     n = int((length < metres).sum())
     last = _along(way, torch.tensor([min(1.0, metres / float(length[-1]))], dtype=way.dtype))

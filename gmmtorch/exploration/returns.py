@@ -34,6 +34,8 @@ class DiminishingReturns:
     planner that believes them flies on for ever. What a robot's own frames take off the entropy
     of its map cannot be argued with. Once it rests, news of teammates that add up to a quarter of its best
     window wake it, for a window at least.
+
+    Time in which it was boxed in does not count: nothing it could have done would have taught it more.
     """
 
     def __init__(self, rule: RestRule | None = None) -> None:
@@ -42,15 +44,23 @@ class DiminishingReturns:
         self._noted: deque[tuple[float, float]] = deque()  # time (s) and bits learned, a window of them
         self._best = 0.0
         self._known = 0.0  # bits, when it came to rest
+        self._when: float | None = None  # of the last note, s
+        self._lost = 0.0  # seconds that do not count
 
-    def note(self, now: float, learned: float, known: float) -> None:
+    def note(self, now: float, learned: float, known: float, boxed_in: bool = False) -> None:
         """What is so at time `now` (s): bits that the robot's own frames took off the entropy of its map,
-        and bits that are off it altogether."""
+        and bits that are off it altogether. boxed_in: whether it was since the last note."""
+        if boxed_in and self._when is not None:
+            self._lost += now - self._when
+        self._when = now
         if self.rests:
             if known - self._known >= _NEWS * self._best:
                 self.rests = False
                 self._noted.clear()
             return
+        if boxed_in:
+            return
+        now -= self._lost
         self._noted.append((now, learned))
         while len(self._noted) > 1 and self._noted[1][0] <= now - self._rule.window:
             self._noted.popleft()
@@ -67,9 +77,13 @@ class DiminishingReturns:
             "noted": [list(entry) for entry in self._noted],
             "best": self._best,
             "known": self._known,
+            "when": self._when,
+            "lost": self._lost,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         self.rests = bool(state["rests"])
         self._noted = deque((float(now), float(learned)) for now, learned in state["noted"])
         self._best, self._known = float(state["best"]), float(state["known"])
+        self._when = None if state["when"] is None else float(state["when"])
+        self._lost = float(state["lost"])

@@ -53,7 +53,7 @@ class Robot:
         self.plans: dict[int, PlanMessage] = {}  # the last heard of each teammate
         self._start = (pose[:3].double().clone(), start_radius)
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
-        self._retreats = False
+        self._kind = ""  # of the plan it follows
         self.trail = pose[None, :3].double().clone()
         self.returns = DiminishingReturns(rest)
         self._learned = 0.0
@@ -65,7 +65,7 @@ class Robot:
     def follow(self, plan: Plan) -> None:
         """Take up a plan that starts at the present state."""
         self.path, self.braking = plan.path, plan.braking
-        self._retreats = plan.kind == "retreat"
+        self._kind = plan.kind
 
     def advance(self, begin: int, stop: int) -> Tensor:
         """Fly on from step `begin` of the path to step `stop`; returns the positions on the way (n, 3)."""
@@ -79,7 +79,7 @@ class Robot:
 
     def _remember_way(self, flown: Tensor) -> None:
         """The trail, with positions flown through (S, 3); a retreat takes away of it what it went back."""
-        if self._retreats:
+        if self._kind == "retreat":
             self.trail = shortened(self.trail, flown)
             return
         way = torch.cat([self.trail[-1:], flown])
@@ -96,8 +96,10 @@ class Robot:
         return sensed
 
     def rests(self, now: float) -> bool:
-        """Whether it has learned too little lately to fly on."""
-        self.returns.note(now, self._learned, self.mapper.belief.known_bits)
+        """Whether it has learned too little lately to fly on, though it could."""
+        self.returns.note(
+            now, self._learned, self.mapper.belief.known_bits, boxed_in=self._kind == "boxed_in"
+        )
         return self.returns.rests
 
     def _remember(self, frame: DepthFrame) -> None:
@@ -147,7 +149,7 @@ class Robot:
             "plans": [dict(vars(plan)) for plan in self.plans.values()],
             "recent": list(self._recent),
             "trail": self.trail,
-            "retreats": self._retreats,
+            "kind": self._kind,
             "returns": self.returns.state(),
             "learned": self._learned,
         }
@@ -161,6 +163,6 @@ class Robot:
         self.collisions = int(state["collisions"])
         self.plans = {int(plan["sender"]): PlanMessage(**plan) for plan in state["plans"]}
         self._recent = deque(state["recent"], maxlen=_REMEMBERED)
-        self.trail, self._retreats = state["trail"], bool(state["retreats"])
+        self.trail, self._kind = state["trail"], str(state["kind"])
         self.returns.restore(state["returns"])
         self._learned = float(state["learned"])

@@ -34,13 +34,17 @@ _SLACK = 24
 filled in broad slabs a map draws each of them far less often. Planners see the window around the robot."""
 _ROUNDING = 4  # cells that the planner's window may be off the robot
 _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
+_REMEMBERED_ALONE = 64  # of a robot that nobody shares its memo with: what strangers send may be large
 
 
-def assemble(world: World, options: TeamOptions) -> Mission:
-    """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin."""
+def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None) -> Mission:
+    """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin.
+
+    watch: times its stages, of all robots together; None: by the wall.
+    """
     poses = start_poses(world, options)
     network = Network(options.size, options.conditions, seed=options.seed)
-    memo, watch = Memo(_REMEMBERED), Stopwatch()
+    memo, watch = Memo(_REMEMBERED), Stopwatch() if watch is None else watch
     agents = [
         make_agent(number, poses[number], world, options, network, memo, watch)
         for number in range(options.size)
@@ -88,7 +92,7 @@ def make_agent(
     # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
     needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
     clear = world.mesh.clearance(pose[None, :3]).clamp_max(needed)
-    camera, memo = options.camera, Memo(_REMEMBERED) if memo is None else memo
+    camera, memo = options.camera, Memo(_REMEMBERED_ALONE) if memo is None else memo
     evaluator = ViewEvaluator(
         camera.horizontal_fov,
         camera.vertical_fov,
@@ -132,7 +136,7 @@ def _mapper(number: int, world: World, options: TeamOptions, memo: Memo, incarna
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief)
     width = options.camera.width
     if options.framework != "gmm_shared":
-        return GridMapper(number, local, belief, width, options.novelty, memo, shared=options.shares)
+        return GridMapper(number, local, belief, width, options.novelty, memo, options.shares, options.size)
     shared: Replica | Broadcast
     if options.codec == "quantized":
         shared = Replica(number, dim=3, incarnation=incarnation)

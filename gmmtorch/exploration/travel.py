@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.distance import DistanceField
+from gmmtorch.exploration.goal import Goal
 from gmmtorch.exploration.planning import PlanningTask
 from gmmtorch.exploration.roadmap import at_the_rim
-from gmmtorch.exploration.tree_search import Goal
 
 _REFRESHED = 10.0  # seconds that a way over the roadmap is relied on
 _PATIENCE = 12.0  # seconds without coming closer, after which a robot gives up

@@ -10,14 +10,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.distance import DistanceField
+from gmmtorch.exploration.goal import Goal
 from gmmtorch.exploration.planning import Options, PlanningTask, options
 from gmmtorch.exploration.primitives import Primitives
-from gmmtorch.exploration.views import ViewEvaluator
+from gmmtorch.exploration.view_memory import Memory
 
-_NEAR = 1.0  # metres of level way within which a robot turns to look as the goal asks
 _FAR = 1e4  # metres
-_AHEAD = 3  # cells of the distance field that a robot looks along its way
 
 
 @dataclass(frozen=True)
@@ -45,35 +43,6 @@ class SearchRule:
 
 
 @dataclass(frozen=True, eq=False)
-class Goal:
-    """Where to go, and what a metre on the way there is worth.
-
-    distances: to the goal. yaw: heading to look along once there; None: any. weight: return of a metre.
-    turning: metres that a radian off the way counts for.
-    """
-
-    distances: DistanceField
-    weight: float
-    yaw: float | None = None
-    turning: float = 1.25
-
-    def cost(self, states: Tensor) -> Tensor:
-        """Metres (...,) left from states (..., 7): the way, the turn into it, and that to the goal's yaw.
-
-        Close to the goal, and straight above or below it, only the last turn counts.
-        """
-        points, yaw = states[..., :3], states[..., 3]
-        metres, there = self.distances.way(points, _AHEAD)
-        way = there - points
-        bearing = torch.atan2(way[..., 1], way[..., 0])
-        into, last = _angle(bearing - yaw), torch.zeros_like(yaw)
-        if self.yaw is not None:
-            into, last = into + _angle(self.yaw - bearing), _angle(self.yaw - yaw)
-        level = (way[..., :2].norm(dim=-1) / _NEAR).clamp_max(1)
-        return metres + self.turning * torch.lerp(last, into, level)
-
-
-@dataclass(frozen=True, eq=False)
 class Found:
     """The best branch.
 
@@ -89,47 +58,6 @@ class Found:
     value: float
     information: float
     progress: float
-
-
-class Memory:
-    """What lattice poses are worth, for the length of a plan."""
-
-    def __init__(self, task: PlanningTask, evaluator: ViewEvaluator) -> None:
-        self._surroundings, self._evaluator = task.surroundings, evaluator
-        self._row: dict[tuple[int, ...], int] = {}
-        self._keys: list[Tensor] = []
-        n_blocks = len(task.residual)
-        self._gain, self._left = torch.zeros(0, n_blocks), torch.zeros(0, n_blocks)
-
-    def rows(self, poses: Tensor) -> Tensor:
-        """Row (V,) of each of poses (V, 4); those not known yet are evaluated in one call."""
-        keys = self._evaluator.keys(poses)
-        names = [tuple(key) for key in keys.tolist()]
-        new = []
-        for i, name in enumerate(names):
-            if name not in self._row:
-                self._row[name] = len(self._row)
-                new.append(i)
-        if new:
-            values = self._evaluator.evaluate(self._surroundings, keys[new])
-            self._gain = torch.cat([self._gain, values.gain])
-            self._left = torch.cat([self._left, 1 - values.measured])
-            self._keys.append(keys[new])
-        return torch.tensor([self._row[name] for name in names], dtype=torch.int64)
-
-    def marginal(self, rows: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
-        """What views (V,) bring where residuals (V, G) are left, and what they leave, (V, G)."""
-        return (self._gain[rows] * residuals).sum(1), residuals * self._left[rows]
-
-    def measured(self, row: int) -> Tensor:
-        """The share (G,) of what each block has to tell that a view takes."""
-        return 1 - self._left[row]
-
-    def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses (V, 4) of all that was evaluated, and what each is worth (V,), `residual` (G,) being left."""
-        if not self._keys:
-            return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
-        return self._evaluator.poses(torch.cat(self._keys)), self._gain @ residual
 
 
 @dataclass(slots=True, eq=False)
@@ -166,7 +94,7 @@ class _Node:
 
 
 class TreeSearch:
-    """Searches for the branch of the largest return (MATH.md section 5).
+    """Searches for the branch of the largest return (thesis 4.3).
 
     A branch returns what its views bring, given each other and the teammates' plans, and the goal's weight
     for every metre that it comes closer; the sooner, the more, so that nothing is put off. What the robot
@@ -347,8 +275,3 @@ class _Tree:
 def _finite(metres: Tensor) -> Tensor:
     """Metres to a goal, more than from anywhere else where there is no way."""
     return metres.clamp_max(_FAR)
-
-
-def _angle(radians: Tensor) -> Tensor:
-    """The size of angles, at most half a turn."""
-    return (torch.remainder(radians + math.pi, 2 * math.pi) - math.pi).abs()

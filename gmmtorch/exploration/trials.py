@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import concurrent.futures
+import concurrent.futures.process
+import functools
+import hashlib
+import itertools
 import json
 import math
 import multiprocessing
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,22 +19,27 @@ from typing import Any
 
 import torch
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch import __version__
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.outcome import row_of
+from gmmtorch.exploration.pace import Pace, Paces, pace_of
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.world import World, open_world
-from gmmtorch.files import write_json, write_npz
+from gmmtorch.files import check_writable, write_json, write_npz
 
 CHECKPOINT = "mission.safetensors"
 ROW = "row.json"
-_PATIENCE = 120.0  # simulated seconds after a mission, for maps to become the same
+STAGE = "simulated seconds"
 TRAJECTORIES = "trajectories.npz"
+_PATIENCE = 120.0  # simulated seconds after a mission, for maps to become the same
+_GLANCE = 0.5  # seconds between looks at how far the missions of other processes are
 
 OnSample = Callable[[Mission], None]
+OnPace = Callable[[Pace], None]
 
 
 @dataclass(frozen=True)
@@ -67,7 +77,7 @@ class Trial:
     """One mission in one world.
 
     folder: where its checkpoint and its row are kept; None: nowhere. checkpoint_every: simulated seconds
-    between checkpoints; 0: none.
+    between checkpoints, at least a tick; 0: none.
     """
 
     world: WorldOptions
@@ -81,9 +91,28 @@ class Trial:
                 f"checkpoint.every={self.checkpoint_every} must be finite seconds, at least zero."
             )
 
+    @property
+    def ticks_per_checkpoint(self) -> int | None:
+        """None: there are none."""
+        every = self.checkpoint_every
+        return max(1, round(every * self.team.rate)) if every > 0 else None
+
     def facts(self) -> dict[str, Any]:
         """What a checkpoint must agree in to go on from it."""
-        return {"world": repr(replace(self.world, cache=True)), "team": repr(self.team)}
+        return {
+            "world": repr(replace(self.world, cache=True)),
+            "mesh": self._mesh,
+            "team": repr(self.team),
+            "version": __version__,
+        }
+
+    @functools.cached_property
+    def _mesh(self) -> str | None:
+        """A hash of the mesh, if the world is one: what lies at its path may change."""
+        if self.world.path is None or not (path := Path(self.world.path).expanduser()).is_file():
+            return None
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def run_mission(
@@ -91,8 +120,11 @@ def run_mission(
 ) -> tuple[Mission, dict[str, Any]]:
     """Run a trial, from its checkpoint if there is one; returns the mission at its end and its row.
 
-    A mission that was killed goes on from its last checkpoint to the same result.
+    A mission that was killed goes on from its last checkpoint to the same result. Raises `OutputError`,
+    before anything is flown, for a folder that cannot be written to.
     """
+    if trial.folder is not None:
+        check_writable(trial.folder)
     world = trial.world.open(trial.team) if world is None else world
     mission = assemble(world, trial.team)
     path = None if trial.folder is None else trial.folder / CHECKPOINT
@@ -101,14 +133,14 @@ def run_mission(
         state = load_checkpoint(path, **trial.facts())
         mission.restore(state["mission"])
         wall = float(state["wall_seconds"])
-    begin, every = time.perf_counter() - wall, round(trial.checkpoint_every * trial.team.rate)
+    begin, every = time.perf_counter() - wall, trial.ticks_per_checkpoint
     if on_sample is not None:
         on_sample(mission)
     while not mission.is_over:
         mission.step()
         if on_sample is not None and mission.sampled_now:
             on_sample(mission)
-        if path is not None and every > 0 and (mission.tick % every == 0 or mission.is_over):
+        if path is not None and every is not None and (mission.tick % every == 0 or mission.is_over):
             state = {"mission": mission.state(), "wall_seconds": time.perf_counter() - begin}
             save_checkpoint(path, state, **trial.facts())
     row = row_of(mission, time.perf_counter() - begin)
@@ -123,34 +155,47 @@ def run_trials(
     workers: int = 1,
     on_row: Callable[[dict[str, Any]], None] | None = None,
     on_event: Event = ignore,
+    on_pace: OnPace | None = None,
 ) -> list[dict[str, Any]]:
     """The rows of trials in their order, run in `workers` processes; those done already are read.
 
-    Every trial has one thread, so that its result does not depend on how many run.
+    Every trial has one thread, so that its result does not depend on how many run. Once one fails, no other
+    begins; those that run end, and their rows are kept in their folders.
+
+    Args:
+        on_row: hears each row as it is there. on_event: hears of the simulated seconds of all trials
+            together (`STAGE`). on_pace: then hears how far the trial is that has got further.
     """
     check_whole("workers", workers, 1)
-    rows: list[dict[str, Any] | None] = [_kept_row(trial) for trial in trials]
+    rows = [_kept_row(trial) for trial in trials]
     missing = [i for i, row in enumerate(rows) if row is None]
+    durations = [trial.team.duration for trial in trials]
+    seconds = [0.0 if row is None else whole for whole, row in zip(durations, rows, strict=True)]
+
+    def reached(i: int, now: float) -> None:
+        seconds[i] = now
+        on_event(STAGE, round(sum(seconds)), round(sum(durations)))
+
+    def got_further(i: int, pace: Pace) -> None:
+        reached(i, pace.now)
+        if on_pace is not None:
+            on_pace(pace)
 
     def done(i: int, row: dict[str, Any]) -> None:
         rows[i] = row
+        reached(i, durations[i])
         if on_row is not None:
             on_row(row)
-        on_event("trials", sum(r is not None for r in rows), len(rows))
 
     for row in rows:
         if row is not None and on_row is not None:
             on_row(row)
-    on_event("trials", len(rows) - len(missing), len(rows))
+    on_event(STAGE, round(sum(seconds)), round(sum(durations)))
     if workers == 1:
         for i in missing:
-            done(i, _run_one(trials[i]))
+            done(i, _run_one(trials[i], functools.partial(got_further, i)))
     else:
-        context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            waiting = {pool.submit(_run_one, trials[i]): i for i in missing}
-            for future in concurrent.futures.as_completed(waiting):
-                done(waiting[future], future.result())
+        _run_several(trials, missing, workers, done, got_further)
     return [row for row in rows if row is not None]
 
 
@@ -160,9 +205,55 @@ def save_trajectories(mission: Mission, path: Path) -> None:
     write_npz(path, **paths)
 
 
-def _run_one(trial: Trial) -> dict[str, Any]:
+def _run_several(
+    trials: Sequence[Trial],
+    missing: Sequence[int],
+    workers: int,
+    done: Callable[[int, dict[str, Any]], None],
+    got_further: Callable[[int, Pace], None],
+) -> None:
+    """Run those that are missing, so many at once."""
+    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    waiting = iter(missing)
+    running: dict[concurrent.futures.Future[dict[str, Any]], int] = {}
+    with (
+        tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder,
+        concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool,
+    ):
+        paces = Paces(Path(folder) / "paces", len(trials))
+        while True:
+            # No more than there are workers: what the pool has been given cannot be taken back.
+            for i in itertools.islice(waiting, workers - len(running)):
+                running[pool.submit(_run_apart, trials[i], paces, i)] = i
+            if not running:
+                return
+            ended, _ = concurrent.futures.wait(
+                running, _GLANCE, return_when=concurrent.futures.FIRST_COMPLETED
+            )
+            for i, pace in paces.changes():
+                got_further(i, pace)
+            for future in ended:
+                done(running.pop(future), _row_in(future))
+
+
+def _row_in(future: concurrent.futures.Future[dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return future.result()
+    except concurrent.futures.process.BrokenProcessPool as error:
+        raise GmmTorchError(
+            "A process that flew a mission was ended from outside, perhaps for want of memory. Missions go "
+            "on from their last checkpoints with checkpoint.folder=RUN; runtime.workers=1 takes least memory."
+        ) from error
+
+
+def _run_apart(trial: Trial, paces: Paces, number: int) -> dict[str, Any]:
+    """Run a trial in a process of its own."""
+    return _run_one(trial, functools.partial(paces.note, number))
+
+
+def _run_one(trial: Trial, on_pace: OnPace) -> dict[str, Any]:
     torch.set_num_threads(1)
-    mission, row = run_mission(trial)
+    mission, row = run_mission(trial, on_sample=lambda mission: on_pace(pace_of(mission)))
     if trial.folder is not None:
         save_trajectories(mission, trial.folder / TRAJECTORIES)
         write_json(trial.folder / ROW, {"facts": trial.facts(), "row": row})

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.surroundings import Surroundings
-from gmmtorch.sharing.messages import MAX_BYTES, Message, quantized_poses
+from gmmtorch.sharing.messages import MAX_BYTES, Message, ViewsMessage, quantized_poses
 from gmmtorch.sharing.record_ids import first_key, robot_of
 from gmmtorch.sharing.view_set import ViewSet
 
@@ -19,6 +19,7 @@ Id = tuple[int, int]
 """(robot that found it, its number there), as of records: `gmmtorch.sharing.record_ids`."""
 
 _HARDLY = 0.2  # of a value
+_AHEAD = 1.0  # seconds that clocks of a team are apart where they are one
 
 
 class Candidates(NamedTuple):
@@ -59,7 +60,8 @@ class ViewLibrary:
         self._robot = robot
         self._size = check_whole("size", size, 1)
         self.spacing, self.turn = spacing, turn
-        self._checked: dict[Id, float] = {}  # when a value was last found here
+        # When a value was last found here; or heard, if it is of a clock that this one is far behind.
+        self._checked: dict[Id, float] = {}
         self._cached: tuple[int, Candidates] | None = None
 
     def __len__(self) -> int:
@@ -166,9 +168,20 @@ class ViewLibrary:
         """What is held here, for others to send what is missing: as `ViewSet.announcements`."""
         return self._set.announcements(max_bytes)
 
-    def receive(self, message: Message) -> bool:
-        """Merge what others say: as `ViewSet.receive`."""
-        return self._set.receive(message)
+    def receive(self, message: Message, now: float = math.inf) -> bool:
+        """Merge what others say, as `ViewSet.receive`; heard at `now` (s).
+
+        Stamps are of the clocks of others, which count from their own starts: those far ahead of `now` would
+        pass for fresh until this clock has come to them. What they say is as old as the hearing of it.
+        """
+        ids = message.ids.tolist() if isinstance(message, ViewsMessage) else []
+        before = {(robot, number): self._set.views.get(_key((robot, number))) for robot, number in ids}
+        is_taken = self._set.receive(message)
+        for name, old in before.items():
+            view = self._set.views.get(_key(name))
+            if view is not None and view != old and view.stamp > now + _AHEAD:
+                self._checked[name] = now
+        return is_taken
 
     # -- keeping ----------------------------------------------------------------------------------
 

@@ -57,7 +57,8 @@ def best_code(values: Ints) -> Coding:
     if not len(values):
         return Coding(Code.FIXED, 0, 0, 0.0)
     base, largest = int(values.min()), int(values.max())
-    if largest - base >> (MAX_WIDTH - 1) or abs(base) >> MAX_WIDTH:
+    extent = largest - base
+    if extent >> (MAX_WIDTH - 1) or (extent + abs(base)) >> MAX_WIDTH:
         raise InvalidArgumentError(f"Numbers from {base} to {largest} take more than {MAX_WIDTH} bits.")
     if base == largest:
         return Coding(Code.FIXED, 0, base, 0.0)
@@ -66,8 +67,14 @@ def best_code(values: Ints) -> Coding:
             code, int(parameter[0]), int(values[0]) if code is Code.DIFFERENCES else base, float(n_bits[0])
         )
         for code, (parameter, n_bits) in _codings(values[None]).items()
+        if code is not Code.DIFFERENCES or _way(values) < 2.0**MAX_WIDTH
     ]
     return min(codings, key=lambda coding: coding.n_bits)
+
+
+def _way(values: Ints) -> float:
+    """How far it is from zero to the first number, and on from each to the next: a reader adds them up."""
+    return float(np.abs(np.diff(values, prepend=0).astype(np.float64)).sum())
 
 
 def fewest_bits(rows: Ints) -> NDArray[np.float64]:
@@ -265,10 +272,10 @@ class BitReader:
             return _bounded(self.rice(n, parameter), base)
         if code != Code.DIFFERENCES:
             raise DataError(f"A column has code {code}, which is none: it is damaged.")
-        steps = unzigzag(self.rice(max(n - 1, 0), parameter))
-        if float(np.abs(steps.astype(np.float64)).sum()) + abs(base) >= 2.0**MAX_WIDTH:
+        steps = np.append(np.int64(base), unzigzag(self.rice(max(n - 1, 0), parameter)))
+        if float(np.abs(steps.astype(np.float64)).sum()) >= 2.0**MAX_WIDTH:
             raise DataError("A column's differences add up to too much: it is damaged.")
-        return np.concatenate([np.array([base], np.int64), steps]).cumsum()[:n]
+        return steps.cumsum()[:n]
 
     def rice_column(self, n: int) -> Ints:
         """So many numbers ≥ 0."""

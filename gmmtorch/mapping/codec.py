@@ -55,7 +55,7 @@ def encode(components: Components) -> bytes:
 
 
 def encode_quantized(values: Quantized) -> bytes:
-    """A batch of components that are whole numbers already."""
+    """A batch of components that are whole numbers already, as `quantize` made them: they are not checked."""
     dim, k = values.places.dim, len(values)
     writer = BitWriter()
     writer.number(dim)
@@ -283,7 +283,8 @@ def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear:
     k, dim = deviation.shape
     exponent = reader.number()
     least, extent = zip(*((reader.number(), reader.number()) for _ in range(dim)), strict=True)
-    reach = 2 * FARTHEST / 2.0**exponent if abs(exponent) <= LARGEST_SIDE else 0.0
+    # A box of cells may stick out of the world by one on each side.
+    reach = 2 * FARTHEST / 2.0**exponent + 2 if abs(exponent) <= LARGEST_SIDE else 0.0
     if max(map(abs, least + extent)) > reach or min(extent) < 1 or math.prod(extent) >> RASTER_BITS:
         raise DataError(f"Cells of side 2^{exponent} m, {extent} of them from {least} on: out of range.")
     number = _within(reader.column(k), "cells", 0, math.prod(extent) - 1)

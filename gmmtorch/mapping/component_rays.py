@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import safe_cholesky
+from gmmtorch.mapping.component_draws import normals
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence, in_cells, shares_near
+from gmmtorch.occupancy.cell_evidence import (
+    Box,
+    CellEvidence,
+    cast_evidence,
+    in_cells,
+    shares_near,
+    united,
+)
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.monte_carlo import RayBundle
 
 _EFFECTIVE_AREA = 4 * math.pi
 _THINNING = 4
-_RADII = 4096  # steps of the table of truncated radii
-_FARTHEST_DRAW = 11.0  # a radius, in deviations, beyond every draw: the quantiles end at 6.4 an axis
+_MOST_DRAWS = 1 << 19  # at a time: they take some 250 bytes each meanwhile
 
 
 def component_rays(
@@ -50,7 +57,8 @@ def component_rays(
     """
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
-    return _rays(components, seen, density, torch.ones_like(seen))[0]
+    number = _numbers(components, seen, density)
+    return _rays(components, seen, density, number, torch.ones_like(seen))[0]
 
 
 def component_evidence(
@@ -68,7 +76,8 @@ def component_evidence(
 ) -> CellEvidence:
     """Evidence of components in the cells of a box, by their rays: see `component_rays`.
 
-    Sightings whose rays cannot reach the box are left out before any is drawn, which changes nothing.
+    Sightings whose rays cannot reach the box are left out before any is drawn, which changes nothing. Of
+    very many some are drawn at a time, which bounds the memory that they take.
 
     shell: cells. A component knows its surface, as a grid of rays does not: within that distance of it
         a ray says nothing of free space. Without that, rays that come in flat call the very cells free
@@ -90,7 +99,37 @@ def component_evidence(
         & ~components.max_range[components.seen_by[seen]]
     )
     times = torch.where(ends_here, hits_per_ray, 1)
-    drawn, sighting, followed = _rays(components, seen, density, times)
+    number = _numbers(components, seen, density)
+    parts = [
+        _evidence(components, seen[some], box, density, number[some], times[some], shell, thinned)
+        for some in _portions(number * times)
+    ]
+    return parts[0] if len(parts) == 1 else united(parts)
+
+
+def _portions(draws: Tensor) -> Iterator[slice]:
+    """Sightings (C,) in a row of `_MOST_DRAWS` draws at most, or one by itself; of none an empty one."""
+    so_far, begin = torch.cumsum(draws, 0), 0
+    while begin < len(draws) or begin == 0:
+        room = int(so_far[begin] - draws[begin]) + _MOST_DRAWS if len(draws) else 0
+        end = max(begin + 1, int(torch.searchsorted(so_far, room, right=True)))
+        yield slice(begin, end)
+        begin = end
+
+
+def _evidence(
+    components: Components,
+    seen: Tensor,
+    box: Box,
+    density: _Density,
+    number: Tensor,
+    times: Tensor,
+    shell: float,
+    thinned: bool,
+) -> CellEvidence:
+    """`component_evidence` of sightings `seen` (C,), by `number` (C,) of rays and `times` (C,) the hits."""
+    resolution = density.resolution
+    drawn, sighting, followed = _rays(components, seen, density, number, times)
     rays, sighting = RayBundle(*(field[followed] for field in drawn)), sighting[followed]
     stops, weights = rays.ends, rays.weights * times[sighting]
     if shell > 0:
@@ -178,11 +217,20 @@ def _in_reach(
     return (first <= last) & (last >= 1) if ends_only else first <= last
 
 
+def _numbers(components: Components, seen: Tensor, density: _Density) -> Tensor:
+    """How many rays (C,) the density asks for of each of the sightings `seen` (C,)."""
+    by, whence = components.seen_by[seen], components.seen_from[seen]
+    toward = components.means[by].double() - components.origins[whence].double()
+    hidden = _hidden_area(toward, components.covariances[by].double()) / density.resolution**2
+    wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused where rays are drawn
+    return wanted.clamp(density.least, density.most).long()
+
+
 def _rays(
-    components: Components, seen: Tensor, density: _Density, times: Tensor
+    components: Components, seen: Tensor, density: _Density, once: Tensor, times: Tensor
 ) -> tuple[RayBundle, Tensor, Tensor]:
-    """Rays of the sightings `seen` (C,), `times` (C,) as many as the density asks for; which of the
-    sightings each ray (R,) is of; and which rays (F,) would be all of them once."""
+    """Rays of the sightings `seen` (C,), `times` (C,) the number `once` (C,) of each; which of the sightings
+    each ray (R,) is of; and which rays (F,) would be all of them once."""
     used, by = torch.unique(components.seen_by[seen], return_inverse=True)
     mean, covariance = components.means[used].double(), components.covariances[used].double()
     origin, count = (
@@ -190,15 +238,13 @@ def _rays(
         components.seen_count[seen].double(),
     )
     factor = safe_cholesky(covariance)
-    hidden = _hidden_area(mean[by] - origin, covariance[by]) / density.resolution**2
-    number = (density.rays_per_cell * hidden).ceil().clamp(density.least, density.most).long()
-    once, number = number, number * times
+    number = once * times
     sighting = torch.repeat_interleave(number)
     first = torch.cumsum(number, 0) - number
     draw = torch.arange(len(sighting), device=seen.device) - first[sighting]
     component = by[sighting]
-    longest = replace(density, most=density.most * int(times.max()) if len(times) else density.most)
-    normal = _normals(_shifts(components.ids[used]), component, draw, longest)
+    longest = density.most * (int(times.max()) if len(times) else 1)
+    normal = normals(components.ids[used], component, draw, longest, density.cutoff)
     # Row by row, by sums and products alone: a matrix product may round differently in other company.
     ends = []
     for row in range(3):
@@ -233,73 +279,3 @@ def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
     # Seen from its very mean a component has no direction: as large as it can look.
     determinant = torch.where(length > 0, along, a + b + c).clamp_min(0)
     return _EFFECTIVE_AREA * scale * determinant.sqrt()
-
-
-def _shifts(ids: Tensor) -> Tensor:
-    """Points (K, 3) of the unit cube, one for each id (K, 2), that look drawn at random."""
-    key = _scrambled(_scrambled(ids[:, 0]) ^ ids[:, 1])
-    words = torch.stack([_scrambled(key + axis) for axis in range(1, 4)], 1)
-    return ((words >> 11) & (2**53 - 1)).double() * 2.0**-53
-
-
-def _scrambled(word: Tensor) -> Tensor:
-    """Bijective hash of int64 words: the finalizer of SplitMix64 (Steele, Lea and Flood 2014)."""
-    word = word + _signed(0x9E3779B97F4A7C15)
-    word = (word ^ _shifted(word, 30)) * _signed(0xBF58476D1CE4E5B9)
-    word = (word ^ _shifted(word, 27)) * _signed(0x94D049BB133111EB)
-    return word ^ _shifted(word, 31)
-
-
-def _shifted(word: Tensor, bits: int) -> Tensor:
-    """Logical shift to the right: torch's keeps the sign."""
-    return (word >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def _signed(word: int) -> int:
-    return word - (1 << 64) if word >= 1 << 63 else word
-
-
-def _normals(shifts: Tensor, component: Tensor, draw: Tensor, density: _Density) -> list[Tensor]:
-    """Coordinates, (R,) each, of draws from a standard normal cut off at a radius: draw (R,) of each
-    component (R,), whose rotations are shifts (K, 3)."""
-    points = _sobol(density.most).to(shifts.device)
-    normal, square = [], torch.zeros((), dtype=torch.float64, device=shifts.device)
-    for axis in range(3):
-        cube = points[axis][draw] + shifts[:, axis][component]
-        cube = torch.where(cube >= 1, cube - 1, cube)
-        normal.append(torch.special.ndtri(cube.clamp(2.0**-33, 1 - 2.0**-33)))
-        square = square + normal[-1] * normal[-1]
-    table = _shrinkage(density.cutoff).to(shifts.device)
-    position = square.sqrt() * (_RADII / _FARTHEST_DRAW)
-    step = position.long()
-    below = table[step]
-    shrunk = below + (position - step) * (table[step + 1] - below)
-    return [coordinate * shrunk for coordinate in normal]
-
-
-@functools.cache
-def _sobol(n: int) -> Tensor:
-    """The first n points of the Sobol sequence, (3, n) float64."""
-    points: Tensor = torch.quasirandom.SobolEngine(3).draw(n, dtype=torch.float64)
-    return points.T.contiguous()
-
-
-@functools.cache
-def _shrinkage(cutoff: float) -> Tensor:
-    """By what a normal draw of radius r, r in even steps from 0, is to be multiplied (_RADII + 2,) so
-    that its radius is that of a normal cut off at `cutoff`: F⁻¹(F(r) F(cutoff))/r, F that of χ₃."""
-    radius = torch.arange(_RADII + 2, dtype=torch.float64) * (_FARTHEST_DRAW / _RADII)
-    target = _chi3(radius) * _chi3(torch.tensor(cutoff, dtype=torch.float64))
-    low, high = torch.zeros_like(radius), radius.clamp_max(cutoff)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        above = _chi3(middle) > target
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    shrunk = low / radius.clamp_min(1e-9)
-    shrunk[:8] = shrunk[8]  # F loses its digits near 0, where the factor is level
-    return shrunk
-
-
-def _chi3(radius: Tensor) -> Tensor:
-    """Share of a standard normal in three dimensions within a radius."""
-    return torch.erf(radius * math.sqrt(0.5)) - math.sqrt(2 / math.pi) * radius * torch.exp(-0.5 * radius**2)

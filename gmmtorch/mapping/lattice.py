@@ -45,6 +45,8 @@ LEAST_DEVIATION = -20 * PER_OCTAVE
 LARGEST_RATIO = 20 * PER_OCTAVE
 """Steps: deviations less than 2⁻²⁰ of the component's largest become that, as double precision tells
 smaller ones from none no more."""
+LARGEST_VARIANCE = 4.0 ** (LARGEST_DEVIATION / PER_OCTAVE)
+"""m², along each axis of the world."""
 FARTHEST = 2.0**27
 """Metres from the world's origin to a mean on each axis, at most."""
 STEEPEST = 2
@@ -84,13 +86,15 @@ class Lattice:
         return Lattice(self.axis_order[rows], self.deviation[rows], self.shear[rows], self.mean[rows])
 
     def is_valid(self) -> Tensor:
-        """Which (K,) are within bounds: deviations that do not rise, and shears that are not too steep."""
+        """Which (K,) are within bounds: deviations that do not rise, shears that are not too steep, and no
+        mean or variance along the world's axes that is too large."""
         falling = (self.deviation[:, 1:] <= self.deviation[:, :-1]).all(1)
         ratio = self.deviation[:, 0] - self.deviation[:, -1] <= LARGEST_RATIO
         inside = (self.deviation[:, 0] <= LARGEST_DEVIATION) & (self.deviation[:, -1] >= LEAST_DEVIATION)
         gentle = (scaled(self.shear, shear_exponents(self.deviation)).abs() <= STEEPEST).all(1)
         near = (scaled(self.mean, self.mean_exponents()).abs() <= FARTHEST).all(1)
-        return falling & ratio & inside & gentle & near
+        small = (self.restored()[1].diagonal(dim1=1, dim2=2) <= LARGEST_VARIANCE).all(1)
+        return falling & ratio & inside & gentle & near & small
 
     def restored(self) -> tuple[Tensor, Tensor]:
         """Means (K, D) and covariances (K, D, D)."""
@@ -117,7 +121,7 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     """Where means (K, D) and covariances (K, D, D), float64 on the CPU, go on the lattice.
 
     Covariances that are not quite positive definite become so. Raises `InvalidArgumentError` beyond
-    `FARTHEST` and `LARGEST_DEVIATION`.
+    `FARTHEST` and `LARGEST_DEVIATION`, or where rounding leads there: what is returned `is_valid`.
     """
     _check(means, covariances)
     exact, rows = _exact(means, covariances)
@@ -128,7 +132,7 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     # Of several axis orders that restore the same component the first is taken, whatever order the
     # component came in with: so the bytes of what was rounded before are the same again.
     earlier = _exact(*rounded.restored(), before=order)
-    return _replaced(_replaced(rounded, *earlier), exact, rows)
+    return _within_bounds(_replaced(_replaced(rounded, *earlier), exact, rows), means, covariances)
 
 
 def shear_exponents(deviation: Tensor) -> Tensor:
@@ -153,8 +157,7 @@ def floor_divide(values: Tensor, divisor: int) -> Tensor:
 
 
 def _check(means: Tensor, covariances: Tensor) -> None:
-    largest = 4.0 ** (LARGEST_DEVIATION / PER_OCTAVE)
-    for name, value, limit in (("means", means, FARTHEST), ("covariances", covariances, largest)):
+    for name, value, limit in (("means", means, FARTHEST), ("covariances", covariances, LARGEST_VARIANCE)):
         bad = ~(value.abs() <= limit).flatten(1).all(1)  # NaN is bad, too
         if bool(bad.any()):
             first = int(bad.nonzero()[0])
@@ -162,6 +165,19 @@ def _check(means: Tensor, covariances: Tensor) -> None:
                 f"{name}[{first}] is {value[first].tolist()}; entries up to {limit:g} can be stored. "
                 "Is it in metres?"
             )
+
+
+def _within_bounds(places: Lattice, means: Tensor, covariances: Tensor) -> Lattice:
+    """The places, if they are within bounds: what they stand for is, but perhaps only just."""
+    bad = ~places.is_valid()
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"means[{first}]={means[first].tolist()} with covariances[{first}]="
+            f"{covariances[first].tolist()} rounds to a place beyond {FARTHEST:g} m, or a variance beyond "
+            f"{LARGEST_VARIANCE:g} m². Is it in metres?"
+        )
+    return places
 
 
 def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> tuple[Lattice, Tensor]:
@@ -196,6 +212,7 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
     variances, shears = _factors(covariances[_pairs(axes)])
     steps = (torch.log2(variances) * (PER_OCTAVE / 2)).round().long()
     steps = torch.maximum(steps, steps[:, :1] - LARGEST_RATIO).clamp_min(LEAST_DEVIATION)
+    steps = steps.cummin(1).values  # of two that are equal the second may be the larger by a rounding error
     blank = Lattice(axis_order, steps, steps.new_zeros(len(mean), shears.shape[1]), torch.zeros_like(steps))
 
     e = shear_exponents(steps)

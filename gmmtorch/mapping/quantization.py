@@ -24,6 +24,7 @@ LEAST_SHARE = 15
 """Steps: shares below 2^(−15/2) of the component's largest, 1/181, become that."""
 LEAST_COUNT, LARGEST_COUNT = -10 * PER_OCTAVE, 40 * PER_OCTAVE
 """Steps: 2⁻¹⁰ and 2⁴⁰ points. Less than half the least is none; more than the largest is refused."""
+MOST_POINTS = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
 NO_COUNT = LEAST_COUNT - 1
 """Stands for no points."""
 COUNT_ERROR = lattice.DEVIATION_ERROR
@@ -127,12 +128,12 @@ def quantize(components: Components) -> Quantized:
 
 
 def _count_steps(support: Tensor) -> Tensor:
-    largest = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
-    bad = ~((support >= 0) & (support <= largest))
+    bad = ~((support >= 0) & (support <= MOST_POINTS))
     if bool(bad.any()):
         first = int(bad.nonzero()[0])
         raise InvalidArgumentError(
-            f"support[{first}]={float(support[first])} cannot be stored; it must be from 0 to {largest:g}."
+            f"support[{first}]={float(support[first])} cannot be stored; it must be from 0 to "
+            f"{MOST_POINTS:g}."
         )
     least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
     steps = (torch.log2(support.clamp_min(least)) * PER_OCTAVE).round().long()

@@ -22,7 +22,6 @@ _ALIKE = 0.2  # squared Hellinger distance up to which blurred components are on
 _BEST_KEPT = 4  # poses that go on from one level to the next,
 _LEAST_SHARE = 0.7  # of the best one's score at least
 _SECOND_CHANCE = 2  # levels below the first: a single initial pose is tried there once more
-_COARSE_STEPS = 15  # of all levels but the last
 _COARSELY = 0.05  # blurs: the tolerance of all levels but the last
 _THINNEST = 1e-6  # blur, in radii: covariances without any thickness can be inverted, too
 _LEAST_OVERLAP = 0.05
@@ -123,8 +122,7 @@ def register(
         last = number == len(blurs) - 1
         ascent = Ascent(_level(f, blur), _level(g, blur), radius)
         accuracy = tolerance if last else max(tolerance, _COARSELY * blur)
-        n_steps = max_iterations if last else min(max_iterations, _COARSE_STEPS)
-        climbed, found, converged = ascent.run(climbed, n_steps, accuracy)
+        climbed, found, converged = ascent.run(climbed, max_iterations, accuracy)
         n_evaluated += ascent.n_evaluated
         best = _promising(climbed, found.log_score, radius, 0.5 * ascent.thickness)
         climbed, found, converged = climbed.at(best), found.at(best), converged[best]

@@ -48,7 +48,7 @@ def encode_thesis(components: Components) -> bytes:
     """
     c = components
     for name, value in (("means", c.means), ("origins", c.origins)):
-        if value.numel() and not float(value.abs().max()) < FARTHEST:
+        if value.numel() and not float(value.abs().max()) <= FARTHEST:
             raise InvalidArgumentError(
                 f"{name} reach {float(value.abs().max()):g} m from the origin, where float32 is coarser "
                 "than a millimetre; move the map nearer to the origin, or use the codec."

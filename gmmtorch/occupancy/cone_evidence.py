@@ -17,7 +17,7 @@ from gmmtorch.occupancy.silhouette import facing, image, meets_disc, outline
 from gmmtorch.occupancy.whitened import length, outside_cone
 
 CHUNK_PAIRS = 1 << 13
-"""Pairs of a box and a cone worked on at once: some 10 KB each."""
+"""Pairs of a box and a cone worked on at once: some 10 kB each."""
 
 
 def cone_evidence(

@@ -15,16 +15,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 TOLERANCE = 1e-4
 """Error that a rule may make on a panel, as a share of the integrand's peak there."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,15 +16,15 @@ from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
     UNKNOWN,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     log_axis,
     marker,
     new_figure,
 )
-
-Rows = Sequence[Mapping[str, Any]]
 
 _LABELS = {
     "point": "point form",
@@ -157,7 +157,7 @@ def _sweep_figure(rows: Rows, field: str, title: str) -> Figure:
             axes.set_xticks([1e-9, 1e-6, 1e-3, 1], ["≤ 1e-9", "1e-6", "1e-3", "1"])
             axes.set_yticks(places, [label(r["method"], dim) for r in here] if axes is line[0] else [])
             axes.set_ylim(-0.6, len(here) - 0.4)
-            axes.grid(axis="x", color="#e4e4e4", linewidth=0.8)
+            draw_grid(axes, "x")
     for axes in grid[-1]:
         axes.set_xlabel("absolute error", fontsize=LABEL_SIZE)
     handles, texts = grid[0, 0].get_legend_handles_labels()
@@ -201,7 +201,7 @@ def _curve_figure(rows: Rows, field: str, title: str) -> Figure:
             log_axis(axes, "y", [row[name] for row in rows])
             log_axis(axes, "x", [row["seconds"] for row in here])
             axes.tick_params(labelbottom=True, labelleft=True)
-            axes.grid(color="#e4e4e4", linewidth=0.8)
+            draw_grid(axes)
         grid[1, column].set_xlabel("time  [s]", fontsize=LABEL_SIZE)
     handles = {
         text: h for axes in grid.flat for h, text in zip(*axes.get_legend_handles_labels(), strict=True)

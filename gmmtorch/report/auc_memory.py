@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
+from gmmtorch.report.labels import Label, around, place_labels
+from gmmtorch.report.quantities import byte_text
 from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -22,7 +23,7 @@ from gmmtorch.report.style import (
 )
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+def figures(rows: Rows) -> dict[str, Figure]:
     """`auc_memory`: one panel a resolution, one line a method, a point for each size it was given.
 
     Args:
@@ -32,6 +33,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     methods = list(dict.fromkeys(str(row["method"]) for row in rows))
     figure = new_figure(1.2 + 6.2 * len(resolutions), 5.2)
     grid = figure.subplots(1, len(resolutions), squeeze=False, sharey=True)
+    labels: list[Label] = []
     for axes, resolution in zip(grid[0], resolutions, strict=True):
         for index, method in enumerate(methods):
             here = [r for r in rows if r["method"] == method and float(r["resolution"]) == resolution]
@@ -52,33 +54,22 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
                 elinewidth=1,
                 label=label_of(method),
             )
-            for row in here:
-                if row["size"] is not None:
-                    axes.annotate(
-                        f"{row['size']:,}",
-                        (row["nbytes"], row["auc"]),
-                        xytext=(4, -11),
-                        textcoords="offset points",
-                        fontsize=TICK_SIZE - 2,
-                        color=colour(index),
-                    )
+            look = {"fontsize": TICK_SIZE - 1, "color": colour(index)}
+            labels += [
+                Label(axes, f"{row['size']:,}", around(row["nbytes"], row["auc"]), look)
+                for row in here
+                if row["size"] is not None
+            ]
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _bytes(value)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
         dress(axes, f"cells of {metres(resolution)}", "bytes of the map", "")
-        axes.grid(color="#e4e4e4", linewidth=0.8)
+        draw_grid(axes)
     grid[0][0].set_ylabel("area under the ROC curve", fontsize=LABEL_SIZE)
     lines, names = grid[0][0].get_legend_handles_labels()
     figure.legend(
         lines, names, loc="outside lower center", ncols=min(4, len(names)), frameon=False, fontsize=LABEL_SIZE
     )
     figure_title(figure, f"AUC against the size of the map: {rows[0]['dataset']}")
+    place_labels(figure, labels)
     return {"auc_memory": figure}
-
-
-def _bytes(value: float) -> str:
-    """1 KB is 1000 bytes."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("KB", 1e3)):
-        if value >= size:
-            return f"{value / size:g} {unit}"
-    return f"{value:g} B"

@@ -16,6 +16,7 @@ from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -72,11 +73,11 @@ def reliability_figure(
         _draw_shares(lower, curve, index)
     dress(upper, "", "", "share that is occupied")
     upper.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    upper.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(upper)
     dress(lower, "", "probability θ given to the point", "share of points")
     lower.set_ylim(bottom=0)
     lower.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
-    lower.grid(axis="y", color="#e4e4e4", linewidth=0.8)
+    draw_grid(lower, "y")
     figure.legend(
         *upper.get_legend_handles_labels(),
         loc="outside lower center",

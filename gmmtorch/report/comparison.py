@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gmmtorch.report.style import (
     LABEL_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -18,8 +17,6 @@ from gmmtorch.report.style import (
     marker,
     new_figure,
 )
-
-Rows = Sequence[Mapping[str, Any]]
 
 
 def comparison_figure(rows: Rows, title: str | None = None) -> Figure:
@@ -67,4 +64,4 @@ def _draw(axes: Axes, rows: Rows, field: str, heading: str, unit: str) -> None:
     dress(axes, heading, "seconds", unit)
     log_axis(axes, "x", [row["seconds"] for row in rows])
     axes.margins(0.12)
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)

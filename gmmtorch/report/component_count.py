@@ -5,8 +5,20 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gmmtorch.report.panels import Panel, Rows, subject
-from gmmtorch.report.style import LABEL_SIZE, colour, dress, figure_title, log_axis, marker, new_figure
+from gmmtorch.report.labels import Label, around, place_labels
+from gmmtorch.report.panels import Panel, subject
+from gmmtorch.report.style import (
+    LABEL_SIZE,
+    TICK_SIZE,
+    Rows,
+    colour,
+    draw_grid,
+    dress,
+    figure_title,
+    log_axis,
+    marker,
+    new_figure,
+)
 
 _FITS = (
     Panel("held_out_psnr2_db", "PSNR2 of points held out", "dB"),
@@ -38,34 +50,40 @@ def figures(rows: Rows) -> dict[str, Figure]:
     grid = figure.subplots(2, 2)
     fits = [row for row in rows if not str(row["rule"]).startswith(_MAP)]
     maps = [row for row in rows if str(row["rule"]).startswith(_MAP)]
+    labels: list[Label] = []
     for axes, panel in zip(grid.flat, _FITS, strict=False):
-        _draw(axes, fits, panel)
+        labels += _draw(axes, fits, panel)
     _show_best(grid.flat[1], fits, "held_out_log_likelihood", _SHOWN_NATS)
     if maps:
-        _draw(grid.flat[3], [{**row, "rule": str(row["rule"]).removeprefix(_MAP)} for row in maps], _AUC)
+        named = [{**row, "rule": str(row["rule"]).removeprefix(_MAP)} for row in maps]
+        labels += _draw(grid.flat[3], named, _AUC)
     grid.flat[3].set_visible(bool(maps))
-    lines, labels = grid.flat[0].get_legend_handles_labels()
+    lines, names = grid.flat[0].get_legend_handles_labels()
     if lines:
-        figure.legend(lines, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=LABEL_SIZE)
+        figure.legend(lines, names, loc="outside lower center", ncols=5, frameon=False, fontsize=LABEL_SIZE)
     figure_title(figure, f"How many components: {subject(fits)}")
+    place_labels(figure, labels)
     return {"component_count": figure}
 
 
-def _draw(axes: Axes, rows: Rows, panel: Panel) -> None:
+def _draw(axes: Axes, rows: Rows, panel: Panel) -> list[Label]:
+    """A panel, and the labels that it is to have."""
+    labels: list[Label] = []
     measured = [row for row in rows if row[panel.field] is not None]
     for index, name in enumerate(_NAMES):
         own = sorted((row for row in measured if row["rule"] == name), key=lambda row: row["component_bytes"])
         if own:
-            _draw_rule(axes, own, panel.field, name, index)
+            labels += _draw_rule(axes, own, panel.field, name, index)
     dress(axes, panel.title, "bytes of the components, four a number", panel.unit)
     log_axis(axes, "x", [row["component_bytes"] for row in measured])
     if panel.log:
         log_axis(axes, "y", [row[panel.field] for row in measured])
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)
+    return labels
 
 
-def _draw_rule(axes: Axes, rows: Rows, field: str, name: str, index: int) -> None:
-    """A line with a dot for each number; for a rule marks, and beside each what the rule was told."""
+def _draw_rule(axes: Axes, rows: Rows, field: str, name: str, index: int) -> list[Label]:
+    """A line with a dot for each number; for a rule marks, and a label of each: what the rule was told."""
     is_curve = name == "fixed"
     tint = "#333333" if is_curve else colour(index - 1)
     axes.plot(
@@ -80,18 +98,10 @@ def _draw_rule(axes: Axes, rows: Rows, field: str, name: str, index: int) -> Non
         zorder=2 if is_curve else 3,
     )
     if is_curve or name == "bic":
-        return
-    for row in rows:
-        axes.annotate(
-            f"{row['setting']:g}",
-            (row["component_bytes"], row[field]),
-            xytext=(5, -11),
-            textcoords="offset points",
-            fontsize=8.5,
-            color=tint,
-            annotation_clip=True,
-            zorder=5,
-        )
+        return []
+    look = {"fontsize": TICK_SIZE, "color": tint, "zorder": 5}
+    spots = [around(row["component_bytes"], row[field]) for row in rows]
+    return [Label(axes, f"{row['setting']:g}", spot, look) for row, spot in zip(rows, spots, strict=True)]
 
 
 def _show_best(axes: Axes, rows: Rows, field: str, depth: float) -> None:

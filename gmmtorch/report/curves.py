@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from gmmtorch.report.style import (
     LABEL_SIZE,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -44,7 +45,7 @@ def roc_figure(
         )
     dress(axes, "", "false positive rate (free called occupied)", "true positive rate (occupied found)")
     axes.set(xlim=(-0.01, 1.01), ylim=(-0.01, 1.01), aspect="equal")
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)
     axes.legend(loc="lower right", fontsize=LABEL_SIZE - 1, frameon=True, framealpha=0.95, edgecolor="none")
     figure_title(figure, title)
     return figure
@@ -66,7 +67,7 @@ def convergence_figure(
         axes.plot(steps[-1], values[-1], "o", color=colour(index), markersize=6)
     dress(axes, "", "iteration", "mean log-likelihood per point [nats]")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)
     if axes.lines:
         figure.legend(loc="outside lower center", ncols=2, fontsize=LABEL_SIZE, frameon=False)
     figure_title(figure, title)

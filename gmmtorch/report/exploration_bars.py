@@ -16,19 +16,19 @@ from matplotlib.ticker import FuncFormatter
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import Interval, mean_band, paired_interval
 from gmmtorch.report.exploration_style import (
-    GRID,
-    Rows,
     about,
     by_framework,
-    byte_text,
     framework_colour,
     framework_name,
     seeds_note,
 )
+from gmmtorch.report.quantities import byte_text
 from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -82,8 +82,7 @@ def summary_bars(rows: Rows, title: str | None = None) -> Figure:
         if pairs:
             _draw_differences(column[1], groups, pairs, measure)
     for axes in grid.flat:
-        axes.grid(axis="y", color=GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
+        draw_grid(axes, "y")
     names = ", ".join(framework_name(name) for name in groups)
     figure_title(figure, title or f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
     return figure
@@ -151,8 +150,7 @@ def profile_figure(
     axes.invert_yaxis()
     axes.set_xlim(0, 1.3 * longest)
     dress(axes, "", "wall time [ms a simulated second]", "")
-    axes.grid(axis="x", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
+    draw_grid(axes, "x")
     for name in names:
         axes.barh(0, 0, color=hues[name], label=label_of(name))
     figure.legend(loc="outside lower center", ncols=min(len(names), 7), frameon=False, fontsize=LABEL_SIZE)

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.exploration.variants import differing
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.board import Board
-from gmmtorch.report.style import as_array, colour
+from gmmtorch.report.style import Rows, as_array, colour
 from gmmtorch.scan import ArrayLike
 
 if TYPE_CHECKING:
@@ -31,11 +31,12 @@ _SERIES = (
 
 
 class MissionBoard:
-    """Numbers of a mission as it runs, by simulated time.
+    """A mission as it runs, by simulated time.
 
         with Board("outputs/run/tensorboard") as board:
             live = MissionBoard(board)
             live.step(12.0, {"entropy_bits": 1.2e6, "bytes_sent": 48_000})
+            live.scene(12.0, mixture, trajectories)
 
     A mission that resumes from a checkpoint goes back in time; TensorBoard then forgets what it had
     been told of later times.
@@ -52,13 +53,24 @@ class MissionBoard:
         """Write the finite numbers of `scalars`; the step is the whole simulated second (s)."""
         self.board.scalars(scalars, self.prefix, step=int(time))
 
+    def scene(self, time: float, components: Components | None, trajectories: Sequence[ArrayLike]) -> None:
+        """The mixture and the paths so far, at a simulated time (s), in 3D.
+
+        Args:
+            components: shown as ellipsoids; beams without return are left out. None: there is no mixture.
+            trajectories: of each robot, poses (T, ≥ 3), world metres, shown as a cloud in their colours.
+        """
+        if components is not None:
+            surface = ~components.max_range
+            means, covariances = components.means[surface], components.covariances[surface]
+            self.board.ellipsoids("mixture", means, covariances, step=int(time))
+        self.board.cloud("paths", *_path_cloud(trajectories), step=int(time))
+
 
 def write_exploration_board(
     board: Board,
-    rows: Sequence[Mapping[str, Any]],
+    rows: Rows,
     figures: Mapping[str, Figure],
-    components: Components | None = None,
-    trajectories: Sequence[ArrayLike] = (),
 ) -> None:
     """Trials and their pictures into one TensorBoard run.
 
@@ -70,8 +82,6 @@ def write_exploration_board(
         board: the run; who opened it closes it.
         rows: explore rows of `results.json`.
         figures: by name.
-        components: the final mixture, shown as ellipsoids; beams without return are left out.
-        trajectories: of each robot, poses (T, ≥ 3), world metres, shown as a cloud in their colours.
     """
     fields = differing(rows, without=["framework"])
     for row in rows:
@@ -80,10 +90,6 @@ def write_exploration_board(
         board.scalars(row, tag, step=int(row["times"][-1]))
     for name, figure in figures.items():
         board.figure(f"figures/{name}", figure)
-    if components is not None:
-        surface = ~components.max_range
-        board.ellipsoids("mixture", components.means[surface], components.covariances[surface])
-    board.cloud("paths", *_path_cloud(trajectories))
 
 
 def _variant(row: Mapping[str, Any], fields: Sequence[str]) -> str:
@@ -107,7 +113,7 @@ def _write_series(board: Board, row: Mapping[str, Any], tag: str) -> None:
         now = {name: row[name][i] for name in _SERIES if row.get(name)}
         now["entropy_left"] = row["entropy_bits"][i] / observable
         robots = row.get("entropy_bits_per_robot") or []
-        now |= {f"robot_{n}/entropy_bits": bits[i] for n, bits in enumerate(robots, 1)}
+        now |= {f"robot_{n}/entropy_bits": bits[i] for n, bits in enumerate(robots)}
         board.scalars(now, tag, step=int(time))
 
 

@@ -15,26 +15,29 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import time_to_share
 from gmmtorch.report.exploration_style import (
-    GRID,
+    TIME,
     Curves,
-    Rows,
     about,
     by_framework,
-    byte_text,
     curves_of,
     draw_curves,
     framework_colour,
     framework_name,
     label_ends,
-    ratio_text,
+    observable,
+    percent_left,
     seeds_note,
 )
 from gmmtorch.report.exploration_variants import by_variant
+from gmmtorch.report.labels import Label, along, place_labels
+from gmmtorch.report.quantities import byte_text, ratio_text
 from gmmtorch.report.style import (
     LABEL_SIZE,
     PALETTE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     line_style,
@@ -42,7 +45,6 @@ from gmmtorch.report.style import (
 )
 
 _MILESTONES = (("t50", 0.5, "o"), ("t90", 0.9, "s"))
-_TIME = "simulated time [s]"
 _LEFT = "entropy left [% of the observable]"
 
 
@@ -64,11 +66,11 @@ def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
     figure = new_figure(9.6, 5.4)
     axes = figure.subplots()
     whose = "E1's" if "grid_shared" in groups else "the"
-    levels = _draw_levels(axes, _reference(list(groups.get("grid_shared", rows))), f"{whose} final reduction")
+    levels = _draw_levels(axes, _reference(list(groups.get("grid_shared", rows))))
     ends = []
     for framework, trials in groups.items():
         hue = framework_colour(framework)
-        curves = curves_of(trials, [_percent_left(row) for row in trials])
+        curves = curves_of(trials, [percent_left(row) for row in trials])
         draw_curves(axes, curves, color=hue)
         if len(trials) == 1:
             _draw_robots(axes, trials[0], hue)
@@ -81,6 +83,7 @@ def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
         handles.append(Line2D([], [], color="#555555", linewidth=0.8, label="each robot's own map"))
     axes.legend(handles=handles, loc="upper right", fontsize=LABEL_SIZE - 1, frameon=False)
     figure_title(figure, title or f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}")
+    place_labels(figure, _level_labels(axes, levels, f"{whose} final reduction"))
     return figure
 
 
@@ -145,18 +148,19 @@ def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
     reference = max(_reference(trials) or 0.0 for trials in variants.values())
     figure = new_figure(9.6, 5.4)
     axes = figure.subplots()
-    levels = _draw_levels(axes, reference, "the best one's reduction")
+    levels = _draw_levels(axes, reference)
     ends = []
     for index, (name, trials) in enumerate(variants.items()):
         trials = [_timed(row, reference) for row in trials]
         look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index)}
-        curves = curves_of(trials, [_percent_left(row) for row in trials])
+        curves = curves_of(trials, [percent_left(row) for row in trials])
         draw_curves(axes, curves, **look)
         notes = [_mark(axes, trials, curves, levels, *milestone, colour(index)) for milestone in _MILESTONES]
         ends.append((float(curves.band.mean[-1]), f"{name}\n{', '.join(notes)}", colour(index)))
     _finish(axes, ends, rows)
     axes.legend(handles=_milestone_handles(), loc="upper right", fontsize=LABEL_SIZE - 1, frameon=False)
     figure_title(figure, title or f"Planners: {about(rows)}\n{seeds_note(rows)}")
+    place_labels(figure, _level_labels(axes, levels, "the best"))
     return figure
 
 
@@ -169,20 +173,9 @@ _BYTE_LINES = (
 )
 
 
-def _percent_left(row: Mapping[str, Any]) -> np.ndarray:
-    return 100 * np.asarray(row["entropy_bits"], dtype=np.float64) / _observable(row)
-
-
-def _observable(row: Mapping[str, Any]) -> float:
-    bits = float(row["observable_bits"])
-    if not bits > 0:
-        raise InvalidArgumentError(f"observable_bits={bits} must be above zero; the world shows nothing.")
-    return bits
-
-
 def _timed(row: Mapping[str, Any], reference: float) -> dict[str, Any]:
     """The row with its times to shares of a common reference, a share of the observable."""
-    reduction = 1 - _percent_left(row) / 100
+    reduction = 1 - percent_left(row) / 100
     times = {name: time_to_share(row["times"], reduction, reference, share) for name, share, _ in _MILESTONES}
     return {**row, **times}
 
@@ -196,39 +189,35 @@ def _milestone_handles() -> list[Line2D]:
 
 def _reference(rows: Rows) -> float | None:
     """The reduction that milestones are shares of, as a share of the observable; None if rows disagree."""
-    said = {float(row["reference_bits"]) / _observable(row) for row in rows if row.get("reference_bits")}
+    said = {float(row["reference_bits"]) / observable(row) for row in rows if row.get("reference_bits")}
     if said:
         return said.pop() if len(said) == 1 else None
-    return float(np.mean([row["entropy_reduction_bits"] / _observable(row) for row in rows]))
+    return float(np.mean([row["entropy_reduction_bits"] / observable(row) for row in rows]))
 
 
-def _draw_levels(axes: Axes, reference: float | None, of: str) -> dict[str, float]:
+def _draw_levels(axes: Axes, reference: float | None) -> dict[str, float]:
     """The entropy left (%) at each milestone, drawn and by name."""
     if reference is None:
         return {}
     levels = {name: 100 * (1 - share * reference) for name, share, _ in _MILESTONES}
-    for name, share, _ in _MILESTONES:
-        axes.axhline(levels[name], color="#777777", linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-        # Where no curve is: the upper level to the right, the lower one to the left.
-        side, shift, anchor = (1, -4, "right") if share <= 0.5 else (0, 4, "left")
-        axes.annotate(
-            f"{100 * share:.0f} % of {of}",
-            (side, levels[name]),
-            xytext=(shift, 3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha=anchor,
-            fontsize=TICK_SIZE - 1,
-            color="#555555",
-            path_effects=[Stroke(linewidth=3, foreground="white"), Normal()],
-        )
+    for level in levels.values():
+        axes.axhline(level, color="#777777", linewidth=1, linestyle=(0, (1, 2)), zorder=1)
     return levels
+
+
+def _level_labels(axes: Axes, levels: Mapping[str, float], of: str) -> list[Label]:
+    halo = [Stroke(linewidth=3, foreground="white"), Normal()]
+    look = {"fontsize": TICK_SIZE, "color": "#555555", "path_effects": halo}
+    return [
+        Label(axes, f"{100 * share:.0f} % of {of}", along(levels[name]), look)
+        for name, share, _ in _MILESTONES
+        if name in levels
+    ]
 
 
 def _draw_robots(axes: Axes, row: Mapping[str, Any], hue: str) -> None:
     for bits in row.get("entropy_bits_per_robot") or []:
-        left = 100 * np.asarray(bits, dtype=np.float64) / _observable(row)
-        axes.plot(row["times"], left, color=hue, linewidth=0.8, alpha=0.7, zorder=2)
+        axes.plot(row["times"], percent_left(row, bits), color=hue, linewidth=0.8, alpha=0.7, zorder=2)
 
 
 def _mark(
@@ -254,12 +243,11 @@ def _mark(
 def _finish(axes: Axes, ends: Sequence[tuple[float, str, str]], rows: Rows, percent: bool = True) -> None:
     """Labels, limits, grid, and the names beside the lines."""
     last = max(float(row["times"][-1]) for row in rows)
-    dress(axes, "", _TIME, _LEFT if percent else "bytes, cumulative")
+    dress(axes, "", TIME, _LEFT if percent else "bytes, cumulative")
     axes.set_xlim(0, last or 1.0)
     if percent:
         axes.set_ylim(0, max(100.0, axes.dataLim.y1) * 1.015)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
+    draw_grid(axes)
     label_ends(axes, ends, LABEL_SIZE - 0.5)
 
 

@@ -13,21 +13,29 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import Band
 from gmmtorch.report.exploration_style import (
-    GRID,
+    TIME,
     Curves,
-    Rows,
     about,
-    byte_text,
     curves_of,
     draw_curves,
     label_ends,
-    ratio_text,
+    percent_left,
     seeds_note,
 )
 from gmmtorch.report.exploration_variants import by_variant
-from gmmtorch.report.style import LABEL_SIZE, TICK_SIZE, colour, dress, figure_title, line_style, new_figure
+from gmmtorch.report.quantities import byte_text, ratio_text
+from gmmtorch.report.style import (
+    LABEL_SIZE,
+    TICK_SIZE,
+    Rows,
+    colour,
+    draw_grid,
+    dress,
+    figure_title,
+    line_style,
+    new_figure,
+)
 
-_TIME = "simulated time [s]"
 _LEAST = 0.1  # % of the records, below which the axis of those missing is linear
 _SHARES = (0.0, 0.1, 1.0, 10.0, 100.0)
 _SERIES = ("entropy_bits", "wire_bytes_over_time", "missing_share")
@@ -66,7 +74,7 @@ def loss_figure(rows: Rows, title: str | None = None) -> Figure:
     for index, (name, trials) in enumerate(by_variant(rows, otherwise="loss").items()):
         look: dict[str, Any] = {"color": colour(index), "linestyle": line_style(index)}
         drawn = (
-            (left, curves_of(trials, [_percent_left(row) for row in trials]), [_t90_text(trials)]),
+            (left, curves_of(trials, [percent_left(row) for row in trials]), [_t90_text(trials)]),
             (sent, curves_of(trials, [row["wire_bytes_over_time"] for row in trials]), [_wire_text(trials)]),
             (lacking, _shares(curves_of(trials, [_percent_lacking(r) for r in trials])), _map_texts(trials)),
         )
@@ -78,16 +86,11 @@ def loss_figure(rows: Rows, title: str | None = None) -> Figure:
     last = max(float(row["times"][-1]) for row in rows)
     for axes, notes in zip((left, sent, lacking), ends, strict=True):
         axes.set_xlim(0, last or 1.0)
-        axes.grid(color=GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
+        draw_grid(axes)
         _shade(axes, rows)
         label_ends(axes, notes, LABEL_SIZE - 1)
     figure_title(figure, title or f"Sharing over bad networks: {about(rows)}\n{seeds_note(rows)}")
     return figure
-
-
-def _percent_left(row: Mapping[str, Any]) -> np.ndarray:
-    return 100 * np.asarray(row["entropy_bits"], dtype=np.float64) / float(row["observable_bits"])
 
 
 def _percent_lacking(row: Mapping[str, Any]) -> np.ndarray:
@@ -133,12 +136,12 @@ def _known(trials: Rows, field: str) -> list[float]:
 
 
 def _dress_panels(left: Axes, sent: Axes, lacking: Axes) -> None:
-    dress(left, "entropy left", _TIME, "% of the observable")
+    dress(left, "entropy left", TIME, "% of the observable")
     left.set_ylim(0, max(100.0, left.dataLim.y1) * 1.015)
-    dress(sent, "sent, with headers", _TIME, "bytes, cumulative")
+    dress(sent, "sent, with headers", TIME, "bytes, cumulative")
     sent.set_ylim(0, max(sent.dataLim.y1, 1.0) * 1.03)
     sent.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=2)))
-    dress(lacking, "records that a robot lacks, at most", _TIME, "% of all that are held")
+    dress(lacking, "records that a robot lacks, at most", TIME, "% of all that are held")
     lacking.set_yscale("symlog", linthresh=_LEAST, linscale=0.4)
     lacking.set_ylim(0, 100)
     lacking.set_yticks(_SHARES, [f"{share:g}" for share in _SHARES])

@@ -246,7 +246,7 @@ def _ellipses(means: Tensor, covariances: Tensor, n_corners: int = 24) -> np.nda
 
 def _path_handles(n_robots: int, ends: bool) -> list[Handle]:
     handles: list[Handle] = [
-        Line2D([], [], color=colour(i), linewidth=2.2, label=f"robot {i + 1}")
+        Line2D([], [], color=colour(i), linewidth=2.2, label=f"robot {i}")
         for i in range(min(n_robots, _MAX_NAMED))
     ]
     marks = (("o", "start"), ("^", "end")) if ends else (("^", "robot, now"),)

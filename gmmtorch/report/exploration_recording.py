@@ -68,13 +68,14 @@ def record_rerun(
     if not (math.isfinite(period) and period > 0):
         raise InvalidArgumentError(f"period={period} must be above zero seconds.")
     check_resolution(resolution)
-    rerun = _library()
+    rerun = load_rerun()
     return write_atomically(
         path, lambda temporary: _write(rerun, temporary, trajectories, period, maps, resolution, row)
     )
 
 
-def _library() -> Any:
+def load_rerun() -> Any:
+    """The library that recordings are written with. Raises `GmmTorchError` if it is not there, or too old."""
     try:
         rerun = importlib.import_module("rerun")
     except ImportError as error:

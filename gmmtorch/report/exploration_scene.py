@@ -292,7 +292,7 @@ def _legend(figure: Figure, robots: Tensor | None, n_paths: int) -> None:
         look: dict[str, Any] = (
             {"linewidth": 2.4} if robot < n_paths else {"linestyle": "", "marker": "o", "markersize": 8}
         )
-        handles.append(Line2D([], [], color=colour(robot), label=f"robot {robot + 1}", **look))
+        handles.append(Line2D([], [], color=colour(robot), label=f"robot {robot}", **look))
     if n_paths:
         look = {"color": "#666666", "linestyle": "", "markersize": 8}
         handles += [Line2D([], [], marker=m, label=t, **look) for m, t in (("o", "start"), ("^", "end"))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -13,9 +12,8 @@ from matplotlib.figure import Figure
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import Band, mean_band, on_common_times
 from gmmtorch.exploration.variants import variant_of
-from gmmtorch.report.style import LABEL_SIZE, PALETTE, colour, label_of
-
-Rows = Sequence[Mapping[str, Any]]
+from gmmtorch.report.style import LABEL_SIZE, PALETTE, Rows, as_array, colour, label_of
+from gmmtorch.scan import ArrayLike
 
 FRAMEWORKS = {
     "gmm_shared": "E0 mixtures shared",
@@ -24,7 +22,8 @@ FRAMEWORKS = {
 }
 """The thesis's three, as readers are to see them, in the order in which they are drawn."""
 
-GRID = "#e4e4e4"
+TIME = "simulated time [s]"
+
 _BAND_ALPHA = 0.18
 _LABEL_GAP = 1.25  # height of a line of text, in its size
 
@@ -54,6 +53,22 @@ def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     order = [name for name in FRAMEWORKS if name in found]
     order += [name for name in found if name not in FRAMEWORKS]
     return {name: [row for row in rows if row["framework"] == name] for name in order}
+
+
+def percent_left(row: Mapping[str, Any], entropy_bits: ArrayLike | None = None) -> np.ndarray:
+    """Entropy left (T,), in percent of the observable: the union's, or `entropy_bits` (T,) if given.
+
+    Raises `InvalidArgumentError` where nothing was to be observed.
+    """
+    return 100 * as_array(row["entropy_bits"] if entropy_bits is None else entropy_bits) / observable(row)
+
+
+def observable(row: Mapping[str, Any]) -> float:
+    """Bits of the observable cells. Raises `InvalidArgumentError` where there is none."""
+    bits = float(row["observable_bits"])
+    if not bits > 0:
+        raise InvalidArgumentError(f"observable_bits={bits} must be above zero; the world shows nothing.")
+    return bits
 
 
 def curves_of(rows: Rows, values: Sequence[Any]) -> Curves:
@@ -116,25 +131,6 @@ def about(rows: Rows) -> str:
         n = robots.pop()
         parts.append(f"{n} robot" + "s" * (n != 1))
     return ", ".join(parts)
-
-
-def byte_text(value: float, digits: int = 3) -> str:
-    """1 kB is 1000 bytes."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if value >= 0.9995 * size:
-            return f"{_rounded(value / size, digits)} {unit}"
-    return f"{value:.0f} B"
-
-
-def ratio_text(value: float) -> str:
-    return f"{_rounded(value, 3)}×"
-
-
-def _rounded(value: float, digits: int) -> str:
-    """To so many significant digits, never fewer than stand before the point."""
-    rounded = float(f"{value:.{digits - 1}e}")
-    before = math.floor(math.log10(rounded)) + 1 if value > 0 else 1
-    return f"{value:.{max(digits - before, 0)}f}"
 
 
 def _groups(rows: Rows) -> list[list[Mapping[str, Any]]]:

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gmmtorch.exploration.variants import NETWORK, differing
-from gmmtorch.report.exploration_style import Rows, byte_text, framework_name
+from gmmtorch.report.exploration_style import framework_name
+from gmmtorch.report.quantities import byte_text
+from gmmtorch.report.style import Rows
 
 _SHOWN = {"mcts": "MCTS", "csqmi": "CSQMI", "fsmi": "FSMI"}
 _UNLIMITED = {"bandwidth": "no limit", "reach": "any reach", "budget": "no budget"}

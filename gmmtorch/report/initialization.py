@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from gmmtorch.report.panels import Panel, Rows, line_label, panels_figure, subject
+from gmmtorch.report.panels import Panel, line_label, panels_figure, subject
+from gmmtorch.report.style import Rows
 
 _COST = (
     Panel("init_seconds", "initialization time", "seconds", log=True),

@@ -250,7 +250,9 @@ def _draw_perspective(
     axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     axes.set_title("perspective", fontsize=TITLE_SIZE)
     axes.set_xlabel("x [m]", fontsize=LABEL_SIZE)
-    axes.set_ylabel("y [m]", fontsize=LABEL_SIZE)  # z: the colour bar says it, and its label has no room
+    axes.set_ylabel("y [m]", fontsize=LABEL_SIZE)
+    # Above its axis: beside it, the name would reach into the other panel.
+    axes.text(*box[1], "z [m]\n", fontsize=LABEL_SIZE, ha="center", va="bottom", linespacing=0.5)
     for name in "xyz":
         getattr(axes, f"{name}axis").set_pane_color((0.97, 0.97, 0.97, 1.0))
     axes.tick_params(labelsize=TICK_SIZE - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +14,9 @@ from matplotlib.ticker import NullLocator
 from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -23,8 +25,6 @@ from gmmtorch.report.style import (
     marker,
     new_figure,
 )
-
-Rows = Sequence[Mapping[str, Any]]
 
 _AXES = {"n_components": "components", "nbytes": "bytes", "component_bytes": "bytes"}
 _LABELS = {"kmeans": "k-means", "kmeans_restarts": "k-means, best of ten"}
@@ -66,7 +66,7 @@ def panels_figure(
         _scale(axes, x, ticks)
         if panel.log:
             log_axis(axes, "y", [row[panel.field] for row in rows if row[panel.field] is not None])
-        axes.grid(color="#e4e4e4", linewidth=0.8)
+        draw_grid(axes)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
     lines, labels = grid.flat[0].get_legend_handles_labels()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from matplotlib.figure import Figure
 
 from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
+    Rows,
     colour,
     dress,
     figure_title,
@@ -21,7 +19,7 @@ from gmmtorch.report.style import (
 _BARS = (("auc", "poses wrong"), ("auc_corrected", "components moved"), ("auc_clean", "poses right"))
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+def figures(rows: Rows) -> dict[str, Figure]:
     """`pose_correction`: three bars a row: AUC with wrong poses, once corrected, and with right ones.
 
     Args:

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.blocks import BlockEvidence
-from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.scan import ArrayLike
 
@@ -64,27 +62,6 @@ class MapPanel:
     @property
     def dim(self) -> int:
         return len(self.low)
-
-    @classmethod
-    def of_evidence(
-        cls,
-        title: str,
-        evidence: Evidence | BlockEvidence,
-        prior: float = 1.0,
-        bounds: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> MapPanel:
-        """A panel of counted evidence. Without `bounds`, a grid is shown whole, and of scattered
-        blocks the region that most of them lie in."""
-        if isinstance(evidence, Evidence):
-            grid = evidence.grid
-            resolution = grid.resolution
-            low, high = _corners(grid.origin, grid.shape, resolution)
-        else:
-            resolution = evidence.resolution
-            low, high = _block_bounds(evidence)
-        if bounds is not None:
-            low, high = (_corner(corner) for corner in bounds)
-        return cls(title, lambda points: evidence.lookup(points, prior), resolution, low, high)
 
 
 def busiest_regions(
@@ -264,20 +241,6 @@ def _ask(panel: MapPanel, points: Tensor) -> np.ndarray:
             "it must give one probability for each point."
         )
     return theta
-
-
-def _block_bounds(evidence: BlockEvidence) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    size = evidence.block_side * evidence.resolution
-    if evidence.n_blocks == 0:
-        return (-size,) * evidence.dim, (size,) * evidence.dim
-    blocks = evidence.unpack(evidence.keys)
-    corners = evidence.bounds()[0] + (blocks - blocks.amin(0)).double() * size
-    return robust_bounds(torch.cat([corners, corners + size]), margin=size)
-
-
-def _corners(origin: ArrayLike, shape: tuple[int, ...], resolution: float) -> tuple[tuple[float, ...], ...]:
-    low = _corner(origin)
-    return low, tuple(a + n * resolution for a, n in zip(low, shape, strict=True))
 
 
 def _corner(value: ArrayLike) -> tuple[float, ...]:

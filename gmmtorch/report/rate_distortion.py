@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.style import LABEL_SIZE, TICK_SIZE, dress, figure_title, new_figure
-
-Rows = Sequence[Mapping[str, Any]]
+from gmmtorch.report.quantities import byte_text
+from gmmtorch.report.style import LABEL_SIZE, TICK_SIZE, Rows, draw_grid, dress, figure_title, new_figure
 
 QUALITIES = {"psnr2_db": "PSNR2", "psnr_lesser_db": "lesser term of PSNR2", "auc": "AUC"}
 OURS = "ours"
@@ -195,17 +194,12 @@ def _draw(axes: Axes, rows: Rows, quality: str) -> None:
             fontsize=TICK_SIZE,
             color="#00507f",
         )
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)
 
 
 def _scale(axes: Axes, values: Sequence[float]) -> None:
     axes.set_xscale("log")
     axes.set_xlim(min(values) / 1.4, max(values) * 1.6)
     axes.xaxis.set_major_locator(LogLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _bytes(value)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
     axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _bytes(value: float) -> str:
-    """1 kB is 1000 bytes."""
-    return f"{value / 1000:g} kB" if value >= 1000 else f"{value:g} B"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from gmmtorch.report.panels import Panel, Rows, panels_figure, subject
+from gmmtorch.report.panels import Panel, panels_figure, subject
+from gmmtorch.report.style import Rows
 
 _PANELS = (
     Panel("held_out_log_likelihood", "log-likelihood of measurements held out", "nats a point"),

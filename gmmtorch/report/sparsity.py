@@ -13,7 +13,9 @@ from matplotlib.ticker import NullFormatter, NullLocator
 from gmmtorch.report.style import (
     LABEL_SIZE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -84,7 +86,7 @@ def _heading(key: tuple[str, str, float], keys: Sequence[tuple[str, str, float]]
     return ", ".join(parts)
 
 
-def _draw_panel(axes: Axes, rows: Sequence[Mapping[str, Any]], methods: Sequence[str], heading: str) -> None:
+def _draw_panel(axes: Axes, rows: Rows, methods: Sequence[str], heading: str) -> None:
     shares = sorted({float(row["kept"]) for row in rows})
     for index, method in enumerate(methods):
         mine = sorted(
@@ -114,10 +116,10 @@ def _draw_panel(axes: Axes, rows: Sequence[Mapping[str, Any]], methods: Sequence
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlim(130 * shares[-1], 100 * shares[0] / 1.3)
-    axes.grid(color="#e4e4e4", linewidth=0.8)
+    draw_grid(axes)
 
 
-def _draw_intervals(axes: Axes, rows: Sequence[Mapping[str, Any]], line_colour: str) -> None:
+def _draw_intervals(axes: Axes, rows: Rows, line_colour: str) -> None:
     known = [row for row in rows if _is_number(row.get("auc_low")) and _is_number(row.get("auc_high"))]
     if not known:
         return

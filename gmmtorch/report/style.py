@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -11,9 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from gmmtorch.scan import ArrayLike
+
+Rows = Sequence[Mapping[str, Any]]
+"""Of `results.json`."""
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
 """Okabe and Ito's colours, less the yellow that white paper swallows."""
@@ -30,6 +34,10 @@ SAVED_DPI = 150
 """Pixels an inch of the pictures that are written."""
 
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 12.0, 11.0, 9.5
+
+_GRID = "#e4e4e4"
+_LOG_STEPS = ((1.0,), (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0))
+_FEWEST_TICKS = 4
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -57,16 +65,35 @@ def dress(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> 
             axes.spines[side].set_visible(False)
 
 
+def draw_grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
+    """Light lines at the ticks, beneath all that is drawn."""
+    axes.grid(axis=axis, color=_GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+
+
 def log_axis(axes: Axes, name: str, values: Iterable[float]) -> None:
-    """Make the axis "x" or "y" logarithmic for these values, its labels in full: 0.2, 0.5, 1, 2, …"""
-    positive = [value for value in values if value > 0]
-    decades = math.log10(max(positive) / min(positive)) if positive else 1.0
-    subs = (1.0,) if decades > 3 else (1.0, 2.0, 5.0)
+    """Make the axis "x" or "y" logarithmic for these values, its labels in full: 0.2, 0.5, 1, 2, …
+
+    As few steps a decade as give a handful of ticks; within a fraction of one, those of a linear axis.
+    """
+    positive = [value for value in values if value > 0] or [1.0, 10.0]
+    low, high = min(positive), max(positive)
+    enough = [steps for steps in _LOG_STEPS if _n_ticks(steps, low, high) >= _FEWEST_TICKS]
     axes.set(**{f"{name}scale": "log"})
     axis = getattr(axes, f"{name}axis")
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    if enough:
+        axis.set_major_locator(LogLocator(subs=enough[0]))
+    else:
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _n_ticks(steps: Sequence[float], low: float, high: float) -> int:
+    """How many products of a step and a power of ten lie between low and high."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return sum(low <= step * 10.0**decade <= high for decade in decades for step in steps)
 
 
 def colour(index: int) -> str:

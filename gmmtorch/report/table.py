@@ -6,15 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gmmtorch.report.quantities import byte_text
+
 _FOUR_DECIMALS = ("accuracy", "auc", "brier", "called", "ece", "recall")
-_PREFIXES = ("", "K", "M", "G", "T")
 
 
 def format_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Rows as aligned text: a heading, a rule, one line a row; no trailing newline.
 
     Numbers stand to the right: four decimals for areas, Brier scores and shares of answers, bytes
-    with SI prefixes (28.1 KB is 28,100 bytes), whole numbers with commas, other numbers with four
+    with SI prefixes (28.1 kB is 28,100 bytes), whole numbers with commas, other numbers with four
     digits; None and what a row lacks is a dash.
 
     Args:
@@ -43,24 +44,12 @@ def format_value(name: str, value: Any) -> str:
         return " ".join(str(value).split())
     words = name.split("_")
     if any(word in ("bytes", "nbytes") for word in words) and math.isfinite(value):
-        return format_bytes(float(value))
+        return byte_text(float(value))
     if any(word in words for word in _FOUR_DECIMALS):
         return f"{value:.4f}"
     if isinstance(value, int):
         return f"{value:,}"
     return f"{value:.4g}"
-
-
-def format_bytes(n_bytes: float) -> str:
-    """Bytes with an SI prefix and three digits: 950 B, 28.1 KB, 1.25 MB."""
-    value = float(n_bytes)
-    for prefix in _PREFIXES:
-        # 999.6 would round to 1000 of this unit, which is 1.00 of the next.
-        if abs(value) < 999.5 or prefix == _PREFIXES[-1]:
-            break
-        value /= 1000
-    digits = 0 if prefix == "" or abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
-    return f"{value:.{digits}f} {prefix}B"
 
 
 def _is_number(value: object) -> bool:

@@ -11,12 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.exploration_style import GRID, Rows, byte_text, label_ends
+from gmmtorch.report.exploration_style import label_ends, percent_left
+from gmmtorch.report.quantities import byte_text
 from gmmtorch.report.style import (
     LABEL_SIZE,
     PALETTE,
     TICK_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     line_style,
@@ -79,14 +82,14 @@ def _draw_maps(axes: Axes, rows: Rows) -> None:
         ends.append((float(values[-1]), f"{row['robot']}", colour(index)))
     dress(axes, "", "robot's time [s]", "entropy left [% of the observable]" if explores else "records held")
     axes.set(xlim=axes.get_xlim(), ylim=(0, axes.get_ylim()[1]))
-    axes.grid(color=GRID, linewidth=0.8)
+    draw_grid(axes)
     if 1 < len(rows) <= _MOST_LABELS:
         label_ends(axes, ends)
 
 
 def _values(row: Mapping[str, Any], explores: bool) -> np.ndarray:
     if explores:
-        return 100 * np.asarray(row["entropy_bits"], dtype=np.float64) / float(row["observable_bits"])
+        return percent_left(row)
     return np.asarray(row["records_over_time"], dtype=np.float64)
 
 
@@ -109,5 +112,4 @@ def _draw_bytes(axes: Axes, rows: Rows) -> None:
     axes.set_xlim(0, 1.2 * max(float(start.max()), 1.0))
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value)))
-    axes.grid(axis="x", color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
+    draw_grid(axes, "x")

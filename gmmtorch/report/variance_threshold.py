@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from gmmtorch.occupancy.evidence import CellClass, classify
@@ -17,8 +19,11 @@ from gmmtorch.report.raster import busiest_regions
 from gmmtorch.report.style import (
     HEIGHTS,
     LABEL_SIZE,
+    TICK_SIZE,
     TITLE_SIZE,
+    Rows,
     colour,
+    draw_grid,
     dress,
     figure_title,
     label_of,
@@ -28,10 +33,14 @@ from gmmtorch.report.style import (
 )
 
 _MAX_CELLS = 400_000
+_ROW_NAME: dict[str, Any] = {"fontsize": TITLE_SIZE, "fontweight": "bold", "ha": "center", "va": "center"}
 _VIEW = {"elev": 24, "azim": -60}
+_SIDE = 2.9  # inches of a panel
+_FILLED = 0.6  # of a panel's side, what the longest edge of the box takes
+_ZOOM = 0.95  # leaves room for the names of the axes
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+def figures(rows: Rows) -> dict[str, Figure]:
     """`variance_threshold`: what each threshold decides, one line a number of components."""
     panels = (
         ("occupied_recall", "occupied points called occupied"),
@@ -55,7 +64,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
             )
         dress(axes, title, "variance threshold v", "")
         axes.set_ylim(0, 1.02)
-        axes.grid(color="#e4e4e4", linewidth=0.8)
+        draw_grid(axes)
     grid[0].set_ylabel("share of the points", fontsize=LABEL_SIZE)
     grid[-1].legend(frameon=False, fontsize=LABEL_SIZE, loc="lower right")
     figure_title(figure, f"What the dead band decides: {rows[0]['dataset']}, {label_of(rows[0]['method'])}")
@@ -84,7 +93,7 @@ def cells_figure(
 ) -> Figure:
     """Cells called occupied in the box [low, high] (m): a row for each map, a column for each threshold.
 
-    The first column shows the held-out points themselves.
+    The first column shows the held-out points themselves. Colours are heights, the same in all panels.
 
     Args:
         maps: by number of components: occupancy (M,) of points (M, 3).
@@ -97,28 +106,48 @@ def cells_figure(
         torch.arange(a, b, size, dtype=torch.float64) + size / 2 for a, b in zip(low, high, strict=True)
     ]
     centers = torch.cartesian_prod(*axes_points)
-    figure = new_figure(3.6 * (1 + len(thresholds)), 3.5 * len(maps) + 0.4)
-    grid = figure.subplots(len(maps), 1 + len(thresholds), squeeze=False, subplot_kw={"projection": "3d"})
-    for row, (n_components, occupancy) in zip(grid, maps.items(), strict=True):
+    heights = ScalarMappable(Normalize(low[2], high[2]), HEIGHTS)
+    figure = new_figure(_SIDE * (1 + len(thresholds)) + 1.0, _SIDE * len(maps) + 0.6)
+    panels = figure.subplots(len(maps), 1 + len(thresholds), squeeze=False, subplot_kw={"projection": "3d"})
+    for row, (n_components, occupancy) in zip(panels, maps.items(), strict=True):
         theta = occupancy(centers)
-        _scatter(row[0], inside.numpy(), low, high, 0.6)
-        row[0].set_title(f"held-out points\n(map: {n_components} components)", fontsize=TITLE_SIZE - 1)
+        _scatter(row[0], inside.numpy(), heights, low, high, 1.5)
+        row[0].set_title("held-out points", fontsize=TITLE_SIZE)
+        name = f"{n_components:,} components"
+        row[0].text2D(-0.12, 0.5, name, rotation=90, transform=row[0].transAxes, **_ROW_NAME)
         for axes, threshold in zip(row[1:], thresholds, strict=True):
             called = classify(theta, threshold) == CellClass.OCCUPIED
-            _scatter(axes, centers[called].numpy(), low, high, 5.0)
-            axes.set_title(f"v = {threshold:g}: {int(called.sum()):,} cells", fontsize=TITLE_SIZE - 1)
-    figure_title(figure, f"Cells of {metres(size)} called occupied, by variance threshold")
+            _scatter(axes, centers[called].numpy(), heights, low, high, _mark_side(size, low, high))
+            axes.set_title(f"v = {threshold:g}\n{int(called.sum()):,} cells", fontsize=TITLE_SIZE)
+    bar = figure.colorbar(heights, ax=panels.ravel().tolist(), shrink=0.6, pad=0.02, aspect=25)
+    bar.set_label("height z [m]", fontsize=LABEL_SIZE)
+    bar.ax.tick_params(labelsize=TICK_SIZE)
+    figure_title(figure, f"Cells of {metres(size)} called occupied, by the variance threshold v")
     return figure
 
 
+def _mark_side(size: float, low: Sequence[float], high: Sequence[float]) -> float:
+    """Points that a cell of `size` metres takes in a panel."""
+    return _FILLED * 72 * _SIDE * size / max(b - a for a, b in zip(low, high, strict=True))
+
+
 def _scatter(
-    axes: Axes, points: np.ndarray, low: Sequence[float], high: Sequence[float], size: float
+    axes: Any,  # mpl_toolkits has no types
+    points: np.ndarray,
+    heights: ScalarMappable,
+    low: Sequence[float],
+    high: Sequence[float],
+    side: float,
 ) -> None:
-    drawn: Any = axes
-    drawn.scatter(
-        *points.T, c=points[:, 2], cmap=HEIGHTS, vmin=low[2], vmax=high[2], s=size, marker="s", linewidths=0
-    )
-    drawn.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    drawn.set_box_aspect([b - a for a, b in zip(low, high, strict=True)])
-    drawn.view_init(**_VIEW)
-    drawn.tick_params(labelsize=6, pad=-2)
+    axes.scatter(*points.T, c=heights.to_rgba(points[:, 2]), s=side**2, marker="s", linewidths=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect([b - a for a, b in zip(low, high, strict=True)], zoom=_ZOOM)
+    axes.view_init(**_VIEW)
+    for name in "xyz":
+        axis = getattr(axes, f"{name}axis")
+        # Where two axes meet, one of their labels is enough.
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="lower" if name == "y" else None))
+        axis.set_pane_color((0.97, 0.97, 0.97, 1.0))
+        axis.labelpad = -6
+        getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=TICK_SIZE)
+    axes.tick_params(labelsize=TICK_SIZE, pad=-2)

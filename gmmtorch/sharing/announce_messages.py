@@ -1,52 +1,15 @@
-"""What a replicated map says besides components, as datagrams: what is held, and records without shape.
-
-An announcement; and three kinds of records: what supersedes what, totals of counts, a pose correction. See
-docs/messages.md.
-"""
+"""What a replica holds, announced in datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-from scipy.spatial.transform import Rotation
-from torch import Tensor
-
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.linalg import check_rigid
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.bitstream import BitReader, BitWriter
-from gmmtorch.mapping.lattice import FARTHEST
-from gmmtorch.sharing.component_messages import count_steps, counts_of
 from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed, split
-from gmmtorch.sharing.fields import (
-    read_intervals,
-    read_keys,
-    read_number,
-    write_intervals,
-    write_keys,
-    write_number,
-)
-from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.record_ids import (
-    END,
-    LARGEST_INCARNATION,
-    LARGEST_ROBOT,
-    first_key,
-    keys_of_robot,
-    robot_of,
-)
-
-RECORD_BYTES = 1000
-"""Longest record: so all fit where encryption takes its share of a datagram."""
-_POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
-_UNIT = 1e-9
-
-
-def check_size(max_bytes: int) -> None:
-    """Raises `InvalidArgumentError` unless datagrams of so many bytes at most hold any record."""
-    if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
-        raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")
+from gmmtorch.sharing.fields import read_intervals, read_number, write_intervals, write_number
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.record_ids import END, LARGEST_INCARNATION, LARGEST_ROBOT
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,76 +27,17 @@ class AnnouncementMessage:
         return Intervals.span(self.begin, self.end)
 
 
-@dataclass(frozen=True, eq=False)
-class SupersessionMessage:
-    """Record `key`: where all of `new` is held, `old` counts no more. All are keys of one robot."""
-
-    key: int
-    old: Intervals
-    new: Intervals
-
-
-@dataclass(frozen=True, eq=False)
-class TotalsMessage:
-    """Record `key`: all points that one life of a robot has counted to components of these keys (J,).
-
-    steps (J,): as in `mapping.quantization`. Of two totals of a component the larger is the later.
-    """
-
-    key: int
-    components: Ints
-    steps: Ints
-
-    @property
-    def totals(self) -> np.ndarray:
-        """Points (J,)."""
-        return counts_of(self.steps)
-
-
-@dataclass(frozen=True, eq=False)
-class CorrectionMessage:
-    """Record `key`: the robot's components `moved` (keys), those of its scan, belong where `pose` takes them.
-
-    pose: position and (cos, sin) of the yaw (4,), or position and unit quaternion x, y, z, w (7,): the
-    motion from where they were published. Of two of one scan the higher version counts, then the higher key.
-    """
-
-    key: int
-    scan: int
-    version: int
-    moved: Intervals
-    pose: Tensor
-
-    @property
-    def dim(self) -> int:
-        return {n: dim for dim, n in _POSE_NUMBERS.items()}[len(self.pose)]
-
-    def transform(self) -> Tensor:
-        """The motion (D+1, D+1)."""
-        matrix = torch.eye(self.dim + 1, dtype=torch.float64)
-        matrix[:-1, -1] = self.pose[: self.dim]
-        if self.dim == 2:
-            cos, sin = self.pose[2:].tolist()
-            turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-        else:
-            turn = torch.from_numpy(Rotation.from_quat(self.pose[3:].numpy()).as_matrix())
-        matrix[:-1, :-1] = turn
-        return matrix
-
-
-RecordMessage = SupersessionMessage | TotalsMessage | CorrectionMessage
-
-
-# -- announcements -----------------------------------------------------------------------------------------
-
-
 def encode_announcements(
     sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
 ) -> list[bytes]:
     """Datagrams that say what is held, and by it what is not: one at least.
 
-    Each says so of a part of all keys of its own, so that any of them may get lost.
+    Each says so of a part of all keys of its own, so that any of them may get lost. Raises
+    `InvalidArgumentError` for what is out of range.
     """
+    _check_speaker(sender, incarnation)
+    if not Intervals.span(0, END).covers(held):
+        raise InvalidArgumentError(f"held={held!r} goes beyond the keys that robots give.")
     n = len(held)
 
     def part(begin: int, end: int) -> bytes:
@@ -153,8 +57,7 @@ def encode_announcements(
 def read_announcement(body: bytes) -> AnnouncementMessage:
     reader = BitReader(body)
     sender, incarnation = read_number(reader), read_number(reader)
-    if sender > LARGEST_ROBOT or incarnation > LARGEST_INCARNATION:
-        raise DataError(f"Robot {sender} in its life {incarnation} announces: it is damaged.")
+    _check_speaker(sender, incarnation)
     begin = reader.number()
     end = begin + reader.number() + 1
     if not 0 <= begin < end <= END:
@@ -164,92 +67,9 @@ def read_announcement(body: bytes) -> AnnouncementMessage:
     return AnnouncementMessage(sender, incarnation, begin, end, held)
 
 
-# -- records -----------------------------------------------------------------------------------------------
-
-
-def encode_record(record: RecordMessage) -> bytes:
-    """The datagram of a record. It may be longer than `RECORD_BYTES`; who makes records sees to that."""
-    writer = BitWriter()
-    writer.number(record.key)
-    base = first_key(robot_of(record.key))
-    if isinstance(record, SupersessionMessage):
-        write_intervals(writer, record.old, base)
-        write_intervals(writer, record.new, base)
-        return sealed(Kind.SUPERSESSION, writer.to_bytes())
-    if isinstance(record, TotalsMessage):
-        order = np.argsort(record.components)
-        write_keys(writer, record.components[order])
-        writer.column(record.steps[order])
-        return sealed(Kind.TOTALS, writer.to_bytes())
-    writer.number(record.scan)
-    writer.number(record.version)
-    writer.one(int(record.dim == 3), 1)
-    writer.fixed(record.pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
-    write_intervals(writer, record.moved, base)
-    return sealed(Kind.CORRECTION, writer.to_bytes())
-
-
-def read_supersession(body: bytes) -> SupersessionMessage:
-    reader = BitReader(body)
-    key, keys = _read_key(reader)
-    old, new = (read_intervals(reader, *keys.pairs()[0]) for _ in range(2))
-    reader.finish()
-    if not old or key in old or key in new or old & new:
-        raise DataError(f"Record {key} supersedes {old!r} by {new!r}: it is damaged.")
-    return SupersessionMessage(key, old, new)
-
-
-def read_totals(body: bytes) -> TotalsMessage:
-    reader = BitReader(body)
-    key, _ = _read_key(reader)
-    components = read_keys(reader)
-    steps = reader.column(len(components))
-    reader.finish()
-    counts_of(steps)  # which says what is wrong with them
-    return TotalsMessage(key, components, steps)
-
-
-def read_correction(body: bytes) -> CorrectionMessage:
-    reader = BitReader(body)
-    key, keys = _read_key(reader)
-    scan, version = read_number(reader), read_number(reader)
-    dim = 2 + reader.one(1)
-    halves = reader.fixed(2 * _POSE_NUMBERS[dim], 32)
-    moved = read_intervals(reader, *keys.pairs()[0])
-    reader.finish()
-    pose = torch.from_numpy(halves.astype("<u4").view("<f8").astype(np.float64))
-    if not (bool((pose[:dim].abs() <= FARTHEST).all()) and abs(float(pose[dim:].norm()) - 1) <= _UNIT):
-        raise DataError(f"A correction by {pose.tolist()}, which is no motion: it is damaged.")
-    return CorrectionMessage(key, scan, version, moved, pose)
-
-
-def totals_message(key: int, totals: dict[int, float]) -> TotalsMessage:
-    """Record `key` of totals by the keys of components, rounded as counts are."""
-    components = np.array(sorted(totals), np.int64)
-    counts = torch.tensor([totals[int(name)] for name in components], dtype=torch.float64)
-    return TotalsMessage(key, components, count_steps(counts))
-
-
-def pose_of(transform: Tensor) -> Tensor:
-    """The pose of a `CorrectionMessage` of a rigid motion (3, 3) or (4, 4). Raises if it is none."""
-    if transform.shape not in ((3, 3), (4, 4)):
-        raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
-    rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)
-    if not bool((translation.abs() <= FARTHEST).all()):
-        raise InvalidArgumentError(f"transform moves by {translation.tolist()}; {FARTHEST:g} m is the most.")
-    if len(rotation) == 2:
-        turn = rotation[:, 0] / rotation[:, 0].norm()
-    else:
-        turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
-    return torch.cat([translation, turn]) + 0.0  # no −0
-
-
-# -- fields ------------------------------------------------------------------------------------------------
-
-
-def _read_key(reader: BitReader) -> tuple[int, Intervals]:
-    """A record's key, and all that its robot may give."""
-    key = reader.number()
-    if not 0 <= key < END:
-        raise DataError(f"Record {key} is out of range: it is damaged.")
-    return key, keys_of_robot(robot_of(key))
+def _check_speaker(sender: int, incarnation: int) -> None:
+    if sender > LARGEST_ROBOT or incarnation > LARGEST_INCARNATION:
+        raise InvalidArgumentError(
+            f"sender={sender} in its life incarnation={incarnation}: robots go to {LARGEST_ROBOT}, lives to "
+            f"{LARGEST_INCARNATION}."
+        )

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
 from gmmtorch.sharing.announce_messages import AnnouncementMessage
 from gmmtorch.sharing.envelope import loaded, stored
-from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.intervals import Intervals, excess
 from gmmtorch.sharing.record_ids import keys_of_robot
 
 _ON_THE_WAY = 3
@@ -18,6 +16,14 @@ _ON_THE_WAY = 3
 quick as that, announces before it has heard what was sent a tick ago, and is heard a tick later."""
 MOST_PEERS = 64
 """Robots whose gaps are remembered, those heard last."""
+MOST_REMEMBERED = 1 << 16
+"""Intervals of what these lack, all together, and of what they hold: 1 MiB each. As much as two honest robots
+come to at their limits, or hundreds as a rule. Who takes most is forgotten: it will announce again."""
+MOST_PASSING = 1 << 14
+"""Intervals of what is taken to be on its way; where there are more nothing is, and some is said twice."""
+PATIENCE = 1 << 7
+"""Announcements after which a robot that has not been heard since is taken to be gone, with what it alone
+claimed to hold: two minutes of them, longer than what cuts a team in two as a rule."""
 
 Packet = tuple[bytes, Intervals]
 """A datagram, and the keys of the records in it."""
@@ -38,6 +44,7 @@ class Backlog:
         self._passing = [Intervals.empty()] * _ON_THE_WAY  # heard or sent; since the last call, and before
         self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others lack, by who said so
         self._theirs: OrderedDict[int, Intervals] = OrderedDict()  # what others hold, and this robot lacked
+        self._waited: dict[int, int] = {}  # announcements made here since those others were heard
 
     def add(self, keys: Intervals, packets: Sequence[Packet] = ()) -> None:
         """Something new to say; packets: of some of it, ready to be sent."""
@@ -47,31 +54,46 @@ class Backlog:
     def heard(self, keys: Intervals) -> None:
         """Somebody, perhaps this robot again, has said it."""
         self.due -= keys
-        self._passing[0] |= keys
+        self._passing[0] = (self._passing[0] | keys).up_to(MOST_PASSING)
+
+    def buried(self, dead: Intervals) -> None:
+        """These are superseded: nobody needs them any more."""
+        self.due -= dead
 
     def sent(self, keys: Intervals) -> None:
         """All that this robot has sent since the last call."""
         self.due -= keys
-        self._passing = [keys, *self._passing[:-1]]
+        self._passing = [keys.up_to(MOST_PASSING), *self._passing[:-1]]
         self.ready = [packet for packet in self.ready if self.due.covers(packet[1])]
 
-    def announced(self, message: AnnouncementMessage, held: Intervals) -> None:
-        """Another robot says what it holds; `held`: what is here."""
+    def asks(self) -> None:
+        """This robot announces what it holds. Who has not been heard for long enough is asked for nothing
+        more: it is gone, or was never there."""
+        self._waited = {robot: self._waited.get(robot, 0) + 1 for robot in self._theirs}
+        for robot, n in self._waited.items():
+            if n >= PATIENCE:
+                del self._theirs[robot]
+
+    def announced(self, message: AnnouncementMessage, held: Intervals, dead: Intervals) -> None:
+        """Another robot says what it holds. held: what is here, or was; dead: what of it is superseded."""
         gap = (held & message.scope) - message.held
         before = self._gaps.get(message.sender, Intervals.empty())
         lacking = (gap & self._own) | (gap & before)
         for passing in self._passing:
             lacking -= passing
-        self.due |= lacking
+        self.due = (self.due | lacking) - dead
+        self._waited.pop(message.sender, None)
         for table, now in ((self._gaps, gap), (self._theirs, message.held - held)):
             known = table.pop(message.sender, Intervals.empty())
             table[message.sender] = (known - message.scope) | now
             while len(table) > MOST_PEERS:
                 table.popitem(last=False)
+            for robot in excess(table, MOST_REMEMBERED):
+                del table[robot]
 
     def missing(self, held: Intervals) -> Intervals:
         """What others have announced that they hold, and is not held here."""
-        return functools.reduce(operator.or_, self._theirs.values(), Intervals.empty()) - held
+        return Intervals.union(self._theirs.values()) - held
 
     def state(self) -> dict[str, Any]:
         return {
@@ -79,6 +101,7 @@ class Backlog:
             "passing": [keys.stored() for keys in self._passing],
             "gaps": [[robot, gap.stored()] for robot, gap in self._gaps.items()],
             "theirs": [[robot, keys.stored()] for robot, keys in self._theirs.items()],
+            "waited": [[robot, n] for robot, n in self._waited.items()],
             "ready": [[stored(datagram), keys.stored()] for datagram, keys in self.ready],
         }
 
@@ -87,6 +110,7 @@ class Backlog:
         self._passing = [Intervals.empty()] * _ON_THE_WAY
         self._gaps.clear()
         self._theirs.clear()
+        self._waited.clear()
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`."""
@@ -96,4 +120,5 @@ class Backlog:
             OrderedDict((int(robot), Intervals.loaded(keys)) for robot, keys in state[name])
             for name in ("gaps", "theirs")
         )
+        self._waited = {int(robot): int(n) for robot, n in state["waited"]}
         self.ready = [(loaded(data), Intervals.loaded(keys)) for data, keys in state["ready"]]

@@ -14,7 +14,14 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec import order_of, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.quantization import NO_COUNT, quantize
-from gmmtorch.sharing.announce_messages import (
+from gmmtorch.sharing.anti_entropy import Packet
+from gmmtorch.sharing.component_messages import fitted
+from gmmtorch.sharing.component_table import fingerprints, most_sightings
+from gmmtorch.sharing.envelope import split
+from gmmtorch.sharing.intervals import Intervals, Ints
+from gmmtorch.sharing.messages import decode
+from gmmtorch.sharing.record_ids import MOST_RECORDS, first_key, ids_of, keys_of_life, keys_of_robot, life_of
+from gmmtorch.sharing.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
     RecordMessage,
@@ -24,13 +31,6 @@ from gmmtorch.sharing.announce_messages import (
     pose_of,
     totals_message,
 )
-from gmmtorch.sharing.anti_entropy import Packet
-from gmmtorch.sharing.component_messages import fitted
-from gmmtorch.sharing.component_table import fingerprints, most_sightings
-from gmmtorch.sharing.envelope import split
-from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.record_ids import MOST_RECORDS, first_key, ids_of, keys_of_life, keys_of_robot, life_of
 from gmmtorch.sharing.records import MOST_SIGHTINGS, Records
 
 _MOST_SUPERSESSIONS = 32
@@ -80,7 +80,6 @@ class Author:
             )
         if not self._mine.covers(old):
             raise InvalidArgumentError(f"Only who made records supersedes them; robot={self._robot}.")
-        self._records.check_room(len(components), self._first)
         values = quantize(components)
         order = order_of(values.places)
         first = self._numbers(len(order))
@@ -90,7 +89,7 @@ class Author:
         packets: list[Packet] = []
         written = Intervals.empty()
         for datagram, part in fitted(values, max_bytes):
-            packets.append((datagram, self._records.add_components(part.restored())))
+            packets.append((datagram, self._records.add_components(part.restored(), bounded=False)))
             written |= packets[-1][1]
         keys = np.empty_like(numbered)
         keys[order.numpy()] = numbered
@@ -128,7 +127,7 @@ class Author:
         for key, gain in gains.items():
             if not 0 <= gain <= 2.0**40:
                 raise InvalidArgumentError(f"A component gained {gain} points; counts go from 0 to 2⁴⁰.")
-            self._totals[key] = min(self._totals.get(key, 0.0) + gain, 2.0**40)
+            self._totals[key] = min(self._totals.get(key, 0.0) + float(gain), 2.0**40)
         due = totals_message(self._first, {key: self._totals[key] for key in gains})
         lapsed = self._records.dead.contains(due.components)
         rises = {
@@ -173,7 +172,7 @@ class Author:
                 "Number a scan's components one after another."
             )
         self._numbers(1)
-        written = self._records.add_record(record)
+        written = self._records.add_record(record, bounded=False)
         old = Intervals.of(np.array([r.key for r in before], np.int64))
         return written | self._supersede(old, written)
 
@@ -251,7 +250,7 @@ class Author:
     def _write(self, record: RecordMessage) -> Intervals:
         assert record.key == self._first + self._n
         self._numbers(1)
-        return self._records.add_record(record)
+        return self._records.add_record(record, bounded=False)
 
     def _numbers(self, n: int) -> int:
         """The first of n keys that nobody has given."""

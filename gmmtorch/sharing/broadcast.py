@@ -27,12 +27,18 @@ from gmmtorch.sharing.messages import (
     encode_counts,
 )
 
+MOST_ROWS, MOST_BATCHES = 1 << 20, 1 << 17
+"""Components and counts that are held, and the messages that they came in; more are not taken from others."""
+
 
 class Broadcast:
     """A `Replica` that does not care what others have: for networks that lose nothing, and to compare.
 
     The sender holds what its datagrams decode to. Components that come twice count once. Counts count
     whenever they come, as nothing tells them apart; of components that have not come they are left out.
+
+    Components are numbered from 0 in each life of a robot: what one says that starts again is taken for a
+    repetition, until it has said more than before.
     """
 
     def __init__(self, robot: int, codec: str = "thesis") -> None:
@@ -40,8 +46,9 @@ class Broadcast:
         self.codec = check_codec(codec)
         self.refused: Counter[str] = Counter()
         """How many messages were not taken in: "other" (none of components or counts), "unfit" (components
-        that are not in 3D, or not numbered one after another)."""
+        that are not in 3D, or not numbered one after another), "full" (more than is held)."""
         self.version = 0
+        self._n_rows = 0
         self._n_numbered = 0
         self._batches: list[Components] = []
         self._firsts: dict[int, list[tuple[int, int]]] = {}  # by robot: first sequence, row in `_batches`
@@ -76,13 +83,28 @@ class Broadcast:
 
     def _say(self, datagrams: list[bytes]) -> None:
         for datagram in datagrams:
-            self.receive(datagram)
+            self._take(decode(datagram))
         self._due += datagrams
 
     def receive(self, datagram: bytes, message: Message | None = None) -> bool:
         """Take in what a datagram says, if it is of components or counts. Raises `DataError` for a damaged
         one. message: what `decode` makes of it, for those who have that already."""
         message = decode(datagram) if message is None else message
+        if self._is_full(message):
+            self.refused["full"] += 1
+            return False
+        return self._take(message)
+
+    def _is_full(self, message: Message) -> bool:
+        """Whether there is no room for what a message says."""
+        if isinstance(message, ComponentsMessage):
+            n = len(message.components)
+        else:
+            n = len(message.counts) if isinstance(message, CountsMessage) else 0
+        n_batches = len(self._batches) + len(self._gained)
+        return n > 0 and (self._n_rows + n > MOST_ROWS or n_batches >= MOST_BATCHES)
+
+    def _take(self, message: Message) -> bool:
         if isinstance(message, ComponentsMessage) and not _is_fit(message.components):
             self.refused["unfit"] += 1
             return False
@@ -107,6 +129,7 @@ class Broadcast:
             return
         bisect.insort(self._firsts.setdefault(robot, []), (first, len(self._batches)))
         self._batches.append(batch)
+        self._n_rows += len(batch)
         self.version += 1
 
     def _near(self, robot: int, number: int) -> list[tuple[int, int]]:
@@ -127,6 +150,7 @@ class Broadcast:
         if rows:
             self._gained.append(Components.concatenate(rows))
             self._fresh.append(self._gained[-1])
+            self._n_rows += len(rows)
             self.version += 1
 
     def changes(self) -> Changes:
@@ -169,6 +193,7 @@ class Broadcast:
         for batch in unpacked(state["batches"]):
             self._enter(batch)
         self._gained = list(unpacked(state["gained"]))
+        self._n_rows += sum(map(len, self._gained))
         self._n_told, self._n_numbered = len(self._batches), int(state["n_numbered"])
         self._due = [loaded(data) for data in state["due"]]
 

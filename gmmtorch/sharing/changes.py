@@ -11,14 +11,14 @@ import torch
 
 from gmmtorch.errors import DataError
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import CorrectionMessage
 from gmmtorch.sharing.component_table import ComponentTable
 from gmmtorch.sharing.intervals import Ints
+from gmmtorch.sharing.record_messages import CorrectionMessage
 from gmmtorch.sharing.record_view import corrected, gains
 from gmmtorch.sharing.totals import Totals
 
 _MOST_NAMED = 1 << 16
-"""Entries that are remembered one by one while nobody asks; beyond that all are looked at."""
+"""Records, and entries of them, that are remembered while nobody asks; beyond that all are looked at."""
 _NO_KEYS = np.zeros(0, np.int64)
 
 
@@ -54,7 +54,7 @@ class ChangeLog:
         """Totals of these components have come, or have gone."""
         if self._named is not None:
             self._named.append(keys)
-            self._n_named += len(keys)
+            self._n_named += 1 + len(keys)
             if self._n_named > _MOST_NAMED:
                 self._named = None
 

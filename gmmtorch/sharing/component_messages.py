@@ -1,9 +1,9 @@
-"""Components, and counts of points that they gained, as datagrams. See docs/messages.md."""
+"""Components as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,25 +13,23 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.mapping import codec as batches
-from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.lattice import PER_OCTAVE, power
-from gmmtorch.mapping.quantization import LARGEST_COUNT, LEAST_COUNT, NO_COUNT, Quantized
-from gmmtorch.mapping.thesis_message import (
-    decode_thesis,
-    decode_thesis_updates,
-    encode_thesis,
-    encode_thesis_updates,
-)
-from gmmtorch.sharing.envelope import MAX_BYTES, Kind, check_codec, sealed, split
-from gmmtorch.sharing.fields import check_ids, id_order, read_ids, read_number, write_ids, write_number
+from gmmtorch.mapping.lattice import LARGEST_VARIANCE, scaled
+from gmmtorch.mapping.quantization import MOST_POINTS, ORIGIN_STEP, Quantized, quantize
+from gmmtorch.mapping.thesis_message import FARTHEST as THESIS_FARTHEST
+from gmmtorch.mapping.thesis_message import decode_thesis, encode_thesis
+from gmmtorch.sharing.envelope import FARTHEST, MAX_BYTES, Kind, check_codec, sealed, split
+from gmmtorch.sharing.fields import LARGEST_NUMBER, check_places
+
+LARGEST_BATCH = 1024
+"""Components, and sightings of them, in a datagram: for each a receiver may have to cast hundreds of rays. Of
+a map there are some 170."""
 
 _SIZES = struct.Struct("<BIII")  # dimensions, components, origins, sightings
 _TRIED = 128
 """Components that are likely to fit into a datagram."""
 _FILL = 0.95
 """Of a datagram, as components are not all of the same size."""
-_COUNT = np.dtype([("robot", "<i8"), ("number", "<i8"), ("count", "<f8")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +37,6 @@ class ComponentsMessage:
     """Components as whoever sent them holds them."""
 
     components: Components
-
-
-@dataclass(frozen=True, eq=False)
-class CountsMessage:
-    """Points that `sender` has found to belong to components since it last said so, by (robot, sequence)."""
-
-    sender: int
-    counts: dict[tuple[int, int], float]
 
 
 def encode_components(
@@ -59,15 +49,21 @@ def encode_components(
             "float": float64, as they are. "thesis": 57 bytes for each component and sensor position.
         max_bytes: of each datagram.
 
-    Raises `InvalidArgumentError` for what the codec cannot store, and for a component of so many sensor
-    positions that it does not fit into a datagram.
+    Raises `InvalidArgumentError` for what the codec cannot store, or lies farther out than
+    `envelope.FARTHEST`, and for a component of so many sensor positions that it does not fit into a datagram.
     """
+    sightings = torch.bincount(components.seen_by, minlength=len(components)).cpu()
+    _check_sightings(sightings)
+    so_far = torch.cat([sightings.new_zeros(1), sightings.cumsum(0)]).tolist()
     write = {"quantized": _quantized, "float": _float, "thesis": _thesis}[check_codec(codec)]
 
     def part(begin: int, end: int) -> bytes:
         return write(_part(components, begin, end))
 
-    return split(len(components), part, "component", max_bytes)
+    def may_go(begin: int, end: int) -> bool:
+        return max(end - begin, so_far[end] - so_far[begin]) <= LARGEST_BATCH
+
+    return split(len(components), part, "component", max_bytes, may_go)
 
 
 def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
@@ -75,8 +71,14 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
 
     As many are tried as the datagram before lets expect to fit, rather than halves of all.
     """
+    _check_sightings(values.sightings)
+    _check_quantized(values)
+    so_far = values.sightings.cumsum(0)
     begin, n = 0, _TRIED
     while begin < len(values):
+        told = int(so_far[begin - 1]) if begin else 0
+        n_seen = int(torch.searchsorted(so_far, told + LARGEST_BATCH, right=True)) - begin
+        n = min(n, LARGEST_BATCH, n_seen)
         whole = begin == 0 and n >= len(values)
         part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
         datagram = sealed(Kind.COMPONENTS, batches.encode_quantized(part))
@@ -91,35 +93,6 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
                 f"A single component takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
                 "Let it have fewer sensor positions."
             )
-
-
-def encode_counts(
-    sender: int, counts: Mapping[tuple[int, int], float], codec: str = "quantized"
-) -> list[bytes]:
-    """Datagrams of counts ≥ 0 that components (robot, sequence) gained; none of none.
-
-    Args:
-        codec: "quantized": 1 to 3 bytes a count, to 9 %, as in `mapping.quantization`. "float": 24
-            bytes. "thesis": 8 bytes, id and float32.
-    """
-    ids = torch.tensor(list(counts), dtype=torch.int64).reshape(-1, 2)
-    values = torch.tensor(list(counts.values()), dtype=torch.float64)
-    most = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
-    bad = ~((values >= 0) & (values <= most))
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
-        raise InvalidArgumentError(
-            f"counts[{tuple(ids[first].tolist())}]={float(values[first])} must be from 0 to {most:g}."
-        )
-    order = torch.from_numpy(id_order(check_ids("counts", ids)))
-    ids, values = ids[order], values[order]
-    write = {"quantized": _quantized_counts, "float": _float_counts, "thesis": _thesis_counts}[
-        check_codec(codec)
-    ]
-    return split(len(ids), lambda begin, end: write(sender, ids[begin:end], values[begin:end]), "count")
-
-
-# -- components --------------------------------------------------------------------------------------------
 
 
 def _part(components: Components, begin: int, end: int) -> Components:
@@ -140,16 +113,19 @@ def _part(components: Components, begin: int, end: int) -> Components:
 
 
 def _quantized(components: Components) -> bytes:
-    return sealed(Kind.COMPONENTS, batches.encode(components))
+    values = quantize(components)
+    _check_quantized(values)
+    return sealed(Kind.COMPONENTS, batches.encode_quantized(values))
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
-    return ComponentsMessage(batches.decode(body))
+    components = batches.decode(body)
+    _check_range(components.means, components.origins, components.ids)
+    return _message(components)
 
 
 def _float(components: Components) -> bytes:
-    c = components.checked()
-    _check_definite(c.covariances)
+    c = _checked(components)
     fields = [
         _doubles(c.means),
         _doubles(pack_symmetric(c.covariances)),
@@ -171,7 +147,7 @@ def read_float(body: bytes) -> ComponentsMessage:
     dim, k, s, e = _SIZES.unpack_from(body)
     if dim not in (2, 3):
         raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
-    if max(k, s, e) > len(body):
+    if max(k, s, e) > len(body) or not k:
         raise DataError(f"{k} components, {s} positions and {e} sightings are announced: it is damaged.")
     layout = np.dtype(
         [
@@ -196,9 +172,7 @@ def read_float(body: bytes) -> ComponentsMessage:
     }
     values["covariances"] = unpack_symmetric(values["covariances"], dim)
     values["max_range"] = values["max_range"] != 0
-    components = Components(**values).checked()
-    _check_definite(components.covariances)
-    return ComponentsMessage(components)
+    return _message(_checked(Components(**values)))
 
 
 def _thesis(components: Components) -> bytes:
@@ -206,14 +180,76 @@ def _thesis(components: Components) -> bytes:
         raise InvalidArgumentError(
             f"The thesis's messages are of 3D components, not {components.dim}D; use codec=quantized."
         )
-    _check_definite(components.covariances.float().double())
+    c = components
+    count = c.seen_count.float().double()
+    sent = replace(
+        c,
+        means=c.means.float().double(),
+        covariances=c.covariances.float().double(),
+        origins=c.origins.float().double(),
+        support=count.new_zeros(len(c)).index_add_(0, c.seen_by, count),
+        seen_count=count,
+    )
+    _checked(sent, THESIS_FARTHEST)
     return sealed(Kind.THESIS_COMPONENTS, encode_thesis(components))
 
 
 def read_thesis(body: bytes) -> ComponentsMessage:
-    components = decode_thesis(body, 3)
-    _check_definite(components.covariances)
+    return _message(_checked(decode_thesis(body, 3), THESIS_FARTHEST))
+
+
+def _message(components: Components) -> ComponentsMessage:
+    """Of components in range, if they are as many as a datagram may have."""
+    k, e = len(components), len(components.seen_by)
+    if k == 0 or max(k, e) > LARGEST_BATCH:
+        raise DataError(
+            f"{k} components and {e} sightings; a datagram has a component, and {LARGEST_BATCH} of either "
+            "at most: it is damaged."
+        )
     return ComponentsMessage(components)
+
+
+# Who writes asks the same as who reads, so that nobody says what nobody takes.
+
+
+def _check_sightings(sightings: Tensor) -> None:
+    """Raises `InvalidArgumentError` where one of components (K,) was seen from too many places."""
+    most = int(sightings.max()) if len(sightings) else 0
+    if most > LARGEST_BATCH:
+        raise InvalidArgumentError(
+            f"A single component was seen from {most} places; a datagram may have {LARGEST_BATCH}. Let it "
+            "have fewer sensor positions: mapping.sightings.limit_origins."
+        )
+
+
+def _check_quantized(values: Quantized) -> None:
+    means = scaled(values.places.mean, values.places.mean_exponents())
+    _check_range(means, values.origins.double() * ORIGIN_STEP, values.ids)
+
+
+def _check_range(means: Tensor, origins: Tensor, ids: Tensor, farthest: float = FARTHEST) -> None:
+    check_places("means", means, farthest)
+    check_places("origins", origins, farthest)
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
+        raise InvalidArgumentError(
+            f"ids reach from {int(ids.min())} to {int(ids.max())}; robots and numbers go from 0 to "
+            f"{LARGEST_NUMBER}."
+        )
+
+
+def _checked(components: Components, farthest: float = FARTHEST) -> Components:
+    """Itself, if it is as the lattice of `quantized` would have it: definite, and nothing absurd."""
+    c = components.checked()
+    _check_range(c.means, c.origins, c.ids, farthest)
+    for name, value, limit in (
+        ("covariances", c.covariances.diagonal(dim1=1, dim2=2), LARGEST_VARIANCE),
+        ("support", c.support, MOST_POINTS),
+        ("seen_count", c.seen_count, MOST_POINTS),
+    ):
+        if value.numel() and float(value.max()) > limit:
+            raise InvalidArgumentError(f"{name} reach {float(value.max()):g}; {limit:g} is the most. Metres?")
+    _check_definite(unpack_symmetric(pack_symmetric(c.covariances), c.dim))  # its lower half is not sent
+    return c
 
 
 def _check_definite(covariances: Tensor) -> None:
@@ -232,84 +268,3 @@ def _doubles(values: Tensor) -> np.ndarray:
 
 def _wide(kind: np.dtype) -> type:
     return np.float64 if kind.kind == "f" else np.int64
-
-
-# -- counts ------------------------------------------------------------------------------------------------
-
-
-def _quantized_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
-    writer = BitWriter()
-    write_number(writer, "sender", sender)
-    write_ids(writer, ids.numpy())
-    writer.column(count_steps(counts))
-    return sealed(Kind.COUNTS, writer.to_bytes())
-
-
-def read_quantized_counts(body: bytes) -> CountsMessage:
-    reader = BitReader(body)
-    sender, ids = read_number(reader), read_ids(reader)
-    steps = reader.column(len(ids))
-    reader.finish()
-    return _counts(sender, ids, counts_of(steps))
-
-
-def count_steps(counts: Tensor) -> Ints:
-    """log2 of the counts in steps, as `mapping.quantization` has the support of components."""
-    least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
-    steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
-    return torch.where(counts < least / 2, NO_COUNT, steps).numpy()
-
-
-def counts_of(steps: Ints) -> np.ndarray:
-    """The counts that steps stand for. Raises `DataError` for what `count_steps` does not give."""
-    if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
-        raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
-    told = power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy()
-    return np.where(steps == NO_COUNT, 0.0, told)
-
-
-def _float_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
-    writer = BitWriter()
-    write_number(writer, "sender", sender)
-    rows = np.empty(len(ids), _COUNT)
-    rows["robot"], rows["number"], rows["count"] = ids[:, 0], ids[:, 1], counts
-    return sealed(Kind.FLOAT_COUNTS, writer.to_bytes() + rows.tobytes())
-
-
-def read_float_counts(body: bytes) -> CountsMessage:
-    sender, rest = _sender_of(body)
-    if len(rest) % _COUNT.itemsize:
-        raise DataError(f"{len(rest)} bytes are not whole counts of {_COUNT.itemsize} bytes: truncated?")
-    rows = np.frombuffer(rest, _COUNT)
-    return _counts(sender, np.stack([rows["robot"], rows["number"]], 1).astype(np.int64), rows["count"])
-
-
-def _thesis_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
-    writer = BitWriter()
-    write_number(writer, "sender", sender)
-    return sealed(Kind.THESIS_COUNTS, writer.to_bytes() + encode_thesis_updates(ids, counts))
-
-
-def read_thesis_counts(body: bytes) -> CountsMessage:
-    sender, rest = _sender_of(body)
-    ids, counts = decode_thesis_updates(rest)
-    return _counts(sender, ids.numpy(), counts.numpy())
-
-
-def _sender_of(body: bytes) -> tuple[int, bytes]:
-    """The number that a body of whole bytes begins with, and the rest."""
-    reader = BitReader(body)
-    sender = read_number(reader)
-    return sender, body[len(body) - reader.left // 8 :]
-
-
-def _counts(sender: int, ids: Ints, values: np.ndarray) -> CountsMessage:
-    counts = {
-        (robot, number): count for (robot, number), count in zip(ids.tolist(), values.tolist(), strict=True)
-    }
-    most = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
-    if len(counts) != len(ids) or not all(0 <= count <= most for count in counts.values()):
-        raise DataError(f"An id comes twice, or a count is not from 0 to {most:g}: it is damaged.")
-    if len(ids) and int(ids.min()) < 0:
-        raise DataError("An id is negative: it is damaged.")
-    return CountsMessage(sender, counts)

@@ -15,6 +15,9 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 VERSION = 1
 MAX_BYTES = 1200
 """Longest datagram: with its headers it fits the smallest path of IPv6, so it is never fragmented."""
+FARTHEST = 2.0**24
+"""Metres from the world's origin on each axis, of whatever is told: 16 777 km, so that UTM's coordinates fit,
+and earth-centred ones. Even moved by a correction it is within 2³² cells of 2 cm, where rays can be cast."""
 CODECS = ("quantized", "float", "thesis")
 """How components and counts are written."""
 _KIND_BITS = 4
@@ -75,21 +78,29 @@ def opened(datagram: bytes) -> tuple[Kind, bytes]:
     return kind, data[1:]
 
 
-def split(n: int, encode: Callable[[int, int], bytes], what: str, max_bytes: int = MAX_BYTES) -> list[bytes]:
-    """Datagrams of n things, halved until each fits; encode(begin, end) writes those from begin to end − 1.
+def split(
+    n: int,
+    encode: Callable[[int, int], bytes],
+    what: str,
+    max_bytes: int = MAX_BYTES,
+    may_go: Callable[[int, int], bool] = lambda begin, end: True,
+) -> list[bytes]:
+    """Datagrams of n things, halved until each fits; encode(begin, end) writes those from begin to end − 1,
+    and `may_go` says whether a datagram may have them, however few bytes they take.
 
     Raises `InvalidArgumentError` where a single one does not fit.
     """
 
     def parts(begin: int, end: int) -> list[bytes]:
-        datagram = encode(begin, end)
-        if len(datagram) <= max_bytes:
-            return [datagram]
-        if end - begin == 1:
-            raise InvalidArgumentError(
-                f"A single {what} takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
-                "Let it have fewer sensor positions."
-            )
+        if end - begin == 1 or may_go(begin, end):
+            datagram = encode(begin, end)
+            if len(datagram) <= max_bytes:
+                return [datagram]
+            if end - begin == 1:
+                raise InvalidArgumentError(
+                    f"A single {what} takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
+                    "Let it have fewer sensor positions."
+                )
         middle = (begin + end) // 2
         return parts(begin, middle) + parts(middle, end)
 

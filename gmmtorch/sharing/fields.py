@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.mapping.lattice import FARTHEST
+from gmmtorch.sharing.envelope import FARTHEST
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.record_ids import END, MOST_RECORDS, NUMBER_BITS, lives
 
@@ -206,6 +206,18 @@ def read_number(reader: BitReader) -> int:
     if not 0 <= value <= LARGEST_NUMBER:
         raise DataError(f"A number is {value}, not from 0 to {LARGEST_NUMBER}: it is damaged.")
     return value
+
+
+def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
+    """Positions (N, D), m, if they are finite and no farther out on any axis; else `InvalidArgumentError`."""
+    bad = ~(places.abs() <= farthest).all(1)
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"{name}[{first}] is {places[first].tolist()}; positions that can be told are finite, and up to "
+            f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
+        )
+    return places
 
 
 def _check_number(name: str, value: int) -> int:

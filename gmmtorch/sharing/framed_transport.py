@@ -7,16 +7,13 @@ import random
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.sharing.network import Traffic
 from gmmtorch.sharing.security import Opener, Sealer, TeamKey
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 MAX_WAITING = 4096
 """Datagrams that wait to be delivered; of more, the oldest are dropped."""
@@ -87,6 +84,18 @@ class FramedTransport(ABC):
             raise InvalidArgumentError(f"share={share} must be a share of the datagrams in [0, 1).")
         self._loss, self._drawn = float(share), random.Random(seed)
 
+    @property
+    def session(self) -> bytes:
+        """The session of this start, drawn at random."""
+        return self._sealer.session
+
+    def disown(self, former: Iterable[bytes]) -> None:
+        """Sessions of this robot's former starts: frames of them, late or played back, are no other robot's.
+
+        Without them it is told by how they come: see `sessions.TwinWatch`.
+        """
+        self._opener.former = frozenset(former)
+
     # -- the books -----------------------------------------------------------------------------------------
 
     def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
@@ -102,9 +111,16 @@ class FramedTransport(ABC):
         said = self.traffic()
         return said.wire_bytes + self.overhead * said.datagrams
 
-    def books(self) -> dict[str, Any]:
-        """What has passed, and what went wrong, for results."""
+    def books(self, robot: int) -> dict[str, Any]:
+        """What has passed, and what went wrong, for results; `robot`: this one."""
+        self._check_robot("robot", robot)
+        said = self.traffic()
+        with self._lock:
+            by_kind = {kind: traffic.bytes for kind, traffic in sorted(self._broadcast.items())}
         return {
+            "bytes_sent": said.bytes,
+            "datagrams": said.datagrams,
+            "bytes_by_kind": by_kind,
             "wire_bytes": self.wire_bytes,
             "wire_bytes_received": self.received.wire_bytes,
             "socket_bytes": self.sent.bytes,
@@ -112,6 +128,7 @@ class FramedTransport(ABC):
             "refused": {reason: n for reason, n in self.refused.items() if n},
             "failures": dict(self.failures),
             "dropped": self.n_dropped,
+            "namesakes": {str(number): whence for number, whence in sorted(self.namesakes.items())},
         }
 
     @property
@@ -147,9 +164,12 @@ class FramedTransport(ABC):
 
     # -- inside --------------------------------------------------------------------------------------------
 
-    def _check(self, name: str, robot: int) -> None:
+    def _check_robot(self, name: str, robot: int) -> None:
         if robot != self.robot:
             raise InvalidArgumentError(f"{name}={robot} must be {self.robot}, the robot of this transport.")
+
+    def _check(self, name: str, robot: int) -> None:
+        self._check_robot(name, robot)
         if self._closing.is_set():
             raise GmmTorchError(f"The transport of robot {self.robot} is closed; open another.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,20 @@ class Intervals:
         begins, lasts = rising[np.append(0, breaks + 1)], rising[np.append(breaks, len(rising) - 1)]
         return cls(np.stack([begins, lasts + 1], 1).reshape(-1).astype(np.int64))
 
+    @classmethod
+    def union(cls, sets: Iterable[Intervals]) -> Intervals:
+        """The numbers of any of these sets: what `|` makes of them one by one, in one go."""
+        parts = [one for one in sets if one]
+        if len(parts) < 2:
+            return parts[0] if parts else cls.empty()
+        edges = np.concatenate([one.edges for one in parts]).reshape(-1, 2)
+        begins, ends = edges[np.argsort(edges[:, 0])].T
+        ends = np.maximum.accumulate(ends)
+        is_first = np.ones(len(begins), np.bool_)
+        is_first[1:] = begins[1:] > ends[:-1]
+        is_last = np.append(is_first[1:], True)
+        return cls(np.stack([begins[is_first], ends[is_last]], 1).reshape(-1))
+
     def stored(self) -> torch.Tensor:
         """The edges (2n,), a copy, for a file."""
         return torch.from_numpy(self.edges.copy())
@@ -66,6 +81,10 @@ class Intervals:
     def size(self) -> int:
         """How many numbers there are."""
         return sum((self.edges[1::2] - self.edges[::2]).tolist())  # Python's ints do not overflow
+
+    def up_to(self, most: int) -> Intervals:
+        """The set; the empty one where it has more intervals than that."""
+        return self if len(self) <= most else Intervals.empty()
 
     def pairs(self) -> list[tuple[int, int]]:
         """Begin and end of each interval, the end not in it."""
@@ -137,6 +156,17 @@ class Intervals:
         """Where either set may change, and whether the numbers from there on are in each."""
         places = np.unique(np.concatenate([self.edges, other.edges]))
         return places, self.contains(places), other.contains(places)
+
+
+def excess(sets: Mapping[int, Intervals], most: int) -> list[int]:
+    """Whose sets to forget, the largest, so that the others have at most so many intervals together."""
+    gone: list[int] = []
+    n_left = sum(map(len, sets.values()))
+    by_size = sorted(sets, key=lambda name: len(sets[name])) if n_left > most else []
+    while n_left > most:
+        gone.append(by_size.pop())
+        n_left -= len(sets[gone[-1]])
+    return gone
 
 
 def _where(places: Ints, inside: NDArray[np.bool_]) -> Intervals:

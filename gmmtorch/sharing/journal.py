@@ -9,7 +9,8 @@ from pathlib import Path
 from types import TracebackType
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, OutputError, check_whole
-from gmmtorch.sharing.envelope import MAX_BYTES, Kind
+from gmmtorch.sharing.envelope import MAX_BYTES
+from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.journal_files import (
     LOG,
     SNAPSHOT,
@@ -24,10 +25,13 @@ from gmmtorch.sharing.journal_files import (
 )
 from gmmtorch.sharing.journal_format import framed, log_header, pack_snapshot
 from gmmtorch.sharing.journal_restore import MOST_LOG_BYTES, MOST_SNAPSHOT_BYTES, restore
+from gmmtorch.sharing.record_names import RECORDS, names_in
 from gmmtorch.sharing.replica import Replica
 
 SYNCS = ("snapshot", "always")
-_KEPT = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.TOTALS, Kind.CORRECTION})
+_MOST_NAMED = 1 << 16
+"""Intervals of names of what is kept: 1 MiB. Where there are more they are forgotten, and some is written
+again."""
 _log = logging.getLogger(__name__)
 
 
@@ -84,28 +88,27 @@ class Journal:
         self._sync, self._most = sync == "always", int(most_log_bytes)
         self._number = self._size = self._snapshot_at = 0
         self._file = -1
+        self._in_snapshot = Intervals.empty()  # names of what the last one has
         self._lock = locked(self.path)
         try:
             self._number = max([0, *numbers(self.path, SNAPSHOT), *numbers(self.path, LOG)])
             self.restored = restore(self.path, replica)
             self._last_sound = self.restored.snapshot or 0
-            self._heard_version = replica.version
+            # Names of what is there also without the last snapshot, should that one rot.
+            self._kept = replica.held
             self.snapshot()
         except BaseException:
             self.close()
             raise
 
     def said(self, datagrams: bytes | Iterable[bytes]) -> None:
-        """Keep datagrams of the replica, before they are sent. All or, with `OutputError`, none."""
-        self._write(self._frames(datagrams))
+        """Keep datagrams of the replica, before they are sent. All or, with `OutputError`, none; what is kept
+        already is not written again, whatever the datagram in which it comes."""
+        self._keep(datagrams)
 
     def heard(self, datagrams: bytes | Iterable[bytes]) -> None:
-        """Keep datagrams that the replica has merged, before it announces them. All or, with `OutputError`,
-        none; what it held already is not written again."""
-        data = self._frames(datagrams)
-        if self._replica.version != self._heard_version:
-            self._write(data)
-            self._heard_version = self._replica.version
+        """Keep datagrams that the replica has merged, before it announces them; else as `said`."""
+        self._keep(datagrams)
 
     def snapshot(self) -> None:
         """Write the whole state, and start the log anew; also done by itself when the log is long.
@@ -126,6 +129,8 @@ class Journal:
         # The last one stays, with its log: should this one rot, nothing is lost.
         remove_older(self.path, self._last_sound)
         self._last_sound = self._number
+        self._kept = (self._kept | self._in_snapshot).up_to(_MOST_NAMED)
+        self._in_snapshot = self._replica.held
 
     def close(self) -> None:
         """Let go of the folder, without a last snapshot. May be called again."""
@@ -149,14 +154,22 @@ class Journal:
 
     # -- inside -----------------------------------------------------------------------------------
 
-    def _frames(self, datagrams: bytes | Iterable[bytes]) -> bytes:
+    def _keep(self, datagrams: bytes | Iterable[bytes]) -> None:
+        """Write those that hold something that is not kept."""
         self._check_open()
         given = [datagrams] if isinstance(datagrams, bytes) else datagrams
-        return b"".join(framed(datagram) for datagram in given if _is_record(datagram))
+        kept, frames = self._kept, []
+        for datagram in given:
+            if _is_record(datagram) and not kept.covers(names := names_in(datagram)):
+                kept |= names
+                frames.append(framed(datagram))
+        if frames:
+            self._write(b"".join(frames))
+            self._kept = kept.up_to(_MOST_NAMED)
+            if self._size >= self._snapshot_at:
+                self._try_snapshot()
 
     def _write(self, data: bytes) -> None:
-        if not data:
-            return
         path = place(self.path, self._number, LOG)
         if self._size + len(data) > MOST_LOG_BYTES:
             raise OutputError(f"{path} is full, as snapshots have failed. Call snapshot() to see why.")
@@ -165,8 +178,6 @@ class Journal:
         except OSError as error:
             raise unwritten(path, error) from error
         self._size += len(data)
-        if self._size >= self._snapshot_at:
-            self._try_snapshot()
 
     def _try_snapshot(self) -> None:
         """If it fails, what was to be kept is kept all the same."""
@@ -194,4 +205,4 @@ def _is_record(datagram: bytes) -> bool:
     if not isinstance(datagram, bytes) or not 0 < len(datagram) <= MAX_BYTES:
         what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
         raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from 1 to {MAX_BYTES}.")
-    return datagram[0] & 15 in _KEPT
+    return datagram[0] & 15 in RECORDS

@@ -12,25 +12,19 @@ from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.sharing import (
     announce_messages,
     component_messages,
+    count_messages,
     point_messages,
+    record_messages,
     view_announcements,
     view_messages,
 )
-from gmmtorch.sharing.announce_messages import (
-    AnnouncementMessage,
-    CorrectionMessage,
-    SupersessionMessage,
-    TotalsMessage,
-)
-from gmmtorch.sharing.component_messages import (
-    ComponentsMessage,
-    CountsMessage,
-    encode_components,
-    encode_counts,
-)
+from gmmtorch.sharing.announce_messages import AnnouncementMessage
+from gmmtorch.sharing.component_messages import ComponentsMessage, encode_components
+from gmmtorch.sharing.count_messages import CountsMessage, encode_counts
 from gmmtorch.sharing.envelope import CODECS, MAX_BYTES, Kind, opened
 from gmmtorch.sharing.fields import quantized_poses
 from gmmtorch.sharing.point_messages import PointsMessage, encode_points
+from gmmtorch.sharing.record_messages import CorrectionMessage, SupersessionMessage, TotalsMessage
 from gmmtorch.sharing.view_announcements import ViewsHeldMessage
 from gmmtorch.sharing.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
 
@@ -75,16 +69,16 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.COMPONENTS: component_messages.read_quantized,
     Kind.FLOAT_COMPONENTS: component_messages.read_float,
     Kind.THESIS_COMPONENTS: component_messages.read_thesis,
-    Kind.COUNTS: component_messages.read_quantized_counts,
-    Kind.FLOAT_COUNTS: component_messages.read_float_counts,
-    Kind.THESIS_COUNTS: component_messages.read_thesis_counts,
+    Kind.COUNTS: count_messages.read_quantized_counts,
+    Kind.FLOAT_COUNTS: count_messages.read_float_counts,
+    Kind.THESIS_COUNTS: count_messages.read_thesis_counts,
     Kind.POINTS: point_messages.read_points,
     Kind.VIEWS: view_messages.read_views,
     Kind.PLAN: view_messages.read_plan,
     Kind.ANNOUNCEMENT: announce_messages.read_announcement,
-    Kind.SUPERSESSION: announce_messages.read_supersession,
-    Kind.TOTALS: announce_messages.read_totals,
-    Kind.CORRECTION: announce_messages.read_correction,
+    Kind.SUPERSESSION: record_messages.read_supersession,
+    Kind.TOTALS: record_messages.read_totals,
+    Kind.CORRECTION: record_messages.read_correction,
     Kind.VIEWS_HELD: view_announcements.read_views_held,
 }
 
@@ -115,13 +109,14 @@ def kind_of(datagram: bytes) -> str:
 def decode(datagram: bytes) -> Message:
     """What a datagram says; tensors on the CPU.
 
-    Raises `DataError` for anything that no encoder of this version wrote, whatever it may be, and takes
-    memory in proportion to the datagram.
+    Raises `DataError`, and nothing else, for bytes that are no message, or say what no encoder of this
+    version would; and takes memory that `MAX_BYTES` bounds.
     """
     kind, body = opened(datagram)
     try:
         return _READERS[kind](body)
     except DataError:
         raise
-    except GmmTorchError as error:
+    except (GmmTorchError, ValueError, ArithmeticError, LookupError, RuntimeError) as error:
+        # Readers name what is wrong. The others are for what nobody has thought of: the robot goes on.
         raise DataError(f"The datagram is damaged: {error}") from error

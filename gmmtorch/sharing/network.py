@@ -179,6 +179,22 @@ class Network:
         """Bytes without headers, by the kind that the senders gave, sorted."""
         return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
 
+    def books(self, robot: int) -> dict[str, Any]:
+        """What one robot has sent and received, for results; the names are those of a real transport's."""
+        sent, got = self.traffic(robot), self.reception(robot)
+        kinds = sorted(kind for who, kind in self._traffic if who == robot)
+        return {
+            "bytes_sent": sent.bytes,
+            "datagrams": sent.datagrams,
+            "bytes_by_kind": {kind: self.traffic(robot, kind).bytes for kind in kinds},
+            "wire_bytes": sent.wire_bytes,
+            "wire_bytes_received": Traffic(got.datagrams, got.bytes).wire_bytes,
+            "refused": {},
+            "failures": {},
+            "dropped": 0,
+            "namesakes": {},
+        }
+
     @property
     def n_in_flight(self) -> int:
         """Datagrams on their way, one for each robot that will hear it."""

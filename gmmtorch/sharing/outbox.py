@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gmmtorch.mapping.quantization import quantize
-from gmmtorch.sharing.announce_messages import TotalsMessage
 from gmmtorch.sharing.anti_entropy import Packet
 from gmmtorch.sharing.component_messages import fitted
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.record_ids import keys_of, lives
+from gmmtorch.sharing.record_messages import TotalsMessage
 from gmmtorch.sharing.record_view import information
 from gmmtorch.sharing.records import Records
 
@@ -23,12 +23,12 @@ def packets(
     records: Records, due: Intervals, ready: Sequence[Packet], max_bytes: int, by_information: bool
 ) -> Iterator[Packet]:
     """What supersedes or moves others, then components, then counts; of components those that are `ready` as
-    they are.
+    they are. What is due is not superseded.
 
     Components go by their keys, which takes the fewest bytes; or the most informative first, by short
     runs of consecutive keys, which takes few more.
     """
-    due = (due & records.held) - records.dead
+    due &= records.held
     if not due:
         return
     ready = [packet for packet in ready if len(packet[0]) <= max_bytes and due.covers(packet[1])]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed
+from gmmtorch.sharing.fields import check_places
 
 _HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
 _POINT_BYTES = 12
@@ -44,6 +45,8 @@ def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit:
     Args:
         sender: the robot that speaks, up to 65535. frame: its number, up to 2³² − 1.
         origin: (3,). ends: (N, 3). is_hit: (N,) bool.
+
+    Raises `InvalidArgumentError` for what is out of range, or farther out than `envelope.FARTHEST`.
     """
     _check_fits("sender", sender, LARGEST_ROBOT)
     _check_fits("frame", frame, LARGEST_FRAME)
@@ -53,9 +56,10 @@ def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit:
             "be (3,), (N, 3) and (N,)."
         )
     place = origin.detach().double().cpu()
-    offsets = (ends.detach().double().cpu() - place).float().numpy()
-    if not (bool(place.isfinite().all()) and bool(np.isfinite(offsets).all())):
-        raise InvalidArgumentError("origin and ends must be finite, and within float32 of one another.")
+    check_places("origin", place[None])
+    rounded = (ends.detach().double().cpu() - place).float()
+    check_places("ends", place + rounded.double())
+    offsets = rounded.numpy()
     hits = is_hit.cpu().numpy().astype(bool)
     starts = range(0, len(offsets), POINTS_PER_DATAGRAM)
     if len(starts) > MOST_PARTS:
@@ -79,17 +83,18 @@ def read_points(body: bytes) -> PointsMessage:
         raise DataError(f"{len(body)} bytes with {n} points, part {part} of {n_parts}: it is damaged.")
     offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3)
     bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=_HEADER.size + _POINT_BYTES * n))
-    place = np.array([x, y, z])
-    if bits[n:].any() or not (np.isfinite(offsets).all() and np.isfinite(place).all()):
+    if bits[n:].any() or not np.isfinite(offsets).all():
         raise DataError("Points are NaN or infinite, or filling bits are set: it is damaged.")
     offsets = offsets.astype(np.float64)  # not before: some NaNs signal when they are cast
+    origin = torch.tensor([x, y, z], dtype=torch.float64)
+    check_places("origin", origin[None])
     return PointsMessage(
         sender=sender,
         frame=frame,
         part=part,
         n_parts=n_parts,
-        origin=torch.from_numpy(place),
-        ends=torch.from_numpy(place + offsets),
+        origin=origin,
+        ends=check_places("ends", origin + torch.from_numpy(offsets)),
         is_hit=torch.from_numpy(bits[:n] != 0),
     )
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import CorrectionMessage
 from gmmtorch.sharing.intervals import Ints
 from gmmtorch.sharing.record_ids import robot_of
+from gmmtorch.sharing.record_messages import CorrectionMessage
 
 
 def gains(components: Components, gain: Tensor) -> Components:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
-from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 
-from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.errors import DataError
 from gmmtorch.mapping.codec import quantized
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import (
+from gmmtorch.sharing.changes import ChangeLog, Changes
+from gmmtorch.sharing.component_table import ComponentTable, fingerprints, most_sightings
+from gmmtorch.sharing.intervals import Intervals, Ints
+from gmmtorch.sharing.messages import decode
+from gmmtorch.sharing.record_ids import keys_of, robot_of
+from gmmtorch.sharing.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
     RecordMessage,
@@ -21,12 +24,8 @@ from gmmtorch.sharing.announce_messages import (
     TotalsMessage,
     encode_record,
 )
-from gmmtorch.sharing.changes import ChangeLog, Changes
-from gmmtorch.sharing.component_table import ComponentTable, fingerprints, most_sightings
-from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.record_ids import keys_of, robot_of
 from gmmtorch.sharing.record_view import corrected, with_gains
+from gmmtorch.sharing.refusals import RefusedError
 from gmmtorch.sharing.totals import Totals
 
 MOST_SIGHTINGS = 48
@@ -34,35 +33,16 @@ MOST_SIGHTINGS = 48
 MOST_COMPONENTS = 1 << 20
 MOST_OTHERS = 1 << 12
 """Records that are no components."""
+MOST_ENTRIES = 1 << 19
+"""Of these records, all together: totals, and intervals; 16 bytes each, of totals twice. So 16 MiB: eight
+thousand totals of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
-"""Of what is held: more than a team leaves where datagrams are lost, and a bound on memory."""
+"""Of what is held, and of what supersessions that wait may add: more than a team leaves where datagrams are
+lost, and a bound on memory."""
 _PIECE = 128
 """Components of a batch that is restored: dropping one costs as much as its batch is large."""
 
 _Record = TypeVar("_Record", bound=RecordMessage)
-
-
-class RefusedError(DataError):
-    """What came is sound, and not taken in; `reason` is one of few, `robot` whose it is."""
-
-    def __init__(self, reason: str, robot: int, message: str) -> None:
-        super().__init__(message)
-        self.reason, self.robot = reason, robot
-
-
-def merged(take: Callable[[], None], refused: Counter[str], conflicts: Counter[int]) -> bool:
-    """Whether what came was taken in; what refuses it is counted, by reason and, of conflicts, by robot."""
-    try:
-        take()
-    except RefusedError as refusal:
-        refused[refusal.reason] += 1
-        if refusal.reason == "conflict":
-            conflicts[refusal.robot] += 1
-        return False
-    except GmmTorchError:
-        refused["damaged"] += 1
-        return False
-    return True
 
 
 class Records:
@@ -73,11 +53,14 @@ class Records:
     once then, as who lacks them needs only the supersession and the successors, which are here. So
     what counts depends on what is held, and not on the order in which it came.
 
+    There is room for so much of what others say; what the robot itself says is never refused for want of it.
+
     dim: 2 or 3; None: that of the first components.
     """
 
     def __init__(self, dim: int | None = None, most_components: int = MOST_COMPONENTS) -> None:
-        self.dim, self._most = dim, most_components
+        self.dim = self._dim_asked = dim
+        self._most = most_components
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
         self.table = ComponentTable(dim or 3)
@@ -87,14 +70,17 @@ class Records:
         self.version = 0
         """Rises with every change."""
         self._kinds: dict[type, dict[int, RecordMessage]] = {}  # the others by kind
+        self._n_entries = 0  # of the others
         self._waiting: dict[int, SupersessionMessage] = {}  # for successors
         self._log = ChangeLog()
         self._view: tuple[int, Components] | None = None
 
     # -- growing ----------------------------------------------------------------------------------
 
-    def add_components(self, components: Components) -> Intervals:
+    def add_components(self, components: Components, bounded: bool = True) -> Intervals:
         """Take in components that are on the codec's lattice; returns their keys. All or none.
+
+        bounded: whether only as far as there is room.
 
         Raises `RefusedError`: "conflict", where a key is held with other content; "full"; "unfit", where they
         are of another dimension, or seen from more than `MOST_SIGHTINGS` places.
@@ -113,15 +99,16 @@ class Records:
         if not fresh.all():
             self._check_same(keys[~fresh], components.selected(torch.from_numpy(np.flatnonzero(~fresh))))
             components = components.selected(torch.from_numpy(np.flatnonzero(fresh)))
-        self.check_room(len(components), int(keys[0]))
+        if bounded and len(self.table) + len(components) > self._most:
+            raise _full(int(keys[0]))
         added = Intervals.of(keys[fresh])
-        held = self._with(added)
+        held = self._with(added, bounded)
         self.table.add(keys[fresh], components)
         self._hold(held)
         self.dim = components.dim
         return added if fresh.all() else Intervals.of(keys)
 
-    def add_record(self, record: RecordMessage) -> Intervals:
+    def add_record(self, record: RecordMessage, bounded: bool = True) -> Intervals:
         """Take in another record; returns its key. Raises `RefusedError`, as `add_components` does."""
         key, robot, datagram = record.key, robot_of(record.key), encode_record(record)
         span = Intervals.span(key, key + 1)
@@ -134,14 +121,12 @@ class Records:
             raise RefusedError(
                 "unfit", robot, f"Record {key} is too long, or of another dimension than this map."
             )
-        room = MOST_INTERVALS - len(self.held) - sum(len(s.old) for s in self._waiting.values())
-        if len(self.others) >= MOST_OTHERS or (
-            isinstance(record, SupersessionMessage) and len(record.old) > room
-        ):
+        if bounded and not self._has_room(record):
             raise _full(key)
-        held = self._with(span)
+        held = self._with(span, bounded)
         self.others[key], self.datagrams[key] = record, datagram
         self._kinds.setdefault(type(record), {})[key] = record
+        self._n_entries += _n_entries(record)
         if isinstance(record, SupersessionMessage):
             self._waiting[key] = record
         elif isinstance(record, TotalsMessage):
@@ -152,15 +137,18 @@ class Records:
         self._hold(held)
         return span
 
-    def check_room(self, n: int, key: int) -> None:
-        """Raises `RefusedError` unless there is room for so many components; key: of one of them."""
-        if len(self.table) + n > self._most:
-            raise _full(key)
+    def _has_room(self, record: RecordMessage) -> bool:
+        if len(self.others) >= MOST_OTHERS or self._n_entries + _n_entries(record) > MOST_ENTRIES:
+            return False
+        if not isinstance(record, SupersessionMessage):
+            return True
+        waiting = sum(len(one.old) for one in self._waiting.values())
+        return len(self.held) + waiting + len(record.old) <= MOST_INTERVALS
 
-    def _with(self, added: Intervals) -> Intervals:
+    def _with(self, added: Intervals, bounded: bool) -> Intervals:
         """What is held then, if there is room."""
         held = self.held | added
-        if len(held) > max(len(self.held), MOST_INTERVALS):
+        if bounded and len(held) > max(len(self.held), MOST_INTERVALS):
             raise _full(added.pairs()[0][0])
         return held
 
@@ -196,6 +184,7 @@ class Records:
         for key in keys[~shapes].tolist():
             record = self.others.pop(key)
             del self.datagrams[key], self._kinds[type(record)][key]
+            self._n_entries -= _n_entries(record)
             self._waiting.pop(key, None)
             if isinstance(record, TotalsMessage):
                 totals.append(record)
@@ -269,10 +258,17 @@ class Records:
             "log": self._log.state(self.table),
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Hold what `state` says. Raises `DataError` where it is damaged; nothing has changed then."""
-        fresh = Records(state["dim"], self._most)
+    def restore(self, state: dict[str, Any], robot: int) -> None:
+        """Hold what `state` says, of this robot and others. Raises `DataError` where it is damaged, of
+        another dimension, or has more components of others than there is room for; nothing has changed then.
+        """
+        if None not in (asked := self._dim_asked, dim := state["dim"]) and asked != dim:
+            raise DataError(f"The state is of a map in {dim}D, this is one with dim={asked}.")
+        fresh = Records(asked if dim is None else dim, self._most)
+        fresh._dim_asked = asked
         components = Components(**state["components"]).checked()
+        if (n := int((components.ids[:, 0] != robot).sum())) > self._most:
+            raise DataError(f"The state has {n} components of others, with most_components={self._most}.")
         if fingerprints(quantized(components)) != fingerprints(components):
             raise DataError("Components are not as the codec leaves them: the state is damaged.")
         keys, log = keys_of(components.ids), state["log"]
@@ -284,10 +280,10 @@ class Records:
         row_of = dict(zip(keys.tolist(), range(len(keys)), strict=True))
         pieces += [np.array([row_of[key] for key in batch.tolist()], np.int64) for batch in untold]
         for piece in pieces:
-            fresh.add_components(components.selected(torch.from_numpy(piece)))
+            fresh.add_components(components.selected(torch.from_numpy(piece)), bounded=False)
         data, at = state["records"].numpy().tobytes(), 0
         for n_bytes in state["record_bytes"].tolist():
-            fresh.add_record(_record(data[at : at + n_bytes]))
+            fresh.add_record(_record(data[at : at + n_bytes]), bounded=False)
             at += n_bytes
         held = fresh.held | Intervals.loaded(state["held"])
         fresh.dead = held - fresh.live()
@@ -296,6 +292,15 @@ class Records:
         fresh.version = self.version + 1
         fresh._view = None
         vars(self).update(vars(fresh))
+
+
+def _n_entries(record: RecordMessage) -> int:
+    """How much of `MOST_ENTRIES` a record takes."""
+    if isinstance(record, TotalsMessage):
+        return len(record.components)
+    if isinstance(record, SupersessionMessage):
+        return len(record.old) + len(record.new)
+    return len(record.moved)
 
 
 def _record(datagram: bytes) -> RecordMessage:

@@ -14,14 +14,7 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, chec
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import ArrayLike
-from gmmtorch.sharing.announce_messages import (
-    AnnouncementMessage,
-    CorrectionMessage,
-    SupersessionMessage,
-    TotalsMessage,
-    check_size,
-    encode_announcements,
-)
+from gmmtorch.sharing.announce_messages import AnnouncementMessage, encode_announcements
 from gmmtorch.sharing.anti_entropy import Backlog
 from gmmtorch.sharing.authorship import Author
 from gmmtorch.sharing.changes import Changes
@@ -36,7 +29,9 @@ from gmmtorch.sharing.record_ids import (
     ids_of,
     keys_of,
 )
-from gmmtorch.sharing.records import MOST_COMPONENTS, Records, RefusedError, merged
+from gmmtorch.sharing.record_messages import CorrectionMessage, SupersessionMessage, TotalsMessage, check_size
+from gmmtorch.sharing.records import MOST_COMPONENTS, Records
+from gmmtorch.sharing.refusals import RefusedError, merged
 
 
 class Replica:
@@ -71,7 +66,7 @@ class Replica:
         dim: 2 or 3; None: that of the first components.
         incarnation: of this life of the robot, up to 2²⁴ − 1. None: drawn, which is safe whatever
             was saved. Who gives it gives each only once, or goes on from the last state of it.
-        most_components: held at most; more are refused.
+        most_components: beyond so many none are taken from others; this robot's own always are.
         """
         if check_whole("robot", robot, 0) > LARGEST_ROBOT:
             raise InvalidArgumentError(f"robot={robot} must be at most {LARGEST_ROBOT}.")
@@ -146,6 +141,7 @@ class Replica:
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
         said = Intervals.empty()
+        self._backlog.buried(self._records.dead)
         waiting = packets(
             self._records,
             self._backlog.due,
@@ -165,6 +161,7 @@ class Replica:
     def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
         """What this robot holds: who hears it sends what is missing. Of each datagram so many bytes."""
         check_size(max_bytes)
+        self._backlog.asks()
         return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
 
     def receive(self, datagram: bytes, message: Message | None = None) -> bool:
@@ -180,7 +177,7 @@ class Replica:
         message = decode(datagram) if message is None else message
         if isinstance(message, AnnouncementMessage):
             self._check_sender(message)
-            self._backlog.announced(message, self._records.held)
+            self._backlog.announced(message, self._records.held, self._records.dead)
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
             self._check_names(keys_of(message.components.ids))
             self._backlog.heard(self._records.add_components(message.components))
@@ -245,7 +242,8 @@ class Replica:
 
     @property
     def missing(self) -> Intervals:
-        """Names of the records that others have announced they hold, and that are not here."""
+        """Names of the records that others have announced they hold, and that are not here; but not those of
+        robots that have not been heard for long, or never were there: see `anti_entropy.PATIENCE`."""
         return self._backlog.missing(self._records.held)
 
     @property
@@ -279,7 +277,7 @@ class Replica:
         try:
             if state["robot"] != self.robot:
                 raise DataError(f"The state is of robot {state['robot']}, this is robot={self.robot}.")
-            self._records.restore(state["records"])
+            self._records.restore(state["records"], self.robot)
             self._author.restore(state["author"])
             self._backlog.restore(state["backlog"])
             if state["author"]["incarnation"] != self.incarnation:

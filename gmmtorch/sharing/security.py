@@ -10,17 +10,20 @@ import logging
 import os
 import secrets
 import threading
+import time
+from collections.abc import Callable
 from typing import NoReturn
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.sharing.envelope import MAX_BYTES
-from gmmtorch.sharing.sessions import Sessions
+from gmmtorch.sharing.sessions import Sessions, TwinWatch
 from gmmtorch.sharing.team_key import TeamKey
 
 __all__ = ["REFUSALS", "Opener", "Sealer", "TeamKey"]
 
 FRAME_VERSION = 1
 MAX_SENDER = (1 << 16) - 1
+SESSION_BYTES = 8
 PLAIN_OVERHEAD = 15
 """Bytes that a frame without a key adds: first byte, sender (2), session (8), number (4)."""
 TAG_BYTES = 16
@@ -29,7 +32,6 @@ SEALED_OVERHEAD = PLAIN_OVERHEAD + TAG_BYTES
 REFUSALS = ("oversized", "foreign", "version", "malformed", "wrong_key", "echo", "replayed", "namesake")
 """Why a frame is refused, in the order in which it is asked."""
 _PLAIN, _SEALED = 14, 15  # high half of the first byte; the low half is the version
-_SESSION_BYTES = 8
 _NUMBERS = 1 << 32
 _MAX_SAID = 16
 _NEWS = {
@@ -98,7 +100,7 @@ class Sealer:
         self._begin()
 
     def _begin(self) -> None:
-        self.session = secrets.token_bytes(_SESSION_BYTES)
+        self.session = secrets.token_bytes(SESSION_BYTES)
         self._number, self._process = 0, os.getpid()
 
     def seal(self, datagram: bytes) -> bytes:
@@ -124,16 +126,25 @@ class Opener:
     Not for several threads at once.
     """
 
-    def __init__(self, key: TeamKey | None = None, own: Sealer | None = None) -> None:
+    def __init__(
+        self,
+        key: TeamKey | None = None,
+        own: Sealer | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Args:
         key: what the others seal with, or None if they do not.
         own: this robot's, so that what comes back to it, and others with its number, are known.
+        clock: seconds that never go back.
         """
         self._cipher = None if key is None else _Cipher(key)
         self._own = own
         self._form = _PLAIN if key is None else _SEALED
-        self._sessions = Sessions()
+        self._sessions = Sessions(clock)
+        self._twins = TwinWatch(clock)
         self._said: set[tuple[str, int]] = set()
+        self.former: frozenset[bytes] = frozenset()
+        """Sessions of former starts of this robot: whoever speaks in them plays back what it said."""
         self.refused = dict.fromkeys(REFUSALS, 0)
         """How many frames were refused, by reason."""
 
@@ -169,16 +180,19 @@ class Opener:
         datagram = data if self._cipher is None else self._cipher.decrypt(header, data)
         if datagram is None:
             return sender, b"", "wrong_key"
-        reason = self._sessions.refusal(sender, session, int.from_bytes(header[11:], "little"), source)
-        if reason is None and own is not None and sender == own.sender:
-            self._sessions.namesakes[sender] = f"{source} and this robot"
-            reason = "namesake"
-        return sender, datagram, reason
+        number = int.from_bytes(header[11:], "little")
+        if own is not None and sender == own.sender:
+            if session not in self.former and self._twins.finds(session, number):
+                self._sessions.namesakes[sender] = f"{source} and this robot"
+            return sender, datagram, "namesake"
+        return sender, datagram, self._sessions.refusal(sender, session, number, source)
 
     def _say(self, reason: str, sender: int, source: str) -> None:
         """Log what somebody has to mend, once; and not much in all, whoever asks for it."""
         if reason not in _NEWS or (reason, sender) in self._said or len(self._said) >= _MAX_SAID:
             return
+        if reason == "namesake" and sender not in self._sessions.namesakes:
+            return  # of a former life of this robot, for all that is known yet
         self._said.add((reason, sender))
         pair = self._sessions.namesakes.get(sender, source)
         _log.warning(_NEWS[reason].format(sender=sender, source=source or "somewhere", pair=pair))

@@ -15,6 +15,8 @@ RETURNS = 4
 """How often a session must come back after another of the same robot spoke, until they are two robots."""
 SILENCE = 60.0
 """Seconds for which one session has to speak alone until it is believed again."""
+FRESH_FRAMES, FRESH_SECONDS = 5, 5.0
+"""How many new frames of one session, over how long at least, show that a robot is there that sends them."""
 
 
 class ReplayWindow:
@@ -112,3 +114,48 @@ class Sessions:
         if speaker is not None and speaker.session == session:
             del self._speakers[sender]
             self.namesakes.pop(sender, None)
+
+
+@dataclass
+class _Continuing:
+    """A session that goes on: its newest number, and the new ones since it was last silent for long."""
+
+    since: float
+    last: float
+    highest: int = -1
+    n_fresh: int = 0
+
+
+class TwinWatch:
+    """Whether another robot speaks that has this robot's number.
+
+    A frame of that number that is not of this start of the robot may be of a former one: late on a slow way,
+    or recorded and played back. So it takes a session that goes on: `FRESH_FRAMES` frames, each newer than
+    all before, over `FRESH_SECONDS` or longer, without a silence of a minute.
+
+    Memory: a few hundred bytes for each of at most 1024 sessions.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._sessions: OrderedDict[bytes, _Continuing] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def finds(self, session: bytes, number: int) -> bool:
+        """Whether there is another, now that datagram `number` of a session of its has come.
+
+        To be asked only of datagrams that are authentic, and not of this start of the robot.
+        """
+        now = self._clock()
+        heard = self._sessions.setdefault(session, _Continuing(now, now))
+        self._sessions.move_to_end(session)
+        if len(self._sessions) > MAX_SESSIONS:
+            self._sessions.popitem(last=False)
+        if number <= heard.highest:
+            return False
+        if now - heard.last > SILENCE:
+            heard.since, heard.n_fresh = now, 0
+        heard.highest, heard.last, heard.n_fresh = number, now, heard.n_fresh + 1
+        return heard.n_fresh >= FRESH_FRAMES and now - heard.since >= FRESH_SECONDS

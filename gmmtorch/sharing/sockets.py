@@ -42,7 +42,8 @@ def multicast_socket(group: Address, interface: str, ttl: int) -> socket.socket:
         bound.close()
         raise InvalidArgumentError(
             f"interface={interface!r} cannot join the group {group[0]}: {error.strerror}. Give the address "
-            "that this machine has on the team's network (`ip -4 address`)."
+            "that this machine has on the team's network (`ip -4 address`). To start before there is one, "
+            "take no group: listen on 0.0.0.0, and name the peers."
         ) from error
     return bound
 
@@ -71,8 +72,8 @@ def _bound(unbound: socket.socket, address: Address) -> socket.socket:
         remedies = {
             errno.EADDRINUSE: "another process has that port. Stop it (`ss -ulpn` shows it), give another "
             "port, or 0 for any that is free",
-            errno.EADDRNOTAVAIL: "this machine has no such address. `ip -4 address` shows those it has; "
-            "0.0.0.0 is all of them",
+            errno.EADDRNOTAVAIL: "this machine has no such address, or not yet. `ip -4 address` shows those "
+            "it has; 0.0.0.0 is all of them, also those to come: with it a robot starts without a network",
             errno.EACCES: "ports below 1024 are for the system. Give one above",
         }
         remedy = remedies.get(error.errno or 0, f"{error.strerror}")

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gmmtorch.sharing.announce_messages import TotalsMessage
-from gmmtorch.sharing.component_messages import counts_of
+from gmmtorch.sharing.count_messages import counts_of
 from gmmtorch.sharing.intervals import Ints
 from gmmtorch.sharing.record_ids import life_of
+from gmmtorch.sharing.record_messages import TotalsMessage
 
 _Row = tuple[Ints, Ints]
 """Keys of components (N,), rising, and the largest total of each, in steps."""

@@ -108,7 +108,9 @@ class UdpTransport(FramedTransport):
         The others, and what is raised, as in `unicast`; here it is the interface that needs a key.
         """
         if not check_address("group", group).is_multicast:
-            raise InvalidArgumentError(f"group={group!r} must be a multicast address, such as 239.71.77.7.")
+            raise InvalidArgumentError(
+                f"group={group[0]!r} must be a multicast address, such as 239.71.77.7."
+            )
         _check_reach("interface", (interface, 0), key, insecure)
         return cls(robot, lambda: multicast_socket(group, interface, ttl), key, max_waiting)
 
@@ -180,8 +182,8 @@ def _check_reach(name: str, address: Address, key: TeamKey | None, insecure: boo
     host = check_address(name, address)
     if key is None and not insecure and not host.is_loopback:
         raise InvalidArgumentError(
-            f"{name}={str(host)!r} reaches other machines, and there is no key: give "
-            f"key=TeamKey.from_file(…), take {LOOPBACK}, or say insecure=True to let anybody read and write."
+            f"{name}={str(host)!r} reaches other machines, and there is no key (key=None): give one, "
+            f"take {LOOPBACK}, or say insecure=True to let anybody read and write."
         )
 
 

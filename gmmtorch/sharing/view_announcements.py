@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed, split
 from gmmtorch.sharing.fields import (
@@ -63,8 +63,12 @@ def encode_views_held(
 ) -> list[bytes]:
     """The datagram of a digest; or, with the detail of all keys, as many as it takes.
 
-    Each of these speaks of a part of all keys, so that any of them may get lost.
+    Each of these speaks of a part of all keys, so that any of them may get lost. Raises
+    `InvalidArgumentError` for what is out of range, or does not match.
     """
+    _check_sender(sender)
+    if len(digest) != DIGEST_BYTES:
+        raise InvalidArgumentError(f"digest has {len(digest)} bytes; {DIGEST_BYTES} are told.")
 
     def head() -> BitWriter:
         writer = BitWriter()
@@ -74,6 +78,7 @@ def encode_views_held(
 
     if detail is None:
         return [sealed(Kind.VIEWS_HELD, head().to_bytes())]
+    _check_detail(detail)
     cuts = np.union1d(detail.known.edges[::2], detail.alive)
 
     def part(first: int, last: int) -> bytes:
@@ -95,8 +100,7 @@ def encode_views_held(
 def read_views_held(body: bytes) -> ViewsHeldMessage:
     reader = BitReader(body)
     sender = read_number(reader)
-    if sender > LARGEST_ROBOT:
-        raise DataError(f"Robot {sender} says what views it holds: it is damaged.")
+    _check_sender(sender)
     digest = reader.fixed(DIGEST_BYTES, 8).astype(np.uint8).tobytes()
     detail = _read_detail(reader) if reader.left else None
     reader.finish()
@@ -105,11 +109,28 @@ def read_views_held(body: bytes) -> ViewsHeldMessage:
 
 def _read_detail(reader: BitReader) -> ViewsDetail:
     byte, begin, end = reader.number(), reader.number(), END - reader.number()
-    if not (0 <= byte < PRINT_BYTES and 0 <= begin < end <= END):
-        raise DataError(f"Byte {byte} of views from {begin} to {end}: it is damaged.")
+    if not 0 <= begin < end <= END:
+        raise DataError(f"An announcement of the views from {begin} to {end}: it is damaged.")
     known = read_intervals(reader, begin, end)
     alive = read_keys(reader)
-    checks = reader.fixed(len(alive), _CHECK_BITS)
-    if not known.contains(alive).all():
-        raise DataError("Views are held that are not known: it is damaged.")
-    return ViewsDetail(begin, end, known, alive, byte, checks)
+    detail = ViewsDetail(begin, end, known, alive, byte, reader.fixed(len(alive), _CHECK_BITS))
+    _check_detail(detail)
+    return detail
+
+
+# Who writes asks the same as who reads, so that nobody says what nobody takes.
+
+
+def _check_sender(sender: int) -> None:
+    if sender > LARGEST_ROBOT:
+        raise InvalidArgumentError(f"sender={sender} must be at most {LARGEST_ROBOT}.")
+
+
+def _check_detail(detail: ViewsDetail) -> None:
+    known, alive, checks = detail.known, detail.alive, detail.checks
+    if not 0 <= detail.byte < PRINT_BYTES:
+        raise InvalidArgumentError(f"byte={detail.byte} must be from 0 to {PRINT_BYTES - 1}.")
+    if not (Intervals.span(0, END).covers(known) and known.contains(alive).all()):
+        raise InvalidArgumentError("Views are known that no robot can have named, or alive and not known.")
+    if (np.diff(alive) < 1).any() or len(checks) != len(alive) or (checks >> _CHECK_BITS).any():
+        raise InvalidArgumentError("Views alive must rise, and have a byte of its fingerprint each.")

@@ -6,11 +6,14 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.intervals import Intervals, excess
 from gmmtorch.sharing.record_ids import keys_of_robot, robot_of
 
 MOST_PEERS = 64
 """Robots that are remembered, those heard last."""
+MOST_LACKED = 1 << 16
+"""Intervals of what these lack, all together: 1 MiB. What the one lacks that lacks most is forgotten; it will
+say so again."""
 _PRESENT = 3
 """Rounds for which a robot that is not heard counts as there."""
 _DIFFERENT = 2
@@ -90,6 +93,8 @@ class Peers:
             peer.asked, peer.waited = self._round, peer.waited + 1 if peer.lacks else 0
         still = gap & peer.lacks
         peer.lacks = (peer.lacks - scope) | gap
+        for robot in excess({robot: peer.lacks for robot, peer in self._peers.items()}, MOST_LACKED):
+            self._peers[robot].lacks = Intervals.empty()
         others = [robot for robot in self._present() if robot != sender]
         due = Intervals.empty()
         for owner in _owners(gap):

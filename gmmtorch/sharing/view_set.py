@@ -11,7 +11,6 @@ import numpy as np
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.announce_messages import check_size
 from gmmtorch.sharing.envelope import MAX_BYTES
 from gmmtorch.sharing.intervals import Intervals, Ints
 from gmmtorch.sharing.messages import Message, ViewsHeldMessage, ViewsMessage, encode_views
@@ -23,7 +22,8 @@ from gmmtorch.sharing.record_ids import (
     first_key,
     keys_of,
 )
-from gmmtorch.sharing.records import RefusedError, merged
+from gmmtorch.sharing.record_messages import check_size
+from gmmtorch.sharing.refusals import RefusedError, merged
 from gmmtorch.sharing.view_announcements import PRINT_BYTES, encode_views_held
 from gmmtorch.sharing.view_peers import Peers
 from gmmtorch.sharing.view_table import View, ViewTable
@@ -31,7 +31,7 @@ from gmmtorch.sharing.view_table import View, ViewTable
 MOST_VIEWS = 1 << 14
 """Alive; more are not taken from others."""
 MOST_INTERVALS = 1 << 14
-"""Of dead ones; more are not taken from others."""
+"""Of dead ones; more are not taken from others. Nor are more taken to be on their way."""
 MOST_DATAGRAMS = 8
 """Of views in one call: who lacks a whole set gets it bit by bit."""
 _RUN = 96
@@ -158,12 +158,6 @@ class ViewSet:
         self._note_sent(said)
         return sent
 
-    def take_changes(self) -> ViewsMessage:
-        """All that is due, as one message."""
-        alive, dead = self._told()
-        self._note_sent(Intervals.of(alive) | dead)
-        return self._table.message(alive, dead)
-
     def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
         """What is held: a digest; or which views, where others' digests have differed for a while.
 
@@ -217,7 +211,7 @@ class ViewSet:
         self._check_room(message.removed)
         said = self._table.merge(message)
         self._due -= said
-        self._passing |= said
+        self._passing = (self._passing | said).up_to(MOST_INTERVALS)
         self._peers.holds(self.digest())
 
     def _take_announcement(self, message: ViewsHeldMessage) -> None:
@@ -232,8 +226,14 @@ class ViewSet:
             self._check_room(detail.dead)
             self._table.bury(detail.dead)
             gap = self._table.missing(detail)
-            self._due |= self._peers.lacking(message.sender, detail.scope, gap) - self._passing
+            self._answer(self._peers.lacking(message.sender, detail.scope, gap) - self._passing)
             self._peers.holds(self.digest())
+
+    def _answer(self, lacking: Intervals) -> None:
+        """Send this to who lacks it; not now, where more is due already than a set of views comes to."""
+        due = self._due | lacking
+        if len(due) <= MOST_VIEWS + MOST_INTERVALS:
+            self._due = due
 
     def _check_names(self, keys: Intervals) -> None:
         """Nobody but this robot numbers views in its life."""

@@ -18,10 +18,11 @@ _IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
 _LARGEST_MESSAGE = 1 << 16
 """Bytes that Zenoh puts together from parts; unasked, it would take a gigabyte from whoever connects."""
-_KEY_REMEDY = "give key=TeamKey.from_file(…), or say insecure=True to let anybody read and write."
+_KEY_REMEDY = "give one, or say insecure=True to let anybody read and write."
 _REMEDIES = {
     "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
-    "assign requested": "this machine has no such address. `ip address` shows those it has.",
+    "assign requested": "this machine has no such address, or not yet. `ip address` shows those it has; "
+    "0.0.0.0 is all of them, also those to come.",
     "denied": "ports below 1024 are for the system. Give one above.",
 }
 
@@ -59,9 +60,13 @@ def open_session(
     """
     if is_local and (scouting or config is not None):
         given = "scouting=True" if scouting else f"config={str(config)!r}"
-        raise InvalidArgumentError(f"{given} may reach other machines, and there is no key: {_KEY_REMEDY}")
+        raise InvalidArgumentError(
+            f"{given} may reach other machines, and there is no key (key=None): {_KEY_REMEDY}"
+        )
     if not (listen or connect or scouting or config is not None):
-        raise InvalidArgumentError("Nobody is reached: give listen, connect, scouting=True, or config.")
+        raise InvalidArgumentError(
+            "Nobody is reached with listen=[], connect=[], scouting=None and config=None: give one of them."
+        )
     settings = _settings(
         _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
     )
@@ -124,8 +129,8 @@ def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: boo
         host = _host(name, endpoint, least_port)
         if is_local and not _is_loopback(host):
             raise InvalidArgumentError(
-                f"{name}={endpoint!r} reaches other machines, and there is no key: take 127.0.0.1, "
-                f"{_KEY_REMEDY}"
+                f"{name}={endpoint!r} reaches other machines, and there is no key (key=None): "
+                f"take 127.0.0.1, {_KEY_REMEDY}"
             )
     return list(endpoints)
 

@@ -7,8 +7,9 @@ import re
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.sharing.framed_transport import MAX_WAITING, FramedTransport
 from gmmtorch.sharing.network import Traffic
 from gmmtorch.sharing.security import TeamKey
@@ -64,18 +65,11 @@ class ZenohTransport(FramedTransport):
         zenoh = load_zenoh()
         self._session = open_session(listen, connect, scouting, config, key is None and not insecure)
         self._error = zenoh.ZError
-        self._best_effort, self._reliable = (
-            self._session.declare_publisher(
-                f"gmmtorch/{team}/{self.robot}",
-                congestion_control=zenoh.CongestionControl.DROP,
-                reliability=reliability,
-                allowed_destination=zenoh.Locality.REMOTE,
-            )
-            for reliability in (zenoh.Reliability.BEST_EFFORT, zenoh.Reliability.RELIABLE)
-        )
-        self._subscriber = self._session.declare_subscriber(
-            f"gmmtorch/{team}/*", zenoh.handlers.FifoChannel(_QUEUED), allowed_origin=zenoh.Locality.REMOTE
-        )
+        try:
+            self._declare(zenoh, team)
+        except BaseException:
+            self._session.close()
+            raise
         self._thread = threading.Thread(target=self._listen, name=f"zenoh-{self.robot}", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # Python cannot end a thread that waits inside Zenoh
@@ -87,6 +81,28 @@ class ZenohTransport(FramedTransport):
         return len(info.peers_zid()) + len(info.routers_zid())
 
     # -- inside --------------------------------------------------------------------------------------------
+
+    def _declare(self, zenoh: Any, team: str) -> None:
+        """Where it publishes, and what it subscribes to."""
+        own, all_of_team = f"gmmtorch/{team}/{self.robot}", f"gmmtorch/{team}/*"
+        try:
+            self._best_effort, self._reliable = (
+                self._session.declare_publisher(
+                    own,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    reliability=reliability,
+                    allowed_destination=zenoh.Locality.REMOTE,
+                )
+                for reliability in (zenoh.Reliability.BEST_EFFORT, zenoh.Reliability.RELIABLE)
+            )
+            self._subscriber = self._session.declare_subscriber(
+                all_of_team, zenoh.handlers.FifoChannel(_QUEUED), allowed_origin=zenoh.Locality.REMOTE
+            )
+        except zenoh.ZError as error:
+            raise GmmTorchError(
+                f"Zenoh does not let robot {self.robot} publish at {own} and subscribe to {all_of_team}: "
+                f"{error}. See what config allows."
+            ) from error
 
     def _carry(self, frame: bytes, kind: str) -> Traffic:
         publisher = self._best_effort if kind in SOON_REPEATED else self._reliable

@@ -105,17 +105,6 @@ def test_its_file_is_an_octomap_file(tmp_path: Path):
     assert made.occupancy(lattice(3)).tolist() == theta
 
 
-def test_the_binary_file_is_smaller_and_asking_its_size_changes_nothing():
-    made = OctoMapMap(RESOLUTION)
-    assert made.nbytes_binary == 0
-    for _ in range(3):
-        made.insert(wall_scan(3))
-    before, size = made.occupancy(lattice(3)), made.nbytes
-    assert 0 < made.nbytes_binary < size / 3
-    assert torch.equal(made.occupancy(lattice(3)), before)
-    assert made.nbytes == size
-
-
 def test_settings_and_resolution_are_kept_to_the_last_digit(tmp_path: Path):
     made = OctoMapMap(0.123456789, hit=0.8, miss=0.3, clamp_low=0.05, clamp_high=0.99, max_range=7.0)
     made.insert(wall_scan(3))

@@ -15,17 +15,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
 
-from gmmtorch.cli import fit, occupancy
+from gmmtorch.cli import common, fit, occupancy, schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
+CONF = Path(common.conf_dir())
 COMMANDS = {"occupancy": occupancy, "fit": fit}
 QUIET = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
 TINY = {
     "occupancy": ["dataset.n_scans=10", "map.n_samples=20000"],
     "fit": ["max_points=400", "mixture.n_components=5", "mixture.max_iter=20"],
 }
+
+
+def composed(command: str, *overrides: str) -> DictConfig:
+    """The configuration of a command, with these overrides."""
+    schema.register()
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return compose(command, overrides=list(overrides))
 
 
 @dataclass

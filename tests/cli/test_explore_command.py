@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -29,7 +30,6 @@ from command_runs import (
 
 import gmmtorch
 from gmmtorch.cli import explore, export
-from gmmtorch.exploration.mission import Mission
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
 Run = Callable[..., Finished]
@@ -72,20 +72,6 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: Path) -> Run:
         return run_here(monkeypatch, "explore", tmp_path / name, *kept, *options)
 
     return run_command
-
-
-@pytest.fixture
-def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The ticks that missions of this process step from."""
-    ticks: list[int] = []
-    step = Mission.step
-
-    def noted(mission: Mission) -> None:
-        ticks.append(mission.tick)
-        step(mission)
-
-    monkeypatch.setattr(Mission, "step", noted)
-    return ticks
 
 
 # -- a whole mission ------------------------------------------------------------------------------
@@ -177,9 +163,29 @@ def test_the_event_file_holds_the_curves_and_the_figures(mission, row):
     live = events.Scalars("mission/entropy_bits")
     assert [event.step for event in live] == row["times"]
     assert [event.value for event in live] == pytest.approx(row["entropy_bits"], rel=1e-6)
-    flown = sum(events.Scalars(f"mission/robot_{n}/path_length")[-1].value for n in (1, 2))
+    flown = sum(events.Scalars(f"mission/robot_{n}/path_length")[-1].value for n in (0, 1))
     assert flown == pytest.approx(row["path_length"], rel=1e-6)
     assert {f"figures/{name}" for name in ("entropy", "team_map")} <= set(events.Tags()["images"])
+
+
+def test_the_event_file_shows_the_mixture_and_the_paths_as_they_grow(mission):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.util.tensor_util import make_ndarray
+
+    events = EventAccumulator(str(mission.folder / "tensorboard")).Reload()
+    paths, mixture = (events.Tensors(f"{name}_VERTEX") for name in ("paths", "mixture"))
+    times = [event.step for event in paths]
+    assert times == [event.step for event in mixture] == [2, 6, 9]  # from 0.05, 0.2, 0.5 and all of 9 s on
+    with np.load(mission.folder / "trajectories.npz") as kept:
+        flown = [kept[f"robot_{n}"][:, :3] for n in range(2)]
+    for event in paths:
+        expected = np.concatenate([path[: event.step + 1] for path in flown])
+        np.testing.assert_allclose(make_ndarray(event.tensor_proto)[0], expected, rtol=1e-6)
+    sizes = [make_ndarray(event.tensor_proto).shape[1] for event in mixture]
+    made = GaussianMap.load(mission.folder / "map.safetensors").components()
+    surfaces = int((~made.max_range).sum())
+    assert 0 < sizes[0] < sizes[-1]
+    assert sizes[-1] % surfaces == 0  # so many vertices each
 
 
 def test_the_mixture_is_a_map_that_answers(mission, row):
@@ -279,6 +285,16 @@ def test_options_reach_the_mission(run):
         assert kept["robot_1"][0].tolist() == [5, 3, 1.5, 3]
 
 
+def test_the_map_is_that_of_the_missions_end_whatever_is_told_later(run):
+    cut = "network.partitions=[{begin: 0, end: 6, groups: [[0], [1]]}]"  # until after the mission
+    done = succeeded(run(cut))
+    (row,) = done.results()["rows"]
+    assert row["missing_share"][-1] > 0
+    assert row["converged_after"] > 0
+    made = GaussianMap.load(done.folder / "map.safetensors")
+    assert len(made.components()) == row["n_components"]
+
+
 def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):
     done = succeeded(run("-m", "seed=0,1", "duration=2", f"hydra.sweep.dir={tmp_path / 'sweep'}"))
     for number in (0, 1):
@@ -307,6 +323,9 @@ def test_a_study_has_a_row_for_each_trial_and_none_is_flown_twice(run, steps, tm
     pictures = {name for name in done.files() if name.endswith(".png")}
     assert pictures == {"entropy.png", "bandwidth.png", "summary.png", "profile.png"}
     assert any("tfevents" in name for name in done.files())
+    summary = (done.folder / "summary.md").read_text()
+    assert summary.startswith("| 2 seeds: mean (range) | E1")
+    assert "95 % interval" in summary
     assert len(list((tmp_path / "kept").rglob("trajectories.npz"))) == 4
     assert len(steps) == 4 * 4
 
@@ -317,6 +336,15 @@ def test_a_study_has_a_row_for_each_trial_and_none_is_flown_twice(run, steps, tm
     longer = succeeded(run(*options, "study.seeds=[0]", "duration=2", name="other"))
     assert len(steps) == 4 * 4 + 2 * 2  # not the missions that are kept
     assert [row["duration"] for row in longer.results()["rows"]] == [2, 2]
+
+
+def test_a_study_tells_how_far_its_missions_are(run):
+    variants = "study.variants=[{team:grid_shared},{team:gmm_shared}]"
+    options = ["experiment=fig4_4_entropy", "study.seeds=[0]", variants, "report.progress=true"]
+    done = succeeded(run(*options))
+    assert re.search(r"simulated seconds: +\d+%.* \d/8 ", done.stderr)
+    assert "of the entropy left" in done.stderr
+    assert "x real time" in done.stderr
 
 
 def test_a_study_of_planners_compares_them(run):
@@ -362,7 +390,7 @@ def test_a_trial_of_a_study_is_the_mission_alone(run):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 def test_a_mission_that_was_killed_goes_on_to_the_same_result(run, room, steps, tmp_path):
     killed = tmp_path / "killed"
-    options = ["duration=20", "checkpoint.every=1"]
+    options = ["duration=10", "checkpoint.every=1"]
     arguments = [*QUIET, *SMALL, "world=mesh", f"world.path={room}", "evaluation.every=2", *options]
     process = subprocess.Popen(
         [sys.executable, str(CHECKOUT / "scripts" / "explore.py"), f"hydra.run.dir={killed}", *arguments],
@@ -384,8 +412,8 @@ def test_a_mission_that_was_killed_goes_on_to_the_same_result(run, room, steps, 
     assert not (killed / "results.json").exists()
 
     went_on = succeeded(run(*options, f"checkpoint.folder={killed}", name="on"))
-    assert 1 <= steps[0] < 20
-    assert steps == list(range(steps[0], 20))  # from where it was, not anew
+    assert 1 <= steps[0] < 10
+    assert steps == list(range(steps[0], 10))  # from where it was, not anew
     whole = succeeded(run(*options, name="whole"))
     assert timeless(went_on.results())["rows"] == timeless(whole.results())["rows"]
     with (
@@ -443,13 +471,16 @@ def test_without_checkpoints_none_is_written(run):
         ("team.start=[3,3]", "team.start"),
         ("team.start=[[nan,3,1.5,0],[2,2,1.5,0]]", "start pose 0 finite"),
         ("world.path=/no/where.ply", "world.path=/no/where.ply"),
-        ("world.bounds=[20,20,0,30,30,3]", "bounds=[20.0, miss room"),
-        ("world.bounds=[0,0,0,3]", "bounds= six"),
-        ("world.resolution=0", "resolution=0.0"),
-        ("sensor.horizontal_fov=0", "horizontal_fov=0.0"),
-        ("sensor.max_range=0", "max_range=0.0"),
+        ("world.bounds=[20,20,0,30,30,3]", "world.bounds=[20.0, miss room"),
+        ("world.bounds=[0,0,0,3]", "world.bounds= six"),
+        ("world.resolution=0", "world.resolution=0.0"),
+        ("sensor.horizontal_fov=0", "sensor.horizontal_fov=0.0"),
+        ("sensor.max_range=0", "sensor.max_range=0.0"),
+        ("sensor.rate=0", "sensor.rate=0.0"),
+        ("sensor.noise=-1", "sensor.noise=-1.0"),
         ("sensor.rate=0.7", "sensor.rate=0.7 robot.duration"),
         ("duration=-1", "duration=-1.0"),
+        ("robot.duration=-1", "robot.duration=-1.0"),
         ("network.loss=1", "network.loss=1.0"),
         ("network.bandwidth=0", "network.bandwidth=0.0"),
         ("network.delay=-1", "network.delay=-1.0 time"),
@@ -460,43 +491,55 @@ def test_without_checkpoints_none_is_written(run):
         ("network.partitions=[{begin:0,end:1,groups:[[0,2]]}]", "network.partitions[0].groups= 2"),
         ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= nobody"),
         ("network.partitions=[cut]", "network.partitions[0]='cut'"),
-        ("network.announce=0", "announce_every=0.0 seconds"),
-        ("network.budget=0", "budget=0.0 bytes"),
+        ("network.announce=0", "network.announce=0.0 seconds"),
+        ("network.budget=0", "network.budget=0.0 bytes"),
         ("map.window=[8,8]", "map.window=[8, three"),
         ("map.window=[8,8,8]", "map.window=[8, sensor.max_range"),
-        ("map.rays=0", "rays=0.0"),
+        ("map.rays=0", "map.rays=0.0"),
+        ("map.noise=0", "map.noise=0.0"),
+        ("map.observed=-1", "map.observed=-1.0"),
         ("planner.prior=0", "planner.prior=0.0"),
-        ("planner.beams=0", "beams=0"),
+        ("planner.beams=0", "planner.beams=0"),
         ("information=x", "information='x' csqmi fsmi"),
         ("coordination=x", "coordination='x' myopic greedy"),
         ("rounds=0", "rounds=0"),
         ("codec=zip", "codec='zip' quantized thesis"),
         ("transport=zenoh", "transport='zenoh' in_process"),
         ("evaluation.codecs=[jpeg]", "evaluation.codecs 'jpeg' octree draco"),
-        ("evaluation.every=0", "every=0.0"),
-        ("belief.clamp=0.6", "clamp=0.6"),
-        ("robot.radius=5", "robot_radius=5.0 room"),
+        ("evaluation.every=0", "evaluation.every=0.0"),
+        ("belief.clamp=0.6", "belief.clamp=0.6"),
+        ("belief.prior=-1", "belief.prior=-1.0"),
+        ("robot.radius=5", "robot.radius=5.0 room"),
         ("runtime.threads=0", "runtime.threads=0"),
         ("runtime.device=meta", "runtime.device=meta"),
         ("seed=-1", "seed=-1"),
         ("checkpoint.folder=/dev/null/kept", "/dev/null/kept"),
-        ("experiment=fig4_4_entropy runtime.workers=0", "workers=0"),
+        ("experiment=fig4_4_entropy runtime.workers=0", "runtime.workers=0"),
         ("experiment=fig4_4_entropy study.name=other", "study.name='other' trials"),
         ("experiment=fig4_4_entropy study.variants=[]", "study.variants study.seeds"),
         ("planner.rest=1.5", "planner.rest=1.5"),
         ("experiment=fig4_4_entropy study.variants=[{colour:1}]", "study.variants colour team planner"),
         ("experiment=fig4_4_entropy study.variants=[{team:x}]", "team='x' gmm_shared"),
+        ("experiment=fig4_4_entropy study.variants=[{announce:0}]", "study.variants: announce=0"),
         ("experiment=fig4_4_entropy study.seeds=[-1]", "seed=-1"),
     ],
 )
 def test_a_bad_value_is_named_in_one_line(options, words, run):
     line = refused(run(*options.split()))
-    assert all(word in line for word in words.split()), line
+    for word in words.split():  # as a whole: duration= is not robot.duration=
+        assert re.search(rf"(?<![\w.]){re.escape(word)}", line), (word, line)
 
 
 def test_a_bad_value_is_found_before_anything_is_flown(run, steps):
     for options in (["network.loss=1"], ["information=x"], ["map.window=[8,8,8]"], ["sensor.rate=0.7"]):
         refused(run(*options))
+    refused(run("checkpoint.folder=/dev/null/kept", "checkpoint.every=1e9"))
+    assert steps == []
+
+
+def test_a_recording_that_nothing_can_write_is_found_before_anything_is_flown(run, steps, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert "pip install 'rerun-sdk" in refused(run("report.recording=true"))
     assert steps == []
 
 
@@ -533,7 +576,7 @@ def test_variants_that_differ_in_an_option_alone_are_kept_apart(run, steps, tmp_
 
 def test_a_mesh_that_was_not_given_is_asked_for(monkeypatch, tmp_path):
     line = refused(run_here(monkeypatch, "explore", tmp_path / "run", *QUIET, *SMALL, "world=mesh"))
-    assert "world.path" in line
+    assert "world=mesh needs world.path=FILE" in line
 
 
 @pytest.mark.parametrize("size", ["[12,10]", "[12,10,3.5]", "[1,1,1]", "[nan,20,4]"])
@@ -578,6 +621,7 @@ def test_half_a_mesh_is_no_world(run, tmp_path, room):
         ("world=moon", "Could not find 'world/moon' tunnels warehouse"),
         ("world.size=[10,10,3]", "Could not override 'world.size'"),
         ("sensor.widht=3", "Could not override 'sensor.widht'"),
+        ("runtime.memory_limit=1000", "Could not override 'runtime.memory_limit'"),
     ],
 )
 def test_wrong_types_and_unknown_options_are_explained_without_a_traceback(option, words, run):

@@ -127,6 +127,7 @@ def test_a_robot_flies_alone_and_shows_what_it_does(run, tmp_path):
     assert "% of the entropy left" in done.stderr
     assert row["digest"] in done.stdout
     assert "browse    tensorboard" in done.stdout
+    assert "cannot be started again" not in done.stdout
 
 
 def test_where_nobody_listens_it_works_alone(run):
@@ -135,6 +136,14 @@ def test_where_nobody_listens_it_works_alone(run):
     assert row["scans"] == row["n_scans"] == 6
     assert row["n_components"] > 0
     assert row["refused"] == {}
+
+
+@pytest.mark.parametrize("options", ["team=grid_shared", "codec=thesis"])
+def test_what_cannot_be_started_again_is_said_at_the_start(run, tmp_path, options):
+    world = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL]
+    done = succeeded(run(*world, options, "duration=1", "settle=0"))
+    assert done.stdout.count("cannot be started again") == 1
+    assert done.results()["rows"][0]["not_merged"] == {}
 
 
 # -- told to stop ---------------------------------------------------------------------------------
@@ -173,6 +182,19 @@ def test_another_robot_of_its_number_ends_it_with_the_remedy(run):
         said = refused(run(*LOG, "id=1", "team.size=2", f"link.listen={here}", "settle=60"))
     assert f"robot 1 (127.0.0.1:{other.address[1]}" in said
     assert "number" in said
+
+
+def test_what_it_said_before_it_was_started_again_is_no_other_robots(run, tmp_path):
+    kept = f"journal.folder={tmp_path / 'kept'}"
+    succeeded(run(*LOG, "log.rate=50", "settle=0", kept))
+    session = (tmp_path / "kept" / "sessions_0").read_bytes()[-8:]
+    (here,) = links.free_addresses(1)
+    with chatter(0, here) as recorded:
+        recorded._sealer.session = session  # as if what it said then were played back
+        again = run(*LOG, "settle=7", kept, f"link.listen={here}", name="again")
+    (row,) = succeeded(again).results()["rows"]
+    assert row["refused"]["namesake"] > 100
+    assert row["namesakes"] == {}
 
 
 def test_another_key_is_counted_and_told_once(run, tmp_path):
@@ -242,14 +264,23 @@ def test_killed_and_started_again_it_has_everything_and_the_other_catches_up(run
         ("network.loss=1", "network.loss=1.0"),
         ("evaluation.every=0", "evaluation.every=0.0"),
         ("source=log", "source=log dataset@log.dataset=carmen"),
+        ("source=log dataset@log.dataset=carmen log.dataset.path=/no/log", "log.dataset.path=/no/log"),
         ("link.listen=7400", "link.listen='7400' 127.0.0.1:7447"),
         ("link.listen=127.0.0.1:70000", "link.listen='127.0.0.1:70000'"),
         ("link.peers=[127.0.0.1]", "link.peers='127.0.0.1'"),
-        ("link.listen=0.0.0.0:0", "link.listen=0.0.0.0 link.key_file link.insecure=true"),
-        ("link.group=239.71.77.7:7400 link.interface=10.1.2.3", "link.interface=10.1.2.3 link.key_file"),
-        ("link.group=10.0.0.1:7400", "10.0.0.1 multicast"),
+        ("link.listen=0.0.0.0:0", "link.listen='0.0.0.0' link.key_file link.insecure=True"),
+        ("link.group=239.71.77.7:7400 link.interface=10.1.2.3", "link.interface='10.1.2.3' link.key_file"),
+        ("link.group=10.0.0.1:7400", "link.group='10.0.0.1' multicast"),
+        ("link.group=239.71.77.7:7400 link.ttl=256", "link.ttl=256"),
+        ("link.peers=[10.0.0.2:7400]", "link.peers= link.listen= 0.0.0.0"),
+        ("link.listen=198.51.100.7:0 link.insecure=true", "link.listen='198.51.100.7' 0.0.0.0"),
         ("link.key_file=/nowhere/team.key", "/nowhere/team.key openssl"),
-        ("transport=zenoh", "listen connect"),
+        ("transport=zenoh", "link.listen_endpoints=[] link.connect_endpoints=[]"),
+        ("transport=zenoh link.scouting=true", "link.scouting=True link.key_file link.insecure=True"),
+        (
+            "transport=zenoh link.listen_endpoints=[tcp/10.0.0.3:7447]",
+            "link.listen_endpoints='tcp/10.0.0.3:7447'",
+        ),
         ("world.size=[1,1,1]", "size"),
         ("team.start=[[1,2]]", "team.start"),
     ],
@@ -263,12 +294,15 @@ def test_a_bad_value_is_named_in_one_line(options, words, run):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("log.rate=0", "rate=0.0"),
+        ("log.rate=0", "log.rate=0.0"),
         ("speed=0", "speed=0.0"),
+        ("settle=-1", "settle=-1.0"),
         ("log.every=0", "log.every=0"),
-        ("log.part=odd", "split='odd'"),
-        ("network.announce=0", "announce_every=0.0"),
-        ("journal.sync=never", "sync='never'"),
+        ("log.map.prior=-1", "log.map.prior=-1.0"),
+        ("log.map.noise=-1", "log.map.noise=-1.0"),
+        ("log.part=odd", "log.part='odd'"),
+        ("network.announce=0", "network.announce=0.0"),
+        ("journal.sync=never", "journal.sync='never'"),
     ],
 )
 def test_a_bad_value_for_a_log_is_named_in_one_line(options, words, run):

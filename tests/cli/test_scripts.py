@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import sys
 
@@ -20,3 +21,9 @@ def test_processes_of_a_study_import_the_script_without_running_it(script, monke
 
 def test_there_is_a_script_for_every_command():
     assert {"fit", "occupancy", "explore", "export", "robot", "team"} <= {script.stem for script in SCRIPTS}
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_script_runs_by_its_name(script):
+    assert script.read_text(encoding="utf-8").startswith("#!")
+    assert os.access(script, os.X_OK)

@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from test_robot_command import LOG, SMALL, room
 
-from gmmtorch.cli import explore, robot_process, team
+from gmmtorch.cli import missions, robot_process, team
 from gmmtorch.cli.robot_process import RobotProcess
 from gmmtorch.exploration.team import assemble
 from gmmtorch.sharing.team_key import KEY_VARIABLE
@@ -53,8 +53,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 def test_it_is_the_mission_that_one_process_flies(flown):
     results = flown.results()
     config: Any = OmegaConf.create(results["config"])
-    options = replace(explore.team_options(config, config.seed, {}), latency=0.0)
-    mission = assemble(explore.world_options(config).open(options), options)
+    options = replace(missions.team_options(config, config.seed, {}), latency=0.0)
+    mission = assemble(missions.world_options(config).open(options), options)
     while not mission.is_over:
         mission.step()
     mission.converge(config.settle)
@@ -86,7 +86,7 @@ def test_everything_is_where_it_is_said_to_be(flown):
         here = f"robot_{number}/"
         assert {
             here + "results.json",
-            here + "map.gmm",
+            here + "map.safetensors",
             here + "trajectory.npz",
             here + "output.log",
         } <= files

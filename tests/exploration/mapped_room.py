@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from gmmtorch.exploration.mapper import Heard, Memo
+from gmmtorch.exploration.mapper import Memo
 from gmmtorch.exploration.mixture_mapper import FrameRule, MixtureMapper
+from gmmtorch.exploration.radio import Heard
 from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap

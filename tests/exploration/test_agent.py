@@ -76,7 +76,8 @@ def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent
     team = TeamOptions(framework=framework, size=3, camera=CAMERA, window=(40, 40, 20), **options)
     made: Mapper = mapper(number, "replica" if kind.startswith("grid") else kind)
     if kind.startswith("grid"):
-        made = GridMapper(number, made.local, made.belief, CAMERA.width, NOVELTY, Memo(64), team.shares)
+        local, belief = made.local, made.belief
+        made = GridMapper(number, local, belief, CAMERA.width, NOVELTY, Memo(64), team.shares, team.size)
     library = ViewLibrary(number, incarnation=0)
     robot = Robot(number, START, made, Ahead(), library, Roadmap(), start_radius=1.4)
     post = Post()
@@ -140,12 +141,12 @@ AGENTS = {kind: agent(kind=kind) for kind in ("replica", "float", "grid_shared")
 @given(noise=st.lists(damaged, min_size=1, max_size=4), sender=st.integers(0, 40))
 def test_damaged_datagrams_are_counted_and_dropped(kind: str, noise: list[bytes], sender: int) -> None:
     one, post = AGENTS[kind]
-    before = (one.n_heard, one.n_damaged, one.digest(), one.robot.mapper.belief.entropy_bits)
+    before = (one.radio.n_heard, one.radio.n_damaged, one.digest(), one.robot.mapper.belief.entropy_bits)
     n_damaged = sum(map(is_damaged, noise))
     assert n_damaged == len(noise)
     hear(one, post, *((sender, datagram) for datagram in noise))
-    assert one.n_heard == before[0] + len(noise)
-    assert one.n_damaged == before[1] + n_damaged
+    assert one.radio.n_heard == before[0] + len(noise)
+    assert one.radio.n_damaged == before[1] + n_damaged
     assert (one.digest(), one.robot.mapper.belief.entropy_bits) == before[2:]
 
 
@@ -163,8 +164,8 @@ def test_whatever_is_sound_is_taken_as_it_is(kind: str) -> None:
     one.learn(frame(*PLACES[0]), 0.0)
     for number, datagram in enumerate([*SOUND, *SOUND[::-1]]):
         hear(one, post, (number % 4, datagram), now=1.0 + number)
-    assert one.n_damaged == 0
-    assert one.n_heard == 2 * len(SOUND)
+    assert one.radio.n_damaged == 0
+    assert one.radio.n_heard == 2 * len(SOUND)
     belief = one.robot.mapper.belief
     for part in belief.grid.dense(BOX):
         assert bool(part.isfinite().all())
@@ -204,9 +205,10 @@ def test_who_was_quicker_makes_no_difference_to_the_last_bit(sayings: list[list[
 # -- plans ----------------------------------------------------------------------------------------------
 
 
-def plan_datagram(number: int, x: float, sender: int = 1) -> bytes:
-    poses = torch.tensor([[x, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    (datagram,) = encode_plan(sender, number, float(number), 0.2, poses, poses)
+def plan_datagram(number: int, x: float, sender: int = 1, steps: int = 10) -> bytes:
+    """To stand at x for `steps` fifths of a second."""
+    poses = torch.tensor([[x, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(steps, 4)
+    (datagram,) = encode_plan(sender, number, float(number), 0.2, poses, poses[:1])
     return datagram
 
 
@@ -215,9 +217,9 @@ def test_a_plan_that_was_overtaken_is_late() -> None:
     said = {number: plan_datagram(number, float(number)) for number in range(1, 9)}
     latest = 0
     for when, number in enumerate([2, 4, 3, 4, 1, 8, 5]):
-        hear(one, post, (1, said[number]), now=10.0 + when)
+        hear(one, post, (1, said[number]), now=10.0 + when / 4)
         if number > latest:
-            latest, heard = number, 10.0 + when
+            latest, heard = number, 10.0 + when / 4
         assert one.robot.plans[1].number == latest
         assert one.heard_at[1] == heard
     assert list(one.robot.plans) == [1]
@@ -227,8 +229,32 @@ def test_a_robot_that_began_anew_is_believed() -> None:
     one, post = agent()
     hear(one, post, (1, plan_datagram(400, 1.0)), (2, plan_datagram(7, 3.0, sender=2)))
     hear(one, post, (1, plan_datagram(0, 2.0)))
-    assert one.robot.plans[1].path.tolist() == [[2.0, 0.0, 0.0, 0.0]]
+    assert one.robot.plans[1].path.tolist() == [[2.0, 0.0, 0.0, 0.0]] * 10
     assert one.robot.plans[2].number == 7
+
+
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_a_robot_that_began_anew_early_is_believed_once_its_last_path_is_flown(number: int) -> None:
+    one, post = agent()
+    hear(one, post, (1, plan_datagram(4, 1.0)), now=8.0)
+    hear(one, post, (1, plan_datagram(number, 2.0)), now=9.9)  # two seconds of it
+    assert (one.robot.plans[1].number, one.heard_at[1]) == (4, 8.0)
+    hear(one, post, (1, plan_datagram(number, 2.0)), now=10.0)
+    assert one.robot.plans[1].path[0, 0] == 2.0
+    assert one.heard_at[1] == 10.0
+
+
+def test_plans_are_of_teammates_who_speak_for_themselves() -> None:
+    one, post = agent(number=1)
+    hear(one, post, *((sender, plan_datagram(0, 1.0, 2)) for sender in (0, 1, 3, 900)))  # of another
+    hear(one, post, (1, plan_datagram(0, 1.0, 1)))  # its own
+    for stranger in (3, 4, 900, (1 << 60) - 1):  # in a team of three
+        hear(one, post, (stranger, plan_datagram(0, 1.0, stranger, 1000)))
+    assert one.robot.plans == one.heard_at == {}
+    assert one.refused == {"stranger": 9}
+    hear(one, post, (0, plan_datagram(0, 1.0, 0)), (2, plan_datagram(0, 1.0, 2)))
+    assert sorted(one.robot.plans) == sorted(one.heard_at) == [0, 2]
+    assert one.refused == {"stranger": 9}
 
 
 def fly(one: Agent, now: float, number: int, rests: bool) -> None:
@@ -314,10 +340,40 @@ def test_a_budget_bounds_what_is_said_of_the_map_in_every_span_of_time() -> None
     assert post.of("announcements")
 
 
+def test_views_have_what_the_map_leaves_of_the_budget() -> None:
+    rate, said = 1300.0, []
+    one, post = agent(kind="grid_shared", budget=rate, announce_every=1e6)
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(200, 4, generator=generator, dtype=torch.float64) * 300.0
+    one.robot.library.add(places, torch.ones(200), 0.0, 0.0, most=200)
+    for seed, place in enumerate(PLACES):
+        one.robot.sense(frame(*place, seed=seed))
+    for tick in range(400):  # ten times a second
+        one.send(tick / 10)
+        one.tell_views(tick / 10)
+    said = [(now, len(datagram), kind) for now, _, datagram, kind in post.sent]
+    for begin in range(0, 400, 7):
+        for end in range(begin, 400, 7):
+            size = sum(n for now, n, _ in said if begin / 10 <= now <= end / 10)
+            assert size <= rate * (end - begin) / 10 + rate + 1
+    last_of_map = max(now for now, _, kind in said if kind == "points")
+    assert last_of_map > 5.0
+    # Where records wait, views go only where a whole datagram's bytes are left.
+    before = [n for now, n, kind in said if kind == "views" and now < last_of_map]
+    assert sum(before) <= rate
+    other, its_post = agent(kind="grid_shared")  # who has no limit tells as much, at once
+    other.robot.library.add(places, torch.ones(200), 0.0, 0.0, most=200)
+    for _ in range(9):
+        other.tell_views(0.0)
+    told = [decode(datagram) for _, datagram in post.of("views")]
+    free = [decode(datagram) for _, datagram in its_post.of("views")]
+    assert sum(len(m.ids) for m in told) == sum(len(m.ids) for m in free) == len(one.robot.library) > 50
+
+
 def test_announcements_do_not_wait_for_the_budget_and_become_seldom() -> None:
     one, post = agent(budget=1e-3, announce_every=2.0)
-    assert one._budget is not None
-    one._budget.take(1000)  # of the 1200 that are there to begin with
+    assert one.radio._budget is not None
+    one.radio._budget.take(1000)  # of the 1200 that are there to begin with
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
     for tick in range(40):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import time
 from typing import Any
@@ -133,10 +134,24 @@ def test_strange_plans_do_not_end_it(world, monkeypatch, strange, age):
         assert seen["traffic"].paths.shape[1] <= 1000
 
 
+def test_views_are_told_as_often_as_it_plans_and_no_more(world, monkeypatch):
+    with transports(1) as (link,):
+        node, told = flying(0, world, TEAM, link), []
+        monkeypatch.setattr(node.agent, "tell_views", told.append)
+        for k in range(1000):  # every 20 ms
+            node.listen(0.02 * k)
+        assert len(told) == 9
+        assert all(1.99 < b - a < 2.03 for a, b in itertools.pairwise([0.0, *told]))
+        for now in (30.0, 0.0, 1.0, 0.0, 1.1, 1.2):  # a clock that is set back stands still
+            node.listen(now)
+        assert told[9:] == [30.0, 1.1]
+
+
 # -- trouble --------------------------------------------------------------------------------------
 
 
-def test_another_robot_of_its_number_is_named(world):
+def test_another_robot_of_its_number_is_named(world, monkeypatch):
+    monkeypatch.setattr("gmmtorch.sharing.sessions.FRESH_SECONDS", 0.1)
     path = plan(4).path
     with UdpTransport.unicast(0) as link, UdpTransport.unicast(0, peers=[link.address]) as other:
         node = flying(0, world, TEAM, link)

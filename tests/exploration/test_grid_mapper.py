@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.exploration.grid_mapper import GridMapper
-from gmmtorch.exploration.mapper import Heard, Memo
+from gmmtorch.exploration.grid_mapper import MOST_INTERVALS, GridMapper, _recent
+from gmmtorch.exploration.mapper import Memo
+from gmmtorch.exploration.radio import Heard
 from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import Box, cast_evidence
+from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import PointsMessage, decode, encode_counts, encode_points
 from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
 from gmmtorch.simulation.depth_camera import DepthFrame
@@ -26,7 +30,7 @@ NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)
 def mapper(robot: int = 0, shared: bool = True, shape: tuple[int, int, int] = (40, 40, 20)) -> GridMapper:
     local = SlidingVoxelMap(0.2, shape, 4)
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
-    one = GridMapper(robot, local, belief, WIDTH, NOVELTY, Memo(64), shared)
+    one = GridMapper(robot, local, belief, WIDTH, NOVELTY, Memo(64), shared, 31)
     one.center_on(MIDDLE)
     return one
 
@@ -182,6 +186,43 @@ def test_parts_that_come_twice_count_once() -> None:
     one.receive(heard(second))
     one.receive(heard(second, sender=2))  # passed on by another
     torch.testing.assert_close(believed(one), dense_of(beams(view)))
+
+
+def test_points_of_nobody_in_the_team_are_dropped_and_counted() -> None:
+    one, view = mapper(robot=3), frame(0, n=5)
+    for sender in (3, 31, 32, 65535):
+        assert one.receive(heard(*said(view, sender=sender))) == []
+    assert one.refused == {"stranger": 4}
+    assert one._come == {}
+    assert float(believed(one).sum()) == 0
+    assert one.receive(heard(*said(view, sender=30))) != []
+
+
+@settings(deadline=None, max_examples=20)
+@given(numbers=st.lists(st.integers(0, 60), max_size=60), most=st.integers(1, 8))
+def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gmmtorch.exploration.grid_mapper.MOST_INTERVALS", most)
+        kept = Intervals.of(np.array(numbers, np.int64))
+        bounded = _recent(kept)
+    pairs = kept.pairs()
+    expected = set(numbers)
+    if len(pairs) > most:  # all up to the last gap that is one too many
+        expected |= set(range(pairs[0][0], pairs[len(pairs) - most][0]))
+    assert set(bounded.numbers().tolist()) == expected
+    assert len(bounded) <= most
+
+
+def test_memory_is_bounded_whatever_frames_are_invented(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gmmtorch.exploration.grid_mapper.MOST_INTERVALS", 20)
+    one, view = mapper(), frame(0, n=1)
+    datagrams = [said(view, number=7 * k)[0] for k in range(60)]
+    assert one.receive(heard(*datagrams)) == datagrams
+    assert {sender: len(come) for sender, come in one._come.items()} == {1: 20}
+    assert one.receive(heard(*said(view, number=3))) == []  # a gap that was closed
+    assert one.receive(heard(*said(view, number=7 * 59 - 1))) != []  # and one that is open
+    assert one.refused == {"repeated": 1}
+    assert MOST_INTERVALS > 3 * 1600  # three parts of each frame of a mission lost
 
 
 def test_a_budget_is_kept_and_what_waits_comes_later() -> None:

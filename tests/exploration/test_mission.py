@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,33 +10,21 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from exploration.furnished_room import SHELF, SMALL, room, without_seconds
 
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.mixture_mapper import MixtureMapper
 from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.outcome import row_of, with_times
 from gmmtorch.exploration.returns import RestRule
 from gmmtorch.exploration.team import assemble
-from gmmtorch.exploration.trials import CHECKPOINT, ROW, Trial, WorldOptions, run_mission, run_trials
 from gmmtorch.exploration.world import World
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cell_evidence import cast_evidence
 from gmmtorch.sharing.link_conditions import Partition
 from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.solids import box
-
-SMALL = TeamOptions(
-    size=2,
-    duration=20.0,
-    camera=DepthCamera(width=48, height=36, max_range=4.5),
-    window=(64, 64, 32),
-    sample_every=5.0,
-    n_beams=60,
-)
-
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits
@@ -46,15 +33,10 @@ cross_entropy_bits collisions path_length coverage_per_metre overlap wall_second
 """
 
 
-def room(*pieces: Tensor) -> Tensor:
-    """A hall of 10 by 8 by 3 metres, its walls half a cell off the lattice, with pieces in it."""
-    return torch.cat([box((0.1, 0.1, 0.1), (10.1, 8.1, 3.1)), *pieces])
-
-
 @pytest.fixture(scope="module")
 def world() -> World:
-    shelf, crate = box((4.5, 2.5, 0.1), (5.1, 8.1, 3.1)), box((7.5, 5.5, 0.1), (8.5, 6.5, 1.0))
-    return World.from_mesh(room(shelf, crate), start=(2.0, 2.0, 1.3), cache=False, name="room")
+    crate = box((7.5, 5.5, 0.1), (8.5, 6.5, 1.0))
+    return World.from_mesh(room(SHELF, crate), start=(2.0, 2.0, 1.3), cache=False, name="room")
 
 
 def flown(world: World, options: TeamOptions, to: int | None = None) -> Mission:
@@ -62,11 +44,6 @@ def flown(world: World, options: TeamOptions, to: int | None = None) -> Mission:
     while not mission.is_over and mission.tick != to:
         mission.step()
     return mission
-
-
-def without_seconds(row: dict[str, Any]) -> dict[str, Any]:
-    kept = {k: v for k, v in row.items() if not k.endswith("seconds")}
-    return json.loads(json.dumps(kept, allow_nan=False))
 
 
 @pytest.fixture(scope="module", params=list(FRAMEWORKS))
@@ -182,23 +159,6 @@ def test_a_lone_grid_is_the_sum_of_its_frames(world: World, monkeypatch: pytest.
     torch.testing.assert_close(found[0], hits)
     torch.testing.assert_close(found[1], misses)
     assert len(frames) == 6
-
-
-def test_windows_of_mixtures_are_those_built_from_scratch(world: World) -> None:
-    mission = flown(world, replace(SMALL, window=(62, 62, 30), duration=14.0))
-    for robot in mission.robots:
-        mapper = robot.mapper
-        assert isinstance(mapper, MixtureMapper)
-        hits, misses = (torch.zeros(mapper.local.shape) for _ in range(2))
-        for _, batch in mapper.tiles.items():
-            part = mapper._evidence(batch, 0.2, mapper.local.box)
-            at = (part.cells - mapper.local.low).unbind(1)
-            hits[at] += part.hits
-            misses[at] += part.misses
-        found = mapper.local.evidence()
-        torch.testing.assert_close(found[0], hits, rtol=1e-4, atol=1e-3)
-        torch.testing.assert_close(found[1], misses, rtol=1e-4, atol=1e-3)
-        assert float(misses.sum()) > 0
 
 
 def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) -> None:
@@ -325,6 +285,7 @@ START: dict[str, Callable[[], TeamOptions]] = {
     "unknown planner": lambda: replace(SMALL, planner="best"),
     "frames out of step": lambda: replace(SMALL, rate=0.7),
     "prior": lambda: replace(SMALL, planning_prior=1.0),
+    "no beams": lambda: replace(SMALL, n_beams=0),
     "loss": lambda: replace(SMALL, loss=1.0),
     "a cut of nobody": lambda: replace(SMALL, partitions=(Partition(0.0, 1.0, ((0, 1),)),)),
     "coordination": lambda: replace(SMALL, coordination="none"),
@@ -338,71 +299,3 @@ START: dict[str, Callable[[], TeamOptions]] = {
 def test_what_cannot_begin_says_so_before_the_first_step(world: World, case: str) -> None:
     with pytest.raises(InvalidArgumentError, match=r"\w+"):
         assemble(world, START[case]())
-
-
-# -- trials -------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def mesh_file(tmp_path: Path) -> str:
-    import open3d
-
-    triangles = room(box((4.5, 2.5, 0.1), (5.1, 8.1, 3.1))).reshape(-1, 3).double().numpy()
-    mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(triangles),
-        open3d.utility.Vector3iVector(torch.arange(len(triangles)).view(-1, 3).numpy()),
-    )
-    path = tmp_path / "room.ply"
-    open3d.io.write_triangle_mesh(str(path), mesh)
-    return str(path)
-
-
-def trial(mesh_file: str, folder: Path, **changes: Any) -> Trial:
-    team = replace(SMALL, duration=6.0, **changes)
-    return Trial(WorldOptions("mesh", path=mesh_file, cache=False), team, folder, checkpoint_every=2.0)
-
-
-def test_a_killed_trial_goes_on_to_the_same_row(
-    mesh_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, whole = run_mission(trial(mesh_file, tmp_path / "whole"))
-    steps = 0
-    step = Mission.step
-
-    def killed(self: Mission) -> None:
-        nonlocal steps
-        steps += 1
-        if steps == 4:
-            raise KeyboardInterrupt
-        step(self)
-
-    monkeypatch.setattr(Mission, "step", killed)
-    with pytest.raises(KeyboardInterrupt):
-        run_mission(trial(mesh_file, tmp_path / "cut"))
-    assert (tmp_path / "cut" / CHECKPOINT).is_file()
-    _, resumed = run_mission(trial(mesh_file, tmp_path / "cut"))
-    assert steps == 4 + 4  # from the checkpoint after the second on
-    assert without_seconds(resumed) == without_seconds(whole)
-
-
-def test_a_checkpoint_of_other_options_is_refused(mesh_file: str, tmp_path: Path) -> None:
-    run_mission(trial(mesh_file, tmp_path))
-    with pytest.raises(DataError, match="another mission"):
-        run_mission(trial(mesh_file, tmp_path, seed=5))
-
-
-def test_trials_that_are_done_are_not_run_again(
-    mesh_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trials = [trial(mesh_file, tmp_path / str(seed), seed=seed) for seed in range(2)]
-    rows = run_trials(trials)
-    assert (tmp_path / "0" / ROW).is_file()
-    monkeypatch.setattr(Mission, "step", None)
-    assert run_trials(trials) == json.loads(json.dumps(rows))
-
-
-def test_trials_in_two_processes_give_the_rows_of_one(mesh_file: str, tmp_path: Path) -> None:
-    teams = [{"framework": name} for name in ("gmm_shared", "grid_shared")]
-    apart = run_trials([trial(mesh_file, tmp_path / f"a{i}", **t) for i, t in enumerate(teams)], workers=2)
-    alone = run_trials([trial(mesh_file, tmp_path / f"b{i}", **t) for i, t in enumerate(teams)])
-    assert [without_seconds(row) for row in apart] == [without_seconds(row) for row in alone]

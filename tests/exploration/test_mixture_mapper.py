@@ -17,7 +17,9 @@ from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mapper import Memo, Sensed
 from gmmtorch.exploration.mixture_mapper import FrameRule, MixtureMapper
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.mapping.updating import count_explained
+from gmmtorch.occupancy.cell_evidence import common
 from gmmtorch.sharing.messages import (
     CODECS,
     ComponentsMessage,
@@ -150,6 +152,45 @@ def test_a_replica_holds_what_it_says(flight: tuple) -> None:
 def test_the_voxels_are_those_of_the_mixture(codec: str, flight: tuple, broadcast_flight: tuple) -> None:
     one = {"replica": flight, "quantized": broadcast_flight}[codec][0]
     assert_same_evidence(one, anew(one))
+
+
+WAY = [(1.5, 3.0), (2.5, 3.2), (4.0, 3.5), (5.5, 3.0), (6.8, 2.0), (5.0, 2.5), (3.0, 4.0), (1.5, 5.0)]
+
+
+def test_a_window_that_wanders_is_filled_with_what_all_components_say() -> None:
+    """Against the belief, which takes in all evidence of the whole room as it comes, and never moves."""
+    one = mapper()
+    one.local = SlidingVoxelMap(0.2, (20, 20, 12), step=4)
+    one.center_on(torch.tensor([*WAY[0], 1.4], dtype=torch.float64))
+    refilled = 0.0
+    for turn, place in enumerate(WAY):
+        before = one.local.low
+        one.center_on(torch.tensor([*place, 1.4], dtype=torch.float64))
+        found = torch.stack(one.local.evidence())
+        moved = (before - one.local.low).tolist()
+        kept = torch.zeros(one.local.shape, dtype=torch.bool)
+        spans = [slice(max(0, m), n + min(0, m)) for m, n in zip(moved, kept.shape, strict=True)]
+        kept[tuple(spans)] = True
+        refilled += float(found[:, ~kept].sum())
+        assert_window_is_that_of_the_belief(one)
+        one.sense(frame((*place, 1.4), 1.3 * turn, seed=turn))
+        assert_window_is_that_of_the_belief(one)
+    assert refilled > 1000
+    assert float(torch.stack(one.belief.grid.dense(BOX)).sum()) > refilled
+
+
+def assert_window_is_that_of_the_belief(one: MixtureMapper) -> None:
+    """In every cell of the window that the belief has, too."""
+    box = common(one.local.box, BOX)
+    assert box is not None
+    inside = tuple(
+        slice(low, high)
+        for low, high in zip(
+            (box.low - one.local.low).tolist(), (box.high - one.local.low).tolist(), strict=True
+        )
+    )
+    for found, expected in zip(one.local.evidence(), one.belief.grid.dense(box), strict=True):
+        torch.testing.assert_close(found[inside], expected, rtol=1e-4, atol=1e-3)
 
 
 def test_components_stand_for_the_beams_that_were_novel() -> None:

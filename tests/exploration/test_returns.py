@@ -41,6 +41,44 @@ def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
             break
 
 
+@given(
+    gains=st.lists(st.tuples(st.integers(0, 100), st.booleans()), min_size=1, max_size=60),
+    share=st.sampled_from([0.1, 0.9]),
+)
+def test_time_in_which_it_was_boxed_in_does_not_count(gains, share):
+    """What it did otherwise, put end to end, is all that it goes by; what it learned meanwhile counts."""
+    rule = RestRule(share, window=10.0)
+    returns, learned = DiminishingReturns(rule), 0.0
+    told: list[float] = []  # of the notes that count
+    since = 0.0
+    for i, (gain, boxed_in) in enumerate(gains):
+        boxed_in &= i > 0  # before the first note there was nothing
+        learned, since = learned + gain, since + gain
+        returns.note(100.0 + 2.0 * i, learned, known=0.0, boxed_in=boxed_in)
+        if not boxed_in:
+            told.append(since)
+            since = 0.0
+        assert returns.rests == (rests_by_the_book(told, 2.0, rule) is not None)
+        if returns.rests:
+            break
+
+
+def test_boxed_in_for_ever_it_never_rests_and_keeps_nothing_of_it():
+    returns = DiminishingReturns(RestRule(0.9, window=10.0))
+    for now in (0, 5, 9):
+        returns.note(now, 100.0 * now, 0.0)
+    size = len(returns.state()["noted"])
+    for now in range(10, 2000):
+        returns.note(now, 900.0, 0.0, boxed_in=True)
+        assert not returns.rests
+    assert len(returns.state()["noted"]) == size
+    returns.note(2001, 900.0, 0.0)
+    assert not returns.rests  # of all that time 11 s count, in which it learned much
+    for now in (2004, 2012):
+        returns.note(now, 900.0, 0.0)
+    assert returns.rests
+
+
 def resting() -> DiminishingReturns:
     """At rest at 30 s, having learned 100 bits in its best 10 s, with 150 known."""
     returns = DiminishingReturns(RestRule(0.05, window=10.0))

@@ -45,7 +45,7 @@ class Idle:
 def robot(start_radius: float = 0.0) -> Robot:
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     mapper = GridMapper(
-        0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True
+        0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
     )
     mapper.center_on(START[:3])
     return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), start_radius)

@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.distance import DistanceField
+from gmmtorch.exploration.goal import Goal
 from gmmtorch.exploration.planning import PlanningTask
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.safety import feasible
 from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.tree_search import Goal, Memory, SearchRule, TreeSearch
+from gmmtorch.exploration.tree_search import SearchRule, TreeSearch
 from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.view_memory import Memory
 from gmmtorch.exploration.views import ViewValues
 
 N_BLOCKS = 6

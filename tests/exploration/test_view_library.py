@@ -127,6 +127,23 @@ def test_values_are_renewed_where_the_window_shows_them_and_worthless_views_go()
     assert library.covered(here, 40.0, most=9) == []  # nobody can be there
 
 
+def test_views_of_a_clock_that_is_far_ahead_are_as_old_as_the_hearing_of_them():
+    """A robot that was started again hears of teammates that have flown for long."""
+    library, here = ViewLibrary(0), surroundings_from(torch.ones(20, 10, 10, dtype=torch.bool))
+    said_late = message_of([(1, 0, 1.0, 5.0, 500.0), (1, 1, 3.0, 5.0, 2.0)], [])
+    library.receive(said_late, 3.0)
+    assert library.covered(here, 11.9, most=9) == []
+    assert library.covered(here, 12.0, most=9) == [(1, 1)]  # by its stamp, as where clocks are one
+    assert library.covered(here, 13.0, most=9) == [(1, 1), (1, 0)]
+    library.receive(said_late, 13.0)  # again: nobody has looked again
+    assert library.covered(here, 13.0, most=9) == [(1, 1), (1, 0)]
+    library.receive(message_of([(1, 0, 1.0, 6.0, 510.0)], []), 13.0)
+    assert library.covered(here, 22.9, most=9) == [(1, 1)]
+    assert library.covered(here, 23.0, most=9) == [(1, 1), (1, 0)]
+    library.receive(message_of([], [(1, 0)]), 23.0)
+    assert library.covered(here, 900.0, most=9) == [(1, 1)]
+
+
 def test_visited_views_go():
     library = ViewLibrary(0)
     poses = poses_of((0, 0, 0, 0.1), (0, 0, 0, math.pi), (0.5, 0, 3.0, 0))

@@ -17,7 +17,7 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.mapping import lattice
+from gmmtorch.mapping import codec, lattice
 from gmmtorch.mapping.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
 from gmmtorch.mapping.codec import decode, encode, quantized, spatial_order
 from gmmtorch.mapping.components import Components
@@ -236,6 +236,48 @@ def test_a_component_that_nothing_saw_is_kept():
     assert len(quantized(c)) == 2
 
 
+@settings(max_examples=80)
+@given(
+    dim=st.sampled_from([2, 3]),
+    center=st.sampled_from([0.0, lattice.FARTHEST, -lattice.FARTHEST]),
+    extent=st.sampled_from([0.0, 1e6, 2 * lattice.FARTHEST, 4 * lattice.FARTHEST]),
+    deviations=st.sampled_from([(2.0**-21, 1.0), (1.0, 2.0**19), (2.0**19, 2.0**19.9), (2.0**19.9, 2.0**20)]),
+    seed=st.integers(0, 10**6),
+)
+def test_at_the_ends_of_the_world_what_is_written_is_read(dim, center, extent, deviations, seed):
+    """Rounding may lead out of it, which is an error; cells may stick out of it, which is none."""
+    far = lattice.FARTHEST
+    made = random_components(dim, k=8, extent=extent, deviations=deviations, seed=seed)
+    moved = {name: (getattr(made, name) + center).clamp(-far, far) for name in ("means", "origins")}
+    components = replace(made, **moved)
+    try:
+        batch = encode(components)
+    except InvalidArgumentError:
+        assert center or extent > 1e6 or deviations[1] > 2.0**19
+        return
+    assert_same(decode(batch), quantized(components))
+    assert_same(quantized(decode(batch)), decode(batch))
+
+
+@pytest.mark.parametrize("exponent", range(9, 31))  # 2⁹ m: more cells than are numbered, if smaller
+def test_cells_as_large_as_the_world_are_read(monkeypatch, exponent):
+    """Two corners of the world in cells of any side: the writer may take it where it is the shortest."""
+    corners = torch.tensor([[-lattice.FARTHEST] * 3, [lattice.FARTHEST] * 3], dtype=torch.float64)
+    wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
+    components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
+    monkeypatch.setattr(codec, "_cell_exponent", lambda places, in_order: exponent)
+    assert_same(decode(encode(components)), components)
+
+
+def test_deviations_that_are_equal_but_for_rounding_errors_are_written_falling():
+    """Half a step between two of the lattice's: each may go either way."""
+    turns = rotations(300, 3, torch.Generator().manual_seed(0))
+    for deviation in 2.0 ** ((torch.arange(8) + 0.5) / lattice.PER_OCTAVE):
+        covariances = turns @ (deviation.double() ** 2 * torch.eye(3, dtype=torch.float64)) @ turns.mT
+        components = replace(random_components(3, k=300), covariances=(covariances + covariances.mT) / 2)
+        assert_same(decode(encode(components)), quantized(components))
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -440,6 +482,26 @@ def test_the_shortest_code_is_taken(values, code):
     writer = BitWriter()
     writer.column(column)
     assert len(writer.to_bytes()) <= math.ceil((8 + 70 + coding.n_bits) / 8)
+
+
+@given(
+    ends=st.tuples(*[st.sampled_from([0, 1 << 53, 1 << 60, (1 << 61) - 1, -(1 << 61), -(1 << 62) + 1])] * 2),
+    n=st.integers(1, 40),
+    rises=st.booleans(),
+)
+def test_what_a_column_writes_it_reads(ends, n, rises):
+    """To and fro over a wide gap the steps add up to more than is read, however few bits they take."""
+    column = np.array([ends[number % 2] for number in range(n)], np.int64)
+    column = np.sort(column) if rises else column
+    writer = BitWriter()
+    try:
+        writer.column(column)
+    except InvalidArgumentError:
+        assert max(map(abs, ends)) >= 1 << 60
+        return
+    reader = BitReader(writer.to_bytes())
+    assert reader.column(n).tolist() == column.tolist()
+    reader.finish()
 
 
 def test_zigzag_is_its_inverse():

@@ -11,6 +11,7 @@ from mapping.random_components import random_components
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.mapping import component_rays as module
 from gmmtorch.mapping.component_rays import component_evidence, component_rays
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence
@@ -211,6 +212,31 @@ def test_a_box_only_trims(low):
     assert torch.equal(found.cells, expected.cells)
     for index in (1, 2):
         torch.testing.assert_close(found[index], expected[index], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("most", [1, 700, 5000])
+def test_many_are_drawn_some_at_a_time(monkeypatch, most):
+    """So memory is bounded, and nothing else is another."""
+    components = random_components(3, k=60, seed=8, deviations=(1e-3, 3.0))
+    box = Box(torch.tensor([-30, -30, -30]), torch.tensor([30, 30, 30]))
+    options = {"shell": 1.0, "hits_per_ray": 3, "thinned": True}
+    expected = component_evidence(components, 0.2, box, **options)
+    sizes, sightings, draw = [], [], module._rays
+
+    def watched(*args):
+        sizes.append(int((args[-2] * args[-1]).sum()))
+        sightings.append(len(args[1]))
+        return draw(*args)
+
+    monkeypatch.setattr(module, "_rays", watched)
+    monkeypatch.setattr(module, "_MOST_DRAWS", most)
+    found = component_evidence(components, 0.2, box, **options)
+    assert len(sizes) > 3
+    assert all(size <= most or n == 1 for size, n in zip(sizes, sightings, strict=True))
+    torch.testing.assert_close(dense(found, box), dense(expected, box), rtol=1e-5, atol=1e-5)
+    far = replace(components, means=components.means + 1e5, origins=components.origins + 1e5)
+    for nothing in (components.selected(torch.arange(0)), far):
+        assert len(component_evidence(nothing, 0.2, box, **options).cells) == 0
 
 
 def test_beams_without_return_hit_nothing():

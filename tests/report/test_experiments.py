@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.report import comparison_figure, sensor_noise
+from gmmtorch.report import sensor_noise
+from gmmtorch.report.comparison import comparison_figure
 from gmmtorch.report.component_count import figures as count_figures
 from gmmtorch.report.initialization import figures
 

@@ -9,7 +9,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.report import Board, MissionBoard, entropy_figure, write_exploration_board
+from gmmtorch.report.board import Board
+from gmmtorch.report.exploration_board import MissionBoard, write_exploration_board
+from gmmtorch.report.exploration_curves import entropy_figure
 
 
 def read(directory) -> EventAccumulator:
@@ -35,11 +37,10 @@ def mixture() -> Components:
     )
 
 
-def test_trials_figures_mixture_and_paths(tmp_path):
+def test_trials_and_figures(tmp_path):
     rows = [trial("gmm_shared", 0, duration=50), trial("grid_isolated", 1, duration=50)]
-    paths = flights(2, 30)
     with Board(tmp_path) as board:
-        write_exploration_board(board, rows, {"entropy": entropy_figure(rows)}, mixture(), paths)
+        write_exploration_board(board, rows, {"entropy": entropy_figure(rows)})
     events = read(tmp_path)
     left = events.Scalars("gmm_shared/seed_0/entropy_left")
     assert [event.step for event in left] == [0, 10, 20, 30, 40, 50]
@@ -47,15 +48,31 @@ def test_trials_figures_mixture_and_paths(tmp_path):
         [event.value for event in left], np.array(rows[0]["entropy_bits"]) / OBSERVABLE_BITS, rtol=1e-6
     )
     tags = events.Tags()["scalars"]
-    assert "gmm_shared/seed_0/robot_3/entropy_bits" in tags
+    robots = {tag.split("/")[2] for tag in tags if tag.startswith("gmm_shared/seed_0/robot_")}
+    assert robots == {"robot_0", "robot_1", "robot_2"}
     assert "gmm_shared/seed_0/octree_bytes_over_time" in tags
     assert "grid_isolated/seed_1/octree_bytes_over_time" not in tags
     assert events.Scalars("grid_isolated/seed_1/auc")[0].step == 50
     assert events.Tags()["images"] == ["figures/entropy"]
-    cloud = make_ndarray(events.Tensors("paths_VERTEX")[0].tensor_proto)
-    np.testing.assert_allclose(cloud[0], np.concatenate(paths)[:, :3], rtol=1e-6)
-    ellipsoids = make_ndarray(events.Tensors("mixture_VERTEX")[0].tensor_proto)
-    assert ellipsoids[0, :, 0].max() < 1  # the beams without return, at x = 5, are no surface
+
+
+def test_a_scene_that_grows(tmp_path):
+    paths = flights(2, 30)
+    with Board(tmp_path) as board:
+        live = MissionBoard(board)
+        live.scene(0.0, None, [path[:1] for path in paths])
+        live.scene(9.5, Components.empty(3), [path[:10] for path in paths])
+        live.scene(29.0, mixture(), paths)
+    events = read(tmp_path)
+    clouds = events.Tensors("paths_VERTEX")
+    assert [event.step for event in clouds] == [0, 9, 29]
+    for event, n in zip(clouds, (1, 10, 30), strict=True):
+        expected = np.concatenate([path[:n, :3] for path in paths])
+        np.testing.assert_allclose(make_ndarray(event.tensor_proto)[0], expected, rtol=1e-6)
+    (event,) = events.Tensors("mixture_VERTEX")
+    assert event.step == 29
+    across = make_ndarray(event.tensor_proto)[0, :, 0]
+    assert across.max() < 1  # the beams without return, at x = 5, are no surface
 
 
 def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
@@ -98,6 +115,7 @@ def test_a_running_mission_by_its_simulated_seconds(tmp_path):
 
 def test_nothing_to_show(tmp_path):
     with Board(tmp_path) as board:
-        write_exploration_board(board, [], {}, Components.empty(3))
+        write_exploration_board(board, [], {})
+        MissionBoard(board).scene(0.0, Components.empty(3), [])
     assert read(tmp_path).Tags()["scalars"] == []
     assert read(tmp_path).Tags()["tensors"] == []

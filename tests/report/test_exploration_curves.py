@@ -10,22 +10,9 @@ from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import mean_band
-from gmmtorch.report import (
-    bandwidth_figure,
-    entropy_figure,
-    planner_comparison_figure,
-    profile_figure,
-    stage_means,
-    summary_bars,
-)
-from gmmtorch.report.exploration_style import (
-    FRAMEWORKS,
-    byte_text,
-    framework_colour,
-    framework_name,
-    label_ends,
-    ratio_text,
-)
+from gmmtorch.report.exploration_bars import profile_figure, stage_means, summary_bars
+from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
+from gmmtorch.report.exploration_style import FRAMEWORKS, framework_colour, framework_name, label_ends
 from gmmtorch.report.style import PALETTE, new_figure
 
 
@@ -123,6 +110,26 @@ def test_planners_are_measured_by_one_reference():
     assert "t90 1 s" not in said
 
 
+@pytest.mark.parametrize("duration", [120.0, 600.0, 1600.0])
+def test_the_names_of_levels_lie_on_no_mean_and_on_no_mark(duration):
+    figure = entropy_figure(protocol(n_seeds=3, duration=duration))
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    drawn = [line for line in axes.lines if len(line.get_xdata()) > 2 or line.get_marker() != "None"]
+    names = [text for text in axes.texts if "final reduction" in text.get_text()]
+    assert len(names) == 2
+    for name in names:
+        box = name.get_window_extent()
+        assert axes.get_window_extent().contains(*box.min)
+        assert axes.get_window_extent().contains(*box.max)
+        for line in drawn:
+            x, y = np.asarray(line.get_xdata(), dtype=float), np.asarray(line.get_ydata(), dtype=float)
+            fine = np.interp(np.linspace(0, 1, 4001), np.linspace(0, 1, len(x)), x)
+            at = np.stack([fine, np.interp(fine, x, y)], 1) if len(x) > 1 else np.stack([x, y], 1)
+            pixels = axes.transData.transform(at)
+            assert not ((pixels > box.min) & (pixels < box.max)).all(1).any()
+
+
 def test_variants_that_differ_by_planner_alone_are_named_by_it():
     rows = [trial("gmm_shared", 0, planner=name) for name in ("mcts", "frontier")]
     said = texts(planner_comparison_figure(rows).axes[0])
@@ -201,15 +208,6 @@ def test_labels_keep_apart_in_their_order_and_inside():
     assert heights["alone"] == pytest.approx(0.9)
     assert heights["low"] > 0
     assert heights["a"] + heights["b"] + heights["c"] == pytest.approx(3 * 0.4966, abs=1e-2)
-
-
-def test_text_of_bytes_and_ratios():
-    values = [0, 999, 1000, 12_345, 999_499, 999_600, 41e6, 2.5e9]
-    assert [byte_text(v) for v in values] == [
-        *("0 B", "999 B", "1.00 kB", "12.3 kB", "999 kB", "1.00 MB", "41.0 MB", "2.50 GB")
-    ]
-    assert [byte_text(v, digits=1) for v in (1e4, 1e6, 1e8)] == ["10 kB", "1 MB", "100 MB"]
-    assert [ratio_text(v) for v in (58.04, 3.0, 123.4, 0.5)] == ["58.0×", "3.00×", "123×", "0.500×"]
 
 
 def test_frameworks_have_one_name_and_colour():

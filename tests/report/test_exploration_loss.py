@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import mean_band
-from gmmtorch.report import loss_figure
+from gmmtorch.report.exploration_loss import loss_figure
 from gmmtorch.report.exploration_variants import by_variant
 from gmmtorch.report.style import PALETTE
 

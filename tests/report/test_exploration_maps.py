@@ -11,16 +11,10 @@ from exploration_rows import flights
 from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import (
-    TeamSnapshot,
-    TopView,
-    mixture_scene_figure,
-    team_map_figure,
-    top_view,
-    trajectories_figure,
-)
+from gmmtorch.report.exploration_maps import TeamSnapshot, team_map_figure, trajectories_figure
 from gmmtorch.report.exploration_render import Camera, Canvas, render
-from gmmtorch.report.exploration_scene import _uncovered
+from gmmtorch.report.exploration_scene import _uncovered, mixture_scene_figure
+from gmmtorch.report.exploration_top_view import TopView, top_view
 from gmmtorch.report.style import UNKNOWN
 
 
@@ -64,6 +58,7 @@ def test_coverage_is_shaded_where_it_is():
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "seen by 1 robot: 67 %" in said
     assert "seen by 2 robots: 33 %" in said
+    assert [name for name in said if name.startswith("robot ")] == ["robot 0", "robot 1"]
 
 
 @pytest.mark.parametrize(("n_robots", "n_poses"), [(0, 5), (1, 0), (1, 1), (16, 5)])
@@ -72,7 +67,11 @@ def test_any_number_of_robots_and_poses(n_robots, n_poses):
     coverage = torch.randint(0, n_robots + 1, (5, 9))
     paths = [path[:n_poses] for path in flights(n_robots, max(n_poses, 1))]
     trajectories_figure(world, paths, coverage).canvas.draw()
-    mixture_scene_figure(*components(3), trajectories=paths, max_pixels=200).canvas.draw()
+    scene = mixture_scene_figure(*components(3), trajectories=paths, max_pixels=200)
+    scene.canvas.draw()
+    said = [text.get_text() for legend in scene.legends for text in legend.get_texts()]
+    named = [name for name in said if name.startswith("robot ")]
+    assert named == [f"robot {i}" for i in range(min(n_robots, 7))]
 
 
 def test_team_map_outlines_the_components_of_the_layer():

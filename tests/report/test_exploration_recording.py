@@ -11,7 +11,7 @@ import torch
 from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.report.exploration_recording import RecordedMap, _ellipsoids, record_rerun
+from gmmtorch.report.exploration_recording import RecordedMap, _ellipsoids, load_rerun, record_rerun
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs rerun-sdk")
 
@@ -65,4 +65,6 @@ def test_says_what_is_wrong(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(GmmTorchError, match="pip install 'rerun-sdk"):
         record_rerun(tmp_path / "mission.rrd", [])
+    with pytest.raises(GmmTorchError, match="pip install 'rerun-sdk"):
+        load_rerun()
     assert list(tmp_path.iterdir()) == []

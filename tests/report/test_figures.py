@@ -10,13 +10,10 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report import (
-    auc_against_kept_figure,
-    convergence_figure,
-    mixture_figure,
-    roc_figure,
-    save_figure,
-)
+from gmmtorch.report.curves import convergence_figure, roc_figure
+from gmmtorch.report.mixtures import mixture_figure
+from gmmtorch.report.save import save_figure
+from gmmtorch.report.sparsity import auc_against_kept_figure
 
 
 def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -34,6 +31,9 @@ def test_mixture_figure(dim, n, k):
     figure.canvas.draw()
     title = figure.get_suptitle()
     assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}, {n} point{'s' * (n != 1)}"
+    named = [figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()]
+    named += [text.get_text().strip() for text in figure.axes[0].texts]
+    assert named == [f"{axis} [m]" for axis in "xyz"[:dim]]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -121,7 +121,12 @@ PROGRAM = """
 import sys, torch
 import gmmtorch.report
 assert "matplotlib" not in sys.modules and "tensorboard" not in sys.modules
-from gmmtorch.report import Board, MapPanel, map_figure, mixture_figure, roc_figure, save_figure
+from gmmtorch.report.board import Board
+from gmmtorch.report.curves import roc_figure
+from gmmtorch.report.maps import map_figure
+from gmmtorch.report.mixtures import mixture_figure
+from gmmtorch.report.raster import MapPanel
+from gmmtorch.report.save import save_figure
 eye, panel = torch.eye(3)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:
     board.figure("map", map_figure([panel], torch.zeros(2, 3)))

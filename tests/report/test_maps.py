@@ -10,8 +10,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.report import MapPanel, map_figure
-from gmmtorch.report.raster import height_image, plan, robust_bounds, roof_above, slice_image
+from gmmtorch.report.maps import map_figure
+from gmmtorch.report.raster import MapPanel, height_image, plan, robust_bounds, roof_above, slice_image
 
 
 def wall_map(dim: int) -> BlockEvidence:
@@ -60,7 +60,7 @@ def test_pixels_are_the_cells_of_the_grid():
     evidence = Evidence.empty(VoxelGrid((-1.0, 2.0), 0.5, (3, 2)))
     evidence.hits[2, 0] = 3.0
     evidence.misses[0, 1] = 1.0
-    panel = MapPanel.of_evidence("grid", evidence)
+    panel = MapPanel("grid", evidence.lookup, 0.5, (-1.0, 2.0), (0.5, 3.0))
     image, raster = slice_image(panel)
     assert raster.extent == (-1.0, 0.5, 2.0, 3.0)
     expected = np.full((2, 3), np.nan)  # rows are y
@@ -130,21 +130,6 @@ def test_a_roof_is_left_out_of_the_view_from_the_top(roof):
     titles = [axes.get_title() for axes in map_figure([panel], path).axes]
     assert any("below z = 1.5 m" in title for title in titles) == (roof == 2.0)
     assert not any("below" in axes.get_title() for axes in map_figure([panel], path, ceiling=50.0).axes)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_scattered_blocks_are_shown_where_they_are(dim):
-    evidence = BlockEvidence(0.5, dim)
-    ends = torch.full((1, dim), -30.0, dtype=torch.float64)
-    evidence.add_rays(ends + 20, ends)
-    blocks = MapPanel.of_evidence("blocks", evidence)
-    assert -50 < blocks.low[0] <= -30
-    assert -10 <= blocks.high[0] < 10
-    empty = MapPanel.of_evidence("empty", BlockEvidence(0.1, dim))
-    assert np.isnan(slice_image(empty)[0]).all()
-    corners = (torch.zeros(dim), torch.ones(dim))
-    given = MapPanel.of_evidence("given", evidence, bounds=corners)
-    assert (given.low, given.high) == ((0.0,) * dim, (1.0,) * dim)
 
 
 def test_robust_bounds():

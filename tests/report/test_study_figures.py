@@ -68,10 +68,18 @@ def test_cells_are_those_that_the_threshold_calls_occupied(generator):
     hits = torch.rand(100, 3, generator=generator, dtype=torch.float64)
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     figure = variance_threshold.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
-    measured, strict, loose = figure.axes
+    measured, strict, loose, heights = figure.axes
     assert len(measured.collections[0].get_offsets()) == 100
-    assert strict.get_title() == "v = 0.06: 500 cells"
-    assert loose.get_title() == "v = 0.2: 1,000 cells"
+    assert [text.get_text() for text in measured.texts] == ["20 components"]
+    assert strict.get_title() == "v = 0.06\n500 cells"
+    assert loose.get_title() == "v = 0.2\n1,000 cells"
+    assert heights.get_ylabel() == "height z [m]"
+    figure.canvas.draw()
+    for axes in (measured, strict, loose):
+        assert [axes.get_xlabel(), axes.get_ylabel(), axes.get_zlabel()] == ["x [m]", "y [m]", "z [m]"]
+        for ticks in (axes.get_xticks(), axes.get_yticks(), axes.get_zticks()):
+            assert 2 <= sum(0 <= tick <= 1 for tick in ticks) <= 6
+        assert min(label.get_fontsize() for label in axes.get_xticklabels()) >= 9
 
 
 def test_the_closest_look_is_where_most_thin_points_are():

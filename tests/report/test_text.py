@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from gmmtorch.report import ProgressBars, format_table
-from gmmtorch.report.table import format_bytes, format_value
+from gmmtorch.report.progress import ProgressBars
+from gmmtorch.report.quantities import byte_text, ratio_text
+from gmmtorch.report.table import format_table, format_value
 
 
 def test_table_is_aligned():
@@ -16,7 +17,7 @@ def test_table_is_aligned():
     assert format_table(rows).splitlines() == [
         "method             auc  n_components   nbytes  kept",
         "--------------  ------  ------------  -------  ----",
-        "monte_carlo     0.9765        12,670  28.1 KB   0.3",
+        "monte_carlo     0.9765        12,670  28.1 kB   0.3",
         "occupancy_grid  1.0000             -  1.25 MB     1",
     ]
 
@@ -54,16 +55,27 @@ def test_values(name, value, text):
     [
         (0, "0 B"),
         (999, "999 B"),
-        (1000, "1.00 KB"),
-        (28_100, "28.1 KB"),
-        (99_960, "100 KB"),
-        (999_499, "999 KB"),
+        (1000, "1.00 kB"),
+        (28_100, "28.1 kB"),
+        (99_960, "100 kB"),
+        (999_499, "999 kB"),
         (999_600, "1.00 MB"),
         (5e15, "5000 TB"),
     ],
 )
 def test_bytes(n_bytes, text):
-    assert format_bytes(n_bytes) == text
+    assert byte_text(n_bytes) == text
+
+
+def test_bytes_of_ticks_and_ratios():
+    assert [byte_text(v, digits=1) for v in (1e4, 1e6, 1e8)] == ["10 kB", "1 MB", "100 MB"]
+    assert [ratio_text(v) for v in (58.04, 3.0, 123.4, 0.5, 0)] == [
+        "58.0×",
+        "3.00×",
+        "123×",
+        "0.500×",
+        "0.00×",
+    ]
 
 
 def test_bars_open_and_close_with_their_stages(capsys):

@@ -2,10 +2,10 @@
 
     PYTHONPATH=tests python -m sharing.kill_journal 200
 
-A robot adds, supersedes, counts and corrects; hears another that does the same; keeps all of it, and says
-into a pipe what it is about to keep, and when it has been told that it is kept. Half of its lives end by the
-clock, which starts when its journal is open; half inside a file operation, also while it is opened, writes
-after a random part of their bytes. Then it lives again, on what is there.
+A robot adds, supersedes, counts and corrects; hears another that does the same; keeps all of it, much of it
+again, as under loss; and says into a pipe what it is about to keep, and when it has been told that it is
+kept. Half of its lives end by the clock, which starts when its journal is open; half inside a file operation,
+also while it is opened, writes after a random part of their bytes. Then it lives again, on what is there.
 
 After each death a copy of its folder is opened. Everything acknowledged must be there, and the digest be that
 of a replica that heard what was kept, of the batch that was being written at most a beginning.
@@ -148,10 +148,14 @@ def _live(rng: random.Random, home: Path, pipe: int) -> None:
     sync, size = rng.choice(["snapshot", "always"]), rng.choice([4_000, 20_000])
     journal = Journal(home, robot, sync=sync, most_log_bytes=size)
     _tell(pipe, _KEPT, [])
+    before: list[bytes] = []
     while True:
         for maker in (robot, other):
             act(rng, maker)
-            datagrams = maker.datagrams()
+            new = maker.datagrams()
+            datagrams = [*new, *rng.sample(before, min(rng.randrange(4), len(before)))]
+            rng.shuffle(datagrams)
+            before += new
             _tell(pipe, _INTENT, datagrams)
             if maker is robot:
                 journal.said(datagrams)

@@ -13,6 +13,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.mapping.codec import spatial_order
 from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.announce_messages import encode_announcements
 from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.messages import (
     CODECS,
@@ -24,7 +25,16 @@ from gmmtorch.sharing.messages import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.record_ids import first_key
+from gmmtorch.sharing.record_ids import END, first_key
+from gmmtorch.sharing.record_messages import (
+    CorrectionMessage,
+    RecordMessage,
+    SupersessionMessage,
+    encode_record,
+    pose_of,
+    totals_message,
+)
+from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
@@ -62,13 +72,32 @@ def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> Vie
     )
 
 
+def span(robot: int, begin: int, end: int) -> Intervals:
+    """Keys of a robot's."""
+    return Intervals.span(first_key(robot) + begin, first_key(robot) + end)
+
+
+def records() -> list[RecordMessage]:
+    """One of every kind that is no component."""
+    return [
+        SupersessionMessage(first_key(2, 5), span(2, 0, 3) | span(2, 7, 8), span(2, 30, 32)),
+        totals_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
+        CorrectionMessage(first_key(2, 9), 3, 1, span(2, 4, 6), pose_of(torch.eye(4))),
+    ]
+
+
 def examples() -> list[bytes]:
-    """A sound datagram of every kind."""
+    """A sound datagram of every kind, in the order of their numbers."""
     components, counts = frame_of_components(9), {(0, 3): 5.0, (0, 4): 7.5, (2, 900): 0.0}
     ends = torch.arange(30, dtype=torch.float64).reshape(10, 3)
     made = [encode_components(components, codec) for codec in CODECS]
     made += [encode_counts(1, counts, codec) for codec in CODECS]
     made += [encode_points(1, 2, ends[0], ends, ends[:, 0] > 9), encode_views(views(6, 3))]
     made += [encode_plan(2, 5, 12.0, 0.2, views(11).poses, views(3).poses)]
+    made += [encode_announcements(1, 2, span(0, 0, 70) | span(3, 5, 7) | span(3, 900, 901))]
+    made += [[encode_record(record)] for record in records()]
+    alive = np.array([first_key(2) + number for number in (0, 2, 5)])
+    checks = np.array([7, 0, 255])
+    made += [encode_views_held(1, bytes(range(8)), ViewsDetail(0, END, span(2, 0, 9), alive, 3, checks))]
     assert all(len(datagrams) == 1 for datagrams in made)
     return [datagrams[0] for datagrams in made]

@@ -15,20 +15,21 @@ from sharing.message_examples import sealed
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.bitstream import BitWriter
 from gmmtorch.mapping.quantization import COUNT_ERROR
-from gmmtorch.sharing.announce_messages import (
-    AnnouncementMessage,
+from gmmtorch.sharing.announce_messages import AnnouncementMessage, encode_announcements
+from gmmtorch.sharing.anti_entropy import MOST_PEERS, Backlog
+from gmmtorch.sharing.fields import write_intervals, write_keys
+from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.messages import MAX_BYTES, decode
+from gmmtorch.sharing.record_ids import END, first_key, keys_of
+from gmmtorch.sharing.record_messages import (
     CorrectionMessage,
     SupersessionMessage,
     TotalsMessage,
-    encode_announcements,
     encode_record,
     pose_of,
     totals_message,
 )
-from gmmtorch.sharing.anti_entropy import MOST_PEERS, Backlog
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import MAX_BYTES, decode
-from gmmtorch.sharing.record_ids import END, first_key
+from gmmtorch.sharing.record_names import names_in
 from gmmtorch.sharing.replica import Replica
 
 robots = st.integers(0, 1023)
@@ -214,7 +215,27 @@ def test_announcements_of_nonsense_are_refused(numbers):
         decode(sealed(b"\x1a" + writer.to_bytes()))
 
 
-def test_records_of_nonsense_are_refused():
+def written(record: SupersessionMessage | TotalsMessage | CorrectionMessage) -> bytes:
+    """Its datagram, whatever it says."""
+    writer, base = BitWriter(), first_key(record.key >> 52)
+    writer.number(record.key)
+    if isinstance(record, SupersessionMessage):
+        write_intervals(writer, record.old, base)
+        write_intervals(writer, record.new, base)
+        return sealed(b"\x1b" + writer.to_bytes())
+    if isinstance(record, TotalsMessage):
+        write_keys(writer, record.components)
+        writer.column(record.steps)
+        return sealed(b"\x1c" + writer.to_bytes())
+    writer.number(record.scan)
+    writer.number(record.version)
+    writer.one(record.dim - 2, 1)
+    writer.fixed(record.pose.numpy().view("<u4").astype(np.int64), 32)
+    write_intervals(writer, record.moved, base)
+    return sealed(b"\x1d" + writer.to_bytes())
+
+
+def test_records_of_nonsense_are_neither_read_nor_written():
     key = first_key(2)
     pose = pose_of(torch.eye(4))
     long, infinite, far = pose.clone(), pose.clone(), pose.clone()
@@ -224,15 +245,46 @@ def test_records_of_nonsense_are_refused():
         SupersessionMessage(key + 9, within(2, 1), within(2, 1, 2)),  # waits for what it supersedes
         SupersessionMessage(key + 9, within(2, 9), within(2, 1)),  # supersedes itself
         *(CorrectionMessage(key, 0, 1, within(2, 1), bad) for bad in (long, infinite, far)),
+        *(SupersessionMessage(key + 9, within(robot, 5), Intervals.empty()) for robot in (1, 3)),
+        *(CorrectionMessage(key, 0, 1, within(robot, 5), pose) for robot in (1, 3)),  # another's
+        CorrectionMessage(key, 1 << 60, 1, within(2, 1), pose),
+        CorrectionMessage(key, 0, -1, within(2, 1), pose),
+        SupersessionMessage(-1, within(0, 1), Intervals.empty()),
+        *(TotalsMessage(key, np.array([3]), np.array([step])) for step in (-42, 161)),
+        TotalsMessage(key, np.array([END]), np.array([0])),
     ):
         with pytest.raises(DataError):
-            decode(encode_record(record))
-    for others in (within(1, 5), within(3, 5)):  # nobody supersedes or moves what is another's
-        with pytest.raises((DataError, InvalidArgumentError)):
-            decode(encode_record(SupersessionMessage(key + 9, others, Intervals.empty())))
+            decode(written(record))
+        with pytest.raises(InvalidArgumentError):
+            encode_record(record)
+    for record in (
+        SupersessionMessage(END, within(0, 1), Intervals.empty()),
+        CorrectionMessage(key, 0, 1, within(2, 1), pose[:5]),
+        TotalsMessage(key, np.array([3, 3]), np.array([0, 0])),
+        TotalsMessage(key, np.array([3, 4]), np.array([0])),
+    ):
+        with pytest.raises(InvalidArgumentError):
+            encode_record(record)
+
+
+@pytest.mark.parametrize(
+    ("sender", "incarnation", "held"),
+    [
+        (1024, 0, Intervals.span(0, 1)),
+        (-1, 0, Intervals.span(0, 1)),
+        (1, 1 << 24, Intervals.span(0, 1)),
+        (1, 2, Intervals.span(-1, 1)),
+        (1, 2, Intervals.span(5, END + 1)),
+    ],
+)
+def test_announcements_that_nobody_would_read_are_not_written(sender, incarnation, held):
+    with pytest.raises(InvalidArgumentError):
+        encode_announcements(sender, incarnation, held)
 
 
 # -- who answers -------------------------------------------------------------------------------------------
+
+NOTHING = Intervals.empty()
 
 
 def says(sender: int, held: Intervals, scope: Intervals | None = None) -> AnnouncementMessage:
@@ -243,11 +295,11 @@ def says(sender: int, held: Intervals, scope: Intervals | None = None) -> Announ
 def test_who_made_a_record_sends_it_at_once_and_others_if_it_is_still_missing():
     backlog = Backlog(1)
     held = within(1, 0, 1, 2) | within(2, 0, 1)
-    backlog.announced(says(3, within(1, 0)), held)
+    backlog.announced(says(3, within(1, 0)), held, NOTHING)
     assert backlog.due == within(1, 1, 2)
     backlog.sent(backlog.due)
     backlog.sent(Intervals.empty())
-    backlog.announced(says(3, within(1, 0, 1, 2) | within(2, 0)), held)
+    backlog.announced(says(3, within(1, 0, 1, 2) | within(2, 0)), held, NOTHING)
     assert backlog.due == within(2, 1)
     backlog.heard(within(2, 1))  # another has sent it
     assert not backlog.due
@@ -257,11 +309,11 @@ def test_what_was_just_sent_or_heard_is_on_its_way():
     backlog = Backlog(1)
     held = within(1, 0, 1)
     backlog.sent(within(1, 0))
-    backlog.announced(says(3, Intervals.empty()), held)
+    backlog.announced(says(3, NOTHING), held, NOTHING)
     assert backlog.due == within(1, 1)
     for n_calls in range(1, 4):
         backlog.sent(within(1, 1))
-        backlog.announced(says(3, Intervals.empty()), held)
+        backlog.announced(says(3, NOTHING), held, NOTHING)
         # Who announces may not have heard it yet; in the end it is missing.
         assert backlog.due == (within(1, 0) if n_calls == 3 else Intervals.empty())
 
@@ -269,15 +321,49 @@ def test_what_was_just_sent_or_heard_is_on_its_way():
 def test_an_announcement_speaks_of_its_scope_alone():
     backlog = Backlog(1)
     held = within(1, 0, 1, 2, 3, 4)
-    backlog.announced(says(3, within(1, 2), Intervals.span(first_key(1) + 1, first_key(1) + 4)), held)
+    part = Intervals.span(first_key(1) + 1, first_key(1) + 4)
+    backlog.announced(says(3, within(1, 2), part), held, NOTHING)
     assert backlog.due == within(1, 1, 3)
 
 
 def test_gaps_of_few_robots_are_remembered():
     backlog = Backlog(1)
     for sender in range(2, 2 + 3 * MOST_PEERS):
-        backlog.announced(says(sender, Intervals.empty()), within(0, 1))
+        backlog.announced(says(sender, NOTHING), within(0, 1), NOTHING)
     assert len(backlog._gaps) == MOST_PEERS
+
+
+def test_what_is_superseded_is_not_due():
+    backlog = Backlog(1)
+    held, dead = within(1, 0, 1, 2, 3), within(1, 1, 2)
+    backlog.announced(says(3, NOTHING), held, dead)
+    assert backlog.due == within(1, 0, 3)
+    backlog.buried(within(1, 3))
+    assert backlog.due == within(1, 0)
+
+
+def test_nothing_is_due_for_ever():
+    """Superseded while it was due, or before somebody turns out to lack it."""
+
+    def due() -> Intervals:
+        return Intervals.loaded(one.state()["backlog"]["due"])
+
+    one, other = Replica(0), Replica(1)
+    ids = one.add(random_components(3, k=20))
+    kept = one.add(random_components(3, k=3, seed=1), supersedes=ids)
+    dead = Intervals.of(keys_of(ids))
+    assert due() & dead
+    for _ in range(5):  # the last time nothing is on its way any more
+        assert not any(names_in(datagram) & dead for datagram in one.datagrams())
+        assert not due()
+    for datagram in other.announcements():
+        one.receive(datagram)
+    assert due().covers(Intervals.of(keys_of(kept)))
+    assert not due() & dead
+    for datagram in one.datagrams():
+        other.receive(datagram)
+    assert not due()
+    assert other.digest() == one.digest()
 
 
 def test_who_joins_late_catches_up_from_a_third_robot():

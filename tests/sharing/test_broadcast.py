@@ -216,6 +216,30 @@ def test_what_does_not_fit_is_refused_and_counted() -> None:
     assert one.version == 0
 
 
+@pytest.mark.parametrize(("name", "most"), [("MOST_ROWS", 12), ("MOST_BATCHES", 3)])
+def test_more_than_is_held_is_refused_from_others_and_said_all_the_same(
+    name: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"gmmtorch.sharing.broadcast.{name}", most)
+    one = Broadcast(0, "float")
+    batches = [shifted(frame_of_components(5, robot=1), first) for first in (0, 5, 10, 15)]
+    (counted,) = encode_counts(1, {(1, 0): 2.0, (1, 1): 2.0}, "float")
+    told = [*(encode_components(batch, "float")[0] for batch in batches[:2]), counted]
+    assert all(one.receive(datagram) for datagram in told)
+    support = float(one.components().support.sum())
+    for datagram in [*(encode_components(batch, "float")[0] for batch in batches[2:]), counted]:
+        assert not one.receive(datagram)
+    assert one.refused == {"full": 3}
+    assert len(one.components()) == 10
+    assert float(one.components().support.sum()) == support
+    restored = Broadcast(0, "float")
+    restored.restore(one.state())
+    assert not restored.receive(counted)
+    one.add(frame_of_components(4))
+    assert one.datagrams()
+    assert len(one.components()) == 14
+
+
 @pytest.mark.parametrize(("first", "size"), [(0, 12), (4, 2), (3, 9), (0, 6), (5, 5), (9, 20)])
 def test_what_is_here_in_part_is_not_taken_twice(first: int, size: int) -> None:
     one = Broadcast(0, "float")

@@ -5,27 +5,52 @@ from __future__ import annotations
 import math
 import struct
 import warnings
+from collections import Counter
+from dataclasses import replace
+from random import Random
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sharing.message_examples import (
-    examples,
-    sealed,
-)
+from mapping.random_components import random_components
+from sharing.message_examples import examples, sealed
+from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
+from gmmtorch.mapping import codec as batches
 from gmmtorch.mapping.bitstream import BitWriter
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.lattice import LARGEST_VARIANCE
+from gmmtorch.mapping.quantization import MOST_POINTS
+from gmmtorch.sharing import messages
+from gmmtorch.sharing.announce_messages import encode_announcements
+from gmmtorch.sharing.component_messages import LARGEST_BATCH
+from gmmtorch.sharing.envelope import FARTHEST, Kind
 from gmmtorch.sharing.messages import (
+    AnnouncementMessage,
     ComponentsMessage,
+    CorrectionMessage,
     CountsMessage,
+    Message,
     PlanMessage,
     PointsMessage,
+    SupersessionMessage,
+    TotalsMessage,
+    ViewsHeldMessage,
     ViewsMessage,
     decode,
+    encode_components,
+    encode_counts,
+    encode_plan,
+    encode_points,
+    encode_views,
 )
+from gmmtorch.sharing.record_messages import encode_record
+from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.view_announcements import encode_views_held
+from gmmtorch.sharing.view_set import ViewSet
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +59,10 @@ def sound() -> list[bytes]:
 
 
 def test_every_kind_says_what_it_is(sound):
-    kinds = [type(decode(datagram)) for datagram in sound]
-    assert kinds == [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
-    assert [datagram[0] for datagram in sound] == [0x11, 0x12, 0x13, 0x14, 0x15, 0x16, 0x17, 0x18, 0x19]
+    kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
+    kinds += [AnnouncementMessage, SupersessionMessage, TotalsMessage, CorrectionMessage, ViewsHeldMessage]
+    assert [type(decode(datagram)) for datagram in sound] == kinds
+    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 15)]
 
 
 def test_every_cut_flipped_bit_and_added_byte_is_noticed(sound):
@@ -64,17 +90,86 @@ def test_other_versions_kinds_and_sizes_are_refused_by_name():
         decode(b"")
 
 
-def assert_sound(message: object) -> None:
-    """No NaN, nothing infinite or indefinite, and no more than a datagram can hold."""
+def assert_sound(message: Message) -> None:
+    """No NaN, nothing infinite, absurd or indefinite, and no more than a datagram can hold."""
     for value in vars(message.components if isinstance(message, ComponentsMessage) else message).values():
         if isinstance(value, torch.Tensor):
             assert value.numel() <= 1 << 17
             assert not value.is_floating_point() or bool(torch.isfinite(value).all())
     if isinstance(message, ComponentsMessage):
-        message.components.checked()
-        assert not torch.linalg.cholesky_ex(message.components.covariances).info.any()
+        c = message.components.checked()
+        assert not torch.linalg.cholesky_ex(c.covariances).info.any()
+        assert 1 <= len(c) <= LARGEST_BATCH
+        assert len(c.seen_by) <= LARGEST_BATCH
+        assert float(c.covariances.abs().max()) <= LARGEST_VARIANCE
+        assert float(c.support.max()) <= MOST_POINTS
+        assert 0 <= int(c.ids.min()) <= int(c.ids.max()) < 1 << 60
     if isinstance(message, CountsMessage):
         assert all(0 <= count <= 2.0**40 for count in message.counts.values())
+    for places in places_of(message):
+        assert not places.numel() or float(places.abs().max()) <= FARTHEST
+
+
+def places_of(message: Message) -> list[torch.Tensor]:
+    if isinstance(message, ComponentsMessage):
+        return [message.components.means, message.components.origins]
+    if isinstance(message, PointsMessage):
+        return [message.origin, message.ends]
+    if isinstance(message, ViewsMessage):
+        return [message.poses[:, :3]]
+    if isinstance(message, PlanMessage):
+        return [message.path[:, :3], message.views[:, :3]]
+    return [message.pose[: message.dim]] if isinstance(message, CorrectionMessage) else []
+
+
+def written_again(message: Message, kind: Kind) -> list[bytes]:
+    """What a robot that holds this would say."""
+    if isinstance(message, ComponentsMessage):
+        return encode_components(message.components, _CODEC[kind])
+    if isinstance(message, CountsMessage):
+        return encode_counts(message.sender, message.counts, _CODEC[kind])
+    if isinstance(message, PointsMessage):
+        return encode_points(message.sender, message.frame, message.origin, message.ends, message.is_hit)
+    if isinstance(message, ViewsMessage):
+        return encode_views(message)
+    if isinstance(message, PlanMessage):
+        m = message
+        return encode_plan(m.sender, m.number, m.time, m.step, m.path, m.views)
+    if isinstance(message, AnnouncementMessage):
+        return encode_announcements(message.sender, message.incarnation, message.held)
+    if isinstance(message, ViewsHeldMessage):
+        return encode_views_held(message.sender, message.digest, message.detail)
+    return [encode_record(message)]
+
+
+_CODEC = {
+    kind: codec
+    for kinds in ((1, 2, 3), (4, 5, 6))
+    for kind, codec in zip(map(Kind, kinds), messages.CODECS, strict=True)
+}
+
+
+def content(message: Message) -> list[object]:
+    """What is said, comparable."""
+    if isinstance(message, ComponentsMessage):
+        c = message.components
+        return [getattr(c, name).tolist() for name in ("ids", "means", "covariances", "support", "max_range")]
+    if isinstance(message, PointsMessage):  # which part of its frame it is, is not asked
+        return [message.sender, message.origin.tolist(), message.ends.tolist(), message.is_hit.tolist()]
+    if isinstance(message, AnnouncementMessage):
+        return [message.sender, message.incarnation, message.held.pairs()]
+    if isinstance(message, ViewsHeldMessage) and message.detail is not None:
+        d = message.detail
+        return [message.sender, message.digest, d.known.pairs(), d.alive.tolist(), d.byte, d.checks.tolist()]
+    rows = vars(message).values()
+    return [value.tolist() if hasattr(value, "tolist") else value for value in rows]
+
+
+def joined(found: list[Message]) -> list[object]:
+    """The content of what had to be written as several datagrams."""
+    if len(found) > 1 and all(isinstance(message, ComponentsMessage) for message in found):
+        return content(ComponentsMessage(Components.concatenate([m.components for m in found])))
+    return content(found[0]) if len(found) == 1 else []
 
 
 def try_decode(datagram: bytes) -> bool:
@@ -93,7 +188,7 @@ def test_noise_is_refused(data):
 
 
 @settings(max_examples=600)
-@given(kind=st.integers(1, 9), body=st.binary(max_size=400))
+@given(kind=st.integers(1, 14), body=st.binary(max_size=400))
 def test_noise_with_a_sound_checksum_is_refused_or_sound(kind, body):
     try_decode(sealed(b"\x11" + sealed(b"\x01" + body)) if kind == 1 else sealed(bytes([0x10 | kind]) + body))
 
@@ -146,3 +241,109 @@ def test_float_components_that_are_none_are_refused(sound):
             decode(forged(datagram, changed))
     with pytest.raises(DataError, match="0 components"):
         decode(forged(datagram, struct.pack("<BIII", 3, 0, 1 << 31, 1 << 31)))
+
+
+# -- made up by who knows the format ---------------------------------------------------------------------
+
+
+class Bystanders:
+    """Who is told whatever can be read."""
+
+    def __init__(self) -> None:
+        self.replica, self.views = Replica(0, incarnation=1, most_components=2000), ViewSet(0, incarnation=1)
+
+    def hear(self, datagram: bytes, message: Message) -> None:
+        self.replica.receive(datagram, message)
+        self.views.receive(message)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+@settings(max_examples=80)
+@given(rng=st.randoms(use_true_random=False))
+def test_structured_bodies_are_refused_or_sound_and_can_be_said_again(kind, rng):
+    datagram = structured(kind, rng)
+    try:
+        message = decode(datagram)
+    except DataError:
+        assert not Replica(0, incarnation=1).receive(datagram)
+        return
+    assert_sound(message)
+    Bystanders().hear(datagram, message)
+    again = [decode(each) for each in written_again(message, kind)]
+    if len(again) == 1 or isinstance(message, ComponentsMessage):
+        assert joined(again) == content(message)
+
+
+def test_of_structured_bodies_many_are_read_and_many_are_not():
+    """So that what is read, and what is refused, has been looked at; nobody raises, whatever came before."""
+    bystanders = Bystanders()
+    for kind in Kind:
+        found: Counter[bool] = Counter()
+        for seed in range(60):
+            datagram = structured(kind, Random(seed))
+            found[try_decode(datagram)] += 1
+            try:
+                bystanders.hear(datagram, decode(datagram))
+            except DataError:
+                assert not bystanders.replica.receive(datagram)
+        assert min(found[True], found[False]) >= 5, (kind, found)
+
+
+def test_no_components_at_all_are_refused():
+    """K, S and E are zero, which numpy would not have; and the other codecs' way of saying so."""
+    with pytest.raises(DataError, match="0 components"):
+        decode(bytes.fromhex("1203000000000000000000000000c8edadeb"))
+    assert not Replica(0).receive(bytes.fromhex("1203000000000000000000000000c8edadeb"))
+    with pytest.raises(DataError, match="0 components"):
+        decode(b"\x11" + batches.encode(Components.empty(3)))
+    for datagram in (sealed(b"\x13"), *(sealed(bytes([0x10 | kind, 2])) for kind in (5, 6))):
+        with pytest.raises(DataError):
+            decode(datagram)
+
+
+@pytest.mark.parametrize("value", [1e300, 2 * FARTHEST, -1e9])
+@pytest.mark.parametrize(
+    ("number", "place", "layout"),
+    [
+        (1, 13, "<d"),  # the first mean of float components
+        (1, 13 + 9 * (24 + 48 + 8 + 1 + 16), "<d"),  # their first origin
+        (2, 8, "<f"),  # the sensor position of a thesis message
+        (2, 20, "<f"),  # the mean of one
+        (6, 6, "<d"),  # the origin of points
+        (6, 36, "<f"),  # a point
+    ],
+)
+def test_places_that_are_absurd_are_refused(sound, number, place, layout, value):
+    body = sound[number][1:-4]
+    stored = struct.pack(layout, min(value, 3e38) if layout == "<f" else value)
+    with pytest.raises(DataError):
+        decode(forged(sound[number], body[:place] + stored + body[place + len(stored) :]))
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [(13 + 9 * 24, 1e300), (13 + 9 * 72, 1e300), (13 + 9 * 72, 1e13)]
+)
+def test_float_components_that_are_absurd_are_refused(sound, place, value):
+    """The first variance, and the support of the first."""
+    body = sound[1][1:-4]
+    with pytest.raises(DataError, match="is the most"):
+        decode(forged(sound[1], body[:place] + struct.pack("<d", value) + body[place + 8 :]))
+
+
+@pytest.mark.parametrize("shift", [1.0, 1.01])
+def test_what_lies_farther_out_than_is_told_can_be_stored_and_not_heard(shift):
+    """The codec of files reaches farther than messages do."""
+    one = random_components(3, k=1, extent=0.0, n_origins=1, max_sightings=1, deviations=(0.01, 0.1))
+    far = replace(one, means=one.means + shift * FARTHEST)
+    assert try_decode(b"\x11" + batches.encode(far)) == (shift == 1.0)
+
+
+def test_what_nobody_has_thought_of_is_refused_too(sound, monkeypatch):
+    for error in (ValueError, OverflowError, ZeroDivisionError, IndexError, RuntimeError):
+
+        def careless(body: bytes, error: type[Exception] = error) -> Message:
+            raise error("oh")
+
+        monkeypatch.setitem(messages._READERS, Kind.PLAN, careless)
+        with pytest.raises(DataError, match="oh"):
+            decode(sound[8])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.intervals import Intervals
+from gmmtorch.sharing.intervals import Intervals, excess
 
 numbers = st.sets(st.integers(0, 40))
 
@@ -48,6 +48,29 @@ def test_intervals_never_touch_and_are_as_few_as_can_be(one, other):
     assert (np.diff(joined.edges) > 0).all()
     starts = [number for number in one | other if number - 1 not in one | other]
     assert len(joined) == len(starts)
+
+
+@given(sets=st.lists(numbers, max_size=5))
+def test_the_union_of_many_is_that_of_one_after_another(sets):
+    found = Intervals.union(map(of, sets))
+    assert members(found) == set().union(*sets)
+    assert found == of(members(found))
+
+
+@given(sets=st.dictionaries(st.integers(0, 9), numbers), most=st.integers(0, 30))
+def test_who_has_most_is_forgotten_first_and_no_more_than_need_be(sets, most):
+    intervals = {name: of(values) for name, values in sets.items()}
+    gone = excess(intervals, most)
+    sizes = {name: len(one) for name, one in intervals.items()}
+    left = [sizes[name] for name in sizes.keys() - set(gone)]
+    assert sum(left) <= most
+    assert all(sizes[name] >= max(left, default=0) for name in gone)
+    assert not gone or sum(left) + sizes[gone[-1]] > most
+
+
+@given(one=numbers, most=st.integers(0, 20))
+def test_a_set_of_more_intervals_is_none(one, most):
+    assert members(of(one).up_to(most)) == (one if len(of(one)) <= most else set())
 
 
 def test_long_intervals_take_no_memory():

@@ -35,6 +35,7 @@ from gmmtorch.sharing.journal_format import (
     read_log,
     unpack_snapshot,
 )
+from gmmtorch.sharing.messages import encode_components
 from gmmtorch.sharing.replica import Replica
 
 N_KILLS = 5
@@ -176,6 +177,81 @@ def test_what_was_held_already_is_not_written_again(tmp_path):
     journal.close()
     size = newest(tmp_path, ".log").stat().st_size
     assert size == len(log_header(0, 5)) + sum(len(framed(datagram)) for datagram in datagrams)
+    assert reopened(tmp_path)[0].digest() == told(datagrams).digest()
+
+
+def test_what_is_said_again_is_not_written_again(tmp_path):
+    """Under loss: in other datagrams than at first, others' records too, and with new ones between."""
+    rng, replica, deaf = random.Random(0), Replica(0), Replica(1000)
+    journal = Journal(tmp_path, replica)
+
+    def size() -> int:
+        return newest(tmp_path, ".log").stat().st_size
+
+    first = spoken(1, 5)
+    for datagram in first:
+        assert replica.receive(datagram)
+    journal.heard(first)
+    for _ in range(3):
+        act(rng, replica)
+        journal.said(replica.datagrams())
+    journal.said(replica.datagrams())
+    before, n_again = size(), 0
+    for number in range(12):
+        for datagram in deaf.announcements():
+            replica.receive(datagram)
+        again = replica.datagrams(max_bytes=1000 + 10 * number, budget=(None, 1500)[number % 2])
+        journal.said(again)
+        journal.said([*replica.announcements(), *again])
+        n_again += len(again)
+        journal.heard(first)
+        assert size() == before
+    assert n_again > 10
+    replica.add(components(rng, 2))
+    (new,) = replica.datagrams()
+    journal.heard(first)
+    journal.said([*first, new, *again, new])
+    assert size() == before + len(framed(new))
+    journal.close()
+    found, restored = reopened(tmp_path)
+    assert found.digest() == replica.digest()
+    assert restored.n_refused == 0
+
+
+def test_what_is_said_after_a_snapshot_that_rots_is_there(tmp_path):
+    """The snapshot had it, not said yet; so the log has it, too, and once only."""
+    replica = Replica(0)
+    journal = Journal(tmp_path, replica)
+    for seed in range(4):
+        replica.add(components(random.Random(seed), 3))
+        journal.snapshot()
+        said = replica.datagrams()
+        journal.said(said)
+        size = newest(tmp_path, ".log").stat().st_size
+        assert size == len(log_header(0, 5)) + sum(map(len, map(framed, said)))
+        journal.said(said)
+        assert newest(tmp_path, ".log").stat().st_size == size
+        flip(newest(copy := shutil.copytree(tmp_path, tmp_path.with_name(f"copy{seed}")), ".snapshot"), 99)
+        found, restored = reopened(copy)
+        assert len(restored.damage) == 1
+        assert found.digest() == replica.digest()
+    journal.close()
+
+
+def test_names_of_what_is_kept_take_bounded_memory(tmp_path, monkeypatch):
+    """Beyond it they are forgotten, and what comes again is written again."""
+    monkeypatch.setattr("gmmtorch.sharing.journal._MOST_NAMED", 20)
+    replica = Replica(0)
+    journal = Journal(tmp_path, replica)
+    parts = [components(random.Random(seed), 1) for seed in range(50)]
+    for number, part in enumerate(parts):
+        part.ids[:] = torch.tensor([[3, 2 * number]])
+    datagrams = [encode_components(part)[0] for part in parts]
+    for datagram in datagrams:
+        assert replica.receive(datagram)
+        journal.heard(datagram)
+        assert len(journal._kept) <= 20
+    journal.close()
     assert reopened(tmp_path)[0].digest() == told(datagrams).digest()
 
 

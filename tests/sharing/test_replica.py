@@ -140,7 +140,7 @@ def test_schedules_have_trouble_in_them():
 
 
 def test_the_contract():
-    """DESIGN.md's lines, as they stand there."""
+    """The first lines of docs/replica.md: say, hear, and hold the same map."""
     scan = gt.datasets.load("synthetic_building_2d")[0]
     m = gt.GaussianMap(window=1)
     m.insert(scan)
@@ -350,6 +350,17 @@ def test_a_damaged_state_is_refused(where):
     state["records"]["components"]["means"] = state["records"]["components"]["means"] + 1e-7
     with pytest.raises(DataError, match="codec"):
         Replica(0).restore(state)
+
+
+def test_a_state_of_another_dimension_is_refused():
+    flat, empty = Replica(0), Replica(0)
+    flat.add(random_components(2, k=3))
+    spatial = Replica(0, dim=3)
+    with pytest.raises(DataError, match=r"2D.*dim=3"):
+        spatial.restore(flat.state())
+    spatial.restore(empty.state())  # which may become either
+    with pytest.raises(InvalidArgumentError, match="2-dimensional"):
+        spatial.add(random_components(2, k=3))
 
 
 def test_two_robots_of_one_number_are_found_out():

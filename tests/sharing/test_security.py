@@ -300,12 +300,56 @@ def test_two_robots_with_one_number_are_named_and_refused(caplog):
     assert "10.0.0.6:1" in message
 
 
-def test_whoever_has_this_robots_own_number_is_refused_at_once(caplog):
-    opener = Opener(KEY, own=Sealer(3, KEY))
-    assert opener.open(Sealer(3, KEY).seal(b"x"), "10.0.0.6:1") is None
-    assert opener.namesakes == {3: "10.0.0.6:1 and this robot"}
-    assert refused(opener) == {"namesake": 1}
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_whoever_goes_on_with_this_robots_own_number_is_named(caplog):
+    clock = Clock()
+    opener, other = Opener(KEY, own=Sealer(3, KEY), clock=clock), Sealer(3, KEY)
+    for n in range(1, 8):
+        assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
+        assert refused(opener) == {"namesake": n}
+        assert opener.namesakes == ({} if n < 6 else {3: "10.0.0.6:1 and this robot"})
+        assert len(caplog.messages) == (n >= 6)
+        clock.now += 1.0
     assert "10.0.0.6:1 and this robot" in caplog.text
+
+
+def test_a_former_life_of_this_robot_is_refused_and_ends_nothing(caplog):
+    """Recorded, and played back over and over; late; of one life after another, by turns."""
+    clock = Clock()
+    lives = [[life.seal(b"before") for _ in range(40)] for life in (Sealer(3, KEY), Sealer(3, KEY))]
+    own = Sealer(3, KEY)
+    opener = Opener(KEY, own=own, clock=clock)
+    played = [frame for pair in zip(*lives, strict=True) for frame in pair]
+    for clock.now in [0.0, 4.9, *range(10, 50)]:
+        for frame in played:
+            assert opener.open(frame, "10.0.0.6:1") is None
+    n = 42 * len(played)
+    assert opener.open(Sealer(4, KEY).seal(b"x")) == (4, b"x")
+    assert opener.open(own.seal(b"mine")) is None
+    assert refused(opener) == {"namesake": n, "echo": 1}
+    assert (opener.namesakes, caplog.messages) == ({}, [])
+
+
+def test_sessions_of_former_starts_are_no_other_robot_however_they_come(caplog):
+    clock = Clock()
+    before, other = Sealer(3, KEY), Sealer(3, KEY)
+    opener = Opener(KEY, own=Sealer(3, KEY), clock=clock)
+    opener.former = frozenset({before.session})
+    for n in range(1, 60):
+        clock.now += 1.0
+        assert opener.open(before.seal(b"played back in its order"), "10.0.0.6:1") is None
+        assert (opener.namesakes, refused(opener)) == ({}, {"namesake": n})
+    for _ in range(8):
+        clock.now += 1.0
+        assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
+    assert opener.namesakes == {3: "10.0.0.6:1 and this robot"}
+    assert len(caplog.messages) == 1
 
 
 def test_thousands_of_altered_frames_do_not_disturb_those_that_are_sound():

@@ -1,11 +1,21 @@
-"""Sessions: replays against a set that forgets nothing, and two robots with one number."""
+"""Sessions: replays against a set that forgets nothing, and two robots with one number, or with one's own."""
 
 from __future__ import annotations
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmmtorch.sharing.sessions import MAX_SESSIONS, RETURNS, SILENCE, WINDOW, ReplayWindow, Sessions
+from gmmtorch.sharing.sessions import (
+    FRESH_FRAMES,
+    FRESH_SECONDS,
+    MAX_SESSIONS,
+    RETURNS,
+    SILENCE,
+    WINDOW,
+    ReplayWindow,
+    Sessions,
+    TwinWatch,
+)
 
 A, B, C = b"A" * 8, b"B" * 8, b"C" * 8
 
@@ -113,3 +123,54 @@ def test_what_has_long_been_silent_is_forgotten_first():
     assert sessions.refusal(1, A, 0) == "replayed"
     others_speak(1, 2)
     assert sessions.refusal(1, A, 0) is None
+
+
+# -- one's own number --------------------------------------------------------------------------------------
+
+
+def found(frames: list[tuple[float, bytes, int]]) -> list[bool]:
+    """What a watch says of frames (when, session, number)."""
+    clock = Clock()
+    watch, answers = TwinWatch(clock), []
+    for clock.now, session, number in frames:
+        answers.append(watch.finds(session, number))
+    return answers
+
+
+def test_a_session_that_goes_on_is_another_robot():
+    step = FRESH_SECONDS / (FRESH_FRAMES - 1)
+    steady = [(k * step, A, k) for k in range(FRESH_FRAMES + 2)]
+    assert found(steady) == [False] * (FRESH_FRAMES - 1) + [True] * 3
+    often = [(k * FRESH_SECONDS / 100, A, k) for k in range(101)]  # it takes its time, however much it says
+    assert found(often) == [False] * 100 + [True]
+    assert found([*often[:-1], (FRESH_SECONDS, B, 7), often[-1]])[-2:] == [False, True]
+    rarely = [(k * (SILENCE - 1), A, k) for k in range(FRESH_FRAMES)]
+    assert found(rarely) == [False] * (FRESH_FRAMES - 1) + [True]
+
+
+@given(
+    late=st.lists(st.integers(0, 10**6), min_size=1, max_size=50),
+    repeats=st.integers(1, 20),
+    begin=st.floats(0, 1e6),
+)
+def test_a_former_life_is_none_however_late_and_however_often_it_is_repeated(late, repeats, begin):
+    burst = [(begin + 0.9 * FRESH_SECONDS * k / len(late), A, n) for k, n in enumerate(late)]
+    again = [(begin + 10.0 + k, A, n) for k in range(repeats) for n in late]
+    assert not any(found(burst + again))
+    one_each = [(float(k), k.to_bytes(8, "little"), n) for k, n in enumerate(late)]  # of many lives
+    assert not any(found(one_each))
+
+
+def test_what_was_heard_long_ago_does_not_count():
+    few = [(float(k), A, k) for k in range(FRESH_FRAMES - 1)]
+    later = [(few[-1][0] + SILENCE + 1 + k, A, FRESH_FRAMES + k) for k in range(FRESH_FRAMES - 1)]
+    assert not any(found(few + later))
+    assert found([*few, *later, (later[-1][0] + FRESH_SECONDS, A, 100)])[-1]
+
+
+def test_the_memory_of_a_watch_is_bounded():
+    clock = Clock()
+    watch = TwinWatch(clock)
+    for k in range(3 * MAX_SESSIONS):
+        assert not watch.finds(k.to_bytes(8, "little"), k)
+    assert len(watch) == MAX_SESSIONS

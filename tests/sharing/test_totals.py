@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.sharing.announce_messages import TotalsMessage
-from gmmtorch.sharing.component_messages import counts_of
+from gmmtorch.sharing.count_messages import counts_of
 from gmmtorch.sharing.record_ids import first_key
+from gmmtorch.sharing.record_messages import TotalsMessage
 from gmmtorch.sharing.totals import Totals
 
 entries = st.dictionaries(st.integers(0, 12), st.integers(-41, 160), max_size=8)

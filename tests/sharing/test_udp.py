@@ -252,7 +252,8 @@ def heard_any(transport: UdpTransport) -> bool:
     return transport.received != before
 
 
-def test_two_robots_with_one_number_are_found_by_all(opening, caplog):
+def test_two_robots_with_one_number_are_found_by_all(opening, caplog, monkeypatch):
+    monkeypatch.setattr("gmmtorch.sharing.sessions.FRESH_SECONDS", 0.0)
     a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
     everybody = [each.address for each in (a, first, second)]
     for each in (a, first, second):
@@ -267,6 +268,20 @@ def test_two_robots_with_one_number_are_found_by_all(opening, caplog):
     for each in (first, second):
         assert f"127.0.0.1:{each.address[1]}" in a.namesakes[3]
     assert sum("number 3" in message for message in caplog.messages) == 3  # one of each
+
+
+def test_what_was_recorded_of_a_robot_does_not_end_it_when_it_restarts(opening, raw):
+    with UdpTransport.unicast(1, peers=[raw.getsockname()], key=KEY) as first:
+        first.send(1, [bytes([n]) for n in range(50)], 0.0, "maps")
+        recorded = [raw.recv(2000) for _ in range(50)]
+    a, again = opening(0, key=KEY), opening(1, key=KEY)
+    a.peers = [again.address]
+    for frame in 3 * recorded:
+        raw.sendto(frame, again.address)
+    a.send(0, [b"welcome"], 0.0, "maps")
+    assert heard(again, 1) == [(0, b"welcome")]
+    assert {reason: n for reason, n in again.refused.items() if n} == {"namesake": 150}
+    assert again.namesakes == {}
 
 
 def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
@@ -317,7 +332,7 @@ def test_a_port_in_use_is_named_with_what_to_do(opening):
         ({"address": (2130706433, 0)}, "address=.*IPv4 address"),
         ({"address": ("127.0.0.1", 65536)}, "65535"),
         ({"address": ("127.0.0.1", -1)}, "port of address=-1"),
-        ({"address": ("198.51.100.7", 0), "key": KEY}, "no such address"),
+        ({"address": ("198.51.100.7", 0), "key": KEY}, r"no such address.*0\.0\.0\.0"),
         ({"peers": [("127.0.0.1", 0)]}, "port of peers=0"),
         ({"peers": [("robot1", 7447)]}, "names are not looked up"),
         ({"peers": [(GROUP, 7447)]}, "multicast"),
@@ -336,7 +351,10 @@ def test_options_that_cannot_be_are_named(options, message):
     [
         ({"group": ("10.0.0.1", 7447)}, "group=.*multicast address"),
         ({"interface": "eth0"}, "interface="),
-        ({"interface": "198.51.100.7", "key": KEY}, "interface='198.51.100.7'.*ip -4 address"),
+        (
+            {"interface": "198.51.100.7", "key": KEY},
+            r"interface='198.51.100.7'.*ip -4 address.*0\.0\.0\.0",
+        ),
         ({"ttl": 256}, "ttl=256"),
         ({"ttl": -1}, "ttl=-1"),
     ],

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.message_examples import sealed, views
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.bitstream import BitWriter
 from gmmtorch.sharing.fields import write_intervals, write_keys
 from gmmtorch.sharing.intervals import Intervals
@@ -215,6 +217,30 @@ def test_details_of_nonsense_are_refused():
     ):
         with pytest.raises(DataError):
             decode(written(*numbers, known=known, alive=alive))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"byte": 8},
+        {"known": Intervals.span(10, END + 1)},
+        {"alive": np.array([10, 25])},  # and not known
+        {"alive": np.array([12, 11])},
+        {"checks": np.array([1])},
+        {"checks": np.array([1, 256])},
+    ],
+)
+def test_details_that_nobody_would_read_are_not_written(changed):
+    detail = ViewsDetail(0, END, Intervals.span(10, 20), np.array([10, 11]), 3, np.array([1, 2]))
+    assert len(encode_views_held(1, DIGEST, detail)) == 1
+    with pytest.raises(InvalidArgumentError):
+        encode_views_held(1, DIGEST, replace(detail, **changed))
+
+
+def test_digests_that_nobody_would_read_are_not_written():
+    for sender, digest in ((1024, DIGEST), (-1, DIGEST), (1, DIGEST[1:])):
+        with pytest.raises(InvalidArgumentError):
+            encode_views_held(sender, digest)
 
 
 @pytest.mark.parametrize("n", [2**20, 2**40, 2**61])

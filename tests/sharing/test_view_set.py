@@ -416,7 +416,8 @@ def test_memory_is_bounded(monkeypatch):
     monkeypatch.setattr(view_set, "MOST_VIEWS", 50)
     monkeypatch.setattr(view_set, "MOST_INTERVALS", 50)
     one, other = filled(0, 40), filled(1, 20)
-    assert not one.receive(other.take_changes())
+    (datagram,) = other.datagrams()
+    assert not one.receive(decode(datagram))
     assert one.refused == {"full": 1}
     holes = message_of([first_key(9) + 2 * number for number in range(60)])
     assert not one.receive(holes)

@@ -19,6 +19,7 @@ import pytest
 from sharing.schedules import components
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.sharing import zenoh_transport
 from gmmtorch.sharing.network import Network, Traffic, Transport
 from gmmtorch.sharing.replica import Replica
 from gmmtorch.sharing.security import Sealer
@@ -510,7 +511,7 @@ def certify(folder: Path) -> None:
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    private, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.timezone.utc)
+    private, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "robots")])
     address = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
     builder = x509.CertificateBuilder(
@@ -560,3 +561,29 @@ def test_only_its_own_robot_sends_and_hears_through_it(opening):
     with pytest.raises(InvalidArgumentError, match="1201 bytes"):
         a.send(0, [b"", bytes(1201)], 0.0, "maps")
     assert a.sent == a.traffic() == Traffic()
+
+
+@pytest.mark.parametrize("name", ["declare_publisher", "declare_subscriber"])
+def test_a_session_that_cannot_be_used_is_given_back(monkeypatch, name):
+    sessions = []
+
+    class Refusing:
+        """A session that is not allowed to publish, or to subscribe."""
+
+        def __init__(self, session: zenoh.Session) -> None:
+            self._session = session
+            sessions.append(session)
+
+        def __getattr__(self, asked: str) -> object:
+            return self._refuse if asked == name else getattr(self._session, asked)
+
+        def _refuse(self, *_: object, **__: object) -> None:
+            raise zenoh.ZError("denied")
+
+    opened = zenoh_transport.open_session
+    monkeypatch.setattr(zenoh_transport, "open_session", lambda *a: Refusing(opened(*a)))
+    n_threads = threading.active_count()
+    with pytest.raises(GmmTorchError, match=r"robot 3 publish at gmmtorch/team/3.*denied.*config"):
+        ZenohTransport(3, listen=[endpoint()], key=KEY)
+    assert [session.is_closed() for session in sessions] == [True]
+    assert threading.active_count() == n_threads

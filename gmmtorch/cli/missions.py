@@ -1,0 +1,198 @@
+"""The missions that options describe: their world, their team, and the variants of a study."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch.cli import common
+
+if TYPE_CHECKING:
+    from gmmtorch.evaluation.events import Event
+    from gmmtorch.exploration.options import TeamOptions
+    from gmmtorch.exploration.trials import Trial, WorldOptions
+    from gmmtorch.exploration.world import World
+
+T = TypeVar("T")
+OF_ROBOTS = {"announce": "announce_every", "budget": "budget"}
+"""Options of the network that are not of its links, and the arguments that they become."""
+NAMES = {
+    "rate": "sensor.rate",
+    "horizontal_fov": "sensor.horizontal_fov",
+    "vertical_fov": "sensor.vertical_fov",
+    "max_range": "sensor.max_range",
+    "robot_radius": "robot.radius",
+    "resolution": "world.resolution",
+    "prior": "belief.prior",
+    "n_beams": "planner.beams",
+    "n_rounds": "rounds",
+    **{argument: f"network.{option}" for option, argument in OF_ROBOTS.items()},
+    "sample_every": "evaluation.every",
+}
+"""Options by the names of the arguments that they become."""
+
+
+def variants_of(config: DictConfig) -> list[dict[str, Any]]:
+    """The variants of `study.variants`; raises `InvalidArgumentError` for what a variant may not set."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    if config.study.name != "trials":
+        raise InvalidArgumentError(f"study.name={config.study.name!r} is not known; known is trials.")
+    variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
+    known = {"team", "planner", "information", "coordination", "planning_prior", "codec", *config.network}
+    for variant in variants:
+        if not set(variant) <= known:
+            raise InvalidArgumentError(
+                f"study.variants has {sorted(set(variant) - known)}; a variant may set "
+                f"{', '.join(sorted(known))}."
+            )
+        for key in ("planning_prior", *OF_ROBOTS):
+            value = variant.get(key, 0.0)
+            if not (isinstance(value, int | float) or (key == "budget" and value is None)):
+                raise InvalidArgumentError(f"study.variants has {key}={value!r}, which is no number.")
+    if not variants or not config.study.seeds:
+        raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
+    return variants
+
+
+def trial_of(
+    config: DictConfig, folder: Path, variant: dict[str, Any] | None = None, seed: int | None = None
+) -> Trial:
+    """A trial of the mission that the options describe, but for what a variant sets."""
+    from gmmtorch.exploration.trials import Trial
+
+    home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
+    seed = config.seed if seed is None else seed
+    chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
+    about = "_".join(f"{key}-{_short(value)}" for key, value in chosen.items())
+    home = home / "trials" / f"{about}_seed-{seed}"  # sweeps may share a folder
+    return Trial(
+        world=world_options(config),
+        team=team_options(config, seed, variant or {}),
+        folder=home,
+        checkpoint_every=config.checkpoint.every,
+    )
+
+
+def _short(value: Any) -> str:
+    """A value in the name of a folder: lists are too long for one."""
+    return f"{zlib.crc32(repr(value).encode()):08x}" if isinstance(value, list) else str(value)
+
+
+def world_options(config: DictConfig) -> WorldOptions:
+    """The world that the options describe."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.exploration.trials import WorldOptions
+
+    if OmegaConf.is_missing(config.world, "path"):
+        raise InvalidArgumentError(
+            "world=mesh needs world.path=FILE: a triangle mesh (PLY, OBJ, STL) in metres, z up."
+        )
+    options: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in common.as_options(config.world).items()
+    }
+    return WorldOptions(**options, cache=config.runtime.cache)
+
+
+def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = None) -> World:
+    """The world, for this team; errors call what is wrong with either what the user does."""
+    from gmmtorch.evaluation.events import ignore
+
+    of_the_world = {name: f"world.{name}" for name in ("path", "bounds", "size", "seed")}
+    with common.naming({**NAMES, **of_the_world}):
+        return world.open(team, on_event or ignore)
+
+
+def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
+    """The team that the options describe, but for what a variant sets."""
+    from gmmtorch.exploration.mixture_mapper import FrameRule
+    from gmmtorch.exploration.options import TeamOptions
+    from gmmtorch.exploration.primitives import Dynamics
+    from gmmtorch.exploration.returns import RestRule
+    from gmmtorch.exploration.scoring import BeliefRule
+    from gmmtorch.mapping.novelty import NoveltyRule
+    from gmmtorch.simulation.depth_camera import DepthCamera
+
+    sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
+    rate, window = sensor.pop("rate"), mapping.pop("window")
+    novelty = {name: mapping.pop(name) for name in ("threshold", "observed", "distance")}
+    start: Any = config.team.start
+    start = OmegaConf.to_container(start) if OmegaConf.is_config(start) else start
+    names = {name: f"study.variants: {option}" for option, name in OF_ROBOTS.items() if option in variant}
+    with common.naming({**NAMES, **names}):
+        return TeamOptions(
+            framework=variant.get("team", config.team.name),
+            size=config.team.size,
+            duration=config.duration,
+            seed=seed,
+            rate=rate,
+            camera=_of("sensor", DepthCamera, sensor),
+            dynamics=_of("robot", Dynamics, common.as_options(config.robot)),
+            belief=_of("belief", BeliefRule, common.as_options(config.belief)),
+            novelty=_of(
+                "map", NoveltyRule, novelty, resolution=config.world.resolution, prior=config.belief.prior
+            ),
+            frame=_of("map", FrameRule, mapping),
+            window=_three("map.window", window),
+            planner=variant.get("planner", config.planner.name),
+            information=variant.get("information", config.information),
+            n_beams=config.planner.get("beams", 160),
+            coordination=variant.get("coordination", config.coordination),
+            n_rounds=config.rounds,
+            planning_prior=variant.get("planning_prior", config.planner.prior),
+            rest=RestRule(config.planner.rest),
+            codec=variant.get("codec", config.codec),
+            **_network(config, variant),
+            **{name: variant.get(option, config.network[option]) for option, name in OF_ROBOTS.items()},
+            sample_every=config.evaluation.every,
+            codecs=tuple(config.evaluation.get("codecs", ())),
+            start=None if start is None else _poses(start),
+        )
+
+
+def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: Any) -> T:
+    """What the options of a group make, and others with them."""
+    with common.naming({name: f"{group}.{name}" for name in options}):
+        return make(**options, **others)
+
+
+def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
+    """What `TeamOptions` has of the network; errors call it what the user does."""
+    from gmmtorch.sharing.link_conditions import LinkConditions
+
+    given = {key: value for key, value in common.as_options(config.network).items() if key not in OF_ROBOTS}
+    names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
+    given |= {key: variant[key] for key in given if key in variant}
+    if "delay" in given:  # which a real network has, whatever anybody says
+        given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
+    conditions = LinkConditions(**given, names=names)
+    conditions.check_team(config.team.size, names)
+    return {name: getattr(conditions, name) for name in given}
+
+
+def _poses(start: Any) -> tuple[tuple[float, ...], ...]:
+    """Start poses as they are given; raises `InvalidArgumentError` unless they are four numbers each."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    try:
+        poses = tuple(tuple(float(x) for x in pose) for pose in start)
+    except (TypeError, ValueError):
+        poses = ()
+    if not poses or any(len(pose) != 4 for pose in poses):
+        raise InvalidArgumentError(
+            f"team.start={start} must be poses of four numbers each: [[x, y, z, yaw], …], m and rad."
+        )
+    return poses
+
+
+def _three(name: str, values: list[int]) -> tuple[int, int, int]:
+    from gmmtorch.errors import InvalidArgumentError
+
+    if len(values) != 3:
+        raise InvalidArgumentError(f"{name}={values} must have three entries: cells along x, y and z.")
+    return values[0], values[1], values[2]
