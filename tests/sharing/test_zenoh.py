@@ -386,9 +386,10 @@ def test_a_process_that_forgets_to_close_ends(opening):
     where = endpoint()
     a = opening(0, listen=[where])
     with subprocess.Popen([sys.executable, "-c", FORGETFUL, where]) as other:
-        until(lambda: a.send(0, [b"x"], 0.0, "maps") or other.poll() is not None)
+        # It ends once it is told something, and is told so only once it was heard.
+        until(lambda: (1, b"x") in a.deliver(0, 0.0))
+        until(lambda: a.send(0, [b"end"], 0.0, "maps") or other.poll() is not None)
         assert other.returncode == 5
-    assert (1, b"x") in a.deliver(0, 0.0)
     until(lambda: a.n_neighbours == 0)
 
 
