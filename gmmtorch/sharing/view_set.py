@@ -268,6 +268,8 @@ class ViewSet:
         try:
             if state["robot"] != self.robot:
                 raise DataError(f"The state is of robot {state['robot']}, this is robot={self.robot}.")
+            if damaged := [name for name in ("table", "peers") if not isinstance(state[name], dict)]:
+                raise DataError(f"{damaged[0]!r} of the saved views is no table: the state is damaged.")
             fresh = ViewSet(self.robot, incarnation=self.incarnation)
             fresh._table.restore(state["table"])
             fresh._peers.restore(state["peers"])
