@@ -28,7 +28,6 @@ _ZENOH_NAMES = {
 }
 _UDP_NAMES = {
     **_NAMES,
-    "host": "link.listen",
     "address": "link.listen",
     "peers": "link.peers",
     "group": "link.group",
@@ -42,6 +41,13 @@ _PAUSE = 0.02
 
 def open_link(config: DictConfig, robot: int) -> FramedTransport:
     """A robot's end of the network of `transport` and `link.*`."""
+    link = _opened(config, robot)
+    # What the others call it by, should they hear two of this number.
+    common.logger.info("Robot %d speaks over %s in session %s.", robot, config.transport, link.session.hex())
+    return link
+
+
+def _opened(config: DictConfig, robot: int) -> FramedTransport:
     from gmmtorch.errors import InvalidArgumentError
 
     if config.transport not in TRANSPORTS:
@@ -52,6 +58,13 @@ def open_link(config: DictConfig, robot: int) -> FramedTransport:
         with common.naming(_ZENOH_NAMES):
             return _zenoh(robot, link, key)
     with common.naming(_UDP_NAMES):
+        if link["group"] is None and not link["peers"] and config.team.size > 1:
+            common.logger.warning(
+                "link.peers=[]: robot %d of team.size=%d speaks to nobody. Say where the others listen, "
+                "or give all the same link.group.",
+                robot,
+                config.team.size,
+            )
         return _udp(robot, link, key)
 
 
@@ -75,12 +88,12 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
 
     insecure = link["insecure"]
     if link["group"] is not None:
-        group = address("link.group", link["group"])
+        group = address("link.group", link["group"], least_port=1)
         return UdpTransport.multicast(
             robot, group, link["interface"], link["ttl"], key=key, insecure=insecure
         )
     listen = address("link.listen", link["listen"])
-    peers = [address("link.peers", peer) for peer in link["peers"]]
+    peers = [address("link.peers", peer, least_port=1) for peer in link["peers"]]
     return UdpTransport.unicast(robot, listen, peers, key=key, insecure=insecure)
 
 
@@ -105,12 +118,17 @@ def team_key(path: str | None) -> TeamKey | None:
     return TeamKey.from_environment() if KEY_VARIABLE in os.environ else None
 
 
-def address(name: str, text: str) -> tuple[str, int]:
-    """host:port as an address."""
+def address(name: str, text: str, least_port: int = 0) -> tuple[str, int]:
+    """host:port as an address; port 0 is any that is free, where nobody else has to know it."""
     from gmmtorch.errors import InvalidArgumentError
 
     host, colon, port = str(text).rpartition(":")
-    if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 65535:
+    if (
+        not colon
+        or not host
+        or not (port.isascii() and port.isdigit())
+        or not least_port <= int(port) <= 65535
+    ):
         raise InvalidArgumentError(f"{name}={text!r} must be an address and a port, as in 127.0.0.1:7447.")
     return host, int(port)
 

@@ -128,10 +128,10 @@ class FlyingNode:
     def status(self) -> str:
         mapper, sent = self.agent.robot.mapper, self.transport.traffic()
         left = mapper.belief.entropy_bits / max(1.0, mapper.belief.observable_bits)
-        line = (
+        return (
             f"{left:.1%} of the entropy left, {mapper.held.size:,} records, {sent.bytes / 1e3:,.0f} kB sent"
+            f"{self.agent.radio.remarks(self._conflicts)}"
         )
-        return line if self.twin is None else f"{line}, another robot {self.robot} is there"
 
     def scalars(self) -> dict[str, float]:
         """What changes as it flies: numbers for a plot."""
@@ -143,7 +143,7 @@ class FlyingNode:
             "wire_bytes_sent": float(self.transport.wire_bytes),
             "datagrams_sent": float(sent.datagrams),
             "datagrams_heard": float(self.agent.radio.n_heard),
-            "refused": float(sum(self.transport.refused.values())),
+            "refused": float(sum(self.transport.books(self.robot)["refused"].values())),
             "path_length": robot.path_length,
             "collisions": float(robot.collisions),
         }
@@ -179,8 +179,13 @@ class FlyingNode:
     @property
     def twin(self) -> str | None:
         """What is said of another robot of this number, if there is one."""
+        return self.agent.radio.twin(self._conflicts)
+
+    @property
+    def _conflicts(self) -> int:
+        """Records that came as this robot's, and are not what it said."""
         shared = getattr(self.agent.robot.mapper, "shared", None)
-        return self.agent.radio.twin(shared.conflicts[self.robot] if isinstance(shared, Replica) else 0)
+        return shared.conflicts[self.robot] if isinstance(shared, Replica) else 0
 
     def save(self, folder: Path) -> dict[str, Path]:
         """The map, and where the robot flew."""

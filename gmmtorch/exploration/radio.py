@@ -117,6 +117,14 @@ class Radio:
             "folder of its own."
         )
 
+    def remarks(self, conflicts: int) -> str:
+        """What the end of a status line says of the network, if something is wrong; see `twin`."""
+        alone = getattr(self.transport, "n_neighbours", None) == 0
+        twin = self.twin(conflicts) is not None
+        return (", connected to nobody" if alone else "") + (
+            f", another robot {self.robot} is there" if twin else ""
+        )
+
     def state(self) -> dict[str, Any]:
         """Everything that changes, but the transport and the logbook."""
         return {

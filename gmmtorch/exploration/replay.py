@@ -198,11 +198,11 @@ class ReplayNode:
 
     def status(self) -> str:
         total = "?" if self.n_scans is None else f"{self.n_scans:,}"
-        line = (
+        return (
             f"scan {self.position:,}/{total}, {self.replica.n_components:,} components, "
             f"{self.n_missing:,} missing, {self._transport.traffic(self.robot).bytes / 1e3:,.0f} kB sent"
+            f"{self.radio.remarks(self.replica.conflicts[self.robot])}"
         )
-        return line if self.twin is None else f"{line}, another robot {self.robot} is there"
 
     def scalars(self) -> dict[str, float]:
         """What changes as it maps: numbers for a plot."""

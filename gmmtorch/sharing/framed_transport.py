@@ -96,6 +96,11 @@ class FramedTransport(ABC):
         """
         self._opener.former = frozenset(former)
 
+    @property
+    def n_neighbours(self) -> int | None:
+        """To how many others it is connected now; None where there are no connections."""
+        return None
+
     # -- the books -----------------------------------------------------------------------------------------
 
     def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
@@ -112,12 +117,15 @@ class FramedTransport(ABC):
         return said.wire_bytes + self.overhead * said.datagrams
 
     def books(self, robot: int) -> dict[str, Any]:
-        """What has passed, and what went wrong, for results; `robot`: this one."""
+        """What has passed, and what went wrong, for results; `robot`: this one. Its own frames, which
+        multicast brings back, are nothing wrong."""
         self._check_robot("robot", robot)
         said = self.traffic()
         with self._lock:
             by_kind = {kind: traffic.bytes for kind, traffic in sorted(self._broadcast.items())}
         return {
+            "session": self.session.hex(),
+            "neighbours": self.n_neighbours,
             "bytes_sent": said.bytes,
             "datagrams": said.datagrams,
             "bytes_by_kind": by_kind,
@@ -125,7 +133,7 @@ class FramedTransport(ABC):
             "wire_bytes_received": self.received.wire_bytes,
             "socket_bytes": self.sent.bytes,
             "socket_datagrams": self.sent.datagrams,
-            "refused": {reason: n for reason, n in self.refused.items() if n},
+            "refused": {reason: n for reason, n in self.refused.items() if n and reason != "echo"},
             "failures": dict(self.failures),
             "dropped": self.n_dropped,
             "namesakes": {str(number): whence for number, whence in sorted(self.namesakes.items())},

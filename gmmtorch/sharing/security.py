@@ -150,7 +150,8 @@ class Opener:
 
     @property
     def namesakes(self) -> dict[int, str]:
-        """Numbers that two robots have, and the addresses they were heard from. This robot's own stays."""
+        """Numbers that two robots have, and the addresses and sessions they were heard from. This robot's own
+        stays."""
         return dict(self._sessions.namesakes)
 
     def open(self, frame: bytes, source: str = "") -> tuple[int, bytes] | None:
@@ -181,11 +182,12 @@ class Opener:
         if datagram is None:
             return sender, b"", "wrong_key"
         number = int.from_bytes(header[11:], "little")
+        whence = f"{source} (session {session.hex()})"  # which is in that robot's log, too
         if own is not None and sender == own.sender:
             if session not in self.former and self._twins.finds(session, number):
-                self._sessions.namesakes[sender] = f"{source} and this robot"
+                self._sessions.namesakes[sender] = f"{whence} and this robot (session {own.session.hex()})"
             return sender, datagram, "namesake"
-        return sender, datagram, self._sessions.refusal(sender, session, number, source)
+        return sender, datagram, self._sessions.refusal(sender, session, number, whence)
 
     def _say(self, reason: str, sender: int, source: str) -> None:
         """Log what somebody has to mend, once; and not much in all, whoever asks for it."""

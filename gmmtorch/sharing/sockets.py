@@ -18,7 +18,7 @@ _IP_MULTICAST_ALL = 49  # of Linux; Python has no name for it
 def unicast_socket(address: Address) -> socket.socket:
     """A socket bound to an address of this machine, which no other socket has."""
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    return _bound(bound, address)
+    return _bound(bound, "address", address, ", or 0 for any that is free")
 
 
 def multicast_socket(group: Address, interface: str, ttl: int) -> socket.socket:
@@ -31,7 +31,7 @@ def multicast_socket(group: Address, interface: str, ttl: int) -> socket.socket:
         bound.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
     elif hasattr(socket, "SO_REUSEPORT"):  # BSD shares a port only so
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-    _bound(bound, group)
+    _bound(bound, "group", group)
     try:
         card = socket.inet_aton(interface)
         bound.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group[0]) + card)
@@ -63,19 +63,20 @@ def check_address(name: str, address: Address, least_port: int = 0) -> ipaddress
     return parsed
 
 
-def _bound(unbound: socket.socket, address: Address) -> socket.socket:
-    host, port = address
+def _bound(unbound: socket.socket, name: str, address: Address, or_else: str = "") -> socket.socket:
     try:
         unbound.bind(address)
     except OSError as error:
         unbound.close()
         remedies = {
-            errno.EADDRINUSE: "another process has that port. Stop it (`ss -ulpn` shows it), give another "
-            "port, or 0 for any that is free",
+            errno.EADDRINUSE: "another process has that port. Stop it (`ss -ulpn` shows it), or give "
+            f"another port{or_else}",
             errno.EADDRNOTAVAIL: "this machine has no such address, or not yet. `ip -4 address` shows those "
             "it has; 0.0.0.0 is all of them, also those to come: with it a robot starts without a network",
             errno.EACCES: "ports below 1024 are for the system. Give one above",
         }
         remedy = remedies.get(error.errno or 0, f"{error.strerror}")
-        raise InvalidArgumentError(f"host={host!r}, port={port} cannot be listened on: {remedy}.") from error
+        raise InvalidArgumentError(
+            f"{name}={address[0]}:{address[1]} cannot be listened on: {remedy}."
+        ) from error
     return unbound

@@ -76,7 +76,9 @@ class ZenohTransport(FramedTransport):
 
     @property
     def n_neighbours(self) -> int:
-        """Robots and routers that it is connected to now; behind routers there may be more."""
+        """Robots and routers that it is connected to now; behind routers there may be more. 0 once closed."""
+        if self._closing.is_set():
+            return 0
         info = self._session.info
         return len(info.peers_zid()) + len(info.routers_zid())
 

@@ -272,8 +272,9 @@ def test_killed_and_started_again_it_has_everything_and_the_other_catches_up(run
         ("link.group=239.71.77.7:7400 link.interface=10.1.2.3", "link.interface='10.1.2.3' link.key_file"),
         ("link.group=10.0.0.1:7400", "link.group='10.0.0.1' multicast"),
         ("link.group=239.71.77.7:7400 link.ttl=256", "link.ttl=256"),
+        ("link.group=239.71.77.7:0", "link.group='239.71.77.7:0'"),
         ("link.peers=[10.0.0.2:7400]", "link.peers= link.listen= 0.0.0.0"),
-        ("link.listen=198.51.100.7:0 link.insecure=true", "link.listen='198.51.100.7' 0.0.0.0"),
+        ("link.listen=198.51.100.7:0 link.insecure=true", "link.listen=198.51.100.7:0 0.0.0.0"),
         ("link.key_file=/nowhere/team.key", "/nowhere/team.key openssl"),
         ("transport=zenoh", "link.listen_endpoints=[] link.connect_endpoints=[]"),
         ("transport=zenoh link.scouting=true", "link.scouting=True link.key_file link.insecure=True"),
@@ -316,8 +317,22 @@ def test_a_port_in_use_is_told_with_the_remedy(run):
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
         line = refused(run(*LOG, f"link.listen=127.0.0.1:{port}"))
-    assert f"port={port}" in line
+    assert f"link.listen=127.0.0.1:{port} " in line
     assert "another process has that port" in line
+
+
+def test_a_group_whose_port_is_in_use_is_told_as_one(run):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("", 0))
+        port = taken.getsockname()[1]
+        line = refused(run(*LOG, f"link.group=239.71.77.7:{port}"))
+    assert f"link.group=239.71.77.7:{port} " in line
+    assert "give another port." in line
+
+
+def test_a_robot_that_nobody_hears_is_told_so_and_goes_on(run):
+    said = succeeded(run(*LOG, "team.size=2", "log.rate=50")).stdout
+    assert "link.peers=[]: robot 0 of team.size=2 speaks to nobody" in said
 
 
 def test_another_log_on_the_same_folder_is_refused(run, tmp_path):

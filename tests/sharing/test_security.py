@@ -309,14 +309,16 @@ class Clock:
 
 def test_whoever_goes_on_with_this_robots_own_number_is_named(caplog):
     clock = Clock()
-    opener, other = Opener(KEY, own=Sealer(3, KEY), clock=clock), Sealer(3, KEY)
+    own, other = Sealer(3, KEY), Sealer(3, KEY)
+    opener = Opener(KEY, own=own, clock=clock)
+    both = f"10.0.0.6:1 (session {other.session.hex()}) and this robot (session {own.session.hex()})"
     for n in range(1, 8):
         assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
         assert refused(opener) == {"namesake": n}
-        assert opener.namesakes == ({} if n < 6 else {3: "10.0.0.6:1 and this robot"})
+        assert opener.namesakes == ({} if n < 6 else {3: both})
         assert len(caplog.messages) == (n >= 6)
         clock.now += 1.0
-    assert "10.0.0.6:1 and this robot" in caplog.text
+    assert both in caplog.text
 
 
 def test_a_former_life_of_this_robot_is_refused_and_ends_nothing(caplog):
@@ -348,7 +350,7 @@ def test_sessions_of_former_starts_are_no_other_robot_however_they_come(caplog):
     for _ in range(8):
         clock.now += 1.0
         assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
-    assert opener.namesakes == {3: "10.0.0.6:1 and this robot"}
+    assert list(opener.namesakes) == [3]
     assert len(caplog.messages) == 1
 
 

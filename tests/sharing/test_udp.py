@@ -145,8 +145,9 @@ def test_a_team_by_multicast_sends_once_and_hears_the_others_alone(key):
         assert [heard(each, 2) for each in (b, c)] == [[(0, b"x"), (0, b"y")]] * 2
         until(lambda: a.refused["echo"] == 2)
         assert a.deliver(0, 0.0) == []
+        assert (a.books(0)["refused"], a.books(0)["neighbours"]) == ({}, None)
         assert a.sent == a.received == b.received == Traffic(2, 2 * (1 + a.overhead))
-        with pytest.raises(InvalidArgumentError, match=f"port={group[1]}.*another process"):
+        with pytest.raises(InvalidArgumentError, match=f"address=.*:{group[1]} .*another process"):
             UdpTransport.unicast(3, ("0.0.0.0", group[1]), key=KEY)
 
 
@@ -317,7 +318,9 @@ def test_without_a_key_nobody_outside_is_spoken_to_by_accident(opening):
 
 def test_a_port_in_use_is_named_with_what_to_do(opening):
     taken = opening(0).address
-    with pytest.raises(InvalidArgumentError, match=f"port={taken[1]}.*another process.*another port"):
+    with pytest.raises(
+        InvalidArgumentError, match=f"address=.*:{taken[1]} .*another process.*another port, or 0"
+    ):
         opening(1, taken)
 
 

@@ -19,6 +19,7 @@ import pytest
 from sharing.schedules import components
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.exploration.radio import Radio
 from gmmtorch.sharing import zenoh_transport
 from gmmtorch.sharing.network import Network, Traffic, Transport
 from gmmtorch.sharing.replica import Replica
@@ -303,6 +304,7 @@ def test_two_robots_with_one_number_are_found(opening):
     twins = [opening(3, connect=[where], key=KEY) for _ in range(2)]
     until(lambda: any(twin.send(3, [b"x"], 0.0, "maps") for twin in twins) or a.refused["namesake"] > 0)
     assert set(a.namesakes) == {3}
+    assert all(twin.session.hex() in a.namesakes[3] for twin in twins)  # the keys are the same
 
 
 # -- who comes and goes ------------------------------------------------------------------------------------
@@ -313,10 +315,13 @@ def test_a_robot_that_is_alone_goes_on_and_is_heard_when_others_come(opening):
     a = opening(0, listen=endpoints[:1], connect=endpoints[1:], key=KEY)
     a.send(0, [b"nobody hears this"], 0.0, "maps")
     assert (a.n_neighbours, a.deliver(0, 0.0), a.failures) == (0, [], {})
+    assert Radio(0, a, announce_every=1.0).remarks(0) == ", connected to nobody"
     b = opening(1, listen=endpoints[1:], key=KEY)
     meet([a, b])
     a.send(0, [b"this is heard"], 0.0, "maps")
     assert heard(b, 1) == [(0, b"this is heard")]
+    assert Radio(0, a, announce_every=1.0).remarks(0) == ""
+    assert (a.books(0)["neighbours"], a.books(0)["session"]) == (1, a.session.hex())
 
 
 def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
