@@ -120,7 +120,7 @@ def _log_robot(rerun: Any, stream: Any, robot: int, poses: np.ndarray, period: f
         raise InvalidArgumentError(
             f"trajectories[{robot}] has shape {poses.shape}; expected (T, 3) or more, metres."
         )
-    name = f"world/robots/{robot + 1}"
+    name = f"world/robots/{robot}"
     hue = [round(255 * share) for share in to_rgb(colour(robot))]
     if len(poses):
         stream.log(f"{name}/path", rerun.LineStrips3D([poses[:, :3]], colors=[[*hue, 110]]), static=True)

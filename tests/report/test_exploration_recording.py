@@ -46,10 +46,11 @@ def test_records_robots_map_mixture_and_curves(tmp_path):
     for chunk in RrdReader(str(path)).stream():
         rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + chunk.num_rows
     found = {name: n for name, n in rows.items() if "__" not in name and n}
-    assert found["/world/robots/1"] == found["/world/robots/2"] == 30
+    assert found["/world/robots/0"] == found["/world/robots/1"] == 30
     assert found["/world/cells"] == found["/world/mixture"] == 2
     assert found["/entropy_left"] == found["/bytes_sent"] == 11
-    assert found["/world/robots/1/path"] == 1
+    assert found["/world/robots/0/path"] == 1
+    assert "/world/robots/2" not in found
 
 
 @needs_rerun
