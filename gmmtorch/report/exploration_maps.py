@@ -15,11 +15,14 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import Normal, Stroke
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.exploration_top_view import UNKNOWN_BAND, TopView
+from gmmtorch.exploration.scoring import BeliefRule
+from gmmtorch.occupancy.evidence import CellClass
+from gmmtorch.report.exploration_paths import draw_paths, path_handles
+from gmmtorch.report.exploration_top_view import TopView
 from gmmtorch.report.meshes import checked_components
 from gmmtorch.report.style import (
     LABEL_SIZE,
@@ -29,7 +32,6 @@ from gmmtorch.report.style import (
     colour,
     dress,
     figure_title,
-    line_style,
     metres,
     new_figure,
 )
@@ -37,10 +39,10 @@ from gmmtorch.scan import ArrayLike
 
 MAX_ELLIPSES = 20_000
 
-_SURFACE, _FREE, _EDGE, _RIM = "#2b2b2b", "#ffffff", "#666666", "#111111"
+_SURFACE, _FREE, _EDGE = "#2b2b2b", "#ffffff", "#666666"
 _SEEN = ("#fffaf0", "#f6e7ba", "#eaca7e", "#d3a345")
 _N_SIGMA = 2.0
-_MAX_NAMED = 7
+_MAX_COLUMNS = 6
 
 
 Handle = Patch | Line2D
@@ -72,6 +74,8 @@ def trajectories_figure(
 ) -> Figure:
     """Paths of the robots over the world from above, and by how many robots each place was seen (Fig 1.1).
 
+    Where a path is above the heights of the view it has a white core, beneath them it is dotted.
+
     Args:
         world: what is occupied (above ½) is drawn dark.
         trajectories: of each robot, poses (T, ≥ 2), world metres.
@@ -98,33 +102,38 @@ def trajectories_figure(
     figure, grid = _sheet(world, 1, 9.0)
     axes = grid[0]
     _show(axes, colours, world)
-    _draw_paths(axes, trajectories, ends=True)
+    draw_paths(axes, trajectories, world.band, ends=True)
     dress(axes, "", "x [m]", "y [m]")
-    _legend(figure, handles + _path_handles(len(trajectories), ends=True))
-    figure_title(figure, title)
+    _legend(figure, [*handles, *path_handles(trajectories, world.band, ends=True)])
+    heights = _between(world)
+    figure_title(figure, f"{title}\nin the world{heights}" if title and heights else title)
     return figure
 
 
-def team_map_figure(snapshots: Sequence[TeamSnapshot], title: str | None = "The team's map") -> Figure:
+def team_map_figure(
+    snapshots: Sequence[TeamSnapshot], title: str | None = "The team's map", belief: BeliefRule | None = None
+) -> Figure:
     """The team's map at several times: free, occupied and unknown, the paths so far, and the mixture.
 
     Components within the heights shown are outlined as their 2σ ellipses from above, each in the colour
-    of the robot that learned it; of very many an even share.
+    of the robot that learned it; of very many an even share. Paths above those heights have a white core.
 
     Args:
         snapshots: one a panel, at least one.
         title: of the figure; the heights shown are added.
+        belief: what is called free and what occupied; the usual one if not given.
 
     Raises:
         InvalidArgumentError: no snapshot, or components whose shapes disagree.
     """
     if not snapshots:
         raise InvalidArgumentError("snapshots is empty; give the map at one time at least.")
+    belief = belief or BeliefRule()
     figure, grid = _sheet(snapshots[0].view, len(snapshots), 5.6)
     for axes, snapshot in zip(grid, snapshots, strict=False):
-        _show(axes, _classes(snapshot.view.image), snapshot.view)
+        _show(axes, _classes(snapshot.view.image, belief), snapshot.view)
         _draw_ellipses(axes, snapshot)
-        _draw_paths(axes, snapshot.trajectories, ends=False)
+        draw_paths(axes, snapshot.trajectories, snapshot.view.band, ends=False, width=1.7)
         caption = f", {snapshot.caption}" if snapshot.caption else ""
         dress(axes, f"t = {snapshot.time:.0f} s{caption}", "x [m]", "y [m]")
         axes.label_outer()
@@ -137,11 +146,16 @@ def team_map_figure(snapshots: Sequence[TeamSnapshot], title: str | None = "The 
     if any(len(torch.as_tensor(s.means)) for s in snapshots):
         ring: dict[str, Any] = {"marker": "o", "fillstyle": "none", "markersize": 9, "linestyle": ""}
         handles.append(Line2D([], [], color=_EDGE, label="component, 2σ", **ring))
-    _legend(figure, handles + _path_handles(max(len(s.trajectories) for s in snapshots), ends=False))
-    low, high = snapshots[0].view.band
-    heights = f" between z = {metres(low)} and {metres(high)}" if math.isfinite(low + high) else ""
-    figure_title(figure, None if title is None else title + heights)
+    paths = max((s.trajectories for s in snapshots), key=lambda paths: (len(paths), sum(map(len, paths))))
+    _legend(figure, [*handles, *path_handles(paths, snapshots[0].view.band, ends=False)])
+    figure_title(figure, None if title is None else f"{title}{_between(snapshots[0].view)}")
     return figure
+
+
+def _between(view: TopView) -> str:
+    """The heights of a view that has bounds, to be said after what is seen in it."""
+    low, high = view.band
+    return f" between z = {metres(low)} and {metres(high)}" if math.isfinite(low + high) else ""
 
 
 def _sheet(view: TopView, n: int, width: float) -> tuple[Figure, list[Axes]]:
@@ -165,15 +179,17 @@ def _show(axes: Axes, colours: np.ndarray, view: TopView) -> None:
         interpolation="nearest",
     )
     axes.set(xlim=view.extent[:2], ylim=view.extent[2:])
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(steps=[1, 2, 5, 10]))
     axes.tick_params(labelsize=TICK_SIZE)
     axes.autoscale(False)
 
 
-def _classes(image: Tensor) -> np.ndarray:
+def _classes(image: Tensor, belief: BeliefRule) -> np.ndarray:
     """Colours (nx, ny, 3) of free, occupied and unknown."""
-    theta = image.detach().cpu().double().numpy()
-    colours = np.where((theta > 0.5)[..., None], to_rgb(_SURFACE), to_rgb(_FREE))
-    return np.where((np.abs(theta - 0.5) < UNKNOWN_BAND)[..., None], to_rgb(UNKNOWN), colours)
+    label = belief.classes(image.detach().cpu().double()).numpy()[..., None]
+    colours = np.where(label == CellClass.OCCUPIED, to_rgb(_SURFACE), to_rgb(_FREE))
+    return np.where(label == CellClass.UNKNOWN, to_rgb(UNKNOWN), colours)
 
 
 def _shaded(counts: np.ndarray, n_robots: int) -> tuple[np.ndarray, list[Handle]]:
@@ -189,27 +205,6 @@ def _shaded(counts: np.ndarray, n_robots: int) -> tuple[np.ndarray, list[Handle]
         text = f"seen by {level}{more} {robots}: {100 * (seen == level).sum() / total:.0f} %"
         handles.append(Patch(facecolor=_SEEN[level - 1], edgecolor=_EDGE, label=text))
     return colours, handles
-
-
-def _draw_paths(axes: Axes, trajectories: Sequence[ArrayLike], ends: bool) -> None:
-    """Each robot's path, and where it is: a triangle towards its heading if poses have one."""
-    halo = [Stroke(linewidth=3.2, foreground="white"), Normal()]
-    for robot, trajectory in enumerate(trajectories):
-        path = as_array(trajectory)
-        if len(path) == 0:
-            continue
-        look: dict[str, Any] = {"color": colour(robot), "zorder": 3}
-        axes.plot(*path[:, :2].T, linewidth=1.5, linestyle=line_style(robot), path_effects=halo, **look)
-        mark: dict[str, Any] = {
-            "color": colour(robot),
-            "markeredgecolor": _RIM,
-            "markeredgewidth": 0.9,
-            "zorder": 5,
-        }
-        if ends:
-            axes.plot(*path[0, :2], "o", markersize=9, **mark)
-        last = "s" if path.shape[1] < 4 else (3, 0, math.degrees(path[-1, 3]) - 90)
-        axes.plot(*path[-1, :2], marker=last, markersize=12, linestyle="", **mark)
 
 
 def _draw_ellipses(axes: Axes, snapshot: TeamSnapshot) -> None:
@@ -244,23 +239,17 @@ def _ellipses(means: Tensor, covariances: Tensor, n_corners: int = 24) -> np.nda
     return (means[:, None] + _N_SIGMA * circle @ axes.mT).numpy()
 
 
-def _path_handles(n_robots: int, ends: bool) -> list[Handle]:
-    handles: list[Handle] = [
-        Line2D([], [], color=colour(i), linewidth=2.2, label=f"robot {i}")
-        for i in range(min(n_robots, _MAX_NAMED))
-    ]
-    marks = (("o", "start"), ("^", "end")) if ends else (("^", "robot, now"),)
-    if n_robots:
-        look: dict[str, Any] = {"color": _EDGE, "linestyle": "", "markersize": 8}
-        handles += [Line2D([], [], marker=shape, label=name, **look) for shape, name in marks]
-    return handles
-
-
 def _legend(figure: Figure, handles: Sequence[Handle]) -> None:
-    figure.legend(
-        handles=list(handles),
-        loc="outside lower center",
-        ncols=min(len(handles), 5),
-        frameon=False,
-        fontsize=LABEL_SIZE - 0.5,
-    )
+    """Beneath the panels, in as few rows as the width allows."""
+    width = figure.get_window_extent().width
+    for columns in range(min(len(handles), _MAX_COLUMNS), 0, -1):
+        legend = figure.legend(
+            handles=list(handles),
+            loc="outside lower center",
+            ncols=columns,
+            frameon=False,
+            fontsize=LABEL_SIZE - 0.5,
+        )
+        if columns == 1 or legend.get_window_extent().width <= width:
+            return
+        legend.remove()

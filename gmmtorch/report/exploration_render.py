@@ -74,6 +74,7 @@ def render(
     canvas: Canvas,
     n_sigma: float = 2.0,
     smoothing: int = 2,
+    tops: Tensor | None = None,
 ) -> Rendered:
     """The surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = n_sigma² of K ellipsoids, the nearest at each pixel, shaded.
 
@@ -86,6 +87,7 @@ def render(
         camera: the viewer. canvas: the pixels.
         n_sigma: how many standard deviations from the mean.
         smoothing: rays a pixel along either axis.
+        tops: (K,), heights (m) at which they are cut off: of each nothing is drawn above its own.
 
     Raises:
         InvalidArgumentError: n_sigma or smoothing not above zero.
@@ -96,6 +98,8 @@ def render(
     fine = canvas._replace(scale=canvas.scale * smoothing)
     height, width = rows * smoothing, columns * smoothing
     shapes = _Shapes.of(means, covariances, camera, fine, n_sigma)
+    if tops is not None:
+        shapes = shapes.cut_off(tops, camera, fine)
     depth, owner = _nearest(shapes, height, width)
     pixel = (owner >= 0).nonzero()[:, 0]
     who = owner[pixel]
@@ -117,7 +121,8 @@ class _Shapes(NamedTuple):
 
     table: (K, 9): centre x, y, z (z from the middle of all), the inverse of the outline (xx, xy, yy), slope
     c (x, y) and variance v of the depth given the place; first, last: (K, 2) pixels around each, as far as
-    the picture goes; square: n²; middle: metres.
+    the picture goes; square: n²; middle: metres; limits: (K,), which up · (y, z) is not to
+    be beyond.
     """
 
     table: Tensor
@@ -125,6 +130,8 @@ class _Shapes(NamedTuple):
     last: Tensor
     square: float
     middle: float
+    limits: Tensor | None = None
+    up: tuple[float, float] = (0.0, 1.0)
 
     @classmethod
     def of(
@@ -147,6 +154,12 @@ class _Shapes(NamedTuple):
         last = torch.minimum((centre[:, :2] + half).ceil(), limit).long()
         table = torch.cat([centre, unique, slope, variance[:, None]], 1).float()
         return cls(table, first, torch.maximum(first, last), n_sigma**2, middle)
+
+    def cut_off(self, tops: Tensor, camera: Camera, canvas: Canvas) -> _Shapes:
+        """The same with a height (m) that nothing of each reaches beyond: z₀ + u_y y + u_z z in pixels."""
+        _, up, towards = camera.axes[:, 2].tolist()
+        limits = (tops.double() - up * canvas.bottom - towards * self.middle) * canvas.scale
+        return self._replace(limits=limits.float(), up=(up, towards))
 
     def surface(self, rows: tuple[Tensor, ...], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """At pixels (F,), of components with these columns: n² − dᵀS⁻¹d, negative outside, and the depth."""
@@ -181,6 +194,8 @@ def _nearest(shapes: _Shapes, height: int, width: int) -> tuple[Tensor, Tensor]:
         y = shapes.first[:, 1].index_select(0, who) + rank // columns
         left, z = shapes.surface(shapes.table.index_select(0, who).unbind(1), x, y)
         inside = left > 0
+        if shapes.limits is not None:
+            inside &= shapes.up[0] * (y + 0.5) + shapes.up[1] * z <= shapes.limits[who]
         pixel, who, z = (y * width + x)[inside], who[inside], z[inside]
         depth.scatter_reduce_(0, pixel, z, "amax")
         seen = z == depth[pixel]

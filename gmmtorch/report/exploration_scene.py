@@ -19,6 +19,8 @@ from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.report.exploration_cutaway import cut_away
+from gmmtorch.report.exploration_paths import smooth_path
 from gmmtorch.report.exploration_render import Camera, Canvas, render
 from gmmtorch.report.meshes import checked_components
 from gmmtorch.report.style import (
@@ -26,7 +28,6 @@ from gmmtorch.report.style import (
     LABEL_SIZE,
     SAVED_DPI,
     TICK_SIZE,
-    as_array,
     colour,
     figure_title,
     new_figure,
@@ -35,9 +36,6 @@ from gmmtorch.scan import ArrayLike
 
 _WIDTH = 11.0  # inches
 _MAX_NAMED = 7
-_TURNED_AWAY = -0.05  # cosine of the side that was seen and the viewer, below which a surface is left out
-_FLAT = 0.1  # largest ratio of the smallest variance to the next of what has a side
-_TOP = 0.9  # share of the height below which components are kept where nobody says
 _PAINT = 0.55  # share of a robot's colour in what it learned; the rest is white
 _LIGHTER = 0.25
 _FRAME = "#777777"
@@ -58,16 +56,17 @@ def mixture_scene_figure(
 ) -> Figure:
     """Ellipsoids (2σ) of a mixture in parallel perspective, coloured by height or by who learned them.
 
-    What hides the inside is left out: components above the ceiling, and flat ones that were seen from
-    the side turned away from the viewer, so that one looks through roof and near walls into the rooms.
+    What hides the inside is left out, so that one looks through roof and near walls into the rooms: what is
+    above the ceiling, flat components that were seen from the side turned away from the viewer, and what is
+    at these.
 
     Args:
         means, covariances: (K, 3), (K, 3, 3); metres, m².
         seen_from: (K, 3), a place from which each was seen.
         owners: (K,), the robot that learned each: colours by robot. By height if not given.
         trajectories: of each robot, poses (T, ≥ 3), world metres.
-        ceiling: height (m) above which nothing is drawn; if not given, and without `seen_from`, the
-            upper tenth of the heights.
+        ceiling: height (m) above which nothing is drawn; if not given, some way beneath the top where most of
+            what is overhead is up there, or nobody says whence it was seen.
         camera: whence it is seen; from the south-west, 45° up, if not given.
         title: of the figure; the number of components if not given.
         max_pixels: across the picture.
@@ -81,8 +80,8 @@ def mixture_scene_figure(
     places = _as_rows("seen_from", seen_from, mean.shape)
     robots = _as_rows("owners", owners, mean.shape[:1])
     camera = camera or Camera(-120.0, 45.0)
-    kept = _uncovered(mean, covariance, places, ceiling, camera)
-    paths = [as_array(path)[:, :3] for path in trajectories]
+    kept, top = cut_away(mean, covariance, places, ceiling, camera)
+    paths = [smooth_path(path) for path in trajectories]
     low, high = _box(mean, covariance, kept, paths)
     mean, covariance = mean[kept], covariance[kept]
     scale = Normalize(*_heights(mean), clip=True)
@@ -98,6 +97,7 @@ def mixture_scene_figure(
         torch.cat([colours, bead_colours]),
         camera,
         canvas,
+        tops=torch.cat([mean.new_full((len(mean),), top), beads.new_full((len(beads),), math.inf)]),
     )
     _draw_frame(axes, low, high, camera)
     _show(axes, picture.rgb, picture.depth, canvas)
@@ -129,27 +129,6 @@ def _as_rows(name: str, value: ArrayLike | None, shape: Sequence[int]) -> Tensor
             f"{name} has shape {tuple(rows.shape)}; expected {tuple(shape)}, a row a component."
         )
     return rows
-
-
-def _uncovered(
-    mean: Tensor, covariance: Tensor, seen_from: Tensor | None, ceiling: float | None, camera: Camera
-) -> Tensor:
-    """Which (K,) are drawn: those that hide nothing, as `mixture_scene_figure` says."""
-    kept = torch.ones(len(mean), dtype=torch.bool)
-    if len(mean) == 0:
-        return kept
-    if ceiling is None and seen_from is None:
-        low, high = np.quantile(mean[:, 2].numpy(), [0.001, 0.999])
-        ceiling = float(low + _TOP * (high - low))
-    if ceiling is not None:
-        kept &= mean[:, 2] <= ceiling
-    if seen_from is not None:
-        variances, directions = torch.linalg.eigh((covariance + covariance.mT) / 2)
-        normal = directions[:, :, 0]
-        seen_side = normal * ((seen_from - mean) * normal).sum(1, keepdim=True).sign()
-        flat = variances[:, 0] < _FLAT * variances[:, 1]
-        kept &= ~(flat & (seen_side @ camera.axes[2] < _TURNED_AWAY))
-    return kept
 
 
 def _heights(mean: Tensor) -> tuple[float, float]:

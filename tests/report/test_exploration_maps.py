@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,9 +12,13 @@ from exploration_rows import flights
 from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.primitives import Dynamics, Primitives
+from gmmtorch.exploration.scoring import BeliefRule
+from gmmtorch.report.exploration_cutaway import cut_away
 from gmmtorch.report.exploration_maps import TeamSnapshot, team_map_figure, trajectories_figure
+from gmmtorch.report.exploration_paths import smooth_path
 from gmmtorch.report.exploration_render import Camera, Canvas, render
-from gmmtorch.report.exploration_scene import _uncovered, mixture_scene_figure
+from gmmtorch.report.exploration_scene import mixture_scene_figure
 from gmmtorch.report.exploration_top_view import TopView, top_view
 from gmmtorch.report.style import UNKNOWN
 
@@ -94,6 +99,81 @@ def test_team_map_outlines_the_components_of_the_layer():
     for outline, mean, half in zip(outlines, means[within].numpy(), reach, strict=True):
         np.testing.assert_allclose(outline.vertices.max(0), mean[:2] + half, atol=0.02 * half.max() + 1e-9)
     assert "between z = 0.5 m and 2 m" in figure.get_suptitle()
+
+
+def test_cells_are_called_what_the_belief_calls_them():
+    view = TopView(torch.tensor([[0.1, 0.3, 0.5, 0.6, 0.7]]), (0.0, 0.0), 1.0)
+    free, unknown, occupied = (1.0, 1.0, 1.0), to_rgb(UNKNOWN), to_rgb("#2b2b2b")
+    usual = [free, unknown, unknown, unknown, occupied]
+    for belief, expected in (
+        (None, usual),
+        (BeliefRule(free=0.4, occupied=0.55), [free, free, unknown, occupied, occupied]),
+    ):
+        image = team_map_figure([TeamSnapshot(1.0, view)], belief=belief).axes[0].get_images()[0]
+        np.testing.assert_allclose(np.asarray(image.get_array())[:, 0], expected)
+
+
+@pytest.mark.parametrize(("height", "said"), [(1.0, []), (3.0, ["path above 1.8 m"])])
+def test_paths_above_the_heights_shown_look_it(height, said):
+    world = TopView(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
+    poses = np.array([[1.0, 1, 1.0, 0], [3, 1, height, 0], [5, 1, 1.0, 0]])
+    figure = trajectories_figure(world, [poses])
+    assert "between z = 0.8 m and 1.8 m" in figure.get_suptitle()
+    assert [t.get_text() for t in figure.legends[0].get_texts() if "path" in t.get_text()] == said
+    paths = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
+    above = [line for line in paths if len(line.get_path_effects()) == 3]
+    assert len(above) == len(said)
+    for line in above:
+        crossed = np.interp(line.get_xdata()[[0, -1]], [1, 3, 5], [1.0, height, 1.0])
+        np.testing.assert_allclose(crossed, 1.8, atol=0.5)
+    assert sum(np.abs(np.diff(line.get_xdata())).sum() for line in paths) == pytest.approx(4)
+    below = trajectories_figure(world, [poses - [0, 0, 1, 0]])
+    assert "path below 0.8 m" in [t.get_text() for t in below.legends[0].get_texts()]
+
+
+def test_paths_between_poses_are_those_that_were_flown():
+    dynamics = Dynamics()
+    library = Primitives(dynamics)
+    state = torch.zeros(1, 7, dtype=torch.float64)
+    flown = [state]
+    for command in (0, 3, 8, 12, 4, 19, 1):  # ahead, arcs that climb and descend, a turn in place, an arc
+        flown.append(library.rollout(state)[0, command])
+        state = flown[-1][-1:]
+    every = torch.cat(flown).numpy()
+
+    def farthest(path: np.ndarray) -> float:
+        fine = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(path)])
+        return float(np.linalg.norm(every[:, None, :2] - fine[None, :, :2], axis=2).min(1).max())
+
+    kept = every[::5, :4]  # once a second
+    path = smooth_path(kept)
+    assert farthest(path) < 0.03
+    assert farthest(kept) > 0.2
+    np.testing.assert_allclose(path[[0, -1]], kept[[0, -1], :3])
+    assert (np.diff(path[:, 2]) >= -1e-12)[: np.argmax(path[:, 2])].all()  # up, and down once
+    assert (np.diff(path[:, 2]) <= 1e-12)[np.argmax(path[:, 2]) :].all()
+    assert path[:, 2].max() == kept[:, 2].max()
+
+
+def test_paths_against_the_heading_or_without_one_are_straight():
+    poses = np.array([[0.0, 0, 1, math.pi], [2, 0, 1, math.pi], [2, 2, 1, 0]])
+    for path in (smooth_path(poses[:, :2]), smooth_path(poses)):
+        assert np.minimum(np.abs(path[:, 0] - 2), np.abs(path[:, 1])).max() < 1e-12
+    assert smooth_path(np.empty((0, 4))).shape == (0, 3)
+    assert smooth_path(poses[:1]).shape == (1, 3)
+
+
+@pytest.mark.parametrize("n_robots", [1, 16])
+def test_legends_of_one_panel_fit(n_robots):
+    view = TopView(torch.rand(12, 30), (0.0, 0.0), 1.0, (0.8, 1.8))
+    paths = flights(n_robots, 30)
+    for figure in (
+        team_map_figure([TeamSnapshot(1.0, view, paths, *components(5))]),
+        trajectories_figure(view, paths, torch.randint(0, n_robots + 1, (12, 30))),
+    ):
+        figure.canvas.draw()
+        box = figure.legends[0].get_window_extent()
+        assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
 def test_maps_say_what_is_wrong():
@@ -186,18 +266,58 @@ def test_what_hides_the_inside_is_left_out():
     covariances = torch.diag_embed(thin.double())
     inside = torch.tensor([[0.0, 0.1, 2.0]], dtype=torch.float64).expand(5, 3)
     from_front = Camera(0, 40)  # the viewer is at +x
-    assert _uncovered(means, covariances, inside, None, from_front).tolist() == [
-        True,
-        False,
-        False,
-        True,
-        True,
-    ]
-    assert _uncovered(means, covariances, None, 3.0, from_front).tolist() == [True, False, True, True, True]
-    assert _uncovered(means, covariances, None, None, from_front).tolist() == [True, False, True, True, True]
-    assert _uncovered(means, covariances, inside, 1.0, from_front).tolist() == [True, *[False] * 4]
+
+    def shown(seen_from: torch.Tensor | None, ceiling: float | None) -> list[bool]:
+        return cut_away(means, covariances, seen_from, ceiling, from_front)[0].tolist()
+
+    assert shown(inside, None) == [True, False, False, True, True]
+    assert shown(None, 3.0) == [True, False, True, True, True]
+    assert shown(None, None) == [True, False, True, True, True]
+    assert shown(inside, 1.0) == [True, *[False] * 4]
     figure = mixture_scene_figure(means, covariances, seen_from=inside, camera=from_front, max_pixels=200)
     assert "3 of 5 components" in figure.get_suptitle()
+
+
+def test_what_is_at_what_is_left_out_goes_with_it():
+    # A near wall at x = 4 and a far one at −4, of ten flat pieces each, with a blob at each of them; and a
+    # long bar from one to the other.
+    z = torch.linspace(0.5, 3.5, 10, dtype=torch.float64)
+    near, far = (torch.stack([torch.full_like(z, x), torch.zeros_like(z), z], 1) for x in (4.0, -4.0))
+    rest = torch.tensor([[3.8, 0.0, 2.0], [-3.8, 0.0, 2.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    means = torch.cat([near, far, rest])
+    flat, ball, bar = ([0.001, 0.2, 0.2], [0.02, 0.02, 0.02], [4.0, 0.01, 0.01])
+    covariances = torch.diag_embed(torch.tensor([*[flat] * 20, ball, ball, bar], dtype=torch.float64))
+    seen_from = torch.zeros(23, 3, dtype=torch.float64)
+    kept, ceiling = cut_away(means, covariances, seen_from, None, Camera(0, 40))
+    assert kept.tolist() == [*[False] * 10, *[True] * 10, False, True, False]
+    assert ceiling == math.inf  # nothing is overhead
+
+
+def test_a_level_ceiling_is_cut_off_and_a_sloping_one_is_not():
+    x = torch.linspace(-8, 8, 40, dtype=torch.float64)
+    floor, roof = (torch.stack([x, 0 * x, torch.full_like(x, z)], 1) for z in (0.0, 5.0))
+    covariances = torch.diag_embed(torch.tensor([0.2, 0.2, 0.001], dtype=torch.float64)).expand(80, 3, 3)
+    seen_from = torch.stack([x, 0 * x, torch.full_like(x, 2.0)], 1).repeat(2, 1)
+    for lean, cut in ((0.0, 3.9), (0.5, math.inf)):
+        slope = torch.stack([0 * x, 0 * x, lean * x], 1).repeat(2, 1)
+        means = torch.cat([floor, roof]) + slope
+        kept, ceiling = cut_away(means, covariances, seen_from + slope, None, Camera())
+        assert kept.tolist() == [*[True] * 40, *[False] * 40]
+        assert ceiling == pytest.approx(cut)
+
+
+def test_nothing_is_drawn_above_where_it_is_cut_off():
+    means = torch.tensor([[0.0, -2.0, 0.0], [0.0, 2.0, 0.0]])
+    covariances = torch.eye(3).expand(2, 3, 3) * 0.25
+    camera, canvas = Camera(0, 30), Canvas(-4.0, 4.0, -2.0, 2.0, 20.0)
+    tops = torch.tensor([0.25, math.inf])
+    depth = render(means, covariances, torch.ones(2, 3), camera, canvas, smoothing=1, tops=tops).depth
+    rows, _ = canvas.shape
+    up = canvas.top - (torch.arange(rows, dtype=torch.float64) + 0.5) / canvas.scale
+    height = up[:, None] * camera.axes[1, 2] + depth * camera.axes[2, 2]
+    left, right = (half[torch.isfinite(half)] for half in height.chunk(2, dim=1))
+    assert 0.2 < float(left.max()) <= 0.25 + 1e-4
+    assert float(right.max()) > 0.9
 
 
 @pytest.mark.parametrize("k", [0, 1, 30])
