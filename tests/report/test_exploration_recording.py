@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,7 +12,13 @@ import torch
 from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.report.exploration_recording import RecordedMap, _ellipsoids, load_rerun, record_rerun
+from gmmtorch.report.exploration_recording import (
+    RecordedMap,
+    _ellipsoids,
+    _log_robot,
+    load_rerun,
+    record_rerun,
+)
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs rerun-sdk")
 
@@ -51,6 +58,13 @@ def test_records_robots_map_mixture_and_curves(tmp_path):
     assert found["/entropy_left"] == found["/bytes_sent"] == 11
     assert found["/world/robots/0/path"] == 1
     assert "/world/robots/2" not in found
+
+
+def test_robots_are_numbered_from_zero():
+    stream = MagicMock()
+    _log_robot(MagicMock(), stream, 0, flights(1, 3)[0], 1.0)
+    names = {call.args[0] for call in stream.log.call_args_list}
+    assert names == {"world/robots/0", "world/robots/0/path", "world/robots/0/heading"}
 
 
 @needs_rerun
