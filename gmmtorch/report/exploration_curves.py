@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import time_to_share
@@ -41,6 +41,7 @@ from gmmtorch.report.style import (
     dress,
     figure_title,
     line_style,
+    log_axis,
     new_figure,
 )
 
@@ -81,13 +82,13 @@ def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
     handles = _milestone_handles()
     if any(len(trials) == 1 for trials in groups.values()):
         handles.append(Line2D([], [], color="#555555", linewidth=0.8, label="each robot's own map"))
-    axes.legend(handles=handles, loc="upper right", fontsize=LABEL_SIZE - 1, frameon=False)
+    _legend(figure, handles)
     figure_title(figure, title or f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}")
     place_labels(figure, _level_labels(axes, levels, f"{whose} final reduction"))
     return figure
 
 
-def bandwidth_figure(rows: Rows, title: str | None = None) -> Figure:
+def bandwidth_figure(rows: Rows, title: str | None = None, draco_error: float = 0.03) -> Figure:
     """Bytes of what the team shared, cumulative over time on a logarithmic axis (Fig 4.5).
 
     What E0 sent, the novel points of the very frames that it learned from by other codecs, and what
@@ -96,6 +97,7 @@ def bandwidth_figure(rows: Rows, title: str | None = None) -> Figure:
     Args:
         rows: explore rows; of E2, which sends nothing, none is drawn. Series that are null are left out.
         title: of the figure; world, robots and number of seeds if not given.
+        draco_error: RMS (m) of Draco's points, `map.noise` of the missions.
 
     Raises:
         InvalidArgumentError: rows among which no byte was sent.
@@ -122,6 +124,8 @@ def bandwidth_figure(rows: Rows, title: str | None = None) -> Figure:
         note = byte_text(total)
         if base is not None and curves is not base:
             note += f", {ratio_text(total / float(base.band.mean[-1]))} E0"
+        if field == "draco_bytes_over_time":
+            text += f", {100 * draco_error:g} cm RMS"
         ends.append((total, f"{text}\n{note}", hue))
     _byte_axis(axes, list(found.values()))
     _finish(axes, ends, rows, percent=False)
@@ -158,7 +162,7 @@ def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
         notes = [_mark(axes, trials, curves, levels, *milestone, colour(index)) for milestone in _MILESTONES]
         ends.append((float(curves.band.mean[-1]), f"{name}\n{', '.join(notes)}", colour(index)))
     _finish(axes, ends, rows)
-    axes.legend(handles=_milestone_handles(), loc="upper right", fontsize=LABEL_SIZE - 1, frameon=False)
+    _legend(figure, _milestone_handles())
     figure_title(figure, title or f"Planners: {about(rows)}\n{seeds_note(rows)}")
     place_labels(figure, _level_labels(axes, levels, "the best"))
     return figure
@@ -185,6 +189,17 @@ def _milestone_handles() -> list[Line2D]:
         Line2D([], [], color="#555555", marker=shape, linestyle="", markersize=7, label=name)
         for name, _, shape in _MILESTONES
     ]
+
+
+def _legend(figure: Figure, handles: Sequence[Line2D]) -> None:
+    """Beneath the axes: within them a curve may be anywhere."""
+    figure.legend(
+        handles=list(handles),
+        loc="outside lower center",
+        ncols=len(handles),
+        fontsize=LABEL_SIZE - 1,
+        frameon=False,
+    )
 
 
 def _reference(rows: Rows) -> float | None:
@@ -265,12 +280,10 @@ def _above_zero(curves: Curves) -> Curves:
 
 
 def _byte_axis(axes: Axes, curves: Sequence[Curves]) -> None:
-    """Decades that hold the curves from a twentieth of the time on: their steep start is of no interest."""
+    """A logarithmic axis from the first bytes of any curve on, as far as these are within five decades."""
     highest = max(float(c.band.mean[-1]) for c in curves)
-    early = [float(np.interp(0.05 * c.times[-1], c.times, c.band.mean)) for c in curves]
-    lowest = max(min([v for v in early if v > 0] or [highest / 1e3]), highest / 1e6)
-    axes.set_yscale("log")
-    axes.set_ylim(10 ** np.floor(np.log10(lowest)), 10 ** np.ceil(np.log10(highest * 1.05)))
-    axes.yaxis.set_major_locator(LogLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    lowest = max(min(float(c.band.mean[c.band.mean > 0][0]) for c in curves), highest / 1e5)
+    low, high = lowest / 1.3, 1.3 * highest
+    log_axis(axes, "y", (low, high))
+    axes.set_ylim(low, high)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, 2).replace(".0 ", " ")))

@@ -40,6 +40,12 @@ def framework_name(framework: str) -> str:
     return FRAMEWORKS.get(framework, label_of(framework))
 
 
+def short_name(framework: str) -> str:
+    """Of the thesis's three the letter and number alone."""
+    name = framework_name(framework)
+    return name.split()[0] if framework in FRAMEWORKS else name
+
+
 def framework_colour(framework: str) -> str:
     """The same in every figure."""
     return colour(list(FRAMEWORKS).index(framework)) if framework in FRAMEWORKS else PALETTE[-1]
@@ -101,7 +107,7 @@ def label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]], size: float =
     left = axes.get_xlim()[0]
     figure = cast(Figure, axes.figure)
     wanted = np.array([to_share.transform((left, ends[i][0]))[1] for i in order])
-    line = _LABEL_GAP * size / 72 / (0.8 * figure.get_size_inches()[1])  # of the height of the axes
+    line = _LABEL_GAP * size / 72 * figure.dpi / axes.bbox.height  # of the height of the axes
     tall = np.array([line * (ends[i][1].count("\n") + 1.3) for i in order])
     # Least squares under "no label begins before the one below it ends" is an isotonic regression.
     offsets = np.cumsum(tall) - tall / 2
@@ -115,9 +121,15 @@ def label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]], size: float =
 
 
 def seeds_note(rows: Rows, confidence: str = "95 % band of the mean") -> str:
-    """What lines and bands are, for a title: mean of 5 seeds with the 95 % band of the mean."""
-    n = max(len(group) for group in _groups(rows))
-    return f"mean of {n} seeds with the {confidence}" if n > 1 else "one trial each"
+    """What lines and bands are, for a title: mean of 5 seeds with the 95 % band of the mean; or one mission
+    of E0, seed 0."""
+    sizes = sorted({len(group) for group in _groups(rows)})
+    if sizes[-1] > 1:
+        n = f"{sizes[0]} to {sizes[-1]}" if len(sizes) > 1 else str(sizes[0])
+        return f"mean of {n} seeds with the {confidence}"
+    whose = f"of {short_name(str(rows[0]['framework']))}" if len(rows) == 1 else "each"
+    seeds = {int(row["seed"]) for row in rows}
+    return f"one mission {whose}" + (f", seed {seeds.pop()}" if len(seeds) == 1 else "")
 
 
 def about(rows: Rows) -> str:

@@ -12,7 +12,13 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.trials import mean_band
 from gmmtorch.report.exploration_bars import profile_figure, stage_means, summary_bars
 from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
-from gmmtorch.report.exploration_style import FRAMEWORKS, framework_colour, framework_name, label_ends
+from gmmtorch.report.exploration_style import (
+    FRAMEWORKS,
+    framework_colour,
+    framework_name,
+    label_ends,
+    seeds_note,
+)
 from gmmtorch.report.style import PALETTE, new_figure
 
 
@@ -86,6 +92,39 @@ def test_bytes_are_labelled_with_their_total_and_their_ratio():
     assert "Draco" not in said
     assert "E2" not in said
     assert figure.axes[0].get_yscale() == "log"
+
+
+@pytest.mark.parametrize("duration", [60.0, 1600.0])
+def test_the_axis_of_bytes_begins_where_the_first_were_sent(duration):
+    rows = [trial(framework, 0, duration) for framework in ("gmm_shared", "grid_shared")]
+    axes = bandwidth_figure(rows).axes[0]
+    first = min(rows[0][f][1] for f in ("bytes_over_time", "octree_bytes_over_time"))
+    assert first / 2 < axes.get_ylim()[0] < first
+    assert rows[1]["bytes_over_time"][-1] < axes.get_ylim()[1] < 2 * rows[1]["bytes_over_time"][-1]
+    rows[0]["octree_bytes_over_time"][1] = 1  # a single byte does not take the axis along
+    assert bandwidth_figure(rows).axes[0].get_ylim()[0] > 10
+
+
+def test_draco_is_named_with_its_error():
+    rows = [trial("gmm_shared", 0)]
+    assert "same points, Draco, 3 cm RMS\n" in texts(bandwidth_figure(rows).axes[0])
+    assert "Draco, 2.5 cm RMS\n" in texts(bandwidth_figure(rows, draco_error=0.025).axes[0])
+
+
+def test_titles_say_what_is_drawn():
+    one, other = trial("gmm_shared", 3), trial("grid_shared", 3)
+    assert seeds_note([one]) == "one mission of E0, seed 3"
+    assert seeds_note([one, other]) == "one mission each, seed 3"
+    assert seeds_note([one, {**other, "seed": 4}]) == "one mission each"
+    assert seeds_note([{**one, "framework": "another_one"}]) == "one mission of another one, seed 3"
+    assert seeds_note([one, {**one, "seed": 4}]).startswith("mean of 2 seeds")
+    assert seeds_note([one, {**one, "seed": 4}, other]).startswith("mean of 1 to 2 seeds")
+
+
+def test_legends_lie_beneath_the_axes():
+    for figure in (entropy_figure([trial("gmm_shared", 0, 60.0)]), planner_comparison_figure(protocol(1))):
+        figure.canvas.draw()
+        assert figure.legends[0].get_window_extent().y1 < figure.axes[0].get_window_extent().y0
 
 
 def test_a_band_below_zero_is_drawn_on_the_logarithmic_axis():

@@ -33,6 +33,12 @@ def line(axes: Axes, index: int, n_points: int) -> np.ndarray:
     return found
 
 
+def smooth(share: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The median of a thirtieth of the mission around each time."""
+    half = times[-1] / 60
+    return np.array([np.median(share[np.abs(times - t) <= half + 1e-6]) for t in times])
+
+
 def test_each_panel_has_the_mean_of_each_variant_over_seeds():
     rows = networks(n_seeds=3)
     figure = loss_figure(rows)
@@ -40,19 +46,24 @@ def test_each_panel_has_the_mean_of_each_variant_over_seeds():
     series = (
         lambda row: 100 * np.array(row["entropy_bits"]) / OBSERVABLE_BITS,
         lambda row: np.array(row["wire_bytes_over_time"]),
-        lambda row: 100 * np.array(row["missing_share"]),
+        lambda row: smooth(100 * np.array(row["missing_share"]), np.array(row["times"])),
     )
-    assert len(figure.axes) == 3
-    for axes, values in zip(figure.axes, series, strict=True):
-        for index in range(5):
+    left, sent, *multiples = figure.axes
+    assert len(multiples) == 5
+    for index in range(5):
+        lacking = multiples[index]
+        for axes, values, band in (
+            (left, series[0], index),
+            (sent, series[1], index),
+            (lacking, series[2], 0),
+        ):
             trials = np.stack([values(row) for row in rows[index::5]])
             mean, low, high = mean_band(trials)
             np.testing.assert_allclose(line(axes, index, len(mean)), mean)
-            corners = axes.collections[index].get_paths()[0].vertices[:, 1]
-            assert corners.max() == pytest.approx(
-                min(high.max(), 100) if axes is figure.axes[2] else high.max()
-            )
-            assert corners.min() == pytest.approx(max(low.min(), 0) if axes is figure.axes[2] else low.min())
+            corners = axes.collections[band].get_paths()[0].vertices[:, 1]
+            assert corners.max() == pytest.approx(min(high.max(), 100) if axes is lacking else high.max())
+            assert corners.min() == pytest.approx(max(low.min(), 0) if axes is lacking else low.min())
+    assert len(lacking.lines) == 1  # of one mission alone every number is drawn
     assert "3 robots" in figure.get_suptitle()
     assert "mean of 3 seeds" in figure.get_suptitle()
 
@@ -64,25 +75,51 @@ def test_labels_say_times_bytes_ratios_and_how_maps_end():
     rows[3]["t90"] = None  # half lost, seed 0
     rows[2]["t90_ratio"] = None
     figure = loss_figure(rows)
-    left, sent, lacking = (texts(axes) for axes in figure.axes)
+    left, sent = (texts(axes) for axes in figure.axes[:2])
+    lacking = "\n".join(axes.get_title() for axes in figure.axes[2:])
     assert "lossless\nt90 200 s\n" in left
     assert "10 % lost\nt90 200 s, 1.50×" in left
     assert "30 % lost\nt90 200 s\n" in left  # one seed has no companion
     assert "50 % lost\nt90 in 1 of 2" in left
     total = np.mean([rows[i]["wire_bytes_over_time"][-1] for i in (3, 8)])
     assert f"50 % lost\n{total / 1e6:.2f} MB, 2.00×" in sent
-    assert "partition 0 | 1 2,\n60\N{EN DASH}120 s\n0.3 % of cells differ\nwhole again in 10 s" in lacking
+    assert "partition 0 | 1 2, 60\N{EN DASH}120 s\n0.3 % of cells differ\nwhole again in 10 s" in lacking
     assert "lossless\n0.3 % of cells differ" in lacking
 
 
 def test_a_partition_is_shaded_while_it_lasts():
     figure = loss_figure(networks(n_seeds=1))
-    for axes in figure.axes:
+    *whole, cut = figure.axes[2:]
+    for axes in (*figure.axes[:2], cut):
         (shade,) = axes.patches
         assert (shade.get_x(), shade.get_width()) == (60, 60)
+    for axes in figure.axes[:2]:
         assert texts(axes).count("partition\n") + texts(axes).endswith("partition") >= 1
+    assert not any(axes.patches for axes in whole)
     (axes, *_) = loss_figure(networks(n_seeds=1)[:4]).axes
     assert not axes.patches
+
+
+def test_what_is_lacking_is_drawn_smooth_over_what_a_single_mission_had():
+    row = networks(n_seeds=1)[2]
+    row["missing_share"] = [0.5 if i % 10 == 5 else 0.01 for i in range(len(row["times"]))]
+    figure = loss_figure([row])
+    lacking = figure.axes[2]
+    smoothed, every = (np.asarray(drawn.get_ydata()) for drawn in lacking.lines)
+    np.testing.assert_allclose(smoothed, 1)
+    np.testing.assert_allclose(every, 100 * np.array(row["missing_share"]))
+    assert "one mission of E0, seed 0" in figure.get_suptitle()
+
+
+@pytest.mark.parametrize("n", [1, 6, 11])
+def test_any_number_of_variants_has_panels_of_its_own(n):
+    rows = [{**networks(n_seeds=1)[0], "loss": 0.05 * i} for i in range(n)]
+    figure = loss_figure(rows)
+    figure.canvas.draw()
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert len(shown) == 2 + n
+    boxes = [axes.get_window_extent() for axes in shown]
+    assert all(not a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 def test_nothing_lacking_at_all_can_be_drawn():
@@ -90,7 +127,7 @@ def test_nothing_lacking_at_all_can_be_drawn():
     row |= {"missing_share": [0.0] * len(row["times"]), "map_disagreement": None, "t90": None}
     figure = loss_figure([row])
     figure.canvas.draw()
-    assert line(figure.axes[2], 0, len(row["times"])).max() == 0
+    assert all(np.max(drawn.get_ydata()) == 0 for drawn in figure.axes[2].lines)
     assert "lossless\nt90 not reached" in texts(figure.axes[0])
 
 
