@@ -81,7 +81,7 @@ def trajectories_figure(
         trajectories: of each robot, poses (T, ≥ 2), world metres.
         coverage: (nx, ny), on the cells of the world's view: how many robots saw each column; shaded,
             with the share of the seen columns in the legend.
-        title: of the figure.
+        title: of the figure; the heights shown are added.
 
     Raises:
         InvalidArgumentError: coverage of another shape than the view.
@@ -106,7 +106,8 @@ def trajectories_figure(
     dress(axes, "", "x [m]", "y [m]")
     _legend(figure, [*handles, *path_handles(trajectories, world.band, ends=True)])
     heights = _between(world)
-    figure_title(figure, f"{title}\nin the world{heights}" if title and heights else title)
+    shown = "surfaces" if coverage is None else "surfaces and coverage"
+    figure_title(figure, f"{title}\n{shown}{heights}" if title and heights else title)
     return figure
 
 

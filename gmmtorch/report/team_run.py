@@ -81,7 +81,8 @@ def _draw_maps(axes: Axes, rows: Rows) -> None:
         axes.plot(times, values, linewidth=1.8, **look)
         ends.append((float(values[-1]), f"{row['robot']}", colour(index)))
     dress(axes, "", "robot's time [s]", "entropy left [% of the observable]" if explores else "records held")
-    axes.set(xlim=axes.get_xlim(), ylim=(0, axes.get_ylim()[1]))
+    begin, end = axes.dataLim.intervalx
+    axes.set(xlim=(begin, end if end > begin else begin + 1), ylim=(0, axes.get_ylim()[1]))
     draw_grid(axes)
     if 1 < len(rows) <= _MOST_LABELS:
         label_ends(axes, ends)

@@ -118,7 +118,7 @@ def test_paths_above_the_heights_shown_look_it(height, said):
     world = TopView(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
     poses = np.array([[1.0, 1, 1.0, 0], [3, 1, height, 0], [5, 1, 1.0, 0]])
     figure = trajectories_figure(world, [poses])
-    assert "between z = 0.8 m and 1.8 m" in figure.get_suptitle()
+    assert figure.get_suptitle() == "Where the robots flew\nsurfaces between z = 0.8 m and 1.8 m"
     assert [t.get_text() for t in figure.legends[0].get_texts() if "path" in t.get_text()] == said
     paths = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
     above = [line for line in paths if len(line.get_path_effects()) == 3]

@@ -30,6 +30,7 @@ def test_robots_in_a_world_have_lines_of_the_entropy_left():
     assert "entropy left" in left.get_ylabel()
     assert left.lines[1].get_xdata().tolist() == [0.0, 10.0, 20.0]
     assert left.lines[1].get_ydata().tolist() == [100.0, 60.0, 23.5]
+    assert left.get_xlim() == (0.0, 20.0)  # lines end where their names are
     assert {text.get_text(): text.get_color() for text in left.texts} == {
         "0": left.lines[0].get_color(),
         "3": left.lines[1].get_color(),
