@@ -22,9 +22,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +35,7 @@ from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.evaluation.metrics import psnr_terms, roc
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.evaluation.worker_pool import worker_pool
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.codec import spatial_order
@@ -335,7 +334,7 @@ def main() -> None:
     torch.set_num_threads(1)
     tasks = [task for name in options.names for task in tasks_of(name, options.data, options.frames)]
     rows, seconds = [], 0.0
-    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+    with worker_pool(options.jobs) as pool:
         for found, taken in pool.map(measure, tasks):
             rows += found
             seconds += taken

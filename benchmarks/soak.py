@@ -36,6 +36,7 @@ from typing import Any
 import torch
 
 from gmmtorch.errors import DataError
+from gmmtorch.evaluation.worker_pool import end_with_parent
 from gmmtorch.report.table import format_table
 from gmmtorch.sharing.envelope import Kind
 from gmmtorch.sharing.messages import decode
@@ -93,6 +94,7 @@ def _summed(parts: Iterable[dict[str, int]]) -> dict[str, int]:
 
 
 def _alone() -> None:
+    end_with_parent()
     torch.set_num_threads(1)
     logging.disable()  # of what is refused
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))

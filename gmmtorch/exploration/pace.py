@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from gmmtorch.exploration.mission import Mission
+from gmmtorch.files import write_json
 
 
 class Pace(NamedTuple):
@@ -28,29 +29,38 @@ def pace_of(mission: Mission) -> Pace:
 
 
 class Paces:
-    """The last pace of each of n missions, in a file that their processes map into memory.
+    """The last pace of each of several missions, in files that their processes leave for this one.
 
     Writing neither waits nor fills anything up, whoever looks. May be pickled.
 
     Args:
-        path: of the file, which is made anew.
+        paths: of the files, one a mission; what lies there of an earlier run is deleted. None: of that
+            mission nothing is heard.
     """
 
-    def __init__(self, path: Path, n: int) -> None:
-        self._path = path
-        self._seen = np.zeros((n, len(Pace._fields)))
-        self._rows("w+").flush()
+    def __init__(self, paths: Sequence[Path | None]) -> None:
+        self._paths = paths
+        self._seen: dict[int, Pace] = {}
+        self.forget()
 
     def note(self, number: int, pace: Pace) -> None:
         """How far a mission is."""
-        self._rows()[number] = pace
+        if (path := self._paths[number]) is not None:
+            write_json(path, pace._asdict())
 
     def changes(self) -> list[tuple[int, Pace]]:
         """The missions that have got further since this was asked last, and how far they are."""
-        now = np.array(self._rows())
-        changed = (now != self._seen).any(1).nonzero()[0].tolist()
+        now = {
+            number: Pace(**json.loads(path.read_bytes()))
+            for number, path in enumerate(self._paths)
+            if path is not None and path.is_file()
+        }
+        changed = [(number, pace) for number, pace in now.items() if self._seen.get(number) != pace]
         self._seen = now
-        return [(number, Pace(*now[number].tolist())) for number in changed]
+        return changed
 
-    def _rows(self, mode: Literal["r+", "w+"] = "r+") -> np.memmap:
-        return np.memmap(self._path, np.float64, mode, shape=self._seen.shape)
+    def forget(self) -> None:
+        """Delete the files."""
+        for path in self._paths:
+            if path is not None:
+                path.unlink(missing_ok=True)

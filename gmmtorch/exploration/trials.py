@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import concurrent.futures
 import concurrent.futures.process
+import contextlib
 import functools
 import hashlib
 import itertools
 import json
 import math
-import multiprocessing
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import torch
 from gmmtorch import __version__
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.evaluation.worker_pool import worker_pool
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.options import TeamOptions
@@ -32,6 +32,7 @@ from gmmtorch.exploration.world import World, open_world
 from gmmtorch.files import check_writable, write_json, write_npz
 
 CHECKPOINT = "mission.safetensors"
+PACE = "pace.json"
 ROW = "row.json"
 STAGE = "simulated seconds"
 TRAJECTORIES = "trajectories.npz"
@@ -213,14 +214,12 @@ def _run_several(
     got_further: Callable[[int, Pace], None],
 ) -> None:
     """Run those that are missing, so many at once."""
-    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     waiting = iter(missing)
     running: dict[concurrent.futures.Future[dict[str, Any]], int] = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder,
-        concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool,
-    ):
-        paces = Paces(Path(folder) / "paces", len(trials))
+    paces = Paces([None if trial.folder is None else trial.folder / PACE for trial in trials])
+    with contextlib.ExitStack() as stack:
+        stack.callback(paces.forget)  # once the pool is no more
+        pool = stack.enter_context(worker_pool(workers))
         while True:
             # No more than there are workers: what the pool has been given cannot be taken back.
             for i in itertools.islice(waiting, workers - len(running)):

@@ -424,6 +424,34 @@ def test_a_mission_that_was_killed_goes_on_to_the_same_result(run, room, steps, 
             assert np.array_equal(ours[name], all[name])
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
+def test_nothing_of_a_study_that_was_killed_flies_on(room, tmp_path):
+    killed, temporary = tmp_path / "killed", tmp_path / "temporary"
+    temporary.mkdir()
+    small = [option for option in SMALL if "workers" not in option]
+    options = [*QUIET, *small, "world=mesh", f"world.path={room}", "duration=1e6", "checkpoint.every=1"]
+    options += ["experiment=fig4_4_entropy", "study.seeds=[0,1]", "study.variants=[{team:grid_shared}]"]
+    with subprocess.Popen(
+        [sys.executable, str(CHECKOUT / "scripts" / "explore.py"), f"hydra.run.dir={killed}", *options],
+        cwd=tmp_path,
+        env={**environment(), "TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    ) as process:
+        try:
+            deadline = time.monotonic() + 90
+            while time.monotonic() < deadline and process.poll() is None:
+                if len([*killed.rglob("mission.safetensors")]) == 2:
+                    break
+                time.sleep(0.05)
+        finally:
+            process.kill()
+        process.communicate(timeout=60)  # to the end of what it and its workers could write
+    assert process.returncode == -signal.SIGKILL
+    assert len([*killed.rglob("mission.safetensors")]) == 2
+    assert not [path for path in temporary.iterdir() if path.name.startswith("gmmtorch")]
+
+
 def test_a_mission_that_is_over_is_not_flown_again(run, steps, tmp_path):
     kept = f"checkpoint.folder={tmp_path / 'kept'}"
     first, again = (succeeded(run("duration=2", kept, name=name)) for name in ("first", "again"))

@@ -194,10 +194,7 @@ def in_threads(
 ) -> None:
     """Trials of several workers run in threads, by a function that the test can see into."""
 
-    def pool(workers: int, mp_context: Any) -> concurrent.futures.Executor:
-        return concurrent.futures.ThreadPoolExecutor(workers)
-
-    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", pool)
+    monkeypatch.setattr(trials_module, "worker_pool", concurrent.futures.ThreadPoolExecutor)
     monkeypatch.setattr(trials_module, "_run_one", run)
 
 
@@ -253,7 +250,9 @@ def test_once_it_is_interrupted_no_other_begins(workers: int, monkeypatch: pytes
 
 
 def test_paces_are_those_noted_last_and_told_once(tmp_path: Path) -> None:
-    paces = Paces(tmp_path / "paces", 3)
+    paths = [tmp_path / "0", None, tmp_path / "2"]
+    paths[0].write_text("of a run that was killed")
+    paces = Paces(paths)
     elsewhere = pickle.loads(pickle.dumps(paces))
     assert paces.changes() == []
     early, late = Pace(0.0, 1.0, 0.0, 0.0), Pace(10.0, 0.7, 1200.0, 3.5)
@@ -262,7 +261,10 @@ def test_paces_are_those_noted_last_and_told_once(tmp_path: Path) -> None:
     assert paces.changes() == [(0, early), (2, late)]
     assert paces.changes() == []
     elsewhere.note(0, late)
+    elsewhere.note(1, late)
     assert paces.changes() == [(0, late)]
+    paces.forget()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("every", [-1.0, float("nan"), float("inf")])
