@@ -65,6 +65,7 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
     from gmmtorch.exploration.trials import STAGE, run_mission
 
     trial = missions.trial_of(config, folder)
+    missions.tell_what_begins_anew(config, [trial])
     world = missions.open_world(trial.world, trial.team, bars)
     recorder = MissionRecorder(config, folder, world)
 
@@ -74,7 +75,7 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
         recorder.sample(mission)
 
     with common.naming(missions.NAMES):
-        mission, row = run_mission(trial, world, on_sample)
+        mission, row = run_mission(trial, world, on_sample, recorder.album)
     rows = _compared([row])
     common.write_results("explore", config, rows, folder)
     recorder.finish(mission, rows[0])
@@ -100,6 +101,7 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
         for seed in config.study.seeds
         for variant in variants
     ]
+    missions.tell_what_begins_anew(config, trials)
     # Into the cache, before several ask for it at once.
     missions.open_world(trials[0].world, trials[0].team, bars)
     done: list[dict[str, Any]] = []

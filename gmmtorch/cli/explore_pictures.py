@@ -10,14 +10,15 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gmmtorch.exploration.album import Moment
     from gmmtorch.exploration.mission import Mission
     from gmmtorch.exploration.world import World
     from gmmtorch.mapping.components import Components
     from gmmtorch.report.exploration_maps import TeamSnapshot
-    from gmmtorch.report.exploration_recording import RecordedMap
     from gmmtorch.report.exploration_top_view import TopView
 
-_SHOWN_AT = (0.05, 0.2, 0.5, 1.0)  # shares of the duration at which the team's map is drawn
 _HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
 _OCCUPIED = 0.65
 
@@ -25,37 +26,35 @@ _OCCUPIED = 0.65
 class MissionRecorder:
     """Notes what the pictures of one mission need while it runs, and draws them at its end.
 
-    Numbers go to TensorBoard as they come. The map is noted at a few times, the end among them; where a
-    mission went on from a checkpoint, at those that were still to come.
+    Numbers go to TensorBoard as they come; those of before a checkpoint, where a mission went on from one,
+    at once. What the team knew is in `album`, and shown at the end.
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
+        from gmmtorch.exploration.album import Album
         from gmmtorch.report.board import Board
         from gmmtorch.report.exploration_board import MissionBoard
 
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
         self._live = MissionBoard(self._board) if self._board is not None else None
-        self._noted = 0
-        self._components: Components | None = None  # as they were noted last
-        self._snapshots: list[TeamSnapshot] = []
-        self._maps: list[RecordedMap] = []
+        self._n_told = 0  # samples
+        self._components: Components | None = None  # at the mission's end
+        self.album = Album(self._content)
 
     def sample(self, mission: Mission) -> None:
         """Take note of a mission that has just noted its own numbers."""
         if self._live is not None:
             curves = dict(mission.samples)
-            robots = curves.pop("entropy_bits_per_robot")
-            numbers = {name: curve[-1] for name, curve in curves.items() if name != "times"}
-            for robot, curve in zip(mission.robots, robots, strict=True):
-                numbers[f"robot_{robot.number}/entropy_bits"] = curve[-1]
-                numbers[f"robot_{robot.number}/path_length"] = robot.path_length
-            self._live.step(mission.now, numbers)
-        reached = mission.now / mission.options.duration
-        due = sum(reached >= share - 1e-9 for share in _SHOWN_AT)
-        if due > self._noted:
-            self._noted = due
-            self._note(mission)
+            times, robots = curves.pop("times"), curves.pop("entropy_bits_per_robot")
+            curves |= {f"robot_{number}/entropy_bits": curve for number, curve in enumerate(robots)}
+            for i in range(self._n_told, len(times)):
+                self._live.step(times[i], {name: curve[i] for name, curve in curves.items()})
+            self._n_told = len(times)
+            paths = {f"robot_{robot.number}/path_length": robot.path_length for robot in mission.robots}
+            self._live.step(mission.now, paths)
+        if mission.is_over:
+            self._components = mission.robots[0].mapper.components()
 
     def finish(self, mission: Mission, row: dict[str, Any]) -> None:
         """Draw everything, save the mixture, and close TensorBoard.
@@ -68,7 +67,7 @@ class MissionRecorder:
         from gmmtorch.exploration.trials import TRAJECTORIES, save_trajectories
         from gmmtorch.report.exploration_board import write_exploration_board
 
-        paths = [torch.stack(path).numpy() for path in mission.trajectories]
+        paths = [torch.stack(path) for path in mission.trajectories]
 
         save_trajectories(mission, self._folder / TRAJECTORIES)
         components = self._components
@@ -76,58 +75,73 @@ class MissionRecorder:
             _save_mixture(components, self._world.resolution, self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
         common.save_figures(self._config, figures, self._folder)
-        if self._board is not None:
+        if self._board is not None and self._live is not None:
+            for moment in self.album.chosen():
+                seconds = moment.tick * mission.options.tick_seconds
+                if "means" in moment.content:
+                    mixture = (moment.content["means"], moment.content["covariances"])
+                    self._board.ellipsoids("mixture", *mixture, step=int(seconds))
+                self._live.scene(seconds, None, [path[: moment.tick + 1] for path in paths])
             write_exploration_board(self._board, [row], figures)
             self._board.close()
         if self._config.report.recording:
-            from gmmtorch.report.exploration_recording import record_rerun
+            from gmmtorch.report.exploration_recording import RecordedMap, record_rerun
 
             record_rerun(
                 self._folder / "mission.rrd",
                 paths,
                 period=mission.options.tick_seconds,
-                maps=self._maps,
+                maps=[
+                    RecordedMap(
+                        moment.tick * mission.options.tick_seconds,
+                        moment.content["cells"],
+                        moment.content.get("means", ()),
+                        moment.content.get("covariances", ()),
+                    )
+                    for moment in self.album.moments
+                    if "cells" in moment.content  # those of before a checkpoint may have been without
+                ],
                 resolution=self._world.resolution,
                 row=row,
             )
 
-    def _note(self, mission: Mission) -> None:
-        """The team's map: from above, in 3D for TensorBoard, as cells and components for the recording."""
-        import torch
+    def _content(self, mission: Mission) -> dict[str, Any]:
+        """What the team knows, for pictures: from above, as components, and for the recording as cells.
 
-        from gmmtorch.report.exploration_maps import TeamSnapshot
-        from gmmtorch.report.exploration_recording import RecordedMap
-
-        paths = [torch.stack(path) for path in mission.trajectories]
-        self._components = mission.robots[0].mapper.components()
-        if self._live is not None:
-            self._live.scene(mission.now, self._components, paths)
-        surfaces = _surfaces(self._components)
-        mixture: dict[str, Any] = {}
-        shown: dict[str, Any] = {}
+        Single precision is enough to draw from, and halves the checkpoints.
+        """
+        content = {"image": _team_view(mission).image.float()}
+        surfaces = _surfaces(mission.robots[0].mapper.components())
         if surfaces is not None:
-            mixture = {"means": surfaces.means, "covariances": surfaces.covariances}
-            low, high = _band(mission)
-            within = (surfaces.means[:, 2] > low) & (surfaces.means[:, 2] < high)
-            shown = {name: value[within] for name, value in mixture.items()}
-            shown["owners"] = surfaces.ids[within, 0]
-        gone = 1 - mission.union.entropy_bits / mission.union.observable_bits
-        self._snapshots.append(
-            TeamSnapshot(
-                mission.now,
-                _team_view(mission),
-                paths,
-                caption=f"{gone:.0%} of the entropy gone",
-                **shown,
-            )
-        )
+            content["means"] = surfaces.means.float()
+            content["covariances"] = surfaces.covariances.float()
+            content["owners"] = surfaces.ids[:, 0]
         if self._config.report.recording:
             stored = mission.union.grid.cells()
             occupied = mission.union.rule.probability(stored.hits, stored.misses) > _OCCUPIED
-            self._maps.append(RecordedMap(mission.now, stored.cells[occupied], **mixture))
+            content["cells"] = stored.cells[occupied].int()
+        return content
+
+    def _snapshot(self, mission: Mission, moment: Moment, paths: list[Tensor]) -> TeamSnapshot:
+        """A moment as the picture of the team's map shows it: components within the band of heights."""
+        from gmmtorch.report.exploration_maps import TeamSnapshot
+
+        shown: dict[str, Any] = {}
+        if "means" in moment.content:
+            low, high = _band(mission)
+            heights = moment.content["means"][:, 2]
+            within = (heights > low) & (heights < high)
+            shown = {name: moment.content[name][within] for name in ("means", "covariances", "owners")}
+        return TeamSnapshot(
+            moment.tick * mission.options.tick_seconds,
+            _team_view(mission)._replace(image=moment.content["image"]),
+            [path[: moment.tick + 1] for path in paths],
+            caption=f"{moment.bits / mission.union.observable_bits:.0%} of the entropy gone",
+            **shown,
+        )
 
     def _figures(
-        self, mission: Mission, row: dict[str, Any], paths: list[Any], components: Components | None
+        self, mission: Mission, row: dict[str, Any], paths: list[Tensor], components: Components | None
     ) -> dict[str, Any]:
         from gmmtorch.report.exploration_bars import profile_figure, stage_means
         from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure
@@ -139,7 +153,9 @@ class MissionRecorder:
         figures = {
             "entropy": entropy_figure([row]),
             "trajectories": trajectories_figure(_world_view(mission), paths, _coverage(mission)),
-            "team_map": team_map_figure(self._snapshots),
+            "team_map": team_map_figure(
+                [self._snapshot(mission, moment, paths) for moment in self.album.chosen()]
+            ),
             "profile": profile_figure(*stage_means([row])),
         }
         if row["bytes_sent"]:

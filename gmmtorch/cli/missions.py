@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -62,20 +63,44 @@ def variants_of(config: DictConfig) -> list[dict[str, Any]]:
 def trial_of(
     config: DictConfig, folder: Path, variant: dict[str, Any] | None = None, seed: int | None = None
 ) -> Trial:
-    """A trial of the mission that the options describe, but for what a variant sets."""
+    """A trial of the mission that the options describe, but for what a variant sets.
+
+    The jobs of a sweep may share `checkpoint.folder`: each mission has a folder of its own there, and finds
+    it again.
+    """
     from gmmtorch.exploration.trials import Trial
 
     home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
     chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
     about = "_".join(f"{key}-{_short(value)}" for key, value in chosen.items())
-    home = home / "trials" / f"{about}_seed-{seed}"  # sweeps may share a folder
-    return Trial(
+    trial = Trial(
         world=world_options(config),
         team=team_options(config, seed, variant or {}),
-        folder=home,
         checkpoint_every=config.checkpoint.every,
     )
+    return replace(trial, folder=home / "trials" / f"{about}_seed-{seed}_{trial.digest}")
+
+
+def tell_what_begins_anew(config: DictConfig, trials: Sequence[Trial]) -> None:
+    """Warn of missions that `checkpoint.folder` does not hold, though it holds one of their name."""
+    from gmmtorch.exploration.trials import is_begun
+
+    def has_a_namesake(folder: Path) -> bool:
+        name, _, _ = folder.name.rpartition("_")
+        return any(other.name.startswith(f"{name}_") and is_begun(other) for other in folder.parent.iterdir())
+
+    if not config.checkpoint.folder:
+        return
+    folders = [trial.folder for trial in trials if trial.folder is not None]
+    anew = [f for f in folders if f.parent.is_dir() and not is_begun(f) and has_a_namesake(f)]
+    if anew:
+        common.logger.warning(
+            "checkpoint.folder=%s holds missions named as %d of these, but with other options; these begin "
+            "at their start.",
+            config.checkpoint.folder,
+            len(anew),
+        )
 
 
 def _short(value: Any) -> str:

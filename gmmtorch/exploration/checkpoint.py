@@ -25,11 +25,15 @@ def load_checkpoint(path: str | Path, **facts: Any) -> dict[str, Any]:
     tensors, about = read_tensors(path, _KIND, _VERSION)
     try:
         kept, tree = about["facts"], about["tree"]
-        different = sorted(key for key in {*facts, *kept} if facts.get(key) != kept.get(key))
+        different = [
+            f"{key}={kept.get(key)} there, {facts.get(key)} here"
+            for key in sorted({*facts, *kept})
+            if facts.get(key) != kept.get(key)
+        ]
         if different:
             raise DataError(
-                f"{path} is the checkpoint of another mission ({', '.join(different)} differ); give the "
-                "options it was started with, or another folder."
+                f"{path} is the checkpoint of another mission ({'; '.join(different)}); give what it was "
+                "started with, or another checkpoint.folder."
             )
         state: dict[str, Any] = joined_tensors(tree, tensors)
     except (KeyError, TypeError, AttributeError) as error:

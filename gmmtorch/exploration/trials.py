@@ -11,8 +11,9 @@ import itertools
 import json
 import math
 import time
+import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from gmmtorch import __version__
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.worker_pool import worker_pool
+from gmmtorch.exploration.album import Album
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.options import TeamOptions
@@ -98,14 +100,19 @@ class Trial:
         every = self.checkpoint_every
         return max(1, round(every * self.team.rate)) if every > 0 else None
 
-    def facts(self) -> dict[str, Any]:
-        """What a checkpoint must agree in to go on from it."""
-        return {
-            "world": repr(replace(self.world, cache=True)),
-            "mesh": self._mesh,
-            "team": repr(self.team),
-            "version": __version__,
-        }
+    def facts(self) -> dict[str, str | None]:
+        """What a checkpoint must agree in to go on from it: the options of world and team, by the names of
+        their fields, what lies at the path of a mesh, and the version."""
+        return {**self._options, "mesh": self._mesh, "version": __version__}
+
+    @property
+    def digest(self) -> str:
+        """Of the options, eight hexadecimal digits: missions that differ can have folders that do."""
+        return f"{zlib.crc32(json.dumps(self._options).encode()):08x}"
+
+    @property
+    def _options(self) -> dict[str, str]:
+        return {**_fields_of(replace(self.world, cache=True), "world."), **_fields_of(self.team)}
 
     @functools.cached_property
     def _mesh(self) -> str | None:
@@ -113,16 +120,28 @@ class Trial:
         if self.world.path is None or not (path := Path(self.world.path).expanduser()).is_file():
             return None
         with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether a trial in this folder was run to its end, or to a checkpoint."""
+    return any((folder / name).is_file() for name in (CHECKPOINT, ROW))
 
 
 def run_mission(
-    trial: Trial, world: World | None = None, on_sample: OnSample | None = None
+    trial: Trial,
+    world: World | None = None,
+    on_sample: OnSample | None = None,
+    album: Album | None = None,
 ) -> tuple[Mission, dict[str, Any]]:
     """Run a trial, from its checkpoint if there is one; returns the mission at its end and its row.
 
-    A mission that was killed goes on from its last checkpoint to the same result. Raises `OutputError`,
-    before anything is flown, for a folder that cannot be written to.
+    A mission that was killed goes on from its last checkpoint to the same result, and to the same album.
+    Raises `OutputError`, before anything is flown, for a folder that cannot be written to.
+
+    Args:
+        on_sample: hears of the mission where it begins or goes on, and whenever numbers are noted.
+        album: is shown every step.
     """
     if trial.folder is not None:
         check_writable(trial.folder)
@@ -134,15 +153,25 @@ def run_mission(
         state = load_checkpoint(path, **trial.facts())
         mission.restore(state["mission"])
         wall = float(state["wall_seconds"])
+        if album is not None and state["album"] is not None:
+            album.restore(state["album"])
+        elif album is not None:  # nobody had one before
+            album.look(mission)
     begin, every = time.perf_counter() - wall, trial.ticks_per_checkpoint
     if on_sample is not None:
         on_sample(mission)
     while not mission.is_over:
         mission.step()
+        if album is not None:
+            album.look(mission)
         if on_sample is not None and mission.sampled_now:
             on_sample(mission)
         if path is not None and every is not None and (mission.tick % every == 0 or mission.is_over):
-            state = {"mission": mission.state(), "wall_seconds": time.perf_counter() - begin}
+            state = {
+                "mission": mission.state(),
+                "album": None if album is None else album.state(),
+                "wall_seconds": time.perf_counter() - begin,
+            }
             save_checkpoint(path, state, **trial.facts())
     row = row_of(mission, time.perf_counter() - begin)
     repaired = (
@@ -258,6 +287,15 @@ def _run_one(trial: Trial, on_pace: OnPace) -> dict[str, Any]:
         write_json(trial.folder / ROW, {"facts": trial.facts(), "row": row})
         (trial.folder / CHECKPOINT).unlink(missing_ok=True)  # the row says it all
     return row
+
+
+def _fields_of(value: Any, prefix: str = "") -> dict[str, str]:
+    """The fields of a dataclass, and of those in it, by dotted names, as text."""
+    flat: dict[str, str] = {}
+    for field in fields(value):
+        held, name = getattr(value, field.name), prefix + field.name
+        flat |= _fields_of(held, f"{name}.") if is_dataclass(held) else {name: repr(held)}
+    return flat
 
 
 def _kept_row(trial: Trial) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,13 @@ from command_runs import (
     succeeded,
     timeless,
 )
+from matplotlib.figure import Figure
 
 import gmmtorch
 from gmmtorch.cli import explore, export
+from gmmtorch.exploration.mission import Mission
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.report import exploration_maps, exploration_recording
 
 Run = Callable[..., Finished]
 
@@ -175,7 +179,9 @@ def test_the_event_file_shows_the_mixture_and_the_paths_as_they_grow(mission):
     events = EventAccumulator(str(mission.folder / "tensorboard")).Reload()
     paths, mixture = (events.Tensors(f"{name}_VERTEX") for name in ("paths", "mixture"))
     times = [event.step for event in paths]
-    assert times == [event.step for event in mixture] == [2, 6, 9]  # from 0.05, 0.2, 0.5 and all of 9 s on
+    assert times == [event.step for event in mixture]
+    assert len(times) == 4
+    assert times[-1] == 9
     with np.load(mission.folder / "trajectories.npz") as kept:
         flown = [kept[f"robot_{n}"][:, :3] for n in range(2)]
     for event in paths:
@@ -424,6 +430,53 @@ def test_a_mission_that_was_killed_goes_on_to_the_same_result(run, room, steps, 
             assert np.array_equal(ours[name], all[name])
 
 
+def same(one: Any, other: Any) -> bool:
+    """Whether two snapshots, or what they are made of, are alike to the last bit."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if is_dataclass(one):
+        return all(same(getattr(one, item.name), getattr(other, item.name)) for item in fields(one))
+    return bool(one == other)
+
+
+def test_a_mission_that_went_on_has_the_pictures_of_one_that_was_not_killed(run, monkeypatch, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    drawn: list[Any] = []
+    recorded: list[Any] = []
+    monkeypatch.setattr(exploration_maps, "team_map_figure", lambda shown: drawn.append(shown) or Figure())
+    monkeypatch.setattr(exploration_recording, "load_rerun", lambda: None)
+    monkeypatch.setattr(exploration_recording, "record_rerun", lambda *_, maps, **__: recorded.append(maps))
+    kept = f"checkpoint.folder={tmp_path / 'kept'}"
+    options = ["duration=8", "evaluation.every=10", "checkpoint.every=3", "report.recording=true"]
+    options += ["report.figures=true", "report.tensorboard=true"]
+    step = Mission.step
+
+    def killed(mission: Mission) -> None:
+        if mission.tick == 5:
+            raise KeyboardInterrupt
+        step(mission)
+
+    with monkeypatch.context() as during:
+        during.setattr(Mission, "step", killed)
+        assert run(*options, kept, name="killed").status == 130
+    went_on = succeeded(run(*options, kept, name="on"))
+    whole = succeeded(run(*options, name="whole"))
+    ours, theirs = drawn
+    assert len(theirs) == 4  # though there are numbers of the start and of the end alone
+    assert [known.time for known in recorded[0]] == [1, 2, 3, 4, 5, 6, 7, 8]
+    for one, other in [*zip(ours, theirs, strict=True), *zip(*recorded, strict=True)]:
+        assert same(one, other)
+    boards = [EventAccumulator(str(done.folder / "tensorboard")).Reload() for done in (went_on, whole)]
+    for name in ("mission/entropy_bits", "mission/robot_1/entropy_bits", "mission/bytes_over_time"):
+        ours, theirs = ([(event.step, event.value) for event in board.Scalars(name)] for board in boards)
+        assert ours == theirs
+    ours, theirs = ([event.step for event in board.Tensors("paths_VERTEX")] for board in boards)
+    assert ours == theirs
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 def test_nothing_of_a_study_that_was_killed_flies_on(room, tmp_path):
     killed, temporary = tmp_path / "killed", tmp_path / "temporary"
@@ -460,14 +513,45 @@ def test_a_mission_that_is_over_is_not_flown_again(run, steps, tmp_path):
 
 
 @pytest.mark.parametrize("other", ["network.loss=0.5", "duration=4", "world.resolution=0.25"])
-def test_a_checkpoint_of_another_mission_is_not_taken(other, run, tmp_path):
+def test_a_checkpoint_of_another_mission_is_not_taken(other, run, steps, tmp_path):
     kept = f"checkpoint.folder={tmp_path / 'kept'}"
     succeeded(run("duration=2", kept, name="first"))
-    (path,) = (tmp_path / "kept").rglob("mission.safetensors")
     options = [other] if other.startswith("duration") else [other, "duration=2"]
-    line = refused(run(*options, kept, name="other"))
-    assert str(path) in line
-    assert "another mission" in line
+    begun = succeeded(run(*options, kept, name="other"))
+    assert "begin at their start" in (begun.folder / "explore.log").read_text()
+    assert steps[:3] == [0, 1, 0]
+    n_steps = len(steps)
+    again = succeeded(run(*options, kept, name="again"))
+    assert len(steps) == n_steps
+    assert (again.folder / "explore.log").read_text() == ""
+
+
+def test_jobs_of_a_sweep_may_share_their_checkpoints(run, steps, tmp_path):
+    kept = f"checkpoint.folder={tmp_path / 'kept'}"
+    for _ in range(2):
+        sweep = tmp_path / "sweep"
+        succeeded(run("-m", "network.loss=0,0.5", "duration=2", f"hydra.sweep.dir={sweep}", kept))
+        losses = [Finished(0, "", "", sweep / job).results()["rows"][0]["loss"] for job in "01"]
+        assert losses == [0, 0.5]
+        assert steps == [0, 1, 0, 1]
+
+
+def test_a_sweep_goes_on_in_its_folder(run, steps, tmp_path):
+    for _ in range(2):
+        succeeded(run("-m", "seed=0,1", "duration=2", f"hydra.sweep.dir={tmp_path / 'sweep'}"))
+        assert steps == [0, 1, 0, 1]
+
+
+def test_a_checkpoint_of_an_edited_mesh_is_refused(run, room, tmp_path):
+    mesh = tmp_path / "mesh.obj"
+    mesh.write_text(room.read_text())
+    options = [f"world.path={mesh}", "duration=2", f"checkpoint.folder={tmp_path / 'kept'}"]
+    succeeded(run(*options, name="first"))
+    mesh.write_text(room.read_text().replace("v 7.0", "v 7.5"))
+    line = refused(run(*options, name="edited"))
+    (path,) = (tmp_path / "kept").rglob("mission.safetensors")
+    assert f"{path} is the checkpoint of another mission (mesh=" in line
+    assert "checkpoint.folder" in line
 
 
 def test_a_damaged_checkpoint_is_named(run, tmp_path):
