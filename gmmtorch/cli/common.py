@@ -33,9 +33,14 @@ def conf_dir() -> str:
 
 
 def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any:
-    """Run a command; errors raised on purpose become one line and exit status 1, without a traceback."""
-    from gmmtorch.errors import GmmTorchError
+    """Run a command; errors raised on purpose become one line and exit status 1, without a traceback.
 
+    As a job of a sweep in a process of its own, it ends with the sweep.
+    """
+    from gmmtorch.errors import GmmTorchError
+    from gmmtorch.evaluation.worker_pool import end_with_parent
+
+    end_with_parent()
     try:
         return command(config)
     except GmmTorchError as error:

@@ -6,6 +6,10 @@ import concurrent.futures
 import multiprocessing
 import os
 import threading
+import time
+from typing import Any
+
+_GLANCE = 0.5  # seconds between looks at whether the parent is there
 
 
 def worker_pool(workers: int) -> concurrent.futures.ProcessPoolExecutor:
@@ -20,17 +24,23 @@ def worker_pool(workers: int) -> concurrent.futures.ProcessPoolExecutor:
 
 
 def end_with_parent() -> None:
-    """From now on this process, which multiprocessing started, ends as soon as its parent has ended.
+    """From now on this process, which multiprocessing or joblib started, ends as soon as its parent has.
 
     It ends as by a signal, in the midst of whatever it does: files that are to be whole are renamed into
-    their place (`gmmtorch.files`). In a process that multiprocessing did not start, nothing happens.
+    their place (`gmmtorch.files`). In a process that neither started, nothing happens.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
         return
 
+    sentinel: Any = parent.sentinel
+
     def wait() -> None:
-        parent.join()
+        if sentinel is not None:
+            parent.join()
+        else:  # joblib gives its processes none
+            while os.getppid() == parent.pid:
+                time.sleep(_GLANCE)
         os._exit(1)
 
     threading.Thread(target=wait, name="end with parent", daemon=True).start()

@@ -9,7 +9,18 @@ import pytest
 
 from gmmtorch.evaluation.worker_pool import end_with_parent, worker_pool
 
-_PARENT = """
+_JOBLIB = """
+from joblib import Parallel, delayed
+
+work = (
+    "from gmmtorch.evaluation.worker_pool import end_with_parent",
+    "end_with_parent()",
+    "print('at work', flush=True)",
+    "while True: pass",
+)
+Parallel(n_jobs=2)(delayed(exec)("\\n".join(work)) for _ in range(2))
+"""
+_POOL = """
 from gmmtorch.evaluation.worker_pool import worker_pool
 
 with worker_pool(2) as pool:
@@ -26,9 +37,10 @@ def test_what_workers_answer_is_heard() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe is open as long as anybody holds it")
-def test_workers_end_with_a_parent_that_is_killed() -> None:
+@pytest.mark.parametrize("program", [_POOL, _JOBLIB], ids=["pool", "joblib"])
+def test_workers_end_with_a_parent_that_is_killed(program: str) -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", _PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
         assert parent.stdout.readline() == "at work\n"
