@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
 from gmmtorch.sharing.envelope import loaded, stored, within
 from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import PointsMessage, encode_points
+from gmmtorch.sharing.messages import Message, PointsMessage, decode, encode_points
 from gmmtorch.sharing.point_messages import MOST_PARTS
 from gmmtorch.simulation.depth_camera import DepthFrame
 
@@ -31,6 +31,7 @@ class GridMapper(Mapper):
 
     Its own frames count in full; `shared`: teammates are sent, and count, the beams that were novel to
     the sender. The grid behind the window is `belief.grid`. `size`: robots of the team.
+    `decode`: what datagrams say, where others have asked already.
 
     Frames are numbered from 0 in each life of a robot: one that starts again is not heard until it is past
     what it said before.
@@ -50,9 +51,10 @@ class GridMapper(Mapper):
         memo: Memo,
         shared: bool,
         size: int,
+        decode: Callable[[bytes], Message] = decode,
     ) -> None:
         super().__init__(robot, local, belief, width, novelty, memo)
-        self._shared, self._size = shared, size
+        self._shared, self._size, self._decode = shared, size, decode
         self.refused: Counter[str] = Counter()
         self._n_frames = 0
         self._due: list[bytes] = []
@@ -114,7 +116,7 @@ class GridMapper(Mapper):
         """The evidence of the points of a frame that have arrived."""
 
         def make() -> CellEvidence:
-            said = [self._memo.decoded(datagram) for datagram in datagrams]
+            said = [self._decode(datagram) for datagram in datagrams]
             points = [message for message in said if isinstance(message, PointsMessage)]
             ends = torch.cat([message.ends for message in points]).double()
             is_hit = torch.cat([message.is_hit for message in points])

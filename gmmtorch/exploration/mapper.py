@@ -71,7 +71,7 @@ class Mapper(ABC):
 
     Args:
         robot: its number. width: of its images, pixels. novelty: when a beam is novel.
-        memo: shared by the robots of a simulation.
+        memo: of evidence; shared by the robots of a simulation.
     """
 
     def __init__(

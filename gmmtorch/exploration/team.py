@@ -34,6 +34,7 @@ _SLACK = 24
 filled in broad slabs a map draws each of them far less often. Planners see the window around the robot."""
 _ROUNDING = 4  # cells that the planner's window may be off the robot
 _REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
+_CAST = 16  # of each robot, what its messages tell of cells, which is large: of the last dozen seconds
 _REMEMBERED_ALONE = 64  # of a robot that nobody shares its memo with: what strangers send may be large
 
 
@@ -44,9 +45,10 @@ def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None)
     """
     poses = start_poses(world, options)
     network = Network(options.size, options.conditions, seed=options.seed)
-    memo, watch = Memo(_REMEMBERED), Stopwatch() if watch is None else watch
+    memo, evidence = Memo(_REMEMBERED), Memo(_CAST * options.size)
+    watch = Stopwatch() if watch is None else watch
     agents = [
-        make_agent(number, poses[number], world, options, network, memo, watch)
+        make_agent(number, poses[number], world, options, network, memo, evidence, watch)
         for number in range(options.size)
     ]
     union = BeliefMap(world.resolution, world.box, world.observable, options.belief)
@@ -78,12 +80,14 @@ def make_agent(
     options: TeamOptions,
     transport: Transport,
     memo: Memo | None = None,
+    evidence: Memo | None = None,
     watch: Stopwatch | None = None,
     incarnation: int = 0,
 ) -> Agent:
     """A robot at its start pose (4,), with a transport.
 
-    memo, watch: shared by the robots of a simulation; None: its own. incarnation: of its replica; what may
+    memo, evidence (of what datagrams say, and tell of cells), watch: shared by the robots of a simulation;
+    None: its own. incarnation: of its replica; what may
     be started again needs another each time (`record_ids.drawn_incarnation`).
 
     Raises `InvalidArgumentError` for options that do not go together.
@@ -92,7 +96,9 @@ def make_agent(
     # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
     needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
     clear = world.mesh.clearance(pose[None, :3]).clamp_max(needed)
-    camera, memo = options.camera, Memo(_REMEMBERED_ALONE) if memo is None else memo
+    memo = Memo(_REMEMBERED_ALONE) if memo is None else memo
+    evidence = Memo(_CAST) if evidence is None else evidence
+    camera = options.camera
     evaluator = ViewEvaluator(
         camera.horizontal_fov,
         camera.vertical_fov,
@@ -105,7 +111,7 @@ def make_agent(
     robot = Robot(
         number,
         pose,
-        _mapper(number, world, options, memo, incarnation),
+        _mapper(number, world, options, memo, evidence, incarnation),
         make_planner(options.planner, primitives, evaluator),
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
@@ -130,16 +136,19 @@ def _check_window(options: TeamOptions, resolution: float) -> None:
             )
 
 
-def _mapper(number: int, world: World, options: TeamOptions, memo: Memo, incarnation: int) -> Mapper:
+def _mapper(
+    number: int, world: World, options: TeamOptions, memo: Memo, evidence: Memo, incarnation: int
+) -> Mapper:
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
     local = SlidingVoxelMap(world.resolution, (x, y, z), _SLACK)
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief)
     width = options.camera.width
     if options.framework != "gmm_shared":
-        return GridMapper(number, local, belief, width, options.novelty, memo, options.shares, options.size)
+        team = options.shares, options.size
+        return GridMapper(number, local, belief, width, options.novelty, evidence, *team, memo.decoded)
     shared: Replica | Broadcast
     if options.codec == "quantized":
         shared = Replica(number, dim=3, incarnation=incarnation)
     else:
         shared = Broadcast(number, options.codec)
-    return MixtureMapper(number, local, belief, width, options.novelty, options.frame, memo, shared)
+    return MixtureMapper(number, local, belief, width, options.novelty, options.frame, evidence, shared)

@@ -21,7 +21,7 @@ from gmmtorch.exploration.returns import RestRule
 from gmmtorch.exploration.team import assemble
 from gmmtorch.exploration.world import World
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cell_evidence import cast_evidence
+from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
 from gmmtorch.sharing.link_conditions import Partition
 from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.solids import box
@@ -69,6 +69,14 @@ def test_nobody_touches_anything(mission: Mission) -> None:
         assert float(mission.world.mesh.clearance(torch.stack(path)[:, :3]).min()) >= radius
     one, other = (torch.stack(path)[:, :3] for path in mission.trajectories)
     assert float((one - other).norm(dim=1).min()) >= 2 * radius
+
+
+def test_what_messages_tell_of_cells_is_kept_for_a_while_alone(mission: Mission) -> None:
+    """By the robots together: it is the largest that they could keep, and ever more is said."""
+    memo, *others = [robot.mapper._memo for robot in mission.robots]
+    assert all(other is memo for other in others)
+    assert all(isinstance(value, CellEvidence) for value in memo._values.values())
+    assert len(memo._values) <= 16 * len(mission.robots)
 
 
 def test_the_row_is_whole_and_plain(mission: Mission) -> None:
