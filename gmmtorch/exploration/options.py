@@ -40,9 +40,9 @@ class TeamOptions:
     components, see `sharing.messages`; others than quantized are not repaired after losses. latency …
     partitions: of the network, see `LinkConditions`. announce_every (s): see `Heartbeat`. budget: bytes a
     second that a robot sends of its map and views; None: no limit.
-    sample_every: simulated seconds between the numbers kept. codecs: what the novel points are also
-    encoded with, to compare. margin: metres that robots keep between them. start: (size, 4) poses; None:
-    chosen by the world.
+    sample_every: simulated seconds between the numbers kept, to the nearest whole frame. codecs: what the
+    novel points are also encoded with, to compare. margin: metres that robots keep between them. start:
+    (size, 4) poses; None: chosen by the world.
     """
 
     framework: str = "gmm_shared"
@@ -121,6 +121,16 @@ class TeamOptions:
                     f"sensor.rate={self.rate} Hz with robot.duration={self.dynamics.duration} s and "
                     f"robot.step={self.dynamics.step} s makes {name} {ratio:g}; it must be a whole number."
                 )
+
+        frames = self.duration * self.rate
+        if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
+            near = " or ".join(
+                f"{n / self.rate:g}" for n in (math.floor(frames), math.floor(frames) + 1) if n
+            )
+            raise InvalidArgumentError(
+                f"duration={self.duration} s is no whole number of frames at sensor.rate={self.rate} Hz; "
+                f"take {near}."
+            )
 
     @property
     def tick_seconds(self) -> float:

@@ -117,6 +117,12 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.commands)
 
+    @property
+    def reach(self) -> float:
+        """Metres along an axis that a robot gets off from rest by a primitive, until it is at rest again."""
+        paths = self._rollout(torch.zeros(1, 7, dtype=torch.float64))[0]
+        return float(self.braking(paths[:, -1])[..., :3].norm(dim=-1).max())
+
     def rollout(self, states: Tensor) -> Tensor:
         """States (N, P, S, 7) after 1, 2, …, S steps of every primitive from states (N, 7).
 

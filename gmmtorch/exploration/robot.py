@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gmmtorch.exploration.launch import Launch
 from gmmtorch.exploration.mapper import Mapper, Sensed
 from gmmtorch.exploration.planning import Plan, Planner
 from gmmtorch.exploration.retreat import shortened
@@ -28,8 +29,8 @@ class Robot:
     """What one robot knows and does.
 
     state: (7,) x, y, z, yaw and the velocities v, v_z, ω now. path: (S, 7) the states of the plan it
-    follows. braking: (B, 7) how it would come to rest after it. start_radius: metres around the start that
-    are known to be free. trail: (N, 3) where it flew lately, the latest last.
+    follows. braking: (B, 7) how it would come to rest after it. trail: (N, 3) where it flew lately, the
+    latest last; at first the way on which it was carried to its start.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class Robot:
         planner: Planner,
         library: ViewLibrary,
         roadmap: Roadmap,
-        start_radius: float,
+        launch: Launch,
         rest: RestRule | None = None,
     ) -> None:
         self.number = number
@@ -51,10 +52,10 @@ class Robot:
         self.path_length = 0.0
         self.collisions = 0
         self.plans: dict[int, PlanMessage] = {}  # the last heard of each teammate
-        self._start = (pose[:3].double().clone(), start_radius)
+        self._known_free = launch.known_free
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
         self._kind = ""  # of the plan it follows
-        self.trail = pose[None, :3].double().clone()
+        self.trail = launch.trail.clone()
         self.returns = DiminishingReturns(rest)
         self._learned = 0.0
 
@@ -130,7 +131,7 @@ class Robot:
             planning_prior=planning_prior,
             free_below=rule.free,
             radius=radius,
-            known_free=[self._start],
+            known_free=self._known_free,
             obstacles=torch.cat(recent) if recent else torch.zeros(0, 3, dtype=torch.int64),
         )
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -20,7 +19,16 @@ from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic, clear_of
 from gmmtorch.occupancy.grid import check_resolution
 
-__all__ = ["Traffic", "clear_of", "collides", "feasible", "inflated", "surroundings_of"]
+__all__ = [
+    "Traffic",
+    "cells_in_sphere",
+    "clear_of",
+    "collides",
+    "feasible",
+    "inflated",
+    "passable_cells",
+    "surroundings_of",
+]
 
 _SPACING = 1.0
 """Cells between the points at which a path is checked; half of it is kept around the body besides."""
@@ -55,6 +63,25 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
     return found[inside, inside, inside].contiguous()
 
 
+def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
+    """Cells (nx, ny, nz), bool, in which the centre of a robot may be that knows these to be free."""
+    return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
+
+
+def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
+    """Cells (K, 3) int64 of the lattice that lie wholly in a sphere, centre (3,) and radius in metres."""
+    axes, squares = [], []
+    for x in center.tolist():
+        index = torch.arange(math.floor((x - radius) / resolution), math.floor((x + radius) / resolution) + 1)
+        near = index.double() * resolution - x
+        far = torch.maximum(near.abs(), (near + resolution).abs())  # of the cell's two faces
+        axes.append(index[far <= radius])
+        squares.append(far[far <= radius].square())
+    x, y, z = squares
+    within = (x[:, None, None] + y[:, None] + z <= radius**2).flatten()
+    return torch.cartesian_prod(*axes)[within]
+
+
 def surroundings_of(
     low: Tensor,
     resolution: float,
@@ -65,20 +92,19 @@ def surroundings_of(
     planning_prior: float,
     free_below: float,
     radius: float,
-    known_free: Iterable[tuple[Tensor, float]] = (),
+    known_free: Tensor | None = None,
     obstacles: Tensor | None = None,
 ) -> Surroundings:
     """What a planner reads, from the hits H and misses M of dense cells (nx, ny, nz).
 
     The map's occupancy is θ = (H + N_p)/(H + M + 2N_p), the planner's (H + 2N_p π)/(H + M + 2N_p). A cell
-    is free if observed with θ below `free_below` and hardly ever hit, or if it lies wholly in a sphere that
-    is known to be free.
+    is free if observed with θ below `free_below` and hardly ever hit, or if it is known to be free.
 
     Args:
         low: (3,) int64, index of the lowest cell on the lattice. resolution: side (m) of the cells.
         prior: N_p, rays. planning_prior: π, the planner's occupancy of what was not observed.
-        radius: of the robot (m). known_free: centres (3,) and radii (m) of spheres, world frame; one of
-            √3 (radius + 5/2 resolution) or more makes the cell of its centre passable.
+        radius: of the robot (m). known_free: (K, 3) int64, cells of the lattice; those of a sphere of
+            √3 (radius + 5/2 resolution) or more make the cell of its centre passable.
         obstacles: (C, 3) int64, cells of the lattice that are not free whatever is known of them.
     """
     for name, value in (("planning_prior", planning_prior), ("free_below", free_below)):
@@ -91,18 +117,17 @@ def surroundings_of(
     struck = (hits >= _STRUCK_RAYS) & (hits >= _STRUCK_SHARE * total)
     total += 2 * prior
     free = observed & ~struck & (hits + prior < free_below * total)
-    for center, reach in known_free:
-        _mark_sphere(free, low, resolution, center, reach)
-    if obstacles is not None:
-        inside = ((obstacles >= low) & (obstacles < low + torch.tensor(free.shape))).all(1)
-        free[(obstacles[inside] - low).unbind(1)] = False
+    for cells, value in ((known_free, True), (obstacles, False)):
+        if cells is not None:
+            inside = ((cells >= low) & (cells < low + torch.tensor(free.shape))).all(1)
+            free[(cells[inside] - low).unbind(1)] = value
     return Surroundings(
         low=low,
         resolution=resolution,
         occupancy=((hits + 2 * prior * planning_prior) / total).float(),
         observed=observed,
         free=free,
-        passable=~inflated(~free, radius + _SPACING / 2 * resolution, resolution),
+        passable=passable_cells(free, radius, resolution),
     )
 
 
@@ -178,21 +203,6 @@ def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
         wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
         blocked, done = wider, done + shift
     return blocked
-
-
-def _mark_sphere(free: Tensor, low: Tensor, resolution: float, center: Tensor, radius: float) -> None:
-    """Sets `free` (nx, ny, nz) in the cells that lie wholly in a sphere."""
-    windows, squares = [], []
-    for axis, size in enumerate(free.shape):
-        near = (torch.arange(size) + low[axis]).double() * resolution - float(center[axis])
-        far = torch.maximum(near.abs(), (near + resolution).abs())  # of the cell's two faces
-        within = (far <= radius).nonzero().squeeze(1)
-        if len(within) == 0:
-            return
-        windows.append(slice(int(within[0]), int(within[-1]) + 1))
-        squares.append(far[within].square())
-    x, y, z = squares
-    free[tuple(windows)] |= x[:, None, None] + y[:, None] + z <= radius**2
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:

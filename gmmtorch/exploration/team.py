@@ -11,6 +11,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.agent import Agent
 from gmmtorch.exploration.coordination import Coordination
 from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.launch import launch_from
 from gmmtorch.exploration.mapper import Mapper, Memo
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.exploration.mixture_mapper import MixtureMapper
@@ -57,15 +58,16 @@ def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None)
 
 def start_poses(world: World, options: TeamOptions) -> Tensor:
     """Where the robots start (n, 4). Raises `InvalidArgumentError` for where they cannot."""
-    start = options.start
-    poses = world.start_poses(options.size) if start is None else torch.tensor(start, dtype=torch.float64)
+    primitives = Primitives(options.dynamics)
+    if options.start is None:
+        return world.start_poses(options.size, primitives=primitives)
+    poses = torch.tensor(options.start, dtype=torch.float64)
     if poses.shape != (options.size, 4):
         raise InvalidArgumentError(
             f"team.start has shape {tuple(poses.shape)}; expected a pose x, y, z, yaw for each of "
             f"{options.size} robots."
         )
-    world.check_start(poses)
-    return poses
+    return world.check_start(poses, primitives)
 
 
 def coordination_of(options: TeamOptions) -> Coordination:
@@ -93,9 +95,6 @@ def make_agent(
     Raises `InvalidArgumentError` for options that do not go together.
     """
     _check_window(options, world.resolution)
-    # As much as a robot needs to be sure of to fly off from where it was set down, if it is that free.
-    needed = math.sqrt(3) * (options.dynamics.radius + 2.5 * world.resolution)
-    clear = world.mesh.clearance(pose[None, :3]).clamp_max(needed)
     memo = Memo(_REMEMBERED_ALONE) if memo is None else memo
     evidence = Memo(_CAST) if evidence is None else evidence
     camera = options.camera
@@ -108,6 +107,11 @@ def make_agent(
         n_beams=options.n_beams,
     )
     primitives = Primitives(options.dynamics)
+    launch = launch_from(world, pose[:3].double(), primitives)
+    if launch is None:
+        raise InvalidArgumentError(
+            f"pose={pose.tolist()} is no place that a robot can fly off from; move it."
+        )
     robot = Robot(
         number,
         pose,
@@ -115,7 +119,7 @@ def make_agent(
         make_planner(options.planner, primitives, evaluator),
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
-        start_radius=float(clear),
+        launch,
         rest=options.rest,
     )
     watch = Stopwatch() if watch is None else watch

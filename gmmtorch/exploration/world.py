@@ -16,6 +16,7 @@ from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataE
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.navigable import ON_PLANE, above_floor, connected, occupied_and_clear
 from gmmtorch.exploration.observable import observable_cells, view_directions, viewpoints
+from gmmtorch.exploration.primitives import Dynamics, Primitives
 from gmmtorch.exploration.starts import check_start, start_poses
 from gmmtorch.exploration.world_cache import kept_cells
 from gmmtorch.occupancy.cell_evidence import Box
@@ -96,8 +97,8 @@ class World:
             on_event: hears of the stages.
 
         Raises `DataError` for a mesh that no rays can be cast in, `InvalidArgumentError` for bounds that
-        hold none of it, a camera that sees nothing, or a world without room for a robot, and
-        `MemoryLimitError` for more than `MAX_CELLS` cells.
+        hold none of it, a camera that sees no farther than the next cells, or a world without room for a
+        robot, and `MemoryLimitError` for more than `MAX_CELLS` cells.
         """
         check_resolution(resolution)
         if not 0 < vertical_fov <= math.pi:
@@ -105,6 +106,11 @@ class World:
         for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
             if not (math.isfinite(value) and value > 0):
                 raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
+        if max_range <= robot_radius + 2 * resolution:
+            raise InvalidArgumentError(
+                f"max_range={max_range} m ends within two cells of the robot: robot_radius={robot_radius} m, "
+                f"resolution={resolution} m; take a longer range, or finer cells."
+            )
         triangles = checked_triangles(triangles, name)
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
@@ -117,7 +123,8 @@ class World:
             )
             if not bool(occupied.any()):
                 raise InvalidArgumentError(
-                    f"{name}: no surface in the bounds; the mesh extends from {_text(mesh.low, mesh.high)}."
+                    f"bounds={_listed(bounds)} hold no surface of {name}, which extends from "
+                    f"{_text(mesh.low, mesh.high)}; take wider bounds, with a floor."
                 )
             navigable = connected(clear, mesh, resolution, box, place, robot_radius, name)
             seen = observable_cells(
@@ -146,14 +153,23 @@ class World:
         cells = kept_cells(triangles, options, _CELLS, box.shape, work_out) if cache else work_out()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
 
-    def start_poses(self, n: int, spacing: float = 1.5, at: Sequence[float] | Tensor | None = None) -> Tensor:
-        """See `starts.start_poses`: `at` (3,) is `start` if not given."""
+    def start_poses(
+        self,
+        n: int,
+        spacing: float = 1.5,
+        at: Sequence[float] | Tensor | None = None,
+        primitives: Primitives | None = None,
+    ) -> Tensor:
+        """See `starts.start_poses`: `at` (3,) is `start` if not given, the primitives the usual ones."""
         place = self.start if at is None else _point(at, "at")
-        return start_poses(self, n, spacing, place)
+        return start_poses(self, n, spacing, place, self._flown(primitives))
 
-    def check_start(self, poses: Tensor) -> Tensor:
-        """See `starts.check_start`."""
-        return check_start(self, poses)
+    def check_start(self, poses: Tensor, primitives: Primitives | None = None) -> Tensor:
+        """See `starts.check_start`; the primitives are the usual ones if not given."""
+        return check_start(self, poses, self._flown(primitives))
+
+    def _flown(self, primitives: Primitives | None) -> Primitives:
+        return Primitives(Dynamics(radius=self.robot_radius)) if primitives is None else primitives
 
     def centers(self, cells: Tensor) -> Tensor:
         """Centres (..., 3), metres, of cells (..., 3) relative to the low corner of the box."""
@@ -165,6 +181,11 @@ def _point(place: Sequence[float] | Tensor, name: str) -> Tensor:
     if point.shape != (3,) or not bool(torch.isfinite(point).all()):
         raise InvalidArgumentError(f"{name}={place} must be three finite numbers: x, y, z in metres.")
     return point
+
+
+def _listed(bounds: Sequence[float] | Tensor | None) -> list[float]:
+    """As the user wrote them."""
+    return torch.as_tensor(() if bounds is None else bounds, dtype=torch.float64).tolist()
 
 
 def _text(low: Tensor, high: Tensor) -> str:
@@ -179,7 +200,7 @@ def _lattice_box(
         ends = torch.as_tensor(bounds, dtype=torch.float64)
         if ends.shape != (6,) or not bool(torch.isfinite(ends).all()):
             raise InvalidArgumentError(
-                f"bounds={bounds} must be six finite numbers, x0, y0, z0, x1, y1, z1 (m)."
+                f"bounds={_listed(bounds)} must be six finite numbers, x0, y0, z0, x1, y1, z1 (m)."
             )
         low, high = ends[:3], ends[3:]
         if not bool((low < high).all()):
@@ -193,7 +214,8 @@ def _lattice_box(
     if n_cells > MAX_CELLS:
         raise MemoryLimitError(
             f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)}, more than "
-            f"{MAX_CELLS:.3g}; take a coarser resolution, or tighter bounds."
+            f"{MAX_CELLS:.3g}; take a coarser resolution (world.resolution), or tighter bounds "
+            "(world.bounds); is the mesh in metres, not in millimetres?"
         )
     return Box(first.long(), last.long() + 1)
 

@@ -18,12 +18,14 @@ from gmmtorch.errors import DataError
 from gmmtorch.exploration.agent import Agent
 from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.launch import Launch
 from gmmtorch.exploration.mapper import Mapper, Memo
 from gmmtorch.exploration.options import TeamOptions
 from gmmtorch.exploration.planning import Plan, PlanningTask
 from gmmtorch.exploration.primitives import Primitives
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.safety import cells_in_sphere
 from gmmtorch.exploration.stopwatch import Stopwatch
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.view_library import ViewLibrary
@@ -32,6 +34,7 @@ from gmmtorch.sharing.messages import PlanMessage, decode, encode_components, en
 from gmmtorch.sharing.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
+LAUNCH = Launch(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])
 PRIMITIVES = Primitives(TeamOptions().dynamics)
 EVALUATOR = ViewEvaluator(
     CAMERA.horizontal_fov, CAMERA.vertical_fov, CAMERA.max_range, resolution=0.2, n_beams=20
@@ -79,7 +82,7 @@ def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent
         local, belief = made.local, made.belief
         made = GridMapper(number, local, belief, CAMERA.width, NOVELTY, Memo(64), team.shares, team.size)
     library = ViewLibrary(number, incarnation=0)
-    robot = Robot(number, START, made, Ahead(), library, Roadmap(), start_radius=1.4)
+    robot = Robot(number, START, made, Ahead(), library, Roadmap(), LAUNCH)
     post = Post()
     return Agent(robot, post, EVALUATOR, PRIMITIVES, team, Memo(256), Stopwatch()), post
 

@@ -273,8 +273,14 @@ def test_a_robot_that_is_boxed_in_waits_while_the_mission_goes_on() -> None:
     world = World.from_mesh(room(cage), start=(6.0, 4.0, 1.3), cache=False, name="cage")
     caged = World.from_mesh(room(cage), start=(1.9, 1.9, 1.1), cache=False, name="caged")
     both = replace(world, navigable=world.navigable | caged.navigable)
-    start = ((6.0, 4.0, 1.3, 0.0), (1.9, 1.9, 1.1, 0.0))
-    mission = flown(both, replace(SMALL, duration=12.0, start=start))
+    start = ((6.0, 4.0, 1.3, 0.0), (3.8, 6.0, 1.1, 0.0))
+    mission = assemble(both, replace(SMALL, duration=12.0, start=start))
+    _, shut = mission.robots
+    shut.state[:3] = torch.tensor([1.9, 1.9, 1.1])  # where no robot may start
+    shut.trail = shut.state[None, :3].clone()
+    mission.trajectories[1] = [shut.state[:4].clone()]
+    while not mission.is_over:
+        mission.step()
     assert sum(robot.collisions for robot in mission.robots) == 0
     path = torch.stack(mission.trajectories[1])[:, :3]
     assert float((path - path[0]).norm(dim=1).max()) < 0.8
@@ -307,3 +313,12 @@ START: dict[str, Callable[[], TeamOptions]] = {
 def test_what_cannot_begin_says_so_before_the_first_step(world: World, case: str) -> None:
     with pytest.raises(InvalidArgumentError, match=r"\w+"):
         assemble(world, START[case]())
+
+
+def test_a_duration_that_ends_within_a_frame_is_refused_with_those_that_do_not() -> None:
+    with pytest.raises(InvalidArgumentError, match=r"duration=2.5 s .*sensor.rate=1.0 Hz; take 2 or 3\."):
+        replace(SMALL, duration=2.5)
+    with pytest.raises(InvalidArgumentError, match=r"duration=0.4 s .*; take 1\."):
+        replace(SMALL, duration=0.4)
+    with pytest.raises(InvalidArgumentError, match=r"duration=3.0 s .*sensor.rate=0.5 Hz; take 2 or 4\."):
+        replace(SMALL, duration=3.0, rate=0.5)

@@ -43,7 +43,6 @@ def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> Pla
         planning_prior=0.125,
         free_below=0.2,
         radius=0.3,
-        known_free=[],
         obstacles=torch.zeros(0, 3, dtype=torch.int64),
     )
     given = {

@@ -10,10 +10,12 @@ from sharing.message_examples import assert_same
 from torch import Tensor
 
 from gmmtorch.exploration.grid_mapper import GridMapper
+from gmmtorch.exploration.launch import Launch
 from gmmtorch.exploration.mapper import Memo
 from gmmtorch.exploration.planning import Plan
 from gmmtorch.exploration.roadmap import Roadmap
 from gmmtorch.exploration.robot import Robot
+from gmmtorch.exploration.safety import cells_in_sphere
 from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
 from gmmtorch.exploration.view_library import ViewLibrary
 from gmmtorch.mapping.novelty import NoveltyRule
@@ -48,7 +50,8 @@ def robot(start_radius: float = 0.0) -> Robot:
         0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
     )
     mapper.center_on(START[:3])
-    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), start_radius)
+    launch = Launch(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
+    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch)
 
 
 def plan(path: Tensor) -> Plan:

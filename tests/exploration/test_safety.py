@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.safety import feasible, inflated, surroundings_of
+from gmmtorch.exploration.safety import cells_in_sphere, feasible, inflated, surroundings_of
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic
 
@@ -145,7 +145,8 @@ def test_known_free_spheres_free_the_cells_that_lie_wholly_in_them(seed, radius,
     nothing = torch.zeros(9, 8, 10)
     found = surroundings_of(
         low, CELL, nothing, nothing,
-        prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS, known_free=[(center, radius)],
+        prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS,
+        known_free=cells_in_sphere(center, radius, CELL),
     )  # fmt: skip
     cells = torch.cartesian_prod(*[torch.arange(n) for n in (9, 8, 10)]) + low
     corner = torch.tensor(list(itertools.product((0, 1), repeat=3)))
@@ -162,7 +163,7 @@ def test_a_large_enough_start_sphere_lets_a_robot_leave():
             center = torch.rand(3, generator=seeded(seed), dtype=torch.float64)
             found = surroundings_of(
                 LOW, CELL, nothing, nothing, prior=1.0, planning_prior=0.125, free_below=0.25,
-                radius=radius, known_free=[(center, math.sqrt(3) * (radius + 2.5 * CELL))],
+                radius=radius, known_free=cells_in_sphere(center, math.sqrt(3) * (radius + 2.5 * CELL), CELL),
             )  # fmt: skip
             assert bool(found.is_passable(center))
 
@@ -172,7 +173,7 @@ def test_cells_of_recent_returns_are_never_free():
     found = surroundings_of(
         LOW, CELL, torch.zeros(SHAPE), torch.full(SHAPE, 50.0),
         prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS, obstacles=obstacles,
-        known_free=[(torch.tensor([0.1, 0.7, 0.5]), 1.0)],
+        known_free=cells_in_sphere(torch.tensor([0.1, 0.7, 0.5]), 1.0, CELL),
     )  # fmt: skip
     assert (~found.free).nonzero().tolist() == [[4, 4, 4], [24, 27, 14]]
     assert not bool(found.passable[24, 27, 14])

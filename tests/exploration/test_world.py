@@ -118,7 +118,10 @@ def test_a_start_chooses_the_part_of_the_world_that_is_flown_in():
         ({"bounds": (5, 0, 0, 1, 6, 3)}, "hold nothing"),
         ({"bounds": (0, 0, 0, 5, 6, math.nan)}, "six finite numbers"),
         ({"bounds": (0, 0, 0, 5)}, "six finite numbers"),
-        ({"bounds": (1, 1, 1, 2, 2, 2)}, "no surface in the bounds"),
+        ({"bounds": (0, 0, 0, 5)}, r"bounds=\[0.0, 0.0, 0.0, 5.0\]"),
+        ({"bounds": (1, 1, 1, 2, 2, 2)}, r"bounds=\[1.0, .* 2.0\] hold no surface of mesh"),
+        ({"max_range": 0.7}, r"max_range=0.7 .*robot_radius=0.3 .*resolution=0.2"),
+        ({"resolution": 3.0}, r"max_range=6.0 .*resolution=3.0"),
         ({"robot_radius": 3.0}, "robot_radius=3.0"),
         ({"robot_radius": 0.0}, "robot_radius=0.0"),
         ({"vertical_fov": 0.0}, "vertical_fov=0.0"),
@@ -138,6 +141,8 @@ def test_meshes_that_are_none_and_lattices_too_fine_are_refused():
         World.from_mesh(HALL[:0], cache=False)
     with pytest.raises(MemoryLimitError, match="coarser resolution"):
         World.from_mesh(HALL, 0.001, cache=False)
+    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not in millimetres"):
+        World.from_mesh(1000 * HALL, cache=False)
 
 
 def test_starts_are_apart_in_sight_roomy_and_level(hall):
@@ -161,7 +166,7 @@ def test_without_a_place_teams_start_at_an_end_and_large_ones_fit(hall):
     one = hall.start_poses(1)
     assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
     assert len(hall.check_start(hall.start_poses(16, 1.0))) == 16
-    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* 500 were asked for"):
+    with pytest.raises(InvalidArgumentError, match=r"hall has room for \d+ robots .* team.size=500.*a floor"):
         hall.start_poses(500)
     for n in (0, 1.5):
         with pytest.raises(InvalidArgumentError, match="n="):
@@ -171,13 +176,16 @@ def test_without_a_place_teams_start_at_an_end_and_large_ones_fit(hall):
 @pytest.mark.parametrize(
     ("pose", "message"),
     [
-        ((0.25, 3.0, 1.5, 0.0), r"start pose 1 at \(0.25, 3.00, 1.50\) is 0.15 m from a surface"),
+        (
+            (0.25, 3.0, 1.5, 0.0),
+            r"team.start\[1\]=\[0.25, 3, 1.5, 0\] is 0.15 m from .*move it, for instance to \[",
+        ),
         ((4.1, 2.0, 1.5, 0.0), "from a surface"),
-        ((7.8, 4.6, 0.85, 0.0), "in a solid, cut off"),
-        ((-3.0, 2.0, 1.5, 0.0), "outside the bounds of hall"),
+        ((7.8, 4.6, 0.85, 0.0), "is in a solid, or in another part, which world.bounds="),
+        ((-3.0, 2.0, 1.5, 0.0), r"outside the bounds of hall, \[0, 0, 0\] to \[10, 6, 3\] m"),
         ((2.0, 2.0, 1.5, math.nan), "not finite"),
         ((math.inf, 2.0, 1.5, 0.0), "not finite"),
-        ((1.3, 1.0, 1.5, 0.0), "touches the robot of start pose 0"),
+        ((1.3, 1.0, 1.5, 0.0), r"touches the robot of team.start\[0\]"),
     ],
 )
 def test_starts_where_no_robot_can_be_are_named(hall, pose, message):

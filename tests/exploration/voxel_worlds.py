@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.exploration.planners import Plan, Planner, PlanningTask
 from gmmtorch.exploration.primitives import Dynamics, Primitives
 from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.safety import surroundings_of
+from gmmtorch.exploration.safety import cells_in_sphere, surroundings_of
 from gmmtorch.exploration.surroundings import Surroundings
 from gmmtorch.exploration.traffic import Traffic
 from gmmtorch.exploration.view_library import ViewLibrary
@@ -114,7 +114,7 @@ class Explorer:
             planning_prior=0.125,
             free_below=0.35,
             radius=0.3,
-            known_free=[(self.start, 1.3)],
+            known_free=cells_in_sphere(self.start, 1.3, RESOLUTION),
         )
 
     def task(self, generator: torch.Generator, traffic: Traffic = NOBODY) -> PlanningTask:

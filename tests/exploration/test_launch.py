@@ -1,0 +1,140 @@
+"""Robots set down near walls, near the floor and in corridors fly off, or are refused before they try."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from exploration.furnished_room import SMALL, room
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.launch import launch_from
+from gmmtorch.exploration.mission import Mission
+from gmmtorch.exploration.primitives import Dynamics, Primitives
+from gmmtorch.exploration.safety import cells_in_sphere
+from gmmtorch.exploration.team import assemble, start_poses
+from gmmtorch.exploration.world import World
+from gmmtorch.simulation.solids import box
+
+PRIMITIVES = Primitives(Dynamics())
+ALONE = replace(SMALL, framework="grid_isolated", size=1)
+
+
+@pytest.fixture(scope="module")
+def hall() -> World:
+    return World.from_mesh(room(), cache=False, name="hall")
+
+
+def corridor(width: float, height: float) -> World:
+    walls = box((0.1, 0.1, 0.1), (12.1, 0.1 + width, 0.1 + height))
+    return World.from_mesh(walls, cache=False, name="corridor")
+
+
+def flown(world: World, *start: tuple[float, ...], size: int = 1, duration: float = 8.0) -> Mission:
+    options = replace(ALONE, size=len(start) or size, start=start or None, duration=duration)
+    mission = assemble(world, options)
+    while not mission.is_over:
+        mission.step()
+    assert not any(robot.collisions for robot in mission.robots)
+    return mission
+
+
+def place(*coordinates: float) -> torch.Tensor:
+    return torch.tensor(coordinates, dtype=torch.float64)
+
+
+# -- what it is told --------------------------------------------------------------------------------------
+
+
+def test_with_room_it_knows_the_sphere_that_is_clear_and_no_more(hall: World) -> None:
+    here = place(5.1, 4.3, 1.7)
+    launch = launch_from(hall, here, PRIMITIVES)
+    assert launch is not None
+    assert torch.equal(launch.trail, here[None])
+    clear = min(float(hall.mesh.clearance(here[None])), 3**0.5 * (0.3 + 2.5 * 0.2))
+    assert torch.equal(launch.known_free, cells_in_sphere(here, clear, 0.2))
+
+
+@settings(max_examples=15)
+@given(x=st.floats(0.45, 9.7), y=st.floats(0.45, 7.7), z=st.floats(0.45, 2.7), seed=st.integers(0, 2))
+def test_what_it_is_told_is_true_and_the_way_touches_nothing(
+    hall: World, x: float, y: float, z: float, seed: int
+) -> None:
+    against = [place(0.42, y, z), place(x, 7.78, z), place(x, y, 0.42)][seed]
+    launch = launch_from(hall, against, PRIMITIVES)
+    assert launch is not None
+    cells = launch.known_free - hall.box.low
+    assert bool((cells >= 0).all())
+    assert not bool(hall.occupied[cells.unbind(1)].any())
+    assert torch.equal(launch.trail[-1], against)
+    assert float((launch.trail[0] - against).norm()) < 2
+    assert float(hall.mesh.clearance(launch.trail).min()) > 0.3
+    if len(launch.trail) > 1:
+        assert float((launch.trail[1:] - launch.trail[:-1]).norm(dim=1).max()) < 0.051
+
+
+# -- missions ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        (0.46, 4.0, 1.5, 0.0),  # beside a wall
+        (0.46, 4.0, 1.5, 3.1),  # facing it
+        (0.8, 4.0, 1.5, 0.0),
+        (3.0, 4.0, 0.42, 0.0),  # on the floor
+        (3.0, 4.0, 0.75, 0.0),
+        (0.45, 0.45, 0.45, 0.8),  # in a corner
+    ],
+)
+def test_a_robot_that_starts_near_a_surface_flies_off(hall: World, start: tuple[float, ...]) -> None:
+    (robot,) = flown(hall, start).robots
+    assert robot.path_length > 1
+
+
+def test_teams_start_where_a_narrow_corridor_is_widest_and_fly() -> None:
+    world = corridor(1.8, 2.5)
+    mission = flown(world, size=2, duration=20.0)
+    starts = torch.stack([path[0][:3] for path in mission.trajectories])
+    assert float(world.mesh.clearance(starts).min()) > 0.75
+    assert min(robot.path_length for robot in mission.robots) > 0.3
+    assert max(robot.path_length for robot in mission.robots) > 2
+
+
+def test_a_low_room_is_flown_in_at_half_its_height() -> None:
+    world = World.from_mesh(box((0.1, 0.1, 0.1), (8.1, 6.1, 1.5)), cache=False, name="low")
+    mission = flown(world)
+    assert abs(float(mission.trajectories[0][0][2]) - 0.8) < 0.11
+    assert mission.robots[0].path_length > 2
+
+
+def test_where_nothing_leads_anywhere_starts_are_refused_and_told_where_to() -> None:
+    closet = box((3.1, 3.1, 0.1), (4.7, 4.7, 2.0))
+    hall = World.from_mesh(room(closet), cache=False, name="hall")
+    inside = World.from_mesh(room(closet), start=(3.9, 3.9, 1.1), cache=False, name="hall")
+    with pytest.raises(
+        InvalidArgumentError, match=r"team.start\[0\]=\[3.9, 3.9, 1.1, 0\] is not in the part .*for instance"
+    ) as error:
+        flown(hall, (3.9, 3.9, 1.1, 0.0))
+    moved = tuple(float(x) for x in str(error.value).split("for instance to [")[1].split("]")[0].split(","))
+    assert len(start_poses(hall, replace(ALONE, start=(moved,)))) == 1
+    with pytest.raises(
+        InvalidArgumentError, match=r"team.start\[0\].* nothing that leads anywhere .*robot.radius=0.3 m"
+    ):
+        flown(inside, (3.9, 3.9, 1.1, 0.0))
+    with pytest.raises(InvalidArgumentError, match=r"no places were found .*robot.radius=0.3 .*team.start"):
+        flown(inside)
+
+
+def test_above_no_floor_robots_are_told_so() -> None:
+    floorless = torch.cat([room()[:10], box((1.1, 1.1, 0.1), (3.1, 3.1, 0.3))])
+    world = World.from_mesh(floorless, cache=False, name="hall")
+    with pytest.raises(
+        InvalidArgumentError, match=r"room for \d robots? that starts? .*team.size=9.*a floor"
+    ):
+        flown(world, size=9)
+    with pytest.raises(InvalidArgumentError, match=r"team.start\[0\].* has no surface of hall below it"):
+        flown(world, (6.0, 5.0, 1.5, 0.0))
