@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from gmmtorch.errors import DataError
@@ -19,16 +20,24 @@ def former_sessions(path: str | Path, session: bytes) -> frozenset[bytes]:
 
     To be called before anything is sent in `session`: see `FramedTransport.session`. See docs/network.md.
 
-    Raises `DataError` for a file that is none of these, and `OutputError` where it cannot be written.
+    Raises `DataError` for a file that is none of these, and `OutputError` where it cannot be written: those
+    that were kept before are `known_sessions`.
     """
     path = Path(path)
-    known = _read(path) if path.exists() else []
-    former = [one for one in known if one != session]
+    former = [one for one in _read(path) if one != session]
     write_durably(path, b"".join([_MAGIC, *former[1 - MOST_SESSIONS :], session]))
     return frozenset(former)
 
 
+def known_sessions(path: str | Path) -> frozenset[bytes]:
+    """Those kept at `path`, and nothing more. Raises `DataError` for a file that is none of these."""
+    return frozenset(_read(Path(path)))
+
+
 def _read(path: Path) -> list[bytes]:
+    """Oldest first; none where there is no file."""
+    if not os.path.exists(path):  # unlike a Path's own, no error where nobody may look
+        return []
     data = read(path, _MOST_BYTES)
     if data is None or not data.startswith(_MAGIC) or (len(data) - len(_MAGIC)) % SESSION_BYTES:
         raise DataError(

@@ -74,7 +74,8 @@ class Journal:
 
         Raises `InvalidArgumentError` where another process has the folder; `DataError` where it is another
         robot's, or holds nothing that can be read; `OutputError` where it cannot be written to: the replica
-        is restored then. Damage that leaves something to be used is logged, and in `restored`.
+        is restored then, from what can be read. Damage that leaves something to be used is logged, and in
+        `restored`.
         """
         if sync not in SYNCS:
             raise InvalidArgumentError(f"sync={sync!r} must be one of {', '.join(SYNCS)}.")
@@ -89,7 +90,12 @@ class Journal:
         self._number = self._size = self._snapshot_at = 0
         self._file = -1
         self._in_snapshot = Intervals.empty()  # names of what the last one has
-        self._lock = locked(self.path)
+        try:
+            self._lock = locked(self.path)
+        except OutputError:
+            if os.path.isdir(self.path):  # on a disk that is now for reading alone, say
+                restore(self.path, replica)
+            raise
         try:
             self._number = max([0, *numbers(self.path, SNAPSHOT), *numbers(self.path, LOG)])
             self.restored = restore(self.path, replica)

@@ -20,8 +20,12 @@ def place(folder: Path, number: int, suffix: str) -> Path:
 
 
 def numbers(folder: Path, suffix: str) -> list[int]:
-    """Of the files with that suffix, rising."""
-    matches = (re.fullmatch(r"(\d{8,18})" + re.escape(suffix), name) for name in os.listdir(folder))
+    """Of the files with that suffix, rising. Raises `OutputError` for a folder that cannot be listed."""
+    try:
+        names = os.listdir(folder)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be listed: {error.strerror or error}.") from error
+    matches = (re.fullmatch(r"(\d{8,18})" + re.escape(suffix), name) for name in names)
     return sorted(int(match[1]) for match in matches if match)
 
 

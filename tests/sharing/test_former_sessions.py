@@ -7,7 +7,7 @@ import secrets
 import pytest
 
 from gmmtorch.errors import DataError, OutputError
-from gmmtorch.sharing.former_sessions import MOST_SESSIONS, former_sessions
+from gmmtorch.sharing.former_sessions import MOST_SESSIONS, former_sessions, known_sessions
 
 
 def test_each_start_knows_those_before_it(tmp_path):
@@ -41,7 +41,17 @@ def test_a_file_that_is_something_else_is_named_and_left(tmp_path, data):
     assert path.read_bytes() == data
 
 
+def test_what_is_kept_is_known_without_a_word(tmp_path):
+    path = tmp_path / "sessions_3"
+    assert known_sessions(path) == frozenset()
+    assert not path.exists()
+    for session in (bytes(8), b"12345678"):
+        former_sessions(path, session)
+    assert known_sessions(path) == {bytes(8), b"12345678"}
+
+
 def test_where_it_cannot_be_written_that_is_said(tmp_path):
     (tmp_path / "file").write_bytes(b"")
+    assert known_sessions(tmp_path / "file" / "sessions") == frozenset()
     with pytest.raises(OutputError, match="sessions cannot be written"):
         former_sessions(tmp_path / "file" / "sessions", bytes(8))

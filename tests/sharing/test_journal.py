@@ -701,6 +701,30 @@ def test_a_full_disk_on_opening_gives_the_replica_all_the_same(tmp_path):
     assert reopened(tmp_path)[0].digest() == replica.digest()
 
 
+@pytest.mark.parametrize("what", ["lock", "folder"])
+def test_a_disk_for_reading_alone_gives_the_replica_all_the_same(tmp_path, monkeypatch, what):
+    datagrams = spoken(1, 10)
+    kept(tmp_path, datagrams)
+    opened, listed = os.open, os.listdir
+
+    def reads(path, flags, *mode, **options):
+        if flags & (os.O_WRONLY | os.O_RDWR):
+            raise OSError(errno.EROFS, "Read-only file system")
+        return opened(path, flags, *mode, **options)
+
+    def lists(path):
+        if what == "folder":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return listed(path)
+
+    monkeypatch.setattr(os, "open", reads)
+    monkeypatch.setattr(os, "listdir", lists)
+    replica = Replica(0)
+    with pytest.raises(OutputError, match="Read-only" if what == "lock" else "cannot be listed"):
+        Journal(tmp_path, replica)
+    assert replica.digest() == (told(datagrams) if what == "lock" else Replica(0)).digest()
+
+
 # -- killed ------------------------------------------------------------------------------------------------
 
 
