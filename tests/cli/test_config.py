@@ -241,9 +241,12 @@ def test_results_go_to_outputs_unless_told_otherwise(command):
         node = compose(command, return_hydra_config=True, overrides=["hydra.job.num=3"]).hydra
         assert node.job.name == command
         assert node.job.chdir is False
-        assert node.run.dir.startswith(f"outputs/{command}/")
-        assert node.sweep.dir.startswith(f"outputs/{command}/")
-        assert node.sweep.subdir == "3"
+        # Robots may start in the same second.
+        number = "_robot-0" if command == "robot" else ""
+        for place in (node.run.dir, node.sweep.dir):
+            assert re.fullmatch(rf"outputs/{command}/[-_\d]{{19}}({number})?", place)
+        assert node.run.dir.endswith(number)
+        assert node.sweep.subdir == f"3{number}"
 
 
 @pytest.mark.parametrize(
