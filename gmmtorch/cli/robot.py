@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import signal
 import stat
@@ -17,14 +18,13 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch.cli import common, links, maps, missions, schema
+from gmmtorch.cli.outputs import Outputs, terse
+from gmmtorch.cli.robot_memory import RobotMemory, facts_of
 
 if TYPE_CHECKING:
-    from gmmtorch.datasets import Dataset
     from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.node import Node
     from gmmtorch.sharing.framed_transport import FramedTransport
-    from gmmtorch.sharing.journal import Journal
-    from gmmtorch.sharing.replica import Replica
 
 TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 """In the environment, the process that has started this one; where that ends, this does, too."""
@@ -49,7 +49,8 @@ def main() -> None:
 
 
 def _guarded(answers: IO[str] | None, config: DictConfig) -> None:
-    common.run_guarded(functools.partial(run, answers=answers), config)
+    with terse():
+        common.run_guarded(functools.partial(run, answers=answers), config)
 
 
 def _is_asked() -> bool:
@@ -95,13 +96,15 @@ def _run(config: DictConfig, answers: IO[str] | None) -> None:
             "clock=lockstep is for the robots that gmmtorch-team starts; take clock=wall."
         )
     folder = common.run_dir()
+    memory = RobotMemory(config, folder)
+    memory.check()
     with ExitStack() as stack:
         transport = links.open_link(config, config.id)
         transport.lose(config.network.loss, config.seed + config.id)
         stack.callback(transport.close)
-        _know_former(config, folder, transport)
+        memory.disown_former(transport)
         make = _flying if config.source == "world" else _replay
-        node = make(config, folder, transport, stack)
+        node = make(config, memory, transport, stack)
         stack.callback(node.close)
         if answers is None:
             _by_the_clock(config, node, folder)
@@ -132,6 +135,10 @@ def check_options(config: DictConfig) -> None:
         )
     if not config.evaluation.every > 0:
         raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
+    if not 0 < config.speed < math.inf:
+        raise InvalidArgumentError(f"speed={config.speed} must be above zero, and finite.")
+    if not 0 <= config.settle < math.inf:
+        raise InvalidArgumentError(f"settle={config.settle} must be at least zero seconds, and finite.")
     if config.clock == "lockstep":
         if config.source != "world":
             raise InvalidArgumentError("clock=lockstep is for source=world; logs are replayed by the clock.")
@@ -143,12 +150,21 @@ def check_options(config: DictConfig) -> None:
             raise InvalidArgumentError(
                 f"speed={config.speed} is for clock=wall: in step time passes as fast as robots can think."
             )
+    if config.source == "log":
+        if config.log.dataset is None:
+            raise InvalidArgumentError(
+                "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
+            )
+        if not 0 < config.log.rate < math.inf:
+            raise InvalidArgumentError(f"log.rate={config.log.rate} must be above zero, and finite.")
 
 
 # -- the robot ------------------------------------------------------------------------------------
 
 
-def _flying(config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack) -> FlyingNode:
+def _flying(
+    config: DictConfig, memory: RobotMemory, transport: FramedTransport, stack: ExitStack
+) -> FlyingNode:
     """A robot with a simulated camera in a simulated world."""
     from gmmtorch.exploration.flying import FlyingNode
     from gmmtorch.exploration.team import make_agent, start_poses
@@ -162,53 +178,35 @@ def _flying(config: DictConfig, folder: Path, transport: FramedTransport, stack:
     pose = start_poses(world, options)[config.id]
     agent = make_agent(config.id, pose, world, options, transport, incarnation=life)
     replica = getattr(agent.robot.mapper, "shared", None)
-    journal = None if config.clock == "lockstep" else _journal(config, folder, replica, stack)
+    journal = memory.journal(replica, stack)
     if config.clock != "lockstep" and options.shares and not isinstance(replica, Replica):
         common.logger.warning(_NO_RESTART, config.team.name, config.codec)
     return FlyingNode(agent, world, options, transport, journal)
 
 
-def _replay(config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack) -> Node:
+def _replay(config: DictConfig, memory: RobotMemory, transport: FramedTransport, stack: ExitStack) -> Node:
     """A robot that maps a recorded log, or its part of one."""
     from gmmtorch.datasets.part import Part, part_of
     from gmmtorch.errors import check_whole
     from gmmtorch.exploration.replay import ReplayNode
     from gmmtorch.sharing.replica import Replica
 
-    scans = _scans(config)
+    scans = common.open_dataset(config.log.dataset)
     indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
     part = part_of(len(indices), config.id, config.team.size, config.log.part)
     replica = Replica(config.id)
-    journal = _journal(config, folder, replica, stack)
+    journal = memory.journal(replica, stack)
     return ReplayNode(
         replica,
         Part(scans, [indices[row] for row in part]),
         transport,
         maps.map_factory(_map_options(config)),
         journal=journal,
-        folder=None if journal is None else _home(config, folder) / f"progress_{config.id}",
-        facts=_facts(config),
+        folder=memory.progress,
+        facts=facts_of(config),
         announce_every=config.network.announce,
         budget=config.network.budget,
     )
-
-
-def _scans(config: DictConfig) -> Dataset:
-    from gmmtorch.errors import InvalidArgumentError
-
-    if config.log.dataset is None:
-        raise InvalidArgumentError(
-            "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
-        )
-    return common.open_dataset(config.log.dataset)
-
-
-def _facts(config: DictConfig) -> dict[str, Any]:
-    """What part of what log it is: all that must be the same for a robot that goes on."""
-    dataset = common.as_options(config.log.dataset)
-    if dataset.get("path") is not None:
-        dataset["path"] = str(Path(dataset["path"]).resolve())
-    return {**dataset, **{name: config.log[name] for name in ("every", "part")}, "of": config.team.size}
 
 
 def _map_options(config: DictConfig) -> DictConfig:
@@ -217,39 +215,15 @@ def _map_options(config: DictConfig) -> DictConfig:
     return OmegaConf.create({"map": config.log.map, "runtime": runtime, "seed": config.seed})
 
 
-def _home(config: DictConfig, folder: Path) -> Path:
-    """Where what the robot needs to start again is kept."""
-    return folder if config.journal.folder is None else Path(config.journal.folder)
-
-
-def _journal(config: DictConfig, folder: Path, replica: Replica | None, stack: ExitStack) -> Journal | None:
-    """What keeps the robot's map on disk, where it is one that can be kept; closed with the stack."""
-    from gmmtorch.sharing.journal import Journal
-    from gmmtorch.sharing.replica import Replica
-
-    if not config.journal.enabled or not isinstance(replica, Replica):
-        return None
-    place = _home(config, folder) / f"journal_{config.id}"
-    return stack.enter_context(Journal(place, replica, sync=config.journal.sync))
-
-
-def _know_former(config: DictConfig, folder: Path, transport: FramedTransport) -> None:
-    """What the robot said before it was started again is no other robot's, though it has the same number."""
-    from gmmtorch.sharing.former_sessions import former_sessions
-
-    if config.journal.enabled and config.clock == "wall":
-        kept = _home(config, folder) / f"sessions_{config.id}"
-        transport.disown(former_sessions(kept, transport.session))
-
-
 # -- its time -------------------------------------------------------------------------------------
 
 
 def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
     """Until its work is done, and the team has had time to catch up; or until it is told to stop."""
-    from gmmtorch.cli.robot_report import RobotReport
+    from gmmtorch.cli.robot_report import RobotReport, print_refusals
     from gmmtorch.exploration.node import check_number, run_paced
 
+    outputs = Outputs(folder)
     with RobotReport(config, node, folder) as report, _told_to_stop() as is_told:
 
         def show(_: Node, now: float) -> None:
@@ -266,8 +240,10 @@ def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
             on_status=show,
         )
         report.finish(paced.seconds)
-        row = _leave(config, node, folder, {**report.series, "ticks_late": paced.late, "stopped": is_told()})
+        row = _leave(config, node, outputs, {**report.series, "ticks_late": paced.late, "stopped": is_told()})
     common.print_table([row], _TABLE.split(), f"robot {config.id}")
+    print_refusals([row])
+    outputs.check()
     common.print_files(folder, folder / "results.json")
 
 
@@ -295,20 +271,27 @@ def _in_step(config: DictConfig, node: Node, folder: Path, answers: IO[str]) -> 
 
         def finish(now: float) -> dict[str, Any]:
             report.finish(now)
-            return _leave(config, node, folder, dict(report.series))
+            outputs = Outputs(folder)
+            row = _leave(config, node, outputs, dict(report.series))
+            outputs.check()
+            return row
 
         Serving(node, finish, report).serve(sys.stdin, answers)
 
 
-def _leave(config: DictConfig, node: Node, folder: Path, more: dict[str, Any]) -> dict[str, Any]:
+def _leave(config: DictConfig, node: Node, outputs: Outputs, more: dict[str, Any]) -> dict[str, Any]:
     """Write what the robot leaves behind; its row."""
-    files = node.save(folder)
-    row = {**node.row(), **more, **{f"{name}_path": str(path) for name, path in files.items()}}
-    common.write_results("robot", config, [row], folder)
+    row = {**node.row(), **more}
+    for name, (file, write) in node.files().items():
+        path = outputs.written(file, write)
+        if path is not None:
+            row[f"{name}_path"] = str(path)
+    outputs.written("results.json", lambda _: common.write_results("robot", config, [row], outputs.folder))
     if config.report.figures:
+        from gmmtorch.report.save import save_figure
         from gmmtorch.report.team_run import team_run_figure
 
-        common.save_figures(config, {"run": team_run_figure([row])}, folder)
+        outputs.written("run.png", functools.partial(save_figure, team_run_figure([row])))
     return row
 
 

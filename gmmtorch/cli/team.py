@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 import socket
 import time
@@ -14,6 +15,7 @@ import hydra
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common, links, missions, schema
+from gmmtorch.cli.outputs import Outputs, terse
 from gmmtorch.cli.robot import check_options
 from gmmtorch.cli.robot_process import RobotProcess, end_all
 
@@ -36,11 +38,13 @@ def main() -> None:
 
 
 def _guarded(config: DictConfig) -> None:
-    common.run_guarded(run, config)
+    with terse():
+        common.run_guarded(run, config)
 
 
 def run(config: DictConfig) -> None:
     """One run of a team."""
+    from gmmtorch.cli.robot_report import print_refusals
     from gmmtorch.report.progress import ProgressBars
 
     config.clock = config.clock or ("lockstep" if config.source == "world" else "wall")
@@ -52,10 +56,13 @@ def run(config: DictConfig) -> None:
         about = _in_step(config, robots, bars) if config.clock == "lockstep" else _by_the_clock(robots, bars)
         rows = [robot.row() for robot in robots]
     summary = {**_summary(rows), **about}
-    common.write_results("team", config, [summary, *rows], folder)
-    _show(config, rows, folder)
+    outputs = Outputs(folder)
+    outputs.written("results.json", lambda _: common.write_results("team", config, [summary, *rows], folder))
+    _show(config, rows, outputs)
     same = "all hold the same map" if summary["same_map"] else "their maps differ"
     common.print_table(rows, _TABLE.split(), f"{len(rows)} robots: {same}")
+    print_refusals(rows)
+    outputs.check()
     common.print_files(folder, folder / "results.json")
     if config.report.tensorboard:
         print(f"browse    tensorboard --logdir {folder}")
@@ -154,9 +161,9 @@ def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars)
 def _by_the_clock(robots: list[RobotProcess], bars: ProgressBars) -> dict[str, Any]:
     """Wait until all have ended."""
     begin = time.monotonic()
-    while sum(robot.is_at_work() for robot in robots):  # all are asked, as those that have failed say so
+    while working := [robot for robot in robots if robot.is_at_work()]:
         bars(_STAGE, round(time.monotonic() - begin))
-        bars.note(_STAGE, _status(robots))
+        bars.note(_STAGE, _status(working))
         time.sleep(_PAUSE)
     return {}
 
@@ -179,18 +186,24 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _show(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
+def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> None:
     """The picture of the run: as a file, and in TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.report.board import Board
+    from gmmtorch.report.save import save_figure
     from gmmtorch.report.team_run import team_run_figure
 
     figure = team_run_figure(rows)
-    common.save_figures(config, {"run": figure}, folder)
-    if config.report.tensorboard:
-        with Board(folder / "team") as board:
+
+    def show(folder: Path) -> None:
+        with Board(folder) as board:
             board.figure("figures/run", figure)
+
+    if config.report.figures:
+        outputs.written("run.png", functools.partial(save_figure, figure))
+    if config.report.tensorboard:
+        outputs.written("team", show)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -187,15 +189,16 @@ class FlyingNode:
         shared = getattr(self.agent.robot.mapper, "shared", None)
         return shared.conflicts[self.robot] if isinstance(shared, Replica) else 0
 
-    def save(self, folder: Path) -> dict[str, Path]:
+    def files(self) -> dict[str, tuple[str, Callable[[Path], object]]]:
         """The map, and where the robot flew."""
-        paths = {"trajectory": write_npz(folder / "trajectory.npz", poses=torch.stack(self._flown).numpy())}
-        mapper = self.agent.robot.mapper
+        poses, mapper = torch.stack(self._flown).numpy(), self.agent.robot.mapper
+        files: dict[str, tuple[str, Callable[[Path], object]]] = {
+            "trajectory": ("trajectory.npz", functools.partial(write_npz, poses=poses))
+        }
         if isinstance(mapper, MixtureMapper) and len(components := mapper.components()):
             made = GaussianMap.of(components, robot=self.robot)
-            paths["map"] = folder / f"map{made.suffix}"
-            made.save(paths["map"])
-        return paths
+            files["map"] = f"map{made.suffix}", made.save
+        return files
 
     def close(self) -> None:
         """Close the journal, with a last snapshot, and the transport. May be called again."""

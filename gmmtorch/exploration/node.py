@@ -52,8 +52,8 @@ class Node(Protocol):
     def row(self) -> dict[str, Any]:
         """What it leaves in results.json."""
 
-    def save(self, folder: Path) -> dict[str, Path]:
-        """Write its map, and whatever else it has made; what is where."""
+    def files(self) -> dict[str, tuple[str, Callable[[Path], object]]]:
+        """Its map, and whatever else it has made: of each its file's name, and what writes it to a path."""
 
     def close(self) -> None:
         """Keep what is to be kept, and let go of disk and network. May be called again."""

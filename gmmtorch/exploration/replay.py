@@ -217,7 +217,10 @@ class ReplayNode:
             "datagrams_heard": float(self.radio.n_heard),
             "wire_bytes_sent": float(books["wire_bytes"]),
             "wire_bytes_received": float(books["wire_bytes_received"]),
-            "refused": float(sum(books["refused"].values()) + sum(self.replica.refused.values())),
+            "refused": float(
+                sum(n for why, n in books["refused"].items() if why != "echo")
+                + sum(self.replica.refused.values())
+            ),
         }
 
     def row(self) -> dict[str, Any]:
@@ -242,15 +245,10 @@ class ReplayNode:
             "stage_seconds": self.watch.seconds,
         }
 
-    def save(self, folder: Path) -> dict[str, Path]:
+    def files(self) -> dict[str, tuple[str, Callable[[Path], object]]]:
         """The team's map, as far as it is known here, and this robot's own."""
         maps = {"map": self.replica.map(codec="quantized"), "own_map": self.map}
-        paths = {}
-        for name, made in maps.items():
-            if made.n_components:
-                paths[name] = folder / f"{name}{made.suffix}"
-                made.save(paths[name])
-        return paths
+        return {name: (f"{name}{made.suffix}", made.save) for name, made in maps.items() if made.n_components}
 
     def close(self) -> None:
         """Close the journal, with a last snapshot, and the transport. May be called again."""

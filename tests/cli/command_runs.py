@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import os
+import resource
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -87,7 +88,8 @@ def as_it_was() -> Iterator[None]:
     finally:
         GlobalHydra.instance().clear()
         for handler in set(root.handlers) - set(handlers):
-            handler.close()
+            with contextlib.suppress(OSError):  # of a full disk: as logging itself does in the end
+                handler.close()
         root.handlers, root.level = handlers, level
 
 
@@ -107,6 +109,19 @@ def run_here(monkeypatch: pytest.MonkeyPatch, command: str, folder: Path, *optio
                 print(status, file=sys.stderr)
                 status = 1
     return Finished(status or 0, stdout.getvalue(), stderr.getvalue(), folder)
+
+
+class Disk:
+    """Of this process: as a full disk refuses to, so does the kernel to let a file grow."""
+
+    def __init__(self) -> None:
+        self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(self) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, self._limits[1]))
+
+    def clear(self) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)
 
 
 def environment() -> dict[str, str]:

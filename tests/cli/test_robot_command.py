@@ -22,7 +22,10 @@ from command_runs import (
     CHECKOUT,
     COMMANDS,
     QUIET,
+    Disk,
     Finished,
+    as_it_was,
+    composed,
     environment,
     refused,
     run_here,
@@ -31,8 +34,12 @@ from command_runs import (
 from exploration.replays import content
 
 from gmmtorch.cli import links, robot
+from gmmtorch.cli.robot_memory import facts_of
 from gmmtorch.exploration.replay import ReplayNode
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.sharing.former_sessions import known_sessions
+from gmmtorch.sharing.framed_transport import FramedTransport
+from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.messages import encode_plan
 from gmmtorch.sharing.replica import Replica
 from gmmtorch.sharing.security import TeamKey
@@ -64,6 +71,14 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
         return run_here(monkeypatch, "robot", tmp_path / name, *kept, *options)
 
     return run_command
+
+
+@pytest.fixture
+def disk() -> Iterator[Disk]:
+    """Of this process; not full when the test is over."""
+    disk = Disk()
+    yield disk
+    disk.clear()
 
 
 @contextmanager
@@ -146,6 +161,92 @@ def test_what_cannot_be_started_again_is_said_at_the_start(run, tmp_path, option
     assert done.results()["rows"][0]["not_merged"] == {}
 
 
+# -- a disk that is full --------------------------------------------------------------------------
+
+
+def test_a_disk_that_fills_does_not_keep_it_from_its_work_and_the_end_says_what_is_missing(
+    run, disk, monkeypatch
+):
+    tick = ReplayNode.tick
+
+    def filling(node: ReplayNode, now: float) -> None:
+        tick(node, now)
+        if node.position == 2:
+            disk.fill()
+
+    monkeypatch.setattr(ReplayNode, "tick", filling)
+    shown = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
+    done = run(*LOG, *shown, "log.rate=3")
+    assert done.status == 1
+    assert done.stdout.count("report.tensorboard is switched off") == 1
+    assert "map is no longer kept on disk, and the robot goes on" in done.stdout
+    assert "\nrobot 0\n" in done.stdout  # the table
+    assert "n_records" in done.stdout
+    assert "scan 6/6" in done.stderr
+    *status, error = done.stderr.splitlines()
+    assert all(line.startswith("robot 0 ") for line in status)  # no call stacks
+    assert error.startswith(f"gmmtorch: error: hydra.run.dir={done.folder} has not got all results: ")
+    for name in ("map.safetensors", "own_map.safetensors", "results.json", "run.png", "File too large"):
+        assert error.count(name) == (2 if name == "map.safetensors" else 1)
+    assert not (done.folder / "results.json").exists()
+
+
+def test_where_nothing_can_be_kept_it_starts_all_the_same(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    done = succeeded(run(*LOG, f"journal.folder={tmp_path / 'file'}", "log.rate=50"))
+    assert done.stdout.count("journal.folder=") == 1
+    assert "journal.enabled=false" in done.stdout
+    (row,) = done.results()["rows"]
+    assert row["scans"] == 6
+
+
+def test_what_a_full_disk_holds_is_used(run, disk, monkeypatch, tmp_path):
+    kept = tmp_path / "kept"
+    options = [*LOG, f"journal.folder={kept}", "log.rate=50"]
+    (first,) = succeeded(run(*options)).results()["rows"]
+    former = known_sessions(kept / "sessions_0")
+    opened, made = links.open_link, ReplayNode.__init__
+    disowned: list[frozenset[bytes]] = []
+
+    def open_link(*arguments):
+        disk.fill()
+        return opened(*arguments)
+
+    def make(*arguments, **options) -> None:
+        made(*arguments, **options)
+        disk.clear()
+
+    monkeypatch.setattr(links, "open_link", open_link)
+    monkeypatch.setattr(ReplayNode, "__init__", make)
+    monkeypatch.setattr(FramedTransport, "disown", lambda _, sessions: disowned.append(frozenset(sessions)))
+    done = succeeded(run(*options, name="again"))
+    assert done.stdout.count(f"journal.folder={kept}") == 1
+    assert disowned == [former]
+    assert len(former) == 1
+    (row,) = done.results()["rows"]
+    assert row["resumed_at"] > 0
+    assert row["digest"] == first["digest"]
+    assert row["incarnation"] != first["incarnation"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_where_standard_error_cannot_be_written_it_shows_nothing_and_goes_on(tmp_path):
+    command = [sys.executable, str(CHECKOUT / "scripts" / "robot.py"), *LOG, *QUIET[1:], "log.rate=50"]
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [*command, "team.size=1", "link.listen=127.0.0.1:0", "hydra.run.dir=run"],
+            cwd=tmp_path,
+            env=environment(),
+            stdout=subprocess.PIPE,
+            stderr=full,
+            text=True,
+            timeout=120,
+        )
+    assert done.returncode == 0
+    assert done.stdout.count("report.progress is switched off") == 1
+    assert (tmp_path / "run" / "results.json").is_file()
+
+
 # -- told to stop ---------------------------------------------------------------------------------
 
 
@@ -211,6 +312,8 @@ def test_another_key_is_counted_and_told_once(run, tmp_path):
     assert f"from 127.0.0.1:{other.address[1]}" in done.stdout
     assert "same team key" in done.stdout
     assert " refused" in done.stderr
+    assert f"\nrobot 0 refused {row['refused']['wrong_key']:,} frames: " in done.stdout
+    assert "link.key_file, or $GMMTORCH_TEAM_KEY" in done.stdout
     assert own.read_text().strip() not in done.stdout + done.stderr + str(done.results())
 
 
@@ -295,9 +398,21 @@ def test_a_bad_value_is_named_in_one_line(options, words, run):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("log.rate=0", "log.rate=0.0"),
         ("speed=0", "speed=0.0"),
+        ("speed=inf", "speed=inf"),
         ("settle=-1", "settle=-1.0"),
+        ("settle=inf", "settle=inf"),
+        ("log.rate=0", "log.rate=0.0"),
+    ],
+)
+def test_its_times_are_checked_before_anything_is_opened(options, words, run, monkeypatch):
+    monkeypatch.setattr(robot, "RobotMemory", None)
+    assert words in refused(run(*LOG, options))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
         ("log.every=0", "log.every=0"),
         ("log.map.prior=-1", "log.map.prior=-1.0"),
         ("log.map.noise=-1", "log.map.noise=-1.0"),
@@ -340,6 +455,41 @@ def test_another_log_on_the_same_folder_is_refused(run, tmp_path):
     succeeded(run(*LOG, "log.rate=50", kept))
     assert "every" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
     succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # faster or slower it may be
+
+
+def test_a_map_of_another_world_is_not_gone_on_with(run, tmp_path):
+    kept = f"journal.folder={tmp_path / 'kept'}"
+    succeeded(run(*LOG, "log.rate=50", kept))
+    line = refused(run(kept, name="flying"))
+    assert f"{kept.split('=')[0]}=" in line
+    assert "source was log and is world" in line
+
+
+def test_a_folder_that_another_has_is_called_what_the_user_does(run, tmp_path):
+    with Journal(tmp_path / "journal_0", Replica(0)):
+        line = refused(run(*LOG, f"journal.folder={tmp_path}"))
+    assert "journal.folder=" in line
+    assert "runs already" in line
+    assert "path=" not in line
+
+
+def facts(*options: str) -> dict[str, object]:
+    return facts_of(composed("robot", *options))
+
+
+def test_what_makes_a_map_another_ones(tmp_path):
+    with as_it_was():
+        warehouse = facts()
+        for other in ("world=tunnels", "world.seed=1", "world.size=[20,20,8]"):
+            assert facts(other) != warehouse, other
+        for same in ("seed=3", "world.resolution=0.4", "team.size=2", "sensor.max_range=4", "planner=random"):
+            assert facts(same) == warehouse, same
+        one, moved = room(tmp_path / "one.obj"), room(tmp_path / "moved.obj")
+        meshes = [facts("world=mesh", f"world.path={path}") for path in (one, moved)]
+        assert meshes[0] == meshes[1]
+        one.write_text(one.read_text().replace("7.0", "7.5"))
+        assert facts("world=mesh", f"world.path={one}") != meshes[0]
+        assert facts("world=mesh") != meshes[0]
 
 
 def test_in_step_is_for_the_team_alone(run, monkeypatch):

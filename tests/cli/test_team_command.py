@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_runs import COMMANDS, QUIET, Finished, refused, run_here, succeeded
+from command_runs import COMMANDS, QUIET, Disk, Finished, refused, run_here, succeeded
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from test_robot_command import LOG, SMALL, room
@@ -113,6 +114,61 @@ def test_a_log_is_replayed_by_all_and_each_ends_with_all_of_it(run):
     assert all(row["n_records"] == summary["n_records"] > 0 for row in rows)
     assert not {"figures", "run.png"} & done.files()
     assert "browse" not in done.stdout
+
+
+class Done:
+    """A robot that works while it is asked so often, and has refused something."""
+
+    def __init__(self, number: int, n_asked: int, disk: Disk | None = None) -> None:
+        self.number, self._left, self._disk = number, n_asked, disk
+
+    def is_at_work(self) -> bool:
+        self._left -= 1
+        return self._left >= 0
+
+    def status(self) -> str:
+        return f"robot {self.number} {'works' if self._left >= 0 else 'has ended'}"
+
+    def row(self) -> dict[str, Any]:
+        if self._disk is not None:
+            self._disk.fill()
+        refused = {"wrong_key": 7} if self.number else {}
+        return {"robot": self.number, "digest": "12", "n_records": 5, "refused": refused}
+
+
+def test_those_that_still_work_are_shown(monkeypatch):
+    notes: list[str] = []
+
+    class Bars:
+        def __call__(self, stage: str, done: int) -> None: ...
+
+        def note(self, stage: str, text: str) -> None:
+            notes.append(text)
+
+    times = itertools.count(0.0, 2.0)
+    monkeypatch.setattr(team, "_PAUSE", 0.0)
+    monkeypatch.setattr(team.time, "monotonic", lambda: next(times))
+    robots: Any = [Done(0, 2), Done(1, 12)]
+    team._by_the_clock(robots, Bars())  # type: ignore[arg-type]
+    assert set(notes) == {"robot 0 works", "robot 1 works"}
+    assert len(notes) == 12
+    assert set(notes[2:]) == {"robot 1 works"}
+
+
+def test_what_a_full_disk_does_not_take_is_told_below_the_table(run, monkeypatch):
+    disk = Disk()
+    monkeypatch.setattr(team, "_started", lambda *_: [Done(k, 0, disk) for k in range(2)])
+    try:
+        done = run(*LOG)
+    finally:
+        disk.clear()
+    assert done.status == 1
+    assert "2 robots: all hold the same map" in done.stdout
+    assert "robot 1 refused 7 frames: 7 wrong_key; compare link.key_file" in done.stdout
+    (error,) = done.stderr.splitlines()
+    assert error.startswith(
+        f"gmmtorch: error: hydra.run.dir={done.folder} has not got all results: results.json ("
+    )
 
 
 # -- robots in trouble ----------------------------------------------------------------------------
@@ -218,12 +274,15 @@ def test_told_to_stop_it_ends_all_robots(name, run, robots, monkeypatch):
         ("clock=lockstep source=log", "clock=lockstep source=world"),
         ("journal.folder=kept", "journal.folder=kept clock=wall"),
         ("speed=2", "speed=2.0 clock=wall"),
+        ("settle=-1 clock=wall", "settle=-1.0"),
         ("team.size=0", "team.size=0"),
         ("team.size=40", "team.size=40"),
         ("runtime.device=meta", "runtime.device=meta"),
     ],
 )
-def test_a_bad_value_is_named_before_a_robot_is_started(options, words, run, robots, tmp_path):
+def test_a_bad_value_is_named_before_a_robot_is_started(options, words, run, robots, tmp_path, monkeypatch):
+    if "settle" in options:
+        monkeypatch.setattr(team, "_prepare", None)  # nor is the world worked out
     line = refused(run("world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, *options.split()))
     for word in words.split():
         assert word in line

@@ -54,7 +54,10 @@ def test_by_the_clock_they_come_to_hold_the_same_map(world, tmp_path):
             assert set(node.agent.heard_at) == {1 - node.robot}
             assert row["bytes_sent"] == sum(row["bytes_by_kind"].values())
             assert row["socket_bytes"] == row["wire_bytes"] - 28 * row["datagrams"]
-            assert set(node.save(tmp_path / str(node.robot))) == {"map", "trajectory"}
+            files = node.files()
+            assert set(files) == {"map", "trajectory"}
+            for file, write in files.values():
+                write(tmp_path / f"{node.robot}_{file}")
             assert "another robot" not in node.status()
         assert sum(node.row()["path_length"] for node in nodes) > 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +57,7 @@ class Toy:
     def row(self) -> dict[str, object]:
         return {}
 
-    def save(self, folder: Path) -> dict[str, Path]:
+    def files(self) -> dict[str, tuple[str, Callable[[Path], object]]]:
         return {}
 
     def close(self) -> None:

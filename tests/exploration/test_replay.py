@@ -492,10 +492,12 @@ def test_its_maps_are_files(tmp_path):
     network = Network(2)
     nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
     run(*nodes, settle=2.0)
-    paths = nodes[0].save(tmp_path)
+    paths = {name: tmp_path / file for name, (file, _) in nodes[0].files().items()}
+    for name, (_, write) in nodes[0].files().items():
+        write(paths[name])
     assert content(GaussianMap.load(paths["map"]).components()) == content(nodes[1].replica.components())
     assert content(GaussianMap.load(paths["own_map"]).components()) == content(nodes[0].map.components())
-    assert robot(0, [], Network(1)).save(tmp_path) == {}
+    assert robot(0, [], Network(1)).files() == {}
 
 
 @pytest.mark.real_data

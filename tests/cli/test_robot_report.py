@@ -1,0 +1,148 @@
+"""What a robot shows of itself, and that it does without where that cannot be shown."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_runs import Disk, as_it_was, composed
+
+from gmmtorch.cli import common
+from gmmtorch.cli.outputs import Outputs, terse
+from gmmtorch.cli.robot_report import RobotReport, print_refusals
+from gmmtorch.errors import OutputError
+from gmmtorch.files import write_bytes
+
+
+class Toy:
+    """A robot of which there is little to say."""
+
+    robot = 3
+
+    def status(self) -> str:
+        return "all is well"
+
+    def scalars(self) -> dict[str, float]:
+        return {"records": 5.0, "refused": 0.0}
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Broken(Terminal):
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+
+@pytest.fixture
+def log(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+    with as_it_was(), caplog.at_level(logging.WARNING):
+        yield caplog
+
+
+def report(folder: Path, *options: str) -> RobotReport:
+    toy: Any = Toy()
+    return RobotReport(composed("robot", "evaluation.every=1", *options), toy, folder)
+
+
+def test_a_record_of_the_log_has_a_line_of_its_own(log, tmp_path, monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    written = logging.StreamHandler(terminal)  # as a terminal shows both
+    logging.getLogger().addHandler(written)
+    handlers = list(common.logger.handlers)
+    try:
+        with report(tmp_path, "report.tensorboard=false") as shown:
+            shown(0.0)
+            shown(1.0)
+            logging.getLogger("gmmtorch.sharing.udp").warning("one")
+            logging.getLogger("gmmtorch").warning("two")
+            shown(2.0)
+    finally:
+        logging.getLogger().removeHandler(written)
+    line = "robot 3  {:6.0f} s  all is well"
+    assert terminal.getvalue() == (f"\r{line.format(0)}\r{line.format(1)}\none\ntwo\n\r{line.format(2)}\n")
+    assert common.logger.handlers == handlers
+
+
+def test_a_terminal_that_is_gone_is_done_without(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Broken())
+    with report(tmp_path, "report.tensorboard=false") as shown:
+        for now in range(4):
+            shown(float(now))
+        shown.finish(4.0)
+    assert [record.getMessage() for record in log.records] == [
+        "report.progress is switched off, and the robot goes on: [Errno 28] No space left on device"
+    ]
+    assert shown.series["records_over_time"] == [5.0] * 5
+
+
+@pytest.mark.parametrize("when", ["at the start", "in between", "in the end"])
+def test_what_tensorboard_cannot_write_is_told_once(when, log, tmp_path, capsys):
+    disk = Disk()
+    try:
+        with terse():
+            if when == "at the start":
+                (tmp_path / "tensorboard").write_text("no folder")
+            with report(tmp_path, "report.progress=false") as shown:
+                shown(0.0)
+                if when == "in between":
+                    disk.fill()
+                for now in range(1, 30):
+                    shown(float(now))
+                if when == "in the end":
+                    disk.fill()
+                    shown.finish(30.0)
+    finally:
+        disk.clear()
+    (record,) = log.records
+    assert record.getMessage().startswith("report.tensorboard is switched off, and the robot goes on: ")
+    assert len(shown.series["times"]) >= 30
+    assert capsys.readouterr().err == ""
+
+
+def test_without_standard_error_there_is_no_line(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    with report(tmp_path, "report.tensorboard=false") as shown:
+        shown(0.0)
+    assert not log.records
+
+
+def test_refusals_are_told_with_their_reasons(capsys):
+    rows = [
+        {"robot": 0, "refused": {"echo": 9}},
+        {"robot": 1, "refused": {"wrong_key": 1200, "echo": 7, "replayed": 2}},
+        {"robot": 2, "refused": {"foreign": 1}},
+    ]
+    print_refusals(rows)
+    one, two = capsys.readouterr().out.splitlines()
+    assert one.startswith("robot 1 refused 1,202 frames: 1,200 wrong_key, 2 replayed; compare link.key_file")
+    assert "$GMMTORCH_TEAM_KEY" in one
+    assert two == "robot 2 refused 1 frames: 1 foreign"
+
+
+def test_every_file_is_tried_and_what_is_missing_told(tmp_path):
+    (tmp_path / "taken").mkdir()
+
+    def fails(path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    outputs = Outputs(tmp_path)
+    outputs.check()
+    assert outputs.written("one", fails) is None
+    assert outputs.written("two", lambda path: write_bytes(path, b"2")) == tmp_path / "two"
+    assert outputs.written("three", fails) is None
+    assert outputs.written("taken", lambda path: write_bytes(path, b"4")) is None
+    with pytest.raises(OutputError) as caught:
+        outputs.check()
+    assert str(caught.value).startswith(
+        f"hydra.run.dir={tmp_path} has not got all results: one, three (No space left on device); taken ("
+    )
+    assert (tmp_path / "two").read_bytes() == b"2"
