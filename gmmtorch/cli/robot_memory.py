@@ -75,7 +75,7 @@ class RobotMemory:
         return self._home / f"{what}_{self._robot}{suffix}"
 
     def _naming(self) -> AbstractContextManager[None]:
-        """Of files of the memory errors say where the user has put them."""
+        """Within it errors call the place of a file by the option that it comes from."""
         return common.naming({"path": self._option.split("=")[0]})
 
     @contextmanager

@@ -112,7 +112,8 @@ def run_here(monkeypatch: pytest.MonkeyPatch, command: str, folder: Path, *optio
 
 
 class Disk:
-    """Of this process: as a full disk refuses to, so does the kernel to let a file grow."""
+    """Of this process: as a full disk refuses to, so does the kernel to let a file grow. Within its context,
+    as pytest's own output may be a file."""
 
     def __init__(self) -> None:
         self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -122,6 +123,12 @@ class Disk:
 
     def clear(self) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)
+
+    def __enter__(self) -> Disk:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.clear()
 
 
 def environment() -> dict[str, str]:

@@ -73,14 +73,6 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     return run_command
 
 
-@pytest.fixture
-def disk() -> Iterator[Disk]:
-    """Of this process; not full when the test is over."""
-    disk = Disk()
-    yield disk
-    disk.clear()
-
-
 @contextmanager
 def chatter(number: int, to: str, key: TeamKey | None = None) -> Iterator[UdpTransport]:
     """Another robot, that says all the time where it flies."""
@@ -164,10 +156,8 @@ def test_what_cannot_be_started_again_is_said_at_the_start(run, tmp_path, option
 # -- a disk that is full --------------------------------------------------------------------------
 
 
-def test_a_disk_that_fills_does_not_keep_it_from_its_work_and_the_end_says_what_is_missing(
-    run, disk, monkeypatch
-):
-    tick = ReplayNode.tick
+def test_a_disk_that_fills_does_not_keep_it_from_its_work_and_the_end_says_what_is_missing(run, monkeypatch):
+    tick, disk = ReplayNode.tick, Disk()
 
     def filling(node: ReplayNode, now: float) -> None:
         tick(node, now)
@@ -176,7 +166,8 @@ def test_a_disk_that_fills_does_not_keep_it_from_its_work_and_the_end_says_what_
 
     monkeypatch.setattr(ReplayNode, "tick", filling)
     shown = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
-    done = run(*LOG, *shown, "log.rate=3")
+    with disk:
+        done = run(*LOG, *shown, "log.rate=3")
     assert done.status == 1
     assert done.stdout.count("report.tensorboard is switched off") == 1
     assert "map is no longer kept on disk, and the robot goes on" in done.stdout
@@ -200,8 +191,8 @@ def test_where_nothing_can_be_kept_it_starts_all_the_same(run, tmp_path):
     assert row["scans"] == 6
 
 
-def test_what_a_full_disk_holds_is_used(run, disk, monkeypatch, tmp_path):
-    kept = tmp_path / "kept"
+def test_what_a_full_disk_holds_is_used(run, monkeypatch, tmp_path):
+    kept, disk = tmp_path / "kept", Disk()
     options = [*LOG, f"journal.folder={kept}", "log.rate=50"]
     (first,) = succeeded(run(*options)).results()["rows"]
     former = known_sessions(kept / "sessions_0")
@@ -219,7 +210,8 @@ def test_what_a_full_disk_holds_is_used(run, disk, monkeypatch, tmp_path):
     monkeypatch.setattr(links, "open_link", open_link)
     monkeypatch.setattr(ReplayNode, "__init__", make)
     monkeypatch.setattr(FramedTransport, "disown", lambda _, sessions: disowned.append(frozenset(sessions)))
-    done = succeeded(run(*options, name="again"))
+    with disk:
+        done = succeeded(run(*options, name="again"))
     assert done.stdout.count(f"journal.folder={kept}") == 1
     assert disowned == [former]
     assert len(former) == 1

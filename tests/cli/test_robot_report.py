@@ -86,22 +86,17 @@ def test_a_terminal_that_is_gone_is_done_without(log, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("when", ["at the start", "in between", "in the end"])
 def test_what_tensorboard_cannot_write_is_told_once(when, log, tmp_path, capsys):
-    disk = Disk()
-    try:
-        with terse():
-            if when == "at the start":
-                (tmp_path / "tensorboard").write_text("no folder")
-            with report(tmp_path, "report.progress=false") as shown:
-                shown(0.0)
-                if when == "in between":
-                    disk.fill()
-                for now in range(1, 30):
-                    shown(float(now))
-                if when == "in the end":
-                    disk.fill()
-                    shown.finish(30.0)
-    finally:
-        disk.clear()
+    if when == "at the start":
+        (tmp_path / "tensorboard").write_text("no folder")
+    with Disk() as disk, terse(), report(tmp_path, "report.progress=false") as shown:
+        shown(0.0)
+        if when == "in between":
+            disk.fill()
+        for now in range(1, 30):
+            shown(float(now))
+        if when == "in the end":
+            disk.fill()
+            shown.finish(30.0)
     (record,) = log.records
     assert record.getMessage().startswith("report.tensorboard is switched off, and the robot goes on: ")
     assert len(shown.series["times"]) >= 30

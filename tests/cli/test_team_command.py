@@ -156,12 +156,9 @@ def test_those_that_still_work_are_shown(monkeypatch):
 
 
 def test_what_a_full_disk_does_not_take_is_told_below_the_table(run, monkeypatch):
-    disk = Disk()
-    monkeypatch.setattr(team, "_started", lambda *_: [Done(k, 0, disk) for k in range(2)])
-    try:
+    with Disk() as disk:
+        monkeypatch.setattr(team, "_started", lambda *_: [Done(k, 0, disk) for k in range(2)])
         done = run(*LOG)
-    finally:
-        disk.clear()
     assert done.status == 1
     assert "2 robots: all hold the same map" in done.stdout
     assert "robot 1 refused 7 frames: 7 wrong_key; compare link.key_file" in done.stdout
