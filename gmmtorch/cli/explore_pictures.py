@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from gmmtorch.report.exploration_top_view import TopView
 
 _HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
-_OCCUPIED = 0.65
 
 
 class MissionRecorder:
@@ -118,7 +117,9 @@ class MissionRecorder:
             content["owners"] = surfaces.ids[:, 0]
         if self._config.report.recording:
             stored = mission.union.grid.cells()
-            occupied = mission.union.rule.probability(stored.hits, stored.misses) > _OCCUPIED
+            occupied = (
+                mission.union.rule.probability(stored.hits, stored.misses) > mission.union.rule.occupied
+            )
             content["cells"] = stored.cells[occupied].int()
         return content
 
@@ -136,7 +137,7 @@ class MissionRecorder:
             moment.tick * mission.options.tick_seconds,
             _team_view(mission)._replace(image=moment.content["image"]),
             [path[: moment.tick + 1] for path in paths],
-            caption=f"{moment.bits / mission.union.observable_bits:.0%} of the entropy gone",
+            caption=f"{100 * moment.bits / mission.union.observable_bits:.0f} % of the entropy gone",
             **shown,
         )
 
@@ -154,12 +155,13 @@ class MissionRecorder:
             "entropy": entropy_figure([row]),
             "trajectories": trajectories_figure(_world_view(mission), paths, _coverage(mission)),
             "team_map": team_map_figure(
-                [self._snapshot(mission, moment, paths) for moment in self.album.chosen()]
+                [self._snapshot(mission, moment, paths) for moment in self.album.chosen()],
+                belief=mission.union.rule,
             ),
             "profile": profile_figure(*stage_means([row])),
         }
         if row["bytes_sent"]:
-            figures["bandwidth"] = bandwidth_figure([row])
+            figures["bandwidth"] = bandwidth_figure([row], draco_error=mission.options.frame.noise)
         surfaces = _surfaces(components)
         if surfaces is not None:
             first = surfaces.seen_from.new_zeros(len(surfaces))

@@ -153,9 +153,7 @@ def _tell_off(option: str, error: OSError) -> None:
 def print_refusals(rows: Sequence[dict[str, Any]]) -> None:
     """A line for each robot, by its row, that has refused what came over the network: why, and how often."""
     for row in rows:
-        # What multicast brings back of its own is no news.
-        counts = {reason: n for reason, n in row["refused"].items() if reason != "echo"}
-        if counts:
+        if counts := row["refused"]:
             told = ", ".join(f"{n:,} {reason}" for reason, n in counts.items())
             remedy = _COMPARE if "wrong_key" in counts else ""
             print(f"robot {row['robot']} refused {sum(counts.values()):,} frames: {told}{remedy}")

@@ -217,10 +217,7 @@ class ReplayNode:
             "datagrams_heard": float(self.radio.n_heard),
             "wire_bytes_sent": float(books["wire_bytes"]),
             "wire_bytes_received": float(books["wire_bytes_received"]),
-            "refused": float(
-                sum(n for why, n in books["refused"].items() if why != "echo")
-                + sum(self.replica.refused.values())
-            ),
+            "refused": float(sum(books["refused"].values()) + sum(self.replica.refused.values())),
         }
 
     def row(self) -> dict[str, Any]:
