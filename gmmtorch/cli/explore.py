@@ -19,6 +19,7 @@ _TABLE = (
     "framework seed planner t50 t90 entropy_reduction_bits bytes_sent bytes_raw_points auc "
     "cross_entropy_bits map_disagreement coverage_per_metre path_length collisions wall_seconds"
 )
+_TIME_TO_LEAVE = 30.0  # simulated seconds: one that looks around first has long gone by then
 _NETWORK_TABLE = "wire_bytes bits_per_byte wire_ratio t90_ratio healed_after converged_after"
 
 
@@ -79,7 +80,19 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
     rows = _compared([row])
     common.write_results("explore", config, rows, folder)
     recorder.finish(mission, rows[0])
+    tell_who_stayed(mission)
     return rows
+
+
+def tell_who_stayed(mission: Mission) -> None:
+    """In the log, which robots never left their start though they had the time: there is no other sign."""
+    stayed = [str(robot.number) for robot in mission.robots if robot.path_length == 0]
+    if stayed and mission.now >= _TIME_TO_LEAVE:
+        common.logger.warning(
+            "Robots that never left where they started: %s. Nothing that led anywhere looked safe there. "
+            "Move them by team.start, or take finer cells (world.resolution) or a smaller robot.radius.",
+            ", ".join(stayed),
+        )
 
 
 def _status(pace: Pace) -> str:

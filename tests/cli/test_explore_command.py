@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -744,3 +745,17 @@ def test_wrong_types_and_unknown_options_are_explained_without_a_traceback(optio
     assert "Traceback" not in done.stderr
     assert all(word in done.stderr for word in words.split()), done.stderr
     assert not done.folder.exists()
+
+
+def test_who_never_left_its_start_is_told(caplog):
+    robots = [
+        SimpleNamespace(number=number, path_length=length) for number, length in enumerate((0.0, 3.0, 0.0))
+    ]
+    explore.tell_who_stayed(SimpleNamespace(robots=robots, now=29.0))
+    assert not caplog.messages
+    explore.tell_who_stayed(SimpleNamespace(robots=robots, now=30.0))
+    (said,) = caplog.messages
+    assert "0, 2" in said
+    assert "team.start" in said
+    explore.tell_who_stayed(SimpleNamespace(robots=robots[1:2], now=60.0))
+    assert len(caplog.messages) == 1
