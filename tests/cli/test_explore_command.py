@@ -35,7 +35,7 @@ import gmmtorch
 from gmmtorch.cli import explore, export
 from gmmtorch.exploration.mission import Mission
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report import exploration_maps, exploration_recording
+from gmmtorch.report import exploration_maps, exploration_recording, exploration_scene
 
 Run = Callable[..., Finished]
 
@@ -447,7 +447,10 @@ def test_a_mission_that_went_on_has_the_pictures_of_one_that_was_not_killed(run,
 
     drawn: list[Any] = []
     recorded: list[Any] = []
-    monkeypatch.setattr(exploration_maps, "team_map_figure", lambda shown: drawn.append(shown) or Figure())
+    monkeypatch.setattr(
+        exploration_maps, "team_map_figure", lambda shown, **_: drawn.append(shown) or Figure()
+    )
+    monkeypatch.setattr(exploration_scene, "mixture_scene_figure", lambda *_, **__: Figure())  # takes seconds
     monkeypatch.setattr(exploration_recording, "load_rerun", lambda: None)
     monkeypatch.setattr(exploration_recording, "record_rerun", lambda *_, maps, **__: recorded.append(maps))
     kept = f"checkpoint.folder={tmp_path / 'kept'}"
