@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import os
 import signal
 import stat
@@ -114,8 +113,9 @@ def _run(config: DictConfig, answers: IO[str] | None) -> None:
 
 
 def check_options(config: DictConfig) -> None:
-    """Raises `InvalidArgumentError` for options, of a robot or a team, that nothing else checks."""
+    """Raises `InvalidArgumentError` for options, of a robot or a team, before anything is opened."""
     from gmmtorch.errors import InvalidArgumentError, check_whole
+    from gmmtorch.exploration.node import check_pace
 
     if common.set_up(config) != "cpu":
         raise InvalidArgumentError(
@@ -135,10 +135,8 @@ def check_options(config: DictConfig) -> None:
         )
     if not config.evaluation.every > 0:
         raise InvalidArgumentError(f"evaluation.every={config.evaluation.every} must be above zero seconds.")
-    if not 0 < config.speed < math.inf:
-        raise InvalidArgumentError(f"speed={config.speed} must be above zero, and finite.")
-    if not 0 <= config.settle < math.inf:
-        raise InvalidArgumentError(f"settle={config.settle} must be at least zero seconds, and finite.")
+    with common.naming({"rate": "sensor.rate" if config.source == "world" else "log.rate"}):
+        check_pace(_rate(config), config.speed, config.settle)
     if config.clock == "lockstep":
         if config.source != "world":
             raise InvalidArgumentError("clock=lockstep is for source=world; logs are replayed by the clock.")
@@ -150,13 +148,10 @@ def check_options(config: DictConfig) -> None:
             raise InvalidArgumentError(
                 f"speed={config.speed} is for clock=wall: in step time passes as fast as robots can think."
             )
-    if config.source == "log":
-        if config.log.dataset is None:
-            raise InvalidArgumentError(
-                "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
-            )
-        if not 0 < config.log.rate < math.inf:
-            raise InvalidArgumentError(f"log.rate={config.log.rate} must be above zero, and finite.")
+    if config.source == "log" and config.log.dataset is None:
+        raise InvalidArgumentError(
+            "source=log needs a log: dataset@log.dataset=carmen log.dataset.path=FILE, or another reader."
+        )
 
 
 # -- the robot ------------------------------------------------------------------------------------
@@ -233,7 +228,7 @@ def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
         report(0.0)
         paced = run_paced(
             node,
-            rate=config.sensor.rate if config.source == "world" else config.log.rate,
+            rate=_rate(config),
             speed=config.speed,
             settle=config.settle,
             stop=is_told,
@@ -245,6 +240,12 @@ def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
     print_refusals([row])
     outputs.check()
     common.print_files(folder, folder / "results.json")
+
+
+def _rate(config: DictConfig) -> float:
+    """Frames or scans a second."""
+    rate: float = config.sensor.rate if config.source == "world" else config.log.rate
+    return rate
 
 
 @contextmanager

@@ -102,9 +102,8 @@ def run_paced(
 
     Whatever a node raises ends it. Nodes are not closed.
     """
-    _check(rate=rate, speed=speed, status_every=status_every)
-    if not 0 <= settle < math.inf:
-        raise InvalidArgumentError(f"settle={settle} must be at least zero seconds, and finite.")
+    check_pace(rate, speed, settle)
+    _check(status_every=status_every)
     if duration is not None and not duration >= 0:
         raise InvalidArgumentError(f"duration={duration} must be at least zero seconds.")
     team = list(nodes) if isinstance(nodes, Sequence) else [nodes]
@@ -180,6 +179,13 @@ class _Teller:
         self._next = self._watch.seconds() + self._every
         for node in self._team:
             self._on_status(node, self._watch.now())
+
+
+def check_pace(rate: float, speed: float, settle: float) -> None:
+    """Raises `InvalidArgumentError` for what `run_paced` cannot go by."""
+    _check(rate=rate, speed=speed)
+    if not 0 <= settle < math.inf:
+        raise InvalidArgumentError(f"settle={settle} must be at least zero seconds, and finite.")
 
 
 def _check(**values: float) -> None:

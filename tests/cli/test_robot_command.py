@@ -419,22 +419,21 @@ def test_a_bad_value_for_a_log_is_named_in_one_line(options, words, run):
         assert word in line
 
 
-def test_a_port_in_use_is_told_with_the_remedy(run):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        line = refused(run(*LOG, f"link.listen=127.0.0.1:{port}"))
-    assert f"link.listen=127.0.0.1:{port} " in line
-    assert "another process has that port" in line
-
-
-def test_a_group_whose_port_is_in_use_is_told_as_one(run):
+@pytest.mark.parametrize(
+    ("option", "host", "remedy"),
+    [
+        ("link.listen", "127.0.0.1", "give another port, or 0 for any that is free."),
+        ("link.group", "239.71.77.7", "give another port."),
+    ],
+)
+def test_a_port_in_use_is_told_with_the_remedy(option, host, remedy, run):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("", 0))
-        port = taken.getsockname()[1]
-        line = refused(run(*LOG, f"link.group=239.71.77.7:{port}"))
-    assert f"link.group=239.71.77.7:{port} " in line
-    assert "give another port." in line
+        where = f"{option}={host}:{taken.getsockname()[1]}"
+        line = refused(run(*LOG, where))
+    assert f"{where} " in line
+    assert "another process has that port" in line
+    assert remedy in line
 
 
 def test_a_robot_that_nobody_hears_is_told_so_and_goes_on(run):
