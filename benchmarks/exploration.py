@@ -25,11 +25,11 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.stopwatch import Stopwatch
-from gmmtorch.exploration.team import assemble
-from gmmtorch.exploration.world import World, open_world
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.stopwatch import Stopwatch
+from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.report.table import format_table
 
 

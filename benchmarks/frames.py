@@ -15,9 +15,9 @@ from gmmtorch.datasets.depth_frames import DepthFrames, back_project
 from gmmtorch.evaluation.queries import Queries, hit_and_free, test_beams
 from gmmtorch.evaluation.split import split_indices
 from gmmtorch.scan import Scan
-from gmmtorch.simulation.depth_camera import DepthCamera
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.warehouse import warehouse
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.warehouse import warehouse
 
 RESOLUTIONS = {"kinect": 0.05, "hall": 0.2, "warehouse": 0.2}  # metres, of the cells asked about
 TEST_EVERY, MAX_BEAMS, SEED = 5, 5_000, 0

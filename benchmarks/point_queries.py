@@ -19,9 +19,9 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.point import PointForm
+from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.scan import Scan
 
 RESOLUTION = 0.05

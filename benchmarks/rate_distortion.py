@@ -33,22 +33,8 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.evaluation.metrics import psnr_terms, roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
-from gmmtorch.evaluation.worker_pool import worker_pool
-from gmmtorch.files import write_bytes
-from gmmtorch.mapping.cell_learning import CellRule, learn_cells
-from gmmtorch.mapping.codec import spatial_order
-from gmmtorch.mapping.compaction import compact
-from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.protocol import OccupancyMap
-from gmmtorch.report.rate_distortion import QUALITIES, bytes_for, figures, leads
-from gmmtorch.report.save import save_figure
-from gmmtorch.report.style import label_of
-from gmmtorch.scan import Scan
-from gmmtorch.sharing.messages import ComponentsMessage, decode, encode_components
-from gmmtorch.sharing.point_bytes import compressed
-from gmmtorch.sharing.point_codecs import (
+from gmmtorch.evaluation.codecs.point_bytes import compressed
+from gmmtorch.evaluation.codecs.point_codecs import (
     BEST_LEVEL,
     DepthImage,
     Draco,
@@ -57,6 +43,20 @@ from gmmtorch.sharing.point_codecs import (
     QuantizedPoints,
     RawPoints,
 )
+from gmmtorch.evaluation.metrics import psnr_terms, roc
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
+from gmmtorch.evaluation.worker_pool import worker_pool
+from gmmtorch.files import write_bytes
+from gmmtorch.mapping.codec.component_batch import spatial_order
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.learning.merging import compact
+from gmmtorch.occupancy.protocol import OccupancyMap
+from gmmtorch.report.save import save_figure
+from gmmtorch.report.studies.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
+from gmmtorch.report.style import label_of
+from gmmtorch.scan import Scan
+from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 
 COMPONENTS = (8, 16, 32, 64, 128, 256, 384)  # of a frame at most: our knob
 FINER = 3  # than a map's rule: a frame by itself has more components than its share of a window

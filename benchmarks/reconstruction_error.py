@@ -33,18 +33,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.exploration.mapper import Sensed
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.team import assemble, coordination_of
-from gmmtorch.exploration.world import open_world
+from gmmtorch.evaluation.codecs.point_codecs import Draco, Octree, PointCodec
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.team_setup import assemble, coordination_of
+from gmmtorch.exploration.robot.mapper import Sensed
+from gmmtorch.exploration.world.world import open_world
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.report.table import format_table
-from gmmtorch.sharing.point_codecs import Draco, Octree, PointCodec
-from gmmtorch.simulation.depth_camera import DepthFrame
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.warehouse import warehouse
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.warehouse import warehouse
 
 RIVALS: Mapping[str, Mapping[float, PointCodec]] = {
     "octree": {side: Octree(side) for side in (0.05, 0.07, 0.1, 0.14, 0.2, 0.3)},

@@ -27,10 +27,10 @@ from tables import hardware, markdown
 from torch import Tensor
 
 from gmmtorch import WindowedRule, datasets
-from gmmtorch.mapping import codec
-from gmmtorch.mapping.learning import learn_window
-from gmmtorch.mapping.overlap import generators
-from gmmtorch.mapping.registration import register, yaw_starts
+from gmmtorch.localization.overlap import generators
+from gmmtorch.localization.registration import register, yaw_starts
+from gmmtorch.mapping.codec import component_batch as codec
+from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.scan import Scan
 
 STARTS = ((0.1, 2.0), (0.5, 10.0), (1.0, 20.0), (2.0, 45.0))  # metres, degrees

@@ -38,10 +38,10 @@ import torch
 from gmmtorch.errors import DataError
 from gmmtorch.evaluation.worker_pool import end_with_parent
 from gmmtorch.report.table import format_table
-from gmmtorch.sharing.envelope import Kind
-from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.security import Opener, Sealer, TeamKey
+from gmmtorch.sharing.messages.envelope import Kind
+from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport.security import Opener, Sealer, TeamKey
 from gmmtorch.sharing.view_set import ViewSet
 
 _LIFE = 20_000  # packets that a replica and a set of views hear

@@ -24,13 +24,13 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.mapping.learning import WindowedRule, learn_window
-from gmmtorch.mixture import em
-from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.mapping.learning.windowed import WindowedRule, learn_window
+from gmmtorch.mixture.em import exact as em
 from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.monte_carlo import sample_rays
-from gmmtorch.occupancy.raycast import traverse
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.ray_traversal import traverse
 
 
 def noisy_room(n: int, seed: int) -> Tensor:

@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any
 
 from gmmtorch.cli.links import free_addresses
-from gmmtorch.mapping.codec import quantized
+from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.table import format_table
-from gmmtorch.sharing.component_table import fingerprints
+from gmmtorch.sharing.replica.component_table import fingerprints
 
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory

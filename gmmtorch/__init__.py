@@ -15,21 +15,27 @@ if TYPE_CHECKING:
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
-    from gmmtorch.mapping.incremental import IncrementalRule as IncrementalRule
-    from gmmtorch.mapping.learning import WindowedRule as WindowedRule
+    from gmmtorch.mapping.learning.incremental import IncrementalRule as IncrementalRule
+    from gmmtorch.mapping.learning.windowed import WindowedRule as WindowedRule
     from gmmtorch.mapping.novelty import NoveltyRule as NoveltyRule
-    from gmmtorch.mixture.deconvolved_mixture import DeconvolvedGaussianMixture as DeconvolvedGaussianMixture
     from gmmtorch.mixture.depth_image import fit_depth_image as fit_depth_image
-    from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
-    from gmmtorch.mixture.hierarchical import HierarchicalGaussianMixture as HierarchicalGaussianMixture
-    from gmmtorch.mixture.pruning import prune as prune
-    from gmmtorch.mixture.reduction import merge as merge
-    from gmmtorch.mixture.reduction import simplify as simplify
-    from gmmtorch.mixture.riemannian import RiemannianGaussianMixture as RiemannianGaussianMixture
-    from gmmtorch.mixture.sliced_wasserstein import (
+    from gmmtorch.mixture.estimators.deconvolved import (
+        DeconvolvedGaussianMixture as DeconvolvedGaussianMixture,
+    )
+    from gmmtorch.mixture.estimators.riemannian import RiemannianGaussianMixture as RiemannianGaussianMixture
+    from gmmtorch.mixture.estimators.sliced_wasserstein import (
         SlicedWassersteinGaussianMixture as SlicedWassersteinGaussianMixture,
     )
-    from gmmtorch.mixture.variational import VariationalGaussianMixture as VariationalGaussianMixture
+    from gmmtorch.mixture.estimators.trees.hierarchical import (
+        HierarchicalGaussianMixture as HierarchicalGaussianMixture,
+    )
+    from gmmtorch.mixture.estimators.variational import (
+        VariationalGaussianMixture as VariationalGaussianMixture,
+    )
+    from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
+    from gmmtorch.mixture.reduction.merge import merge as merge
+    from gmmtorch.mixture.reduction.merge import simplify as simplify
+    from gmmtorch.mixture.reduction.pruning import prune as prune
     from gmmtorch.occupancy.evidence import Evidence as Evidence
     from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
     from gmmtorch.scan import Scan as Scan
@@ -40,25 +46,25 @@ except PackageNotFoundError:  # a bare checkout on the path
     __version__ = "0+unknown"
 
 _HOMES = {
-    "DeconvolvedGaussianMixture": "gmmtorch.mixture.deconvolved_mixture",
+    "DeconvolvedGaussianMixture": "gmmtorch.mixture.estimators.deconvolved",
     "Evidence": "gmmtorch.occupancy.evidence",
     "GaussianMap": "gmmtorch.mapping.gaussian_map",
     "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
     "GmmTorchError": "gmmtorch.errors",
-    "HierarchicalGaussianMixture": "gmmtorch.mixture.hierarchical",
-    "IncrementalRule": "gmmtorch.mapping.incremental",
+    "HierarchicalGaussianMixture": "gmmtorch.mixture.estimators.trees.hierarchical",
+    "IncrementalRule": "gmmtorch.mapping.learning.incremental",
     "NoveltyRule": "gmmtorch.mapping.novelty",
     "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
-    "RiemannianGaussianMixture": "gmmtorch.mixture.riemannian",
+    "RiemannianGaussianMixture": "gmmtorch.mixture.estimators.riemannian",
     "Scan": "gmmtorch.scan",
-    "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.sliced_wasserstein",
-    "VariationalGaussianMixture": "gmmtorch.mixture.variational",
+    "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.estimators.sliced_wasserstein",
+    "VariationalGaussianMixture": "gmmtorch.mixture.estimators.variational",
     "VoxelGrid": "gmmtorch.occupancy.grid",
-    "WindowedRule": "gmmtorch.mapping.learning",
+    "WindowedRule": "gmmtorch.mapping.learning.windowed",
     "fit_depth_image": "gmmtorch.mixture.depth_image",
-    "merge": "gmmtorch.mixture.reduction",
-    "prune": "gmmtorch.mixture.pruning",
-    "simplify": "gmmtorch.mixture.reduction",
+    "merge": "gmmtorch.mixture.reduction.merge",
+    "prune": "gmmtorch.mixture.reduction.pruning",
+    "simplify": "gmmtorch.mixture.reduction.merge",
 }
 
 __all__ = [

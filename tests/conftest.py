@@ -55,7 +55,7 @@ def real_data() -> Path:
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The ticks that missions of this process step from."""
-    from gmmtorch.exploration.mission import Mission
+    from gmmtorch.exploration.mission.mission import Mission
 
     ticks: list[int] = []
     step = Mission.step

@@ -15,7 +15,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, c
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.raycast import traverse
+from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.ndt_map", 1

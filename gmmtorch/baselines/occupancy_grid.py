@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, require_counts, write_bytes
-from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 from gmmtorch.scan import ArrayLike, Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1

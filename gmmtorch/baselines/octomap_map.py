@@ -16,7 +16,7 @@ from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.thinned_samples import check_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.raycast import traverse
+from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
 
 _MARK = b"# gmmtorch.octomap_map 1 "

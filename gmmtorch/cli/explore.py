@@ -11,8 +11,8 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common, missions, schema
 
 if TYPE_CHECKING:
-    from gmmtorch.exploration.mission import Mission
-    from gmmtorch.exploration.pace import Pace
+    from gmmtorch.exploration.mission.mission import Mission
+    from gmmtorch.exploration.mission.pace import Pace
     from gmmtorch.report.progress import ProgressBars
 
 _TABLE = (
@@ -47,7 +47,7 @@ def run(config: DictConfig) -> float | None:
             f"transport={config.transport!r} is not one of in_process; gmmtorch-team has the others."
         )
     if config.report.recording:
-        from gmmtorch.report.exploration_recording import load_rerun
+        from gmmtorch.report.exploration.rerun_recording import load_rerun
 
         load_rerun()  # before there is anything to record
     folder = common.run_dir()
@@ -62,8 +62,8 @@ def run(config: DictConfig) -> float | None:
 def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
     """One mission, shown as it goes."""
     from gmmtorch.cli.explore_pictures import MissionRecorder
-    from gmmtorch.exploration.pace import pace_of
-    from gmmtorch.exploration.trials import STAGE, run_mission
+    from gmmtorch.exploration.mission.pace import pace_of
+    from gmmtorch.exploration.mission.trials import STAGE, run_mission
 
     trial = missions.trial_of(config, folder)
     missions.tell_what_begins_anew(config, [trial])
@@ -105,7 +105,7 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
     """Every variant of a study with every seed."""
     from gmmtorch.cli.explore_pictures import save_comparison
     from gmmtorch.errors import check_whole
-    from gmmtorch.exploration.trials import STAGE, run_trials
+    from gmmtorch.exploration.mission.trials import STAGE, run_trials
 
     check_whole("runtime.workers", config.runtime.workers, 1)
     variants = missions.variants_of(config)
@@ -135,12 +135,12 @@ def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:
     """The table; of several variants each has a name, and what networks cost is told where they differ."""
-    from gmmtorch.exploration.variants import NETWORK, differing
+    from gmmtorch.exploration.mission.variants import NETWORK, differing
 
     columns = _TABLE.split()
     title = f"{rows[0]['world']}: {rows[0]['n_robots']} robots"
     if fields := differing(rows):
-        from gmmtorch.report.exploration_variants import by_variant
+        from gmmtorch.report.exploration.variant_figures import by_variant
 
         rows = [{"variant": name, **row} for name, group in by_variant(rows).items() for row in group]
         named = [name for name in columns if name not in ("framework", "planner")]
@@ -150,8 +150,8 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
 
 def _compared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows with what only those beside them tell."""
-    from gmmtorch.exploration.network_outcome import with_network_costs
-    from gmmtorch.exploration.outcome import with_times
+    from gmmtorch.exploration.mission.mission_results import with_times
+    from gmmtorch.exploration.mission.network_results import with_network_costs
 
     return with_network_costs(with_times(rows))
 

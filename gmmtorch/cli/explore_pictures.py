@@ -12,12 +12,12 @@ from gmmtorch.cli import common
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from gmmtorch.exploration.album import Moment
-    from gmmtorch.exploration.mission import Mission
-    from gmmtorch.exploration.world import World
+    from gmmtorch.exploration.mission.mission import Mission
+    from gmmtorch.exploration.mission.snapshots import Moment
+    from gmmtorch.exploration.world.world import World
     from gmmtorch.mapping.components import Components
-    from gmmtorch.report.exploration_maps import TeamSnapshot
-    from gmmtorch.report.exploration_top_view import TopView
+    from gmmtorch.report.exploration.mission_maps import TeamSnapshot
+    from gmmtorch.report.exploration.top_view import TopView
 
 _HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
 
@@ -30,9 +30,9 @@ class MissionRecorder:
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
-        from gmmtorch.exploration.album import Album
-        from gmmtorch.report.board import Board
-        from gmmtorch.report.exploration_board import MissionBoard
+        from gmmtorch.exploration.mission.snapshots import Album
+        from gmmtorch.report.exploration.mission_tensorboard import MissionBoard
+        from gmmtorch.report.tensorboard_writer import Board
 
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
@@ -63,8 +63,8 @@ class MissionRecorder:
         """
         import torch
 
-        from gmmtorch.exploration.trials import TRAJECTORIES, save_trajectories
-        from gmmtorch.report.exploration_board import write_exploration_board
+        from gmmtorch.exploration.mission.trials import TRAJECTORIES, save_trajectories
+        from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
 
         paths = [torch.stack(path) for path in mission.trajectories]
 
@@ -84,7 +84,7 @@ class MissionRecorder:
             write_exploration_board(self._board, [row], figures)
             self._board.close()
         if self._config.report.recording:
-            from gmmtorch.report.exploration_recording import RecordedMap, record_rerun
+            from gmmtorch.report.exploration.rerun_recording import RecordedMap, record_rerun
 
             record_rerun(
                 self._folder / "mission.rrd",
@@ -125,7 +125,7 @@ class MissionRecorder:
 
     def _snapshot(self, mission: Mission, moment: Moment, paths: list[Tensor]) -> TeamSnapshot:
         """A moment as the picture of the team's map shows it: components within the band of heights."""
-        from gmmtorch.report.exploration_maps import TeamSnapshot
+        from gmmtorch.report.exploration.mission_maps import TeamSnapshot
 
         shown: dict[str, Any] = {}
         if "means" in moment.content:
@@ -144,10 +144,10 @@ class MissionRecorder:
     def _figures(
         self, mission: Mission, row: dict[str, Any], paths: list[Tensor], components: Components | None
     ) -> dict[str, Any]:
-        from gmmtorch.report.exploration_bars import profile_figure, stage_means
-        from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure
-        from gmmtorch.report.exploration_maps import team_map_figure, trajectories_figure
-        from gmmtorch.report.exploration_scene import mixture_scene_figure
+        from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means
+        from gmmtorch.report.exploration.mission_curves import bandwidth_figure, entropy_figure
+        from gmmtorch.report.exploration.mission_maps import team_map_figure, trajectories_figure
+        from gmmtorch.report.exploration.mission_scene import mixture_scene_figure
 
         if not (self._config.report.figures or self._config.report.tensorboard):
             return {}
@@ -180,14 +180,18 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
 
     Where teams are flown on several networks, these are one picture, and all others are of the first.
     """
-    from gmmtorch.exploration.variants import NETWORK, differing
+    from gmmtorch.exploration.mission.variants import NETWORK, differing
     from gmmtorch.files import write_bytes
-    from gmmtorch.report.board import Board
-    from gmmtorch.report.exploration_bars import profile_figure, stage_means, summary_bars
-    from gmmtorch.report.exploration_board import write_exploration_board
-    from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
-    from gmmtorch.report.exploration_loss import loss_figure
-    from gmmtorch.report.study_summary import study_summary
+    from gmmtorch.report.exploration.loss_figures import loss_figure
+    from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
+    from gmmtorch.report.exploration.mission_curves import (
+        bandwidth_figure,
+        entropy_figure,
+        planner_comparison_figure,
+    )
+    from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
+    from gmmtorch.report.studies.study_summary import study_summary
+    from gmmtorch.report.tensorboard_writer import Board
 
     write_bytes(folder / "summary.md", study_summary(rows).encode())
     on_first, on_several = _by_networks(rows)
@@ -211,7 +215,7 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
 def _by_networks(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Of each framework the rows on the first network that it was flown on; and, of those that were flown
     on several, all rows."""
-    from gmmtorch.exploration.variants import NETWORK, variant_of
+    from gmmtorch.exploration.mission.variants import NETWORK, variant_of
 
     networks: dict[str, dict[Any, None]] = {}  # in the order they come
     for row in rows:
@@ -248,7 +252,7 @@ def _layers(mission: Mission) -> tuple[int, int]:
 
 
 def _view(mission: Mission, probability: Any) -> TopView:
-    from gmmtorch.report.exploration_top_view import top_view
+    from gmmtorch.report.exploration.top_view import top_view
 
     low = mission.world.box.low.clone()
     low[2] += _layers(mission)[0]
@@ -257,7 +261,7 @@ def _view(mission: Mission, probability: Any) -> TopView:
 
 def _team_view(mission: Mission) -> TopView:
     """The team's map from above, in the band of heights that the robots began in."""
-    from gmmtorch.occupancy.cell_evidence import Box
+    from gmmtorch.occupancy.voxels.cell_evidence import Box
 
     box, (first, last) = mission.world.box, _layers(mission)
     low, high = box.low.clone(), box.high.clone()

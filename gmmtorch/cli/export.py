@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
     from gmmtorch.evaluation.events import Event
+    from gmmtorch.export.mixture_formats import PlainMixture
+    from gmmtorch.export.point_cloud import CellCloud
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mixture.interchange import PlainMixture
-    from gmmtorch.occupancy.cell_cloud import CellCloud
     from gmmtorch.occupancy.grid import VoxelGrid
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd")
@@ -60,7 +60,8 @@ def run(config: DictConfig) -> None:
 
 def _export_components(config: DictConfig) -> str:
     """Weights, means and covariances; returns what to say of it."""
-    from gmmtorch.mixture import GaussianMixture, interchange
+    from gmmtorch.export import mixture_formats as interchange
+    from gmmtorch.mixture import GaussianMixture
 
     mixture = interchange.checked(_components(Path(config.path), config.n_points))
     output = Path(config.output)
@@ -77,8 +78,9 @@ def _export_components(config: DictConfig) -> str:
 def _components(path: Path, n_points: float | None) -> PlainMixture:
     """The mixture in a file of any kind; of a map, the components that are surfaces."""
     from gmmtorch.errors import DataError
+    from gmmtorch.export import mixture_formats as interchange
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mixture import GaussianMixture, interchange
+    from gmmtorch.mixture import GaussianMixture
 
     if path.suffix == ".csv":
         return interchange.read_gira_csv(path, n_points)
@@ -121,9 +123,9 @@ def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
 
 def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
     """Probabilities of cells; returns what to say of it."""
-    from gmmtorch.occupancy import map_server
-    from gmmtorch.occupancy.cell_cloud import write_pcd, write_ply
-    from gmmtorch.occupancy.octree_export import write_octomap
+    from gmmtorch.export import map_server
+    from gmmtorch.export.octomap import write_octomap
+    from gmmtorch.export.point_cloud import write_pcd, write_ply
     from gmmtorch.occupancy.thresholds import Thresholds
 
     output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
@@ -148,8 +150,8 @@ def _cloud(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Ev
     """The cells that something is known of; a grid's are at hand."""
     import torch
 
+    from gmmtorch.export.point_cloud import CellCloud
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.occupancy.cell_cloud import CellCloud
 
     if isinstance(source, GaussianMap) or config.bounds is not None or _band(config) is not None:
         return CellCloud.of_grid(*_dense(config, source, on_event))
@@ -167,7 +169,7 @@ def _dense(
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.occupancy.grid import VoxelGrid
-    from gmmtorch.occupancy.rasterize import rasterize
+    from gmmtorch.occupancy.voxels.rasterize import rasterize
 
     resolution = _resolution(config, source)
     low, high = _box(config, source)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.fitting import FitOutcome, Row
+    from gmmtorch.evaluation.studies.fitting import FitOutcome, Row
 
 _TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
@@ -50,7 +50,7 @@ def run(config: DictConfig) -> float | None:
 
 def _run_streamed(config: DictConfig) -> float | None:
     """The same of a fit that is streamed; None in all processes but the first."""
-    from gmmtorch.evaluation.fitting import FitOutcome
+    from gmmtorch.evaluation.studies.fitting import FitOutcome
 
     folder = common.run_dir()
     streamed = fit_stream.run(config, material.material, folder)
@@ -65,7 +65,7 @@ def _run_streamed(config: DictConfig) -> float | None:
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
     """A row for each method; every mixture is saved, and shown."""
-    from gmmtorch.evaluation import fitting
+    from gmmtorch.evaluation.studies import fitting
 
     given = material.material(config, device, on_event)
     outcome = fitting.compare(
@@ -89,12 +89,12 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
-    from gmmtorch.evaluation.fitting import in_use
-    from gmmtorch.report.board import Board
-    from gmmtorch.report.comparison import comparison_figure
+    from gmmtorch.evaluation.studies.fitting import in_use
     from gmmtorch.report.curves import convergence_figure
-    from gmmtorch.report.mixtures import mixture_figure
+    from gmmtorch.report.maps.comparison import comparison_figure
+    from gmmtorch.report.maps.mixture_figures import mixture_figure
     from gmmtorch.report.style import label_of
+    from gmmtorch.report.tensorboard_writer import Board
 
     likelihoods = {name: b for name, b in outcome.lower_bounds.items() if name not in NO_LIKELIHOODS}
     figures = {"convergence": convergence_figure(likelihoods)}

@@ -15,9 +15,9 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.fitting import Material
-    from gmmtorch.evaluation.streamed import Split, Streamed
-    from gmmtorch.mixture.checkpoints import Checkpoint
+    from gmmtorch.evaluation.studies.fitting import Material
+    from gmmtorch.evaluation.studies.streamed_fit import Split, Streamed
+    from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 
 MaterialOf = Callable[[DictConfig, str, Any], "Material"]
 """(config, device, on_event) → the points of the data set."""
@@ -42,15 +42,15 @@ def quiet_follower() -> Iterator[None]:
 
 def is_wanted(config: DictConfig) -> bool:
     """Whether the options, or torchrun, ask for a streamed fit."""
-    from gmmtorch.mixture.distributed import is_launched
+    from gmmtorch.mixture.streaming.distributed import is_launched
 
     return config.points is not None or config.checkpoint is not None or config.resume or is_launched()
 
 
 def run(config: DictConfig, material_of: MaterialOf, folder: Path) -> Streamed | None:
     """One streamed fit: its row is written, its mixture saved. None in a process other than the first."""
-    from gmmtorch.evaluation.streamed import fit_streamed
-    from gmmtorch.mixture.distributed import joined
+    from gmmtorch.evaluation.studies.streamed_fit import fit_streamed
+    from gmmtorch.mixture.streaming.distributed import joined
     from gmmtorch.report.progress import ProgressBars
 
     device = common.set_up(config)
@@ -103,7 +103,7 @@ def _check(config: DictConfig) -> None:
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:
-    from gmmtorch.mixture.checkpoints import Checkpoint
+    from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 
     if config.checkpoint is None:
         return None
@@ -113,8 +113,8 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
 
 
 def _split(config: DictConfig, material_of: MaterialOf, device: str, on_event: Any) -> Split:
-    from gmmtorch.datasets.point_chunks import open_points
-    from gmmtorch.evaluation.streamed import split_material, split_source
+    from gmmtorch.datasets.point_files.point_chunks import open_points
+    from gmmtorch.evaluation.studies.streamed_fit import split_material, split_source
 
     stream = config.stream
     if config.points is None:

@@ -13,8 +13,8 @@ from omegaconf import DictConfig
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
-    from gmmtorch.sharing.framed_transport import FramedTransport
-    from gmmtorch.sharing.security import TeamKey
+    from gmmtorch.sharing.transport.frames import FramedTransport
+    from gmmtorch.sharing.transport.security import TeamKey
 
 TRANSPORTS = ("udp", "zenoh")
 _NAMES = {"key": "link.key_file", "insecure": "link.insecure"}
@@ -69,7 +69,7 @@ def _opened(config: DictConfig, robot: int) -> FramedTransport:
 
 
 def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
-    from gmmtorch.sharing.zenoh_transport import ZenohTransport
+    from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
     return ZenohTransport(
         robot,
@@ -84,7 +84,7 @@ def _zenoh(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTrans
 
 
 def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTransport:
-    from gmmtorch.sharing.udp import UdpTransport
+    from gmmtorch.sharing.transport.udp import UdpTransport
 
     insecure = link["insecure"]
     if link["group"] is not None:
@@ -99,7 +99,7 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
 
 def await_team(transport: FramedTransport, n_others: int) -> None:
     """Wait until so many are connected; not for long, and only where there are connections."""
-    from gmmtorch.sharing.zenoh_transport import ZenohTransport
+    from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
     end = time.monotonic() + _PATIENCE
     while (
@@ -110,8 +110,8 @@ def await_team(transport: FramedTransport, n_others: int) -> None:
 
 def team_key(path: str | None) -> TeamKey | None:
     """The team's key: of the file, or of the environment where there is one."""
-    from gmmtorch.sharing.security import TeamKey
-    from gmmtorch.sharing.team_key import KEY_VARIABLE
+    from gmmtorch.sharing.transport.security import TeamKey
+    from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
 
     if path is not None:
         return TeamKey.from_file(Path(path))

@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.contenders import MapFactory
+    from gmmtorch.evaluation.methods import MapFactory
     from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
     from gmmtorch.mapping.novelty import NoveltyRule
 
@@ -31,7 +31,7 @@ def limits(config: DictConfig) -> dict[str, Any]:
 
 def known_methods(config: DictConfig) -> dict[str, MapFactory]:
     """Every method by name."""
-    from gmmtorch.evaluation import contenders
+    from gmmtorch.evaluation import methods as contenders
 
     options = common.as_options(config.method_options)
     return contenders.methods(map_factory(config), options, **limits(config))
@@ -54,7 +54,7 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
     """Makes empty maps with the options `map.*`, of which `changes` replace some."""
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.mixture.em import SOFTMAX_DTYPES
+    from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES
 
     dtype = config.runtime.dtype
     if dtype not in SOFTMAX_DTYPES:  # of an incremental map it is checked alone
@@ -75,8 +75,8 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
 
 def _rule(options: dict[str, Any], dtype: str) -> Learning:
     """The learning rule of the options `map.*` that are left."""
-    from gmmtorch.mapping.incremental import IncrementalRule
-    from gmmtorch.mapping.learning import WindowedRule
+    from gmmtorch.mapping.learning.incremental import IncrementalRule
+    from gmmtorch.mapping.learning.windowed import WindowedRule
 
     if options.pop("name") != "incremental":
         return WindowedRule(**options, dtype=dtype)

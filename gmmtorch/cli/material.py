@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.fitting import Material
+    from gmmtorch.evaluation.studies.fitting import Material
     from gmmtorch.scan import Scan
 
 
@@ -26,7 +26,7 @@ def material_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> Materia
     """The same of given scans."""
     import torch
 
-    from gmmtorch.evaluation.fitting import split
+    from gmmtorch.evaluation.studies.fitting import split
 
     points = _thinned(torch.cat([scan.points for scan in scans]), config.max_points, config.seed)
     return split(name, points, config.test_share, config.seed)

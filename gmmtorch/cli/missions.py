@@ -14,9 +14,9 @@ from gmmtorch.cli import common
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.exploration.options import TeamOptions
-    from gmmtorch.exploration.trials import Trial, WorldOptions
-    from gmmtorch.exploration.world import World
+    from gmmtorch.exploration.mission.options import TeamOptions
+    from gmmtorch.exploration.mission.trials import Trial, WorldOptions
+    from gmmtorch.exploration.world.world import World
 
 T = TypeVar("T")
 OF_ROBOTS = {"announce": "announce_every", "budget": "budget"}
@@ -68,7 +68,7 @@ def trial_of(
     The jobs of a sweep may share `checkpoint.folder`: each mission has a folder of its own there, and finds
     it again.
     """
-    from gmmtorch.exploration.trials import Trial
+    from gmmtorch.exploration.mission.trials import Trial
 
     home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
@@ -84,7 +84,7 @@ def trial_of(
 
 def tell_what_begins_anew(config: DictConfig, trials: Sequence[Trial]) -> None:
     """Warn of missions that `checkpoint.folder` does not hold, though it holds one of their name."""
-    from gmmtorch.exploration.trials import is_begun
+    from gmmtorch.exploration.mission.trials import is_begun
 
     def has_a_namesake(folder: Path) -> bool:
         name, _, _ = folder.name.rpartition("_")
@@ -111,7 +111,7 @@ def _short(value: Any) -> str:
 def world_options(config: DictConfig) -> WorldOptions:
     """The world that the options describe."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.exploration.trials import WorldOptions
+    from gmmtorch.exploration.mission.trials import WorldOptions
 
     if OmegaConf.is_missing(config.world, "path"):
         raise InvalidArgumentError(
@@ -135,13 +135,13 @@ def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
     """The team that the options describe, but for what a variant sets."""
-    from gmmtorch.exploration.mixture_mapper import FrameRule
-    from gmmtorch.exploration.options import TeamOptions
-    from gmmtorch.exploration.primitives import Dynamics
-    from gmmtorch.exploration.returns import RestRule
-    from gmmtorch.exploration.scoring import BeliefRule
+    from gmmtorch.exploration.mission.options import TeamOptions
+    from gmmtorch.exploration.planning.primitives import Dynamics
+    from gmmtorch.exploration.robot.gmm_mapper import FrameRule
+    from gmmtorch.exploration.robot.stopping_criterion import RestRule
+    from gmmtorch.exploration.world.scoring import BeliefRule
     from gmmtorch.mapping.novelty import NoveltyRule
-    from gmmtorch.simulation.depth_camera import DepthCamera
+    from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
     rate, window = sensor.pop("rate"), mapping.pop("window")
@@ -188,7 +188,7 @@ def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: A
 
 def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
     """What `TeamOptions` has of the network; errors call it what the user does."""
-    from gmmtorch.sharing.link_conditions import LinkConditions
+    from gmmtorch.sharing.transport.link_conditions import LinkConditions
 
     given = {key: value for key, value in common.as_options(config.network).items() if key not in OF_ROBOTS}
     names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}

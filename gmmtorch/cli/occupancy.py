@@ -13,7 +13,7 @@ from gmmtorch.cli import common, maps, occupancy_studies, schema
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.occupancy import Built, Outcome
+    from gmmtorch.evaluation.held_out import Built, Outcome
     from gmmtorch.scan import Scan
 
 _TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
@@ -45,7 +45,8 @@ def run(config: DictConfig) -> float | None:
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[dict[str, Any]]:
     """A row for each method, share kept and resolution."""
     from gmmtorch.errors import check_whole
-    from gmmtorch.evaluation import contenders, occupancy
+    from gmmtorch.evaluation import held_out as occupancy
+    from gmmtorch.evaluation import methods as contenders
 
     check_whole("report.magnify", config.report.magnify, 0)
     factories = contenders.choose(list(config.method), maps.known_methods(config))
@@ -84,10 +85,10 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.report.curves import roc_figure
-    from gmmtorch.report.maps import map_figure
-    from gmmtorch.report.mixtures import mixture_figure
-    from gmmtorch.report.raster import MapPanel, busiest_regions, robust_bounds
-    from gmmtorch.report.sparsity import auc_against_kept_figure
+    from gmmtorch.report.maps.map_figures import map_figure
+    from gmmtorch.report.maps.mixture_figures import mixture_figure
+    from gmmtorch.report.maps.raster import MapPanel, busiest_regions, robust_bounds
+    from gmmtorch.report.studies.sparsity_figures import auc_against_kept_figure
 
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
@@ -127,7 +128,7 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     """The reliability diagram of the maps at one resolution."""
     from gmmtorch.evaluation.calibration import reliability
     from gmmtorch.evaluation.queries import OCCUPIED
-    from gmmtorch.report.calibration import reliability_figure
+    from gmmtorch.report.studies.calibration_figures import reliability_figure
 
     curves = {}
     for built in shown:
@@ -156,7 +157,7 @@ def _write_board(
 
     from gmmtorch.evaluation.queries import OCCUPIED
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.report.board import Board
+    from gmmtorch.report.tensorboard_writer import Board
 
     with Board(folder) as board:
         # Steps are per cent of the data kept; TensorBoard takes a step back for a restart.

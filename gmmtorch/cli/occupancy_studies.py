@@ -55,7 +55,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> Rows:
     shown = found.rows if found.shown is None else found.shown
     common.save_figures(config, found.figures, folder)
     if config.report.tensorboard:
-        from gmmtorch.report.board import Board
+        from gmmtorch.report.tensorboard_writer import Board
 
         with Board(folder / "tensorboard") as board:
             for step, row in enumerate(shown):
@@ -79,10 +79,12 @@ def _scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[
 def _auc_memory(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
     """Our map and BGK's at each of their sizes, and `study.others` at the one they have."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation import auc_memory, contenders, occupancy
-    from gmmtorch.evaluation.auc_memory import Sized
-    from gmmtorch.mapping.answers import check_method
-    from gmmtorch.report import auc_memory as report
+    from gmmtorch.evaluation import held_out as occupancy
+    from gmmtorch.evaluation import methods as contenders
+    from gmmtorch.evaluation.studies import auc_memory
+    from gmmtorch.evaluation.studies.auc_memory import Sized
+    from gmmtorch.mapping.query import check_method
+    from gmmtorch.report.studies import auc_memory_figures as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     options = _options(config)
@@ -116,9 +118,9 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
     """Maps of several sizes under several thresholds."""
     import torch
 
-    from gmmtorch.evaluation import variance_threshold
-    from gmmtorch.mapping.answers import check_method
-    from gmmtorch.report import variance_threshold as report
+    from gmmtorch.evaluation.studies import variance_threshold
+    from gmmtorch.mapping.query import check_method
+    from gmmtorch.report.studies import variance_threshold_figures as report
 
     options = _options(config)
     method = options.pop("method")
@@ -149,8 +151,8 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
 
 def _approximation_error(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
     """Every form of evidence against the exact angular form; needs no data set."""
-    from gmmtorch.evaluation import approximation_error
-    from gmmtorch.report import approximation_error as report
+    from gmmtorch.evaluation.studies import approximation_error
+    from gmmtorch.report.studies import approximation_error_figures as report
 
     options = approximation_error.Options(**_options(config))
     rows = approximation_error.run(options, config.seed, on_event, keep)
@@ -162,9 +164,10 @@ def _approximation_error(config: DictConfig, device: str, on_event: Event, keep:
 def _pose_correction(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
     """Maps of perturbed poses, before and after the poses are put right."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation import occupancy, pose_correction
-    from gmmtorch.mapping.answers import METHODS, check_method
-    from gmmtorch.report import pose_correction as report
+    from gmmtorch.evaluation import held_out as occupancy
+    from gmmtorch.evaluation.studies import pose_correction
+    from gmmtorch.mapping.query import METHODS, check_method
+    from gmmtorch.report.studies import pose_correction_figures as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
     methods = _options(config)["methods"]

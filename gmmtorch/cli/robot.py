@@ -21,9 +21,9 @@ from gmmtorch.cli.outputs import Outputs, terse
 from gmmtorch.cli.robot_memory import RobotMemory, facts_of
 
 if TYPE_CHECKING:
-    from gmmtorch.exploration.flying import FlyingNode
-    from gmmtorch.exploration.node import Node
-    from gmmtorch.sharing.framed_transport import FramedTransport
+    from gmmtorch.exploration.mission.flying import FlyingNode
+    from gmmtorch.exploration.mission.node import Node
+    from gmmtorch.sharing.transport.frames import FramedTransport
 
 TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 """In the environment, the process that has started this one; where that ends, this does, too."""
@@ -115,7 +115,7 @@ def _run(config: DictConfig, answers: IO[str] | None) -> None:
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for options, of a robot or a team, before anything is opened."""
     from gmmtorch.errors import InvalidArgumentError, check_whole
-    from gmmtorch.exploration.node import check_pace
+    from gmmtorch.exploration.mission.node import check_pace
 
     if common.set_up(config) != "cpu":
         raise InvalidArgumentError(
@@ -161,10 +161,10 @@ def _flying(
     config: DictConfig, memory: RobotMemory, transport: FramedTransport, stack: ExitStack
 ) -> FlyingNode:
     """A robot with a simulated camera in a simulated world."""
-    from gmmtorch.exploration.flying import FlyingNode
-    from gmmtorch.exploration.team import make_agent, start_poses
-    from gmmtorch.sharing.record_ids import drawn_incarnation
-    from gmmtorch.sharing.replica import Replica
+    from gmmtorch.exploration.mission.flying import FlyingNode
+    from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
+    from gmmtorch.sharing.replica.record_keys import drawn_incarnation
+    from gmmtorch.sharing.replica.replica import Replica
 
     options = missions.team_options(config, config.seed, {})
     world = missions.open_world(missions.world_options(config), options)
@@ -181,10 +181,10 @@ def _flying(
 
 def _replay(config: DictConfig, memory: RobotMemory, transport: FramedTransport, stack: ExitStack) -> Node:
     """A robot that maps a recorded log, or its part of one."""
-    from gmmtorch.datasets.part import Part, part_of
+    from gmmtorch.datasets.dataset_shard import Part, part_of
     from gmmtorch.errors import check_whole
-    from gmmtorch.exploration.replay import ReplayNode
-    from gmmtorch.sharing.replica import Replica
+    from gmmtorch.exploration.mission.replay import ReplayNode
+    from gmmtorch.sharing.replica.replica import Replica
 
     scans = common.open_dataset(config.log.dataset)
     indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
@@ -216,7 +216,7 @@ def _map_options(config: DictConfig) -> DictConfig:
 def _by_the_clock(config: DictConfig, node: Node, folder: Path) -> None:
     """Until its work is done, and the team has had time to catch up; or until it is told to stop."""
     from gmmtorch.cli.robot_report import RobotReport, print_refusals
-    from gmmtorch.exploration.node import check_number, run_paced
+    from gmmtorch.exploration.mission.node import check_number, run_paced
 
     outputs = Outputs(folder)
     with RobotReport(config, node, folder) as report, _told_to_stop() as is_told:
@@ -264,8 +264,8 @@ def _told_to_stop() -> Iterator[Callable[[], bool]]:
 
 def _in_step(config: DictConfig, node: Node, folder: Path, answers: IO[str]) -> None:
     from gmmtorch.cli.robot_report import RobotReport
-    from gmmtorch.exploration.flying import FlyingNode
-    from gmmtorch.exploration.lockstep import Serving
+    from gmmtorch.exploration.mission.flying import FlyingNode
+    from gmmtorch.exploration.mission.lockstep import Serving
 
     assert isinstance(node, FlyingNode)  # with source=world
     with RobotReport(config, node, folder) as report:
@@ -289,8 +289,8 @@ def _leave(config: DictConfig, node: Node, outputs: Outputs, more: dict[str, Any
             row[f"{name}_path"] = str(path)
     outputs.written("results.json", lambda _: common.write_results("robot", config, [row], outputs.folder))
     if config.report.figures:
+        from gmmtorch.report.exploration.team_figures import team_run_figure
         from gmmtorch.report.save import save_figure
-        from gmmtorch.report.team_run import team_run_figure
 
         outputs.written("run.png", functools.partial(save_figure, team_run_figure([row])))
     return row

@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli import common
 
 if TYPE_CHECKING:
-    from gmmtorch.sharing.framed_transport import FramedTransport
     from gmmtorch.sharing.journal import Journal
+    from gmmtorch.sharing.transport.frames import FramedTransport
 
 
 class RobotMemory:
@@ -57,7 +57,7 @@ class RobotMemory:
         restored from what can be read in any case."""
         from gmmtorch.sharing.journal import Journal
         from gmmtorch.sharing.journal_facts import keep_facts
-        from gmmtorch.sharing.replica import Replica
+        from gmmtorch.sharing.replica.replica import Replica
 
         if self._is_on and isinstance(replica, Replica):
             with self._going_on():

@@ -15,7 +15,7 @@ from gmmtorch.cli import common
 from gmmtorch.cli.status_line import StatusLine
 
 if TYPE_CHECKING:
-    from gmmtorch.exploration.node import Node
+    from gmmtorch.exploration.mission.node import Node
 
 _EVERY = 1.0  # seconds of the robot's time between what is shown
 _SERIES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
@@ -134,7 +134,7 @@ class _Events:
     option = "report.tensorboard"
 
     def __init__(self, folder: Path) -> None:
-        from gmmtorch.report.board import Board
+        from gmmtorch.report.tensorboard_writer import Board
 
         self._board = Board(folder)
 

@@ -20,7 +20,7 @@ from gmmtorch.cli.material import chosen_scans, material, material_of
 if TYPE_CHECKING:
     from gmmtorch.evaluation.estimators import FitOptions
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.fitting import OnRows, Row
+    from gmmtorch.evaluation.studies.fitting import OnRows, Row
 
 Work = Callable[[DictConfig, str, "Event", "OnRows"], "list[Row]"]
 """(config, device, on_event, on_rows) → the rows of results.json; on_rows is told of them as they come."""
@@ -29,7 +29,7 @@ Work = Callable[[DictConfig, str, "Event", "OnRows"], "list[Row]"]
 class Study(NamedTuple):
     """Where a study's rows come from, and how they are shown.
 
-    work: makes the rows. report: the module of `gmmtorch.report` whose `figures(rows)` draws them.
+    work: makes the rows. report: the module of `gmmtorch.report.studies` whose `figures(rows)` draws them.
     line: the field of which every value has a line of its own, in the table and in TensorBoard.
     step: the whole number that its points are drawn against. table: further columns of the table.
     """
@@ -48,7 +48,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[
     TensorBoard; then the table, of means over the seeds, on standard output.
     """
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation.fitting import means
+    from gmmtorch.evaluation.studies.fitting import means
 
     if config.study.name not in STUDIES:
         raise InvalidArgumentError(
@@ -63,7 +63,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[
     keep(rows)
     table = means(rows, (study.line, study.step))
     if config.report.figures or config.report.tensorboard:
-        figures = importlib.import_module(f"gmmtorch.report.{study.report}").figures(rows)
+        figures = importlib.import_module(f"gmmtorch.report.studies.{study.report}").figures(rows)
         common.save_figures(config, figures, folder)
         if config.report.tensorboard:
             _write_board(config, study, table, figures, folder / "tensorboard")
@@ -75,7 +75,7 @@ def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[
 def _write_board(
     config: DictConfig, study: Study, table: Sequence[Row], figures: dict[str, Any], folder: Path
 ) -> None:
-    from gmmtorch.report.board import Board
+    from gmmtorch.report.tensorboard_writer import Board
 
     with Board(folder) as board:
         for row in sorted(table, key=lambda row: row[study.step]):
@@ -97,7 +97,7 @@ def _mixture(config: DictConfig) -> FitOptions:
 
 
 def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> list[Row]:
-    from gmmtorch.evaluation import initialization
+    from gmmtorch.evaluation.studies import initialization_study as initialization
 
     options = initialization.Options(**_options(config))
     given = material(config, device, on_event)
@@ -107,7 +107,7 @@ def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: O
 def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> list[Row]:
     """The rows of every fit that this study does not measure are None."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation import sensor_noise
+    from gmmtorch.evaluation.studies import sensor_noise
 
     options = _options(config)
     name, changes = options.pop("sensor"), options.pop("sensor_options")
@@ -129,7 +129,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
 
 
 def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> list[Row]:
-    from gmmtorch.evaluation import component_count
+    from gmmtorch.evaluation.studies import component_count
 
     study = component_count.CountStudy(**_options(config))
     dataset, scans = chosen_scans(config, device, on_event)
@@ -142,21 +142,21 @@ _UNMEASURED = {"log_likelihood": None, "psnr2_db": None}
 STUDIES = {
     "component_count": Study(
         _component_count,
-        "component_count",
+        "component_count_figures",
         "rule",
         "n_components",
         "setting component_bytes held_out_psnr2_db held_out_log_likelihood auc count_seconds seconds",
     ),
     "initialization": Study(
         _initialization,
-        "initialization",
+        "initialization_figures",
         "init_params",
         "n_components",
         "init_seconds n_iterations seconds psnr2_db held_out_psnr2_db log_likelihood held_out_log_likelihood",
     ),
     "sensor_model": Study(
         _sensor_model,
-        "sensor_noise",
+        "sensor_noise_figures",
         "variant",
         "n_components",
         "held_out_log_likelihood auc auc_near_surface thickness sensor_deviation seconds n_iterations nbytes",

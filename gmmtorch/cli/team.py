@@ -70,7 +70,7 @@ def run(config: DictConfig) -> None:
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
     """What all robots would otherwise make, each for itself at the same time; and errors, said once."""
-    from gmmtorch.exploration.team import start_poses
+    from gmmtorch.exploration.mission.team_setup import start_poses
 
     if config.source == "world":
         options = missions.team_options(config, config.seed, {})
@@ -138,8 +138,8 @@ def _endpoints(config: DictConfig) -> list[list[str]]:
 
 def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars) -> dict[str, Any]:
     """Fly the mission, tick by tick."""
-    from gmmtorch.exploration.lockstep import RemotePilot, RobotLostError
-    from gmmtorch.exploration.team_flight import TeamFlight
+    from gmmtorch.exploration.mission.lockstep import RemotePilot, RobotLostError
+    from gmmtorch.exploration.mission.team_flight import TeamFlight
 
     pilots: list[RemotePilot] = []
     for robot in robots:
@@ -190,9 +190,9 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
     """The picture of the run: as a file, and in TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report.board import Board
+    from gmmtorch.report.exploration.team_figures import team_run_figure
     from gmmtorch.report.save import save_figure
-    from gmmtorch.report.team_run import team_run_figure
+    from gmmtorch.report.tensorboard_writer import Board
 
     figure = team_run_figure(rows)
 

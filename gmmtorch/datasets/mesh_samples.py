@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, existing
-from gmmtorch.datasets.clouds import open3d_for
+from gmmtorch.datasets.point_files.clouds import open3d_for
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
 

@@ -12,8 +12,9 @@ from gmmtorch.datasets.base import Dataset, Ranges, existing
 from gmmtorch.datasets.mesh_samples import read_triangles
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
-from gmmtorch.simulation import depth_camera, sense, spinning_lidar
-from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation import sense, spinning_lidar
+from gmmtorch.simulation.sensors.range_sensors import depth_camera
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 SENSOR_RANGE = 30.0
 _SEEDS_APART = 1_000_003

@@ -16,11 +16,11 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event
 from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.estimators.riemannian import RiemannianGaussianMixture
+from gmmtorch.mixture.estimators.sliced_wasserstein import SlicedWassersteinGaussianMixture
+from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
+from gmmtorch.mixture.estimators.variational import VariationalGaussianMixture
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.hierarchical import HierarchicalGaussianMixture
-from gmmtorch.mixture.riemannian import RiemannianGaussianMixture
-from gmmtorch.mixture.sliced_wasserstein import SlicedWassersteinGaussianMixture
-from gmmtorch.mixture.variational import VariationalGaussianMixture
 
 
 @dataclass(frozen=True)

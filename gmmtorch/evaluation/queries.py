@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 from gmmtorch.scan import Scan
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture, touching
-from gmmtorch.mixture.arguments import check_number
-from gmmtorch.mixture.em import Parameters
-from gmmtorch.occupancy.box_mass import normal_mass
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.validation import check_number
+from gmmtorch.occupancy.forms.cone.box_mass import normal_mass
 from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike
 

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
-from gmmtorch.mapping import storage
-from gmmtorch.mapping.answers import Answering, Answers, check_method
-from gmmtorch.mapping.codec import quantized, spatial_order
+from gmmtorch.mapping.codec import map_file as storage
+from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.incremental import IncrementalRule, absorb, absorb_depth, depth_scan
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule, absorb, absorb_depth, depth_scan
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.query import Answering, Answers, check_method
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan

@@ -12,9 +12,9 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import CUTOFF
 from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
+from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.point import point_evidence
-from gmmtorch.occupancy.raycast import traverse
+from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
 from gmmtorch.sorting import number_distinct
 

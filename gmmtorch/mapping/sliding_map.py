@@ -12,9 +12,16 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.novelty import NoveltyRule
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, common, flat_index, in_cells, passage_of
 from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.occupancy.voxels.cell_evidence import (
+    Box,
+    CellEvidence,
+    common,
+    flat_index,
+    in_cells,
+    passage_of,
+)
 
 Slices = tuple[slice, ...]
 

@@ -14,8 +14,8 @@ from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.arguments import checked_parameter
-from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.validation import checked_parameter
 from gmmtorch.scan import ArrayLike
 
 Surfaces = Components | GaussianMap | tuple[ArrayLike, ArrayLike, ArrayLike]

@@ -1,14 +1,14 @@
 """Gaussian mixtures and how they are learned (thesis chapter 2)."""
 
-from gmmtorch.mixture.deconvolved_mixture import DeconvolvedGaussianMixture
 from gmmtorch.mixture.depth_image import fit_depth_image
+from gmmtorch.mixture.estimators.deconvolved import DeconvolvedGaussianMixture
+from gmmtorch.mixture.estimators.riemannian import RiemannianGaussianMixture
+from gmmtorch.mixture.estimators.sliced_wasserstein import SlicedWassersteinGaussianMixture
+from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
+from gmmtorch.mixture.estimators.variational import VariationalGaussianMixture
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.hierarchical import HierarchicalGaussianMixture
-from gmmtorch.mixture.pruning import prune
-from gmmtorch.mixture.reduction import merge, simplify
-from gmmtorch.mixture.riemannian import RiemannianGaussianMixture
-from gmmtorch.mixture.sliced_wasserstein import SlicedWassersteinGaussianMixture
-from gmmtorch.mixture.variational import VariationalGaussianMixture
+from gmmtorch.mixture.reduction.merge import merge, simplify
+from gmmtorch.mixture.reduction.pruning import prune
 
 __all__ = [
     "DeconvolvedGaussianMixture",

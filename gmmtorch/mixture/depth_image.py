@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.mixture import em
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.grouping import Rows
+from gmmtorch.mixture.em.initialization import copied, flat_pieces
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.grouping import Rows
-from gmmtorch.mixture.initialization import copied, flat_pieces
 
 _BLOCK = 8  # pixels along the side of the smallest cell
 _LEVELS = 2  # doublings of it

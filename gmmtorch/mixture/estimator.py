@@ -20,8 +20,10 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.linalg import check_rigid, check_symmetric, inverse_factor, safe_cholesky
-from gmmtorch.mixture import em, storage
-from gmmtorch.mixture.arguments import (
+from gmmtorch.mixture import mixture_file as storage
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.validation import (
     Array,
     RandomState,
     as_generator,
@@ -31,7 +33,6 @@ from gmmtorch.mixture.arguments import (
     checked_weight,
     warn_if_coarse,
 )
-from gmmtorch.mixture.em import Parameters
 
 Self = TypeVar("Self", bound="MixtureEstimator")
 

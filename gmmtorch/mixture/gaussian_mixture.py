@@ -10,8 +10,16 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import inverse_factor, safe_cholesky
-from gmmtorch.mixture import em, stepwise
-from gmmtorch.mixture.arguments import (
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import stepwise
+from gmmtorch.mixture.em.cells import pool_into_cells
+from gmmtorch.mixture.em.exact import EMResult, Parameters
+from gmmtorch.mixture.em.grouping import Rows, nearest
+from gmmtorch.mixture.em.initialization import INITIALIZATIONS, copied, flat_pieces, start
+from gmmtorch.mixture.em.surface_rule import surface_pieces
+from gmmtorch.mixture.em.truncated import Settings, learn_truncated
+from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.validation import (
     Array,
     RandomState,
     as_generator,
@@ -20,13 +28,6 @@ from gmmtorch.mixture.arguments import (
     check_number,
     checked_parameter,
 )
-from gmmtorch.mixture.cells import pool_into_cells
-from gmmtorch.mixture.component_count import surface_pieces
-from gmmtorch.mixture.em import EMResult, Parameters
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.grouping import Rows, nearest
-from gmmtorch.mixture.initialization import INITIALIZATIONS, copied, flat_pieces, start
-from gmmtorch.mixture.truncated import Settings, learn_truncated
 
 _KMEANS_IS_CHEAP = 2_000_000  # pairs of point and component: about a second
 _MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # from which on truncated EM is faster

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.raycast import CHUNK_VISITS, traverse
+from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS, traverse
 
 
 class CellClass(IntEnum):

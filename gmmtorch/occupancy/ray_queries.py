@@ -12,8 +12,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
-from gmmtorch.occupancy.point import PointForm
 
 _CELLS_AT_ONCE = 1 << 18
 

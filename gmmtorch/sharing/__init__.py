@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gmmtorch.sharing.journal import Journal as Journal
-    from gmmtorch.sharing.replica import Replica as Replica
+    from gmmtorch.sharing.replica.replica import Replica as Replica
 
 __all__ = ["Journal", "Replica"]
 
-_HOMES = {"Journal": "gmmtorch.sharing.journal", "Replica": "gmmtorch.sharing.replica"}
+_HOMES = {"Journal": "gmmtorch.sharing.journal", "Replica": "gmmtorch.sharing.replica.replica"}
 
 
 def __getattr__(name: str) -> Any:

@@ -12,13 +12,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping.codec import spatial_order
+from gmmtorch.mapping.association import summed
+from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components, packed, unpacked
-from gmmtorch.mapping.updating import summed
-from gmmtorch.sharing.changes import Changes
-from gmmtorch.sharing.envelope import check_codec, loaded, stored, within
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import (
+from gmmtorch.sharing.messages.envelope import check_codec, loaded, stored, within
+from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
     Message,
@@ -26,6 +24,8 @@ from gmmtorch.sharing.messages import (
     encode_components,
     encode_counts,
 )
+from gmmtorch.sharing.replica.changes import Changes
+from gmmtorch.sharing.replica.intervals import Intervals
 
 MOST_ROWS, MOST_BATCHES = 1 << 20, 1 << 17
 """Components and counts that are held, and the messages that they came in; more are not taken from others."""

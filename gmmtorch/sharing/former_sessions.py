@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gmmtorch.errors import DataError
 from gmmtorch.sharing.journal_files import read, write_durably
-from gmmtorch.sharing.security import SESSION_BYTES
+from gmmtorch.sharing.transport.security import SESSION_BYTES
 
 MOST_SESSIONS = 1024
 """That are kept: of more, the oldest are forgotten."""

@@ -9,8 +9,6 @@ from pathlib import Path
 from types import TracebackType
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, OutputError, check_whole
-from gmmtorch.sharing.envelope import MAX_BYTES
-from gmmtorch.sharing.intervals import Intervals
 from gmmtorch.sharing.journal_files import (
     LOG,
     SNAPSHOT,
@@ -25,8 +23,10 @@ from gmmtorch.sharing.journal_files import (
 )
 from gmmtorch.sharing.journal_format import framed, log_header, pack_snapshot
 from gmmtorch.sharing.journal_restore import MOST_LOG_BYTES, MOST_SNAPSHOT_BYTES, restore
-from gmmtorch.sharing.record_names import RECORDS, names_in
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_names import RECORDS, names_in
+from gmmtorch.sharing.replica.replica import Replica
 
 SYNCS = ("snapshot", "always")
 _MOST_NAMED = 1 << 16

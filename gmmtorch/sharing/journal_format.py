@@ -11,7 +11,7 @@ from typing import Any
 
 from gmmtorch.errors import DataError
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
-from gmmtorch.sharing.envelope import MAX_BYTES
+from gmmtorch.sharing.messages.envelope import MAX_BYTES
 
 VERSION = 1
 _MAGIC = b"gmmtlog"

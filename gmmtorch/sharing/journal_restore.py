@@ -9,8 +9,8 @@ from pathlib import Path
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.sharing.journal_files import LOG, SNAPSHOT, numbers, place, read
 from gmmtorch.sharing.journal_format import Log, is_sound, read_log, unpack_snapshot
-from gmmtorch.sharing.record_ids import keys_of_life
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.replica.record_keys import keys_of_life
+from gmmtorch.sharing.replica.replica import Replica
 
 MOST_LOG_BYTES = 64 << 20
 MOST_SNAPSHOT_BYTES = 1 << 30

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.envelope import MAX_BYTES, Kind, sealed, split
-from gmmtorch.sharing.fields import (
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed, split
+from gmmtorch.sharing.messages.fields import (
     read_intervals,
     read_keys,
     read_number,
@@ -17,8 +17,8 @@ from gmmtorch.sharing.fields import (
     write_keys,
     write_number,
 )
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.record_ids import END, LARGEST_ROBOT
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, LARGEST_ROBOT
 
 DIGEST_BYTES = 8
 PRINT_BYTES = 8

@@ -6,8 +6,8 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-from gmmtorch.sharing.intervals import Intervals, excess
-from gmmtorch.sharing.record_ids import keys_of_robot, robot_of
+from gmmtorch.sharing.replica.intervals import Intervals, excess
+from gmmtorch.sharing.replica.record_keys import keys_of_robot, robot_of
 
 MOST_PEERS = 64
 """Robots that are remembered, those heard last."""

@@ -11,10 +11,11 @@ import numpy as np
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.envelope import MAX_BYTES
-from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.messages import Message, ViewsHeldMessage, ViewsMessage, encode_views
-from gmmtorch.sharing.record_ids import (
+from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.messages.message_registry import Message, ViewsHeldMessage, ViewsMessage, encode_views
+from gmmtorch.sharing.messages.record_messages import check_size
+from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
     MOST_RECORDS,
@@ -22,8 +23,7 @@ from gmmtorch.sharing.record_ids import (
     first_key,
     keys_of,
 )
-from gmmtorch.sharing.record_messages import check_size
-from gmmtorch.sharing.refusals import RefusedError, merged
+from gmmtorch.sharing.replica.rejections import RefusedError, merged
 from gmmtorch.sharing.view_announcements import PRINT_BYTES, encode_views_held
 from gmmtorch.sharing.view_peers import Peers
 from gmmtorch.sharing.view_table import View, ViewTable

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.sharing.fields import LATEST, TICKS, quantized_poses
-from gmmtorch.sharing.intervals import Intervals, Ints
-from gmmtorch.sharing.record_ids import END, ids_of, keys_of
+from gmmtorch.sharing.messages.fields import LATEST, TICKS, quantized_poses
+from gmmtorch.sharing.messages.view_messages import ViewsMessage
+from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.record_keys import END, ids_of, keys_of
 from gmmtorch.sharing.view_announcements import DIGEST_BYTES, PRINT_BYTES, ViewsDetail
-from gmmtorch.sharing.view_messages import ViewsMessage
 
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
 

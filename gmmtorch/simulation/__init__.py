@@ -5,9 +5,9 @@ randomness comes from the `torch.Generator` that the caller hands in.
 """
 
 # The module comes before the function of the same name in `sensors`, which is what the package offers.
-from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
-from gmmtorch.simulation.raycast_mesh import ray_segments, ray_triangles
-from gmmtorch.simulation.sensors import (
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments, ray_triangles
+from gmmtorch.simulation.sensors.range_sensors import (
     RangeSensor,
     World,
     depth_camera,
@@ -16,9 +16,9 @@ from gmmtorch.simulation.sensors import (
     simulate_scan,
     spinning_lidar,
 )
-from gmmtorch.simulation.trajectories import poses_2d, poses_3d, smooth_path
-from gmmtorch.simulation.world_2d import World2D, building_2d
-from gmmtorch.simulation.world_3d import World3D, building_3d
+from gmmtorch.simulation.sensors.trajectories import poses_2d, poses_3d, smooth_path
+from gmmtorch.simulation.worlds.hall_3d import World3D, building_3d
+from gmmtorch.simulation.worlds.office_2d import World2D, building_2d
 
 __all__ = [
     "DepthCamera",

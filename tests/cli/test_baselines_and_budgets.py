@@ -17,7 +17,7 @@ from gmmtorch.baselines.hilbert_map import HilbertMap
 from gmmtorch.baselines.ndt_map import NDTMap
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.evaluation import contenders
+from gmmtorch.evaluation import methods as contenders
 from gmmtorch.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 

@@ -21,25 +21,25 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch import datasets
 from gmmtorch.cli import common, missions, occupancy_studies, schema, studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
-from gmmtorch.evaluation import (
+from gmmtorch.evaluation import methods as contenders
+from gmmtorch.evaluation.estimators import METHODS, FitOptions
+from gmmtorch.evaluation.held_out import Protocol
+from gmmtorch.evaluation.studies import (
     approximation_error,
     component_count,
-    contenders,
-    initialization,
+    initialization_study,
     sensor_noise,
     variance_threshold,
 )
-from gmmtorch.evaluation.estimators import METHODS, FitOptions
-from gmmtorch.evaluation.occupancy import Protocol
-from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
-from gmmtorch.exploration.planners import PLANNERS
-from gmmtorch.exploration.trials import WorldOptions
-from gmmtorch.mapping.answers import Answering
+from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.mission.trials import WorldOptions
+from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import WindowedRule
-from gmmtorch.simulation.tunnels import tunnels
-from gmmtorch.simulation.warehouse import warehouse
+from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.query import Answering
+from gmmtorch.simulation.worlds.tunnels import tunnels
+from gmmtorch.simulation.worlds.warehouse import warehouse
 
 COMMANDS = ["occupancy", "fit"]
 CONFIGURED = [*COMMANDS, "explore", "robot", "team"]  # export has options of its own only: see its tests
@@ -133,7 +133,7 @@ def test_every_experiment_composes_and_what_it_asks_for_is_there(command, name):
         return
     if command == "fit":
         study = studies.STUDIES[config.study.name]
-        assert callable(importlib.import_module(f"gmmtorch.report.{study.report}").figures)
+        assert callable(importlib.import_module(f"gmmtorch.report.studies.{study.report}").figures)
     else:
         assert callable(occupancy_studies.STUDIES[config.study.name])
     with pytest.raises(ConfigCompositionException, match="nonsense"):
@@ -322,7 +322,7 @@ def test_the_mixture_takes_what_the_options_offer_with_the_same_defaults():
 @pytest.mark.parametrize(
     ("experiment", "options", "more"),
     [
-        ("fig2_1_initialization", initialization.Options, ()),
+        ("fig2_1_initialization", initialization_study.Options, ()),
         ("sensor_model", sensor_noise.NoiseStudy, ("sensor", "sensor_options")),
         ("automatic_components", component_count.CountStudy, ()),
         ("fig3_3_approximation_error", approximation_error.Options, ()),

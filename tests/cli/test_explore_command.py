@@ -33,9 +33,11 @@ from matplotlib.figure import Figure
 
 import gmmtorch
 from gmmtorch.cli import explore, export
-from gmmtorch.exploration.mission import Mission
+from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.report import exploration_maps, exploration_recording, exploration_scene
+from gmmtorch.report.exploration import mission_maps as exploration_maps
+from gmmtorch.report.exploration import mission_scene as exploration_scene
+from gmmtorch.report.exploration import rerun_recording as exploration_recording
 
 Run = Callable[..., Finished]
 

@@ -17,10 +17,10 @@ from omegaconf import OmegaConf
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.cli import common, export, schema
 from gmmtorch.datasets import load
+from gmmtorch.export.map_server import read_map_server
+from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.interchange import read_gira_csv, read_npz
-from gmmtorch.occupancy.map_server import read_map_server
 from gmmtorch.scan import Scan
 
 CONF = Path(common.conf_dir())

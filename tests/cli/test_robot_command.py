@@ -35,16 +35,16 @@ from exploration.replays import content
 
 from gmmtorch.cli import links, robot
 from gmmtorch.cli.robot_memory import facts_of
-from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.exploration.mission.replay import ReplayNode
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.former_sessions import known_sessions
-from gmmtorch.sharing.framed_transport import FramedTransport
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.messages import encode_plan
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.security import TeamKey
-from gmmtorch.sharing.team_key import KEY_VARIABLE
-from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.sharing.messages.message_registry import encode_plan
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport.frames import FramedTransport
+from gmmtorch.sharing.transport.security import TeamKey
+from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 Run = Callable[..., Finished]
 

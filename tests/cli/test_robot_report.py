@@ -62,7 +62,7 @@ def test_a_record_of_the_log_has_a_line_of_its_own(log, tmp_path, monkeypatch):
         with report(tmp_path, "report.tensorboard=false") as shown:
             shown(0.0)
             shown(1.0)
-            logging.getLogger("gmmtorch.sharing.udp").warning("one")
+            logging.getLogger("gmmtorch.sharing.transport.udp").warning("one")
             logging.getLogger("gmmtorch").warning("two")
             shown(2.0)
     finally:

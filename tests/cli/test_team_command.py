@@ -19,8 +19,8 @@ from test_robot_command import LOG, SMALL, room
 
 from gmmtorch.cli import missions, robot_process, team
 from gmmtorch.cli.robot_process import RobotProcess
-from gmmtorch.exploration.team import assemble
-from gmmtorch.sharing.team_key import KEY_VARIABLE
+from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
 
 Run = Callable[..., Finished]
 

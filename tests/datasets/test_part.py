@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets.part import SPLITS, Part, part_of
+from gmmtorch.datasets.dataset_shard import SPLITS, Part, part_of
 from gmmtorch.errors import InvalidArgumentError
 
 

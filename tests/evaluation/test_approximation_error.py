@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.approximation_error import Options, map_rows, run, sweep_rows
-from gmmtorch.evaluation.error_scenes import Scene, cast_rays, methods, random_scene
-from gmmtorch.report.approximation_error import figures
+from gmmtorch.evaluation.studies.approximation_error import Options, map_rows, run, sweep_rows
+from gmmtorch.evaluation.studies.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.report.studies.approximation_error_figures import figures
 
 SMALL = Options(
     dims=(2,),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from evaluation.pillar_room import room_scans
 
-from gmmtorch.evaluation import auc_memory
-from gmmtorch.evaluation.auc_memory import Sized
-from gmmtorch.evaluation.contenders import Form, MapFactory, methods
-from gmmtorch.evaluation.occupancy import Protocol, evaluate
+from gmmtorch.evaluation.held_out import Protocol, evaluate
+from gmmtorch.evaluation.methods import Form, MapFactory, methods
+from gmmtorch.evaluation.studies import auc_memory
+from gmmtorch.evaluation.studies.auc_memory import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 
 PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
 

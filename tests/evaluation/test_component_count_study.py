@@ -12,10 +12,17 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import component_count
-from gmmtorch.evaluation.component_count import RULES, CountStudy, component_bytes, count_modes, middle, run
 from gmmtorch.evaluation.estimators import FitOptions
-from gmmtorch.evaluation.fitting import Material, Row, split
+from gmmtorch.evaluation.studies import component_count
+from gmmtorch.evaluation.studies.component_count import (
+    RULES,
+    CountStudy,
+    component_bytes,
+    count_modes,
+    middle,
+    run,
+)
+from gmmtorch.evaluation.studies.fitting import Material, Row, split
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan

@@ -17,8 +17,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.estimators import METHODS, FitOptions
 from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fitting import FitOutcome, compare, means, split
 from gmmtorch.evaluation.metrics import psnr2
+from gmmtorch.evaluation.studies.fitting import FitOutcome, compare, means, split
 
 SMALL = FitOptions(n_components=6, max_iter=60)
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import initialization
 from gmmtorch.evaluation.estimators import FitOptions
 from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fitting import Material, Row, compare, split
-from gmmtorch.evaluation.initialization import Options, fit_timed, run
-from gmmtorch.mixture.initialization import INITIALIZATIONS
+from gmmtorch.evaluation.studies import initialization_study as initialization
+from gmmtorch.evaluation.studies.fitting import Material, Row, compare, split
+from gmmtorch.evaluation.studies.initialization_study import Options, fit_timed, run
+from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
 EM = FitOptions(max_iter=20, algorithm="exact")
 SMALL = Options(n_components=(2, 5), init_params=("random_points", "kmeans"), n_seeds=2)

@@ -14,8 +14,8 @@ from pillar_room import room_scans
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.contenders import MapFactory, choose, methods
-from gmmtorch.evaluation.occupancy import Outcome, Protocol, evaluate
+from gmmtorch.evaluation.held_out import Outcome, Protocol, evaluate
+from gmmtorch.evaluation.methods import MapFactory, choose, methods
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 

@@ -10,11 +10,11 @@ from pillar_room import room_scans
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.occupancy import Protocol
-from gmmtorch.evaluation.pose_correction import build_by_scan, correct_poses, evaluate_correction
+from gmmtorch.evaluation.held_out import Protocol
 from gmmtorch.evaluation.split import perturb_poses, pose_perturbations
+from gmmtorch.evaluation.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.scan import Scan
 
 NOISE = (0.3, 0.1)

@@ -15,8 +15,8 @@ from torch import Tensor
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
-from gmmtorch.evaluation.contenders import choose, methods
-from gmmtorch.evaluation.occupancy import Protocol, evaluate
+from gmmtorch.evaluation.held_out import Protocol, evaluate
+from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.evaluation.queries import (
     FREE,
     OCCUPIED,
@@ -28,7 +28,7 @@ from gmmtorch.evaluation.queries import (
     unseen,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 from gmmtorch.scan import Scan
 
 MANY = 1_000_000

@@ -14,10 +14,11 @@ from scipy.stats import multivariate_normal
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import queries, sensor_noise
-from gmmtorch.evaluation.sensor_noise import SENSORS, VARIANTS, NoiseStudy, run
+from gmmtorch.evaluation import queries
+from gmmtorch.evaluation.studies import sensor_noise
+from gmmtorch.evaluation.studies.sensor_noise import SENSORS, VARIANTS, NoiseStudy, run
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.sensor_model import LaserModel, LidarModel
+from gmmtorch.mixture.estimators.sensor_model import LaserModel, LidarModel
 from gmmtorch.scan import Scan
 
 NOISE = 0.04

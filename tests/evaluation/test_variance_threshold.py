@@ -7,9 +7,9 @@ import torch
 from evaluation.pillar_room import room_scans
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.variance_threshold import ThresholdStudy, decided, on_lines, run
+from gmmtorch.evaluation.studies.variance_threshold import ThresholdStudy, decided, on_lines, run
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 
 
 def test_shares_are_those_counted_by_hand():
@@ -51,7 +51,7 @@ def test_chunks_and_motions_do_not_matter(generator, monkeypatch):
     whole = on_lines(points, 0.4)
     assert bool(whole.any())
     assert not bool(whole.all())
-    monkeypatch.setattr("gmmtorch.evaluation.variance_threshold._CHUNK", 7)
+    monkeypatch.setattr("gmmtorch.evaluation.studies.variance_threshold._CHUNK", 7)
     assert torch.equal(on_lines(points, 0.4), whole)
     order = torch.randperm(200, generator=generator)
     assert torch.equal(on_lines(points[order] + 1000, 0.4), whole[order])

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from gmmtorch.exploration.flying import FlyingNode
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.team import make_agent, start_poses
-from gmmtorch.exploration.world import World
-from gmmtorch.sharing.udp import UdpTransport
-from gmmtorch.simulation.depth_camera import DepthCamera
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.mission.flying import FlyingNode
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
+from gmmtorch.exploration.world.world import World
+from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.simulation.worlds.solids import box
 
 TEAM = TeamOptions(
     size=2,

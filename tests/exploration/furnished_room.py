@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.simulation.depth_camera import DepthCamera
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+from gmmtorch.simulation.worlds.solids import box
 
 SMALL = TeamOptions(
     size=2,

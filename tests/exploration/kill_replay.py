@@ -22,14 +22,14 @@ import torch
 from exploration.replays import RULES, content, log, mapped
 from sharing.kill_journal import _die_in_operation
 
-from gmmtorch.exploration.node import run_paced
-from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.exploration.mission.node import run_paced
+from gmmtorch.exploration.mission.replay import ReplayNode
 from gmmtorch.files import write_json
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.sockets import LOOPBACK, unicast_socket
-from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport.sockets import LOOPBACK, unicast_socket
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 N_SCANS = 31
 KILLS_OF_A_ROBOT = 5

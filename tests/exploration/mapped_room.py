@@ -8,17 +8,17 @@ from typing import Any
 
 import torch
 
-from gmmtorch.exploration.mapper import Memo
-from gmmtorch.exploration.mixture_mapper import FrameRule, MixtureMapper
-from gmmtorch.exploration.radio import Heard
-from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule, MixtureMapper
+from gmmtorch.exploration.robot.mapper import Memo
+from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box
+from gmmtorch.occupancy.voxels.cell_evidence import Box
 from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
 
 CAMERA = DepthCamera(width=32, height=24, max_range=4.0)
 NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import torch
 
 from gmmtorch.datasets import load
-from gmmtorch.mapping.codec import quantized
+from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.scan import Scan
 
 RULES = {

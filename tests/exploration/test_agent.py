@@ -15,23 +15,29 @@ from mapping.random_components import random_components
 from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
-from gmmtorch.exploration.agent import Agent
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.grid_mapper import GridMapper
-from gmmtorch.exploration.launch import Launch
-from gmmtorch.exploration.mapper import Mapper, Memo
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.planning import Plan, PlanningTask
-from gmmtorch.exploration.primitives import Primitives
-from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.robot import Robot
-from gmmtorch.exploration.safety import cells_in_sphere
-from gmmtorch.exploration.stopwatch import Stopwatch
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.view_library import ViewLibrary
-from gmmtorch.exploration.views import ViewEvaluator
-from gmmtorch.sharing.messages import PlanMessage, decode, encode_components, encode_plan, kind_of
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.stopwatch import Stopwatch
+from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
+from gmmtorch.exploration.planning.primitives import Primitives
+from gmmtorch.exploration.planning.roadmap import Roadmap
+from gmmtorch.exploration.robot.agent import Agent
+from gmmtorch.exploration.robot.grid_mapper import GridMapper
+from gmmtorch.exploration.robot.initial_free_space import Launch
+from gmmtorch.exploration.robot.mapper import Mapper, Memo
+from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.sharing.messages.message_registry import (
+    PlanMessage,
+    decode,
+    encode_components,
+    encode_plan,
+    kind_of,
+)
+from gmmtorch.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
 LAUNCH = Launch(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gmmtorch.exploration.album import Album
+from gmmtorch.exploration.mission.snapshots import Album
 
 OBSERVABLE = 1e6
 

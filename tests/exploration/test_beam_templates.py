@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.beam_templates import beam_templates, cells_along, pinhole_beams
-from gmmtorch.occupancy.raycast import traverse
+from gmmtorch.exploration.information.beam_templates import beam_templates, cells_along, pinhole_beams
+from gmmtorch.occupancy.voxels.ray_traversal import traverse
 
 FOV = (1.5184, 1.0123)
 

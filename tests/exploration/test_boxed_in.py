@@ -13,14 +13,14 @@ from exploration.furnished_room import SMALL
 from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow
 from torch import Tensor
 
-from gmmtorch.exploration.agent import Agent
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.planning import Plan, Waiting, is_boxed_in
-from gmmtorch.exploration.returns import RestRule
-from gmmtorch.exploration.team import assemble
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.world import World
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import Plan, Waiting, is_boxed_in
+from gmmtorch.exploration.robot.agent import Agent
+from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.world.world import World
 
 OPTIONS = replace(
     SMALL, framework="grid_isolated", size=1, duration=160.0, rate=0.5, rest=RestRule(0.5, window=40.0)

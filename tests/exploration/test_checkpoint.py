@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import DataError, MissingDataError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 
 STATE = {
     "tick": 7,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.coordination import COORDINATIONS, Coordination
+from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.distance import DistanceField, coarsened, geodesic
-from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.planning.geodesic import DistanceField, coarsened, geodesic
+from gmmtorch.exploration.robot.local_map import Surroundings
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 

@@ -20,10 +20,10 @@ from exploration.furnished_room import SHELF, SMALL, room, without_seconds
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, OutputError
-from gmmtorch.exploration import trials as trials_module
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.pace import Pace, Paces
-from gmmtorch.exploration.trials import (
+from gmmtorch.exploration.mission import trials as trials_module
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.pace import Pace, Paces
+from gmmtorch.exploration.mission.trials import (
     CHECKPOINT,
     ROW,
     STAGE,
@@ -32,7 +32,7 @@ from gmmtorch.exploration.trials import (
     run_mission,
     run_trials,
 )
-from gmmtorch.simulation.solids import box
+from gmmtorch.simulation.worlds.solids import box
 
 
 def write_mesh(path: Path, triangles: Tensor) -> str:

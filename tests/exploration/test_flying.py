@@ -14,14 +14,14 @@ from exploration.replays import Clock
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.flying import FlyingNode, _ahead
-from gmmtorch.exploration.node import run_paced
-from gmmtorch.exploration.team import make_agent, start_poses
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.world import World
+from gmmtorch.exploration.mission.flying import FlyingNode, _ahead
+from gmmtorch.exploration.mission.node import run_paced
+from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.world.world import World
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.messages import PlanMessage, encode_plan
-from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.sharing.messages.message_registry import PlanMessage, encode_plan
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_views_are_told_as_often_as_it_plans_and_no_more(world, monkeypatch):
 
 
 def test_another_robot_of_its_number_is_named(world, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.sessions.FRESH_SECONDS", 0.1)
+    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.1)
     path = plan(4).path
     with UdpTransport.unicast(0) as link, UdpTransport.unicast(0, peers=[link.address]) as other:
         node = flying(0, world, TEAM, link)

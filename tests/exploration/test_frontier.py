@@ -8,9 +8,9 @@ import math
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, RESOLUTION, Explorer, corridor, explore, two_rooms
 
-from gmmtorch.exploration.frontier import find_frontiers, frontier_cells
-from gmmtorch.exploration.planners import make_planner
-from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.planning.frontier import find_frontiers, frontier_cells
+from gmmtorch.exploration.planning.planners import make_planner
+from gmmtorch.exploration.robot.local_map import Surroundings
 
 NONE = torch.zeros(0, 3, dtype=torch.float64)
 

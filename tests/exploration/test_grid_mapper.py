@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.exploration.grid_mapper import MOST_INTERVALS, GridMapper, _recent
-from gmmtorch.exploration.mapper import Memo
-from gmmtorch.exploration.radio import Heard
-from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
+from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _recent
+from gmmtorch.exploration.robot.mapper import Memo
+from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box, cast_evidence
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import PointsMessage, decode, encode_counts, encode_points
-from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
-from gmmtorch.simulation.depth_camera import DepthFrame
+from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
+from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_counts, encode_points
+from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 WIDTH = 24
 BOX = Box(torch.tensor([-20, -20, -10]), torch.tensor([20, 20, 10]))
@@ -202,7 +202,7 @@ def test_points_of_nobody_in_the_team_are_dropped_and_counted() -> None:
 @given(numbers=st.lists(st.integers(0, 60), max_size=60), most=st.integers(1, 8))
 def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gmmtorch.exploration.grid_mapper.MOST_INTERVALS", most)
+        patch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", most)
         kept = Intervals.of(np.array(numbers, np.int64))
         bounded = _recent(kept)
     pairs = kept.pairs()
@@ -214,7 +214,7 @@ def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -
 
 
 def test_memory_is_bounded_whatever_frames_are_invented(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gmmtorch.exploration.grid_mapper.MOST_INTERVALS", 20)
+    monkeypatch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", 20)
     one, view = mapper(), frame(0, n=1)
     datagrams = [said(view, number=7 * k)[0] for k in range(60)]
     assert one.receive(heard(*datagrams)) == datagrams

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.heartbeat import Heartbeat
+from gmmtorch.exploration.robot.heartbeat import Heartbeat
 
 contents = st.lists(st.integers(0, 1), min_size=1, max_size=120)
 

@@ -11,7 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information import csqmi, depth_kernel, first_hit, fsmi, needed_band
+from gmmtorch.exploration.information.mutual_information import (
+    csqmi,
+    depth_kernel,
+    first_hit,
+    fsmi,
+    needed_band,
+)
 
 N_CELLS = 8
 MAPS = torch.tensor(list(itertools.product([0.0, 1.0], repeat=N_CELLS)), dtype=torch.float64)

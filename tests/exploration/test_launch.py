@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.launch import launch_from
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.safety import cells_in_sphere
-from gmmtorch.exploration.team import assemble, start_poses
-from gmmtorch.exploration.world import World
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.team_setup import assemble, start_poses
+from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.robot.initial_free_space import launch_from
+from gmmtorch.exploration.world.world import World
+from gmmtorch.simulation.worlds.solids import box
 
 PRIMITIVES = Primitives(Dynamics())
 ALONE = replace(SMALL, framework="grid_isolated", size=1)

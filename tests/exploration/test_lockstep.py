@@ -17,16 +17,16 @@ import torch
 from exploration.flying_robots import TEAM, flying, small_room, transports
 
 from gmmtorch.errors import DataError
-from gmmtorch.exploration import lockstep
-from gmmtorch.exploration.flying import FlyingNode
-from gmmtorch.exploration.lockstep import RemotePilot, RobotLostError, Serving
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.team import assemble
-from gmmtorch.exploration.team_flight import TeamFlight
-from gmmtorch.exploration.traffic import Traffic as Paths
-from gmmtorch.exploration.world import World
-from gmmtorch.sharing.network import Traffic
+from gmmtorch.exploration.mission import lockstep
+from gmmtorch.exploration.mission.flying import FlyingNode
+from gmmtorch.exploration.mission.lockstep import RemotePilot, RobotLostError, Serving
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.team_flight import TeamFlight
+from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.exploration.planning.peer_trajectories import Traffic as Paths
+from gmmtorch.exploration.world.world import World
+from gmmtorch.sharing.transport.simulated_network import Traffic
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.mapper import Memo, novel_beams
+from gmmtorch.exploration.robot.mapper import Memo, novel_beams
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
-from gmmtorch.simulation.depth_camera import DepthFrame
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)
 WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))

@@ -13,18 +13,18 @@ import torch
 from exploration.furnished_room import SHELF, SMALL, room, without_seconds
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.mission import Mission
-from gmmtorch.exploration.options import FRAMEWORKS, TeamOptions
-from gmmtorch.exploration.outcome import row_of, with_times
-from gmmtorch.exploration.returns import RestRule
-from gmmtorch.exploration.team import assemble
-from gmmtorch.exploration.world import World
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.mission_results import row_of, with_times
+from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.world.world import World
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cell_evidence import CellEvidence, cast_evidence
-from gmmtorch.sharing.link_conditions import Partition
-from gmmtorch.simulation.depth_camera import DepthCamera, DepthFrame
-from gmmtorch.simulation.solids import box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.sharing.transport.link_conditions import Partition
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
+from gmmtorch.simulation.worlds.solids import box
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits

@@ -13,14 +13,14 @@ from sharing.replica_model import Model, rows
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.mapper import Memo, Sensed
-from gmmtorch.exploration.mixture_mapper import FrameRule, MixtureMapper
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule, MixtureMapper
+from gmmtorch.exploration.robot.mapper import Memo, Sensed
+from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.mapping.updating import count_explained
-from gmmtorch.occupancy.cell_evidence import common
-from gmmtorch.sharing.messages import (
+from gmmtorch.occupancy.voxels.cell_evidence import common
+from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ComponentsMessage,
     CountsMessage,
@@ -31,8 +31,8 @@ from gmmtorch.sharing.messages import (
     encode_plan,
     encode_points,
 )
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.simulation.depth_camera import DepthFrame
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 
 def replica_of(one: MixtureMapper) -> Replica:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from gmmtorch.exploration.network_outcome import with_network_costs
-from gmmtorch.exploration.variants import VARIANT, differing, variant_of
+from gmmtorch.exploration.mission.network_results import with_network_costs
+from gmmtorch.exploration.mission.variants import VARIANT, differing, variant_of
 
 MINUTE = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
 

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.exploration.node import Node, TwinError, check_number, run_paced
-from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.exploration.mission.node import Node, TwinError, check_number, run_paced
+from gmmtorch.exploration.mission.replay import ReplayNode
 
 if TYPE_CHECKING:
     replaying: type[Node] = ReplayNode

@@ -7,12 +7,12 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.observable import observable_cells, view_directions, viewpoints
-from gmmtorch.occupancy.cell_evidence import Box, cast_evidence
-from gmmtorch.occupancy.voxelize import occupied_cells
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.raycast_mesh import ray_triangles
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.world.observable import observable_cells, view_directions, viewpoints
+from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
+from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.solids import box
 
 RESOLUTION = 0.25
 ROOM = torch.cat(

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from gmmtorch.exploration.outcome import row_of, with_times
-from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
-from gmmtorch.sharing.network import Reception
+from gmmtorch.exploration.mission.mission_results import row_of, with_times
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.sharing.transport.simulated_network import Reception
 
 VARIANT = {
     "framework": "gmm_shared",

@@ -17,12 +17,18 @@ from exploration.voxel_worlds import (
 )
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planners import PLANNERS, RandomPlanner, TreePlanner, TreeRule, make_planner
-from gmmtorch.exploration.planning import Plan
-from gmmtorch.exploration.safety import feasible
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.travel import Journey
-from gmmtorch.exploration.tree_search import SearchRule
+from gmmtorch.exploration.planning.collision_checking import feasible
+from gmmtorch.exploration.planning.global_planner import Journey
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.exploration.planning.planners import (
+    PLANNERS,
+    RandomPlanner,
+    TreePlanner,
+    TreeRule,
+    make_planner,
+)
+from gmmtorch.exploration.planning.tree_search import SearchRule
 
 SMALL = TreeRule(search=SearchRule(n_rounds=3, n_leaves=24))
 

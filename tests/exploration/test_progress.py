@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import DataError, OutputError
-from gmmtorch.exploration.progress import Progress
+from gmmtorch.exploration.mission.mission_progress import Progress
 
 
 def state(n: int) -> dict[str, object]:

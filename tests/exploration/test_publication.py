@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.schedules import components
 
-from gmmtorch.exploration.publication import Publication
+from gmmtorch.exploration.mission.map_publisher import Publication
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.replica.replica import Replica
 
 
 def grown(rng: random.Random, known: Components) -> Components:

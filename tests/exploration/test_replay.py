@@ -18,19 +18,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.part import Part, part_of
+from gmmtorch.datasets.dataset_shard import Part, part_of
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.node import TwinError, check_number, run_paced
-from gmmtorch.exploration.replay import ReplayNode
+from gmmtorch.exploration.mission.node import TwinError, check_number, run_paced
+from gmmtorch.exploration.mission.replay import ReplayNode
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.link_conditions import LinkConditions
-from gmmtorch.sharing.network import Network
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.security import TeamKey
-from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport.link_conditions import LinkConditions
+from gmmtorch.sharing.transport.security import TeamKey
+from gmmtorch.sharing.transport.simulated_network import Network
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 N_KILLS = 4
 """`python -m exploration.kill_replay` has more."""

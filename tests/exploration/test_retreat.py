@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.planning import PlanningTask
-from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.retreat import retreat, shortened
-from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.safety import surroundings_of
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.planning.collision_checking import surroundings_of
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import PlanningTask
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.planning.recovery import retreat, shortened
+from gmmtorch.exploration.planning.roadmap import Roadmap
 
 SHAPE = (40, 40, 20)
 HERE = torch.tensor([4.1, 4.1, 2.1], dtype=torch.float64)

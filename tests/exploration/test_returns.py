@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.returns import DiminishingReturns, RestRule
+from gmmtorch.exploration.robot.stopping_criterion import DiminishingReturns, RestRule
 
 GAINS = st.lists(st.floats(0, 100), min_size=1, max_size=60)
 

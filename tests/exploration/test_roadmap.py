@@ -10,9 +10,9 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.distance import geodesic
-from gmmtorch.exploration.roadmap import Roadmap, at_the_rim
-from gmmtorch.exploration.surroundings import Surroundings
+from gmmtorch.exploration.planning.geodesic import geodesic
+from gmmtorch.exploration.planning.roadmap import Roadmap, at_the_rim
+from gmmtorch.exploration.robot.local_map import Surroundings
 
 WINDOW = (24, 24, 12)
 

@@ -9,20 +9,20 @@ import torch
 from sharing.message_examples import assert_same
 from torch import Tensor
 
-from gmmtorch.exploration.grid_mapper import GridMapper
-from gmmtorch.exploration.launch import Launch
-from gmmtorch.exploration.mapper import Memo
-from gmmtorch.exploration.planning import Plan
-from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.robot import Robot
-from gmmtorch.exploration.safety import cells_in_sphere
-from gmmtorch.exploration.scoring import BeliefMap, BeliefRule
-from gmmtorch.exploration.view_library import ViewLibrary
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
+from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.exploration.planning.roadmap import Roadmap
+from gmmtorch.exploration.robot.grid_mapper import GridMapper
+from gmmtorch.exploration.robot.initial_free_space import Launch
+from gmmtorch.exploration.robot.mapper import Memo
+from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
-from gmmtorch.sharing.messages import PlanMessage
-from gmmtorch.simulation.depth_camera import DepthFrame
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.sharing.messages.message_registry import PlanMessage
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 START = torch.tensor([3.1, 3.1, 1.5, 0.3], dtype=torch.float64)

@@ -12,10 +12,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.safety import cells_in_sphere, feasible, inflated, surroundings_of
-from gmmtorch.exploration.surroundings import Surroundings
-from gmmtorch.exploration.traffic import Traffic
+from gmmtorch.exploration.planning.collision_checking import (
+    cells_in_sphere,
+    feasible,
+    inflated,
+    surroundings_of,
+)
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.robot.local_map import Surroundings
 
 LIBRARY = Primitives(Dynamics())
 RADIUS, CELL = 0.3, 0.2

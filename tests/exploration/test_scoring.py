@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.scoring import BeliefMap, BeliefRule, accuracy, disagreement, overlap
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement, overlap
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
 
 BOX = Box(torch.tensor([-3, 2, 0]), torch.tensor([9, 11, 7]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gmmtorch.exploration.stopwatch import Stopwatch
+from gmmtorch.exploration.mission.stopwatch import Stopwatch
 
 
 def test_a_stage_within_another_counts_to_itself_alone() -> None:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.collisions import collides, meets_others
-from gmmtorch.exploration.traffic import Traffic, clear_of
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.planning.peer_trajectories import Traffic, clear_of
+from gmmtorch.exploration.world.collisions import collides, meets_others
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.solids import box
 
 FINE = 20
 

@@ -12,16 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.distance import DistanceField
-from gmmtorch.exploration.goal import Goal
-from gmmtorch.exploration.planning import PlanningTask
-from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.safety import feasible
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.tree_search import SearchRule, TreeSearch
-from gmmtorch.exploration.view_library import ViewLibrary
-from gmmtorch.exploration.view_memory import Memory
-from gmmtorch.exploration.views import ViewValues
+from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.information.view_evaluator import ViewValues
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.planning.collision_checking import feasible
+from gmmtorch.exploration.planning.geodesic import DistanceField
+from gmmtorch.exploration.planning.goal import Goal
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import PlanningTask
+from gmmtorch.exploration.planning.roadmap import Roadmap
+from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
 
 N_BLOCKS = 6
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.coordination import COORDINATIONS, Coordination
-from gmmtorch.exploration.options import TeamOptions
-from gmmtorch.exploration.planning import Plan
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.turns import take_turns
+from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planner_interface import Plan
+from gmmtorch.exploration.planning.planning_round import take_turns
 
 N, NOW, NUMBER = 5, 40.0, 20
 OPTIONS = TeamOptions(size=N, latency=0.02, jitter=0.004, margin=0.25)

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.view_library import ViewLibrary
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import ViewsMessage, decode
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.sharing.messages.message_registry import ViewsMessage, decode
+from gmmtorch.sharing.replica.intervals import Intervals
 
 
 def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:

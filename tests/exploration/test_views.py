@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.surroundings import Surroundings
-from gmmtorch.exploration.views import ViewEvaluator, ViewValues, residual_of
+from gmmtorch.exploration.information.view_evaluator import ViewEvaluator, ViewValues, residual_of
+from gmmtorch.exploration.robot.local_map import Surroundings
 
 FOV = (1.5184, 1.0123)
 RESOLUTION = 0.2

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
-from gmmtorch.exploration.world import World, open_world
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.solids import box
+from gmmtorch.exploration.world.world import World, open_world
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.solids import box
 
 HALL = torch.cat(
     [

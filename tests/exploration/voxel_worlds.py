@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.planners import Plan, Planner, PlanningTask
-from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.roadmap import Roadmap
-from gmmtorch.exploration.safety import cells_in_sphere, surroundings_of
-from gmmtorch.exploration.surroundings import Surroundings
-from gmmtorch.exploration.traffic import Traffic
-from gmmtorch.exploration.view_library import ViewLibrary
-from gmmtorch.exploration.views import ViewEvaluator
-from gmmtorch.occupancy.cell_evidence import Box, cast_evidence
+from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, surroundings_of
+from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.planners import Plan, Planner, PlanningTask
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.planning.roadmap import Roadmap
+from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
 
 RESOLUTION = 0.2
 PRIMITIVES = Primitives(Dynamics())

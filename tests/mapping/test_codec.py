@@ -17,14 +17,14 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.mapping import codec, lattice
-from gmmtorch.mapping.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
-from gmmtorch.mapping.codec import decode, encode, quantized, spatial_order
+from gmmtorch.mapping.codec import component_batch as codec
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
+from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning import WindowedRule, learn_window
-from gmmtorch.mapping.quantization import COUNT_ERROR, ORIGIN_STEP
+from gmmtorch.mapping.learning.windowed import WindowedRule, learn_window
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.point import point_evidence
+from gmmtorch.occupancy.forms.point import point_evidence
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

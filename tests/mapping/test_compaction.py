@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from mapping.component_cases import counts_add_up, random_components, total_moments
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.compaction import (
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.merging import (
     UNNUMBERED,
     compact,
     compact_to_bytes,
     estimated_bytes,
     merged,
 )
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.sightings import limit_origins
+from gmmtorch.mapping.learning.viewpoints import limit_origins
 
 
 def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (False, False)) -> Components:

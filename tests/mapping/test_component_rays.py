@@ -11,10 +11,10 @@ from mapping.random_components import random_components
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.mapping import component_rays as module
-from gmmtorch.mapping.component_rays import component_evidence, component_rays
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence
+from gmmtorch.mapping.rays import component_rays as module
+from gmmtorch.mapping.rays.component_rays import component_evidence, component_rays
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, cast_evidence
 
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 

@@ -11,10 +11,10 @@ from mapping.component_cases import counts_add_up, random_components
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.component_rays import component_evidence
+from gmmtorch.mapping.association import summed
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.updating import summed
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, united
+from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, united
 
 RESOLUTION = 0.2
 

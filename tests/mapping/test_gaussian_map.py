@@ -13,11 +13,11 @@ from occupancy.protocol_contract import RESOLUTION, dims, lattice, open_scan, wa
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.mapping.codec import quantized
+from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.scan import Scan
 
 BUFFERS = [

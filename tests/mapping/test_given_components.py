@@ -12,9 +12,9 @@ from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal
 
 from gmmtorch.errors import GmmTorchError
-from gmmtorch.mapping.answers import METHODS
-from gmmtorch.mapping.codec import quantized
+from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.query import METHODS
 from gmmtorch.occupancy.grid import VoxelGrid
 
 PARTS = ("means", "covariances", "support", "origins")

@@ -17,14 +17,14 @@ import gmmtorch
 from gmmtorch.datasets.depth_frames import back_project
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.mapping.compaction import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule, absorb, absorb_depth
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule, absorb, absorb_depth
+from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.point import point_evidence
+from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.scan import Scan
 
 RULE = IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=2, window_components=30)

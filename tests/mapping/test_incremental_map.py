@@ -14,10 +14,10 @@ from mapping.map_cases import FINE, assert_same_components, built, drive, names,
 from occupancy.protocol_contract import dims, empty_scan, lattice, open_scan, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.answers import METHODS
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
 from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.query import METHODS
 from gmmtorch.scan import Scan
 
 TIGHT = replace(FINE, n_components=9)

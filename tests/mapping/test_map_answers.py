@@ -10,8 +10,8 @@ from mapping.map_cases import FINE, built, drive, given_parts, open_drive
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping.answers import METHODS, Answering, Answers, fitting_cutoff
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.query import METHODS, Answering, Answers, fitting_cutoff
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import VoxelGrid
 

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping import storage
+from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 
 codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
 

@@ -9,8 +9,8 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.incremental import IncrementalRule
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 from gmmtorch.mapping.novelty import NoveltyRule
 
 RULES = {

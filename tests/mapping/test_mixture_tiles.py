@@ -9,11 +9,11 @@ import torch
 from mapping.random_components import random_components
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.component_rays import component_evidence
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.mixture_tiles import MixtureTiles, regenerate
+from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box
+from gmmtorch.occupancy.voxels.cell_evidence import Box
 
 RESOLUTION, SHAPE = 0.25, (24, 20, 12)
 

@@ -15,13 +15,13 @@ from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.localization.overlap import Motions, Pairs, generators, overlap
+from gmmtorch.localization.overlap_ascent import Ascent
+from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import WindowedRule, learn_window
-from gmmtorch.mapping.overlap import Motions, Pairs, generators, overlap
-from gmmtorch.mapping.overlap_ascent import Ascent
-from gmmtorch.mapping.registration import register, yaw_starts
-from gmmtorch.mixture.em import Parameters
+from gmmtorch.mapping.learning.windowed import WindowedRule, learn_window
+from gmmtorch.mixture.em.exact import Parameters
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

@@ -14,7 +14,7 @@ from occupancy.exact_dda import voxels_left
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.cell_evidence import Box, CellEvidence, cast_evidence, united
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, cast_evidence, united
 
 SHAPE = (12, 16, 10)
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))

@@ -14,11 +14,11 @@ from torch import Tensor
 from gmmtorch.errors import DataError, MissingDataError
 from gmmtorch.files import pack_tensors
 from gmmtorch.linalg import pack_symmetric
-from gmmtorch.mapping import storage
-from gmmtorch.mapping.codec import encode, quantized
+from gmmtorch.mapping.codec import map_file as storage
+from gmmtorch.mapping.codec.component_batch import encode, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning import WindowedRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

@@ -11,7 +11,7 @@ import torch
 from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.thesis_message import (
+from gmmtorch.mapping.codec.thesis_message import (
     decode_thesis,
     decode_thesis_updates,
     encode_thesis,

@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.mixture import GaussianMixture, em
-from gmmtorch.mixture.cells import pool_into_cells
-from gmmtorch.mixture.em import quadratic_features
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.cells import pool_into_cells
+from gmmtorch.mixture.em.exact import quadratic_features
 
 
 def cloud(n: int, dim: int, seed: int) -> Tensor:

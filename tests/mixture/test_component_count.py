@@ -16,10 +16,11 @@ from sklearn.base import clone
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning import WindowedRule
-from gmmtorch.mixture import GaussianMixture, component_count
-from gmmtorch.mixture.component_count import least_support, surface_pieces, surface_rule
-from gmmtorch.mixture.partition import FlatnessRule
+from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import surface_rule as component_count
+from gmmtorch.mixture.em.partition import FlatnessRule
+from gmmtorch.mixture.em.surface_rule import least_support, surface_pieces, surface_rule
 
 NOISE = 0.01
 

@@ -18,9 +18,10 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture, deconvolution, noisy_pairs
-from gmmtorch.mixture.deconvolution import Block, blocks, constrained, expectation, maximization
-from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.estimators import deconvolution, noisy_pairs
+from gmmtorch.mixture.estimators.deconvolution import Block, blocks, constrained, expectation, maximization
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from gmmtorch.datasets.point_chunks import open_points
+from gmmtorch.datasets.point_files.point_chunks import open_points
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture.checkpoints import Checkpoint, read_state
-from gmmtorch.mixture.distributed import ALONE, LostProcessError, is_launched, joined
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming import fit_stream
+from gmmtorch.mixture.streaming.checkpoints import Checkpoint, read_state
+from gmmtorch.mixture.streaming.distributed import ALONE, LostProcessError, is_launched, joined
+from gmmtorch.mixture.streaming.stream_fit import fit_stream
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:EM did not converge"),
@@ -67,11 +67,11 @@ import os, signal, sys, time
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from gmmtorch.datasets.point_chunks import open_points
-from gmmtorch.mixture.checkpoints import Checkpoint
-from gmmtorch.mixture.distributed import LostProcessError, joined
+from gmmtorch.datasets.point_files.point_chunks import open_points
+from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming.distributed import LostProcessError, joined
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming import fit_stream
+from gmmtorch.mixture.streaming.stream_fit import fit_stream
 
 cloud, checkpoint, how = sys.argv[1:]
 ready = [Path(f"{checkpoint}.{rank}") for rank in (0, 1)]

@@ -14,9 +14,9 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.mixture import em
-from gmmtorch.mixture.cells import pool_into_cells
-from gmmtorch.mixture.em import Parameters, quadratic_features
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.cells import pool_into_cells
+from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 
 
 def random_parameters(k: int, dim: int, generator: torch.Generator, spread: float = 2.0) -> Parameters:

@@ -24,8 +24,9 @@ from gmmtorch import datasets
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
-from gmmtorch.mixture.growth import GrowthRule, grow
-from gmmtorch.mixture.nested import (
+from gmmtorch.mixture.estimators.trees.growth import GrowthRule, grow
+from gmmtorch.mixture.estimators.trees.mixture_tree import Tree, check_tree
+from gmmtorch.mixture.estimators.trees.nested import (
     Children,
     Members,
     pack,
@@ -34,7 +35,6 @@ from gmmtorch.mixture.nested import (
     run_em,
     without_weak,
 )
-from gmmtorch.mixture.tree import Tree, check_tree
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

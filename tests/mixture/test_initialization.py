@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.mixture import initialization
-from gmmtorch.mixture.cells import pool_into_cells
-from gmmtorch.mixture.em import Parameters, quadratic_features
-from gmmtorch.mixture.initialization import (
+from gmmtorch.mixture.em import initialization
+from gmmtorch.mixture.em.cells import pool_into_cells
+from gmmtorch.mixture.em.exact import Parameters, quadratic_features
+from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
     copied,
     distinct_points,

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, NumericalError
-from gmmtorch.mixture import interchange
-from gmmtorch.mixture.interchange import PlainMixture, read_gira_csv, read_npz, write_gira_csv, write_npz
+from gmmtorch.export import mixture_formats as interchange
+from gmmtorch.export.mixture_formats import PlainMixture, read_gira_csv, read_npz, write_gira_csv, write_npz
 
 
 def mixture(k: int = 4, dim: int = 3, seed: int = 0, thin: float = 1e-3, offset: float = 0.0) -> PlainMixture:

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.mixture.em import quadratic_features
-from gmmtorch.mixture.partition import FlatnessRule, Partition, partition, pool
+from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool
 
 RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
 

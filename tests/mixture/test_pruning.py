@@ -11,11 +11,12 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture, prune
-from gmmtorch.mixture.em import Parameters
-from gmmtorch.mixture.partition import FlatnessRule, partition
-from gmmtorch.mixture.pruning import expected_density, support_density
-from gmmtorch.mixture.sensor_model import DepthCameraModel, LaserModel, LidarModel, SensorModel
-from gmmtorch.simulation import RangeSensor, depth_camera, laser_2d, simulate_scan, spinning_lidar
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.partition import FlatnessRule, partition
+from gmmtorch.mixture.estimators.sensor_model import DepthCameraModel, LaserModel, LidarModel, SensorModel
+from gmmtorch.mixture.reduction.pruning import expected_density, support_density
+from gmmtorch.simulation import RangeSensor, laser_2d, simulate_scan, spinning_lidar
+from gmmtorch.simulation.sensors.range_sensors import depth_camera
 
 
 def tensor(*rows: object) -> Tensor:

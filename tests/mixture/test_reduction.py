@@ -16,11 +16,12 @@ from scipy.stats import multivariate_normal, norm
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.mixture import GaussianMixture, merge, reduction, simplify
-from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture import GaussianMixture, merge, simplify
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimator import NotFittedError
-from gmmtorch.mixture.merge_costs import COSTS, Gaussians
-from gmmtorch.mixture.moments import merge_components, merge_pairs
+from gmmtorch.mixture.reduction.merge import merge as reduction
+from gmmtorch.mixture.reduction.merge_costs import COSTS, Gaussians
+from gmmtorch.mixture.reduction.moments import merge_components, merge_pairs
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 costs = pytest.mark.parametrize("cost", list(COSTS))

@@ -22,11 +22,12 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.mixture import GaussianMixture, em
-from gmmtorch.mixture.ascent import SOLVERS, LimitedMemory, ascend, search
-from gmmtorch.mixture.em import Parameters
-from gmmtorch.mixture.initialization import start
-from gmmtorch.mixture.riemannian import (
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.initialization import start
+from gmmtorch.mixture.estimators.ascent import SOLVERS, LimitedMemory, ascend, search
+from gmmtorch.mixture.estimators.riemannian import (
     Frames,
     Iterate,
     Likelihood,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture.sensor_model import (
+from gmmtorch.mixture.estimators.sensor_model import (
     DepthCameraModel,
     LaserModel,
     LidarModel,
@@ -20,7 +20,8 @@ from gmmtorch.mixture.sensor_model import (
     cos_incidence,
     estimate_normals,
 )
-from gmmtorch.simulation import depth_camera, laser_2d, simulate_scan, spinning_lidar
+from gmmtorch.simulation import laser_2d, simulate_scan, spinning_lidar
+from gmmtorch.simulation.sensors.range_sensors import depth_camera
 
 MODELS: list[tuple[SensorModel, int]] = [(DepthCameraModel(), 3), (LidarModel(), 3), (LaserModel(), 2)]
 models = pytest.mark.parametrize(("model", "dim"), MODELS, ids=["camera", "lidar", "laser"])

@@ -19,17 +19,21 @@ from torch import Tensor
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture import transport as lines
-from gmmtorch.mixture.em import Parameters
-from gmmtorch.mixture.initialization import start
-from gmmtorch.mixture.sliced_wasserstein import Shape, SlicedWassersteinGaussianMixture, differentiate
-from gmmtorch.mixture.transport import (
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.initialization import start
+from gmmtorch.mixture.estimators import optimal_transport as lines
+from gmmtorch.mixture.estimators.optimal_transport import (
     LEVELS,
     Slices,
     mixture_quantiles,
     random_directions,
     slice_cloud,
     transport,
+)
+from gmmtorch.mixture.estimators.sliced_wasserstein import (
+    Shape,
+    SlicedWassersteinGaussianMixture,
+    differentiate,
 )
 
 UP = torch.ones(1, 1).double()

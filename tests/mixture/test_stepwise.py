@@ -17,8 +17,9 @@ from sklearn.base import clone
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
-from gmmtorch.mixture import GaussianMixture, stepwise
-from gmmtorch.mixture.em import Parameters
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import stepwise
+from gmmtorch.mixture.em.exact import Parameters
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -19,17 +19,16 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.datasets.point_chunks import in_memory
+from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture import GaussianMixture, em, gaussian_mixture, grouping, truncated
-from gmmtorch.mixture.checkpoints import Checkpoint
-from gmmtorch.mixture.distributed import Processes
-from gmmtorch.mixture.em import Parameters
-from gmmtorch.mixture.grouping import Rows, choose_candidates, group_rows, nearest
-from gmmtorch.mixture.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.momentum import Momentum
-from gmmtorch.mixture.streaming import fit_stream
-from gmmtorch.mixture.truncated import (
+from gmmtorch.mixture import GaussianMixture, gaussian_mixture
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import grouping, truncated
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.grouping import Rows, choose_candidates, group_rows, nearest
+from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.em.momentum import Momentum
+from gmmtorch.mixture.em.truncated import (
     Settings,
     learn_truncated,
     local_parameters,
@@ -37,6 +36,9 @@ from gmmtorch.mixture.truncated import (
     run_truncated,
     truncated_expectation,
 )
+from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming.distributed import Processes
+from gmmtorch.mixture.streaming.stream_fit import fit_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

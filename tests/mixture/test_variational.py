@@ -21,10 +21,15 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture, em
+from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.initialization import start
 from gmmtorch.mixture.estimator import NotFittedError
-from gmmtorch.mixture.gaussian_wishart import expected_log_weights, expected_weights, unbiased_covariance
-from gmmtorch.mixture.initialization import start
+from gmmtorch.mixture.estimators.gaussian_wishart import (
+    expected_log_weights,
+    expected_weights,
+    unbiased_covariance,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

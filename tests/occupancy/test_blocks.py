@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 
 RESOLUTION = 0.125
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.box_mass import box_mass, normal_mass
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.culling import Whitened
+from gmmtorch.occupancy.forms.cone.box_mass import box_mass, normal_mass
+from gmmtorch.occupancy.index.culling import Whitened
 
 
 def mass(mean, covariance, low, high, **options):

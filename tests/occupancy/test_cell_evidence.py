@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from occupancy.exact_dda import voxels_left
 
-import gmmtorch.occupancy.cell_evidence as module
+import gmmtorch.occupancy.voxels.cell_evidence as module
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.cell_evidence import (
+from gmmtorch.occupancy.voxels.cell_evidence import (
     Box,
     CellEvidence,
     cast_evidence,

@@ -11,10 +11,10 @@ from hypothesis import given
 from scipy import integrate
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.angular_reference import angular_evidence
-from gmmtorch.occupancy.cone_2d import share_beyond
-from gmmtorch.occupancy.cone_evidence import cone_evidence
+from gmmtorch.evaluation.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.forms.cone.cone_2d import share_beyond
+from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
 
 
 def one_cone(mean, covariance, origin=(0.0, 0.0), count=1.0, max_range=False) -> Cones:

@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.culling import (
+from gmmtorch.occupancy.forms.cone.mahalanobis import cross, outside_ball, outside_cone
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.index.culling import (
     Whitened,
     ball_rows,
     candidate_pairs,
@@ -19,8 +21,6 @@ from gmmtorch.occupancy.culling import (
     face_rows,
     reach,
 )
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.whitened import cross, outside_ball, outside_cone
 
 GRIDS = {2: VoxelGrid((-2.0, -1.8), 0.2, (20, 18)), 3: VoxelGrid((-2.0, -1.8, -2.1), 0.4, (10, 9, 11))}
 

@@ -20,14 +20,14 @@ from gmmtorch.errors import (
     MemoryLimitError,
     MissingDataError,
 )
-from gmmtorch.occupancy.blocks import BlockEvidence
-from gmmtorch.occupancy.cell_cloud import CellCloud, write_pcd, write_ply
+from gmmtorch.export.map_server import highest_in_band, read_map_server, write_map_server
+from gmmtorch.export.octomap import write_octomap
+from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
 from gmmtorch.occupancy.evidence import CellClass
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.map_server import highest_in_band, read_map_server, write_map_server
-from gmmtorch.occupancy.octree_export import write_octomap
-from gmmtorch.occupancy.rasterize import rasterize
 from gmmtorch.occupancy.thresholds import Thresholds
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.rasterize import rasterize
 
 pyoctomap = pytest.importorskip("pyoctomap")
 open3d = pytest.importorskip("open3d")

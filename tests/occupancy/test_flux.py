@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.culling import reach
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE
+from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
+from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.monte_carlo import sample_rays
-from gmmtorch.occupancy.panels import TOLERANCE
+from gmmtorch.occupancy.index.culling import reach
 
 
 def cases(dim: int, n: int, seed: int, deviations=(1e-3, 2.0), distances=(0.1, 10.0), sizes=(1e-2, 1.0)):

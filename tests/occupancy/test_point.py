@@ -1,4 +1,4 @@
-"""Tests of gmmtorch.occupancy.point: formulas by quadrature, rays by simulation, what must never happen."""
+"""Tests of occupancy.forms.point: formulas by quadrature, rays by simulation, what must never happen."""
 
 import math
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.point import PointEvidence, PointForm, _shares, point_evidence
+from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, _shares, point_evidence
 
 
 def one_cone(mean, covariance, origin, count=100.0, max_range=False) -> Cones:

@@ -14,12 +14,12 @@ from occupancy.polygons import random_polygons
 from scipy import integrate
 from scipy.spatial import ConvexHull
 
-from gmmtorch.evaluation.angular_reference import angular_evidence
-from gmmtorch.occupancy.cone_evidence import cone_evidence
+from gmmtorch.evaluation.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.owens_t import polygon_probability
-from gmmtorch.occupancy.projection import Planes, approximate_erf, approximate_probability
-from gmmtorch.occupancy.silhouette import Edges, facing, image, meets_disc, outline
+from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
+from gmmtorch.occupancy.forms.cone.owens_t import polygon_probability
+from gmmtorch.occupancy.forms.cone.projection import Planes, approximate_erf, approximate_probability
+from gmmtorch.occupancy.forms.cone.silhouette import Edges, facing, image, meets_disc, outline
 
 
 def column(*values: float) -> torch.Tensor:

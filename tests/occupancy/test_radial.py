@@ -1,4 +1,4 @@
-"""Tests of gmmtorch.occupancy.radial: closed forms against quadrature."""
+"""Tests of gmmtorch.occupancy.forms.radial: closed forms against quadrature."""
 
 import math
 
@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from gmmtorch.occupancy.cones import whitening
-from gmmtorch.occupancy.radial import flux_density, tail_moment
+from gmmtorch.occupancy.forms.radial import flux_density, tail_moment
 
 
 def component(dim: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

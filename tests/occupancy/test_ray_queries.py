@@ -11,7 +11,7 @@ from occupancy.cone_examples import random_cones
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.point import PointForm
+from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.ray_queries import expected_range, first_hit, hit_probability
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gmmtorch.occupancy.raycast import row_major_strides, traverse
+from gmmtorch.occupancy.voxels.ray_traversal import row_major_strides, traverse
 
 SHAPES = {2: (7, 9), 3: (6, 5, 7)}
 

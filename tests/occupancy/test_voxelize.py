@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy.cell_evidence import Box
-from gmmtorch.occupancy.voxelize import occupied_cells
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.solids import ball, box
+from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.solids import ball, box
 
 
 def lattice(low: tuple[int, ...], high: tuple[int, ...]) -> Box:

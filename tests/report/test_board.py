@@ -10,8 +10,8 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.board import Board
 from gmmtorch.report.curves import roc_figure
+from gmmtorch.report.tensorboard_writer import Board
 
 
 def read(directory) -> EventAccumulator:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.report import sensor_noise
-from gmmtorch.report.comparison import comparison_figure
-from gmmtorch.report.component_count import figures as count_figures
-from gmmtorch.report.initialization import figures
+from gmmtorch.report.maps.comparison import comparison_figure
+from gmmtorch.report.studies import sensor_noise_figures as sensor_noise
+from gmmtorch.report.studies.component_count_figures import figures as count_figures
+from gmmtorch.report.studies.initialization_figures import figures
 
 
 def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]:

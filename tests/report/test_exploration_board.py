@@ -9,9 +9,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.report.board import Board
-from gmmtorch.report.exploration_board import MissionBoard, write_exploration_board
-from gmmtorch.report.exploration_curves import entropy_figure
+from gmmtorch.report.exploration.mission_curves import entropy_figure
+from gmmtorch.report.exploration.mission_tensorboard import MissionBoard, write_exploration_board
+from gmmtorch.report.tensorboard_writer import Board
 
 
 def read(directory) -> EventAccumulator:

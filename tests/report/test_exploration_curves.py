@@ -9,10 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.trials import mean_band
-from gmmtorch.report.exploration_bars import profile_figure, stage_means, summary_bars
-from gmmtorch.report.exploration_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
-from gmmtorch.report.exploration_style import (
+from gmmtorch.evaluation.paired_statistics import mean_band
+from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
+from gmmtorch.report.exploration.mission_curves import (
+    bandwidth_figure,
+    entropy_figure,
+    planner_comparison_figure,
+)
+from gmmtorch.report.exploration.mission_style import (
     FRAMEWORKS,
     framework_colour,
     framework_name,

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.trials import mean_band
-from gmmtorch.report.exploration_loss import loss_figure
-from gmmtorch.report.exploration_variants import by_variant
+from gmmtorch.evaluation.paired_statistics import mean_band
+from gmmtorch.report.exploration.loss_figures import loss_figure
+from gmmtorch.report.exploration.variant_figures import by_variant
 from gmmtorch.report.style import PALETTE
 
 CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}

@@ -12,14 +12,14 @@ from exploration_rows import flights
 from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.primitives import Dynamics, Primitives
-from gmmtorch.exploration.scoring import BeliefRule
-from gmmtorch.report.exploration_cutaway import cut_away
-from gmmtorch.report.exploration_maps import TeamSnapshot, team_map_figure, trajectories_figure
-from gmmtorch.report.exploration_paths import smooth_path
-from gmmtorch.report.exploration_render import Camera, Canvas, render
-from gmmtorch.report.exploration_scene import mixture_scene_figure
-from gmmtorch.report.exploration_top_view import TopView, top_view
+from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
+from gmmtorch.exploration.world.scoring import BeliefRule
+from gmmtorch.report.exploration.cutaway import cut_away
+from gmmtorch.report.exploration.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
+from gmmtorch.report.exploration.mission_scene import mixture_scene_figure
+from gmmtorch.report.exploration.path_figures import smooth_path
+from gmmtorch.report.exploration.scene_renderer import Camera, Canvas, render
+from gmmtorch.report.exploration.top_view import TopView, top_view
 from gmmtorch.report.style import UNKNOWN
 
 

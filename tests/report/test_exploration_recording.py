@@ -12,7 +12,7 @@ import torch
 from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.report.exploration_recording import (
+from gmmtorch.report.exploration.rerun_recording import (
     RecordedMap,
     _ellipsoids,
     _log_robot,

@@ -11,9 +11,9 @@ import torch
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.curves import convergence_figure, roc_figure
-from gmmtorch.report.mixtures import mixture_figure
+from gmmtorch.report.maps.mixture_figures import mixture_figure
 from gmmtorch.report.save import save_figure
-from gmmtorch.report.sparsity import auc_against_kept_figure
+from gmmtorch.report.studies.sparsity_figures import auc_against_kept_figure
 
 
 def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -121,11 +121,11 @@ PROGRAM = """
 import sys, torch
 import gmmtorch.report
 assert "matplotlib" not in sys.modules and "tensorboard" not in sys.modules
-from gmmtorch.report.board import Board
+from gmmtorch.report.tensorboard_writer import Board
 from gmmtorch.report.curves import roc_figure
-from gmmtorch.report.maps import map_figure
-from gmmtorch.report.mixtures import mixture_figure
-from gmmtorch.report.raster import MapPanel
+from gmmtorch.report.maps.map_figures import map_figure
+from gmmtorch.report.maps.mixture_figures import mixture_figure
+from gmmtorch.report.maps.raster import MapPanel
 from gmmtorch.report.save import save_figure
 eye, panel = torch.eye(3)[None], MapPanel("m", lambda x: x[:, 0] * 0 + 0.2, 0.5, (0, 0, 0), (1, 1, 1))
 with Board(sys.argv[1]) as board:

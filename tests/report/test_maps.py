@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.blocks import BlockEvidence
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.report.maps import map_figure
-from gmmtorch.report.raster import MapPanel, height_image, plan, robust_bounds, roof_above, slice_image
+from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.report.maps.map_figures import map_figure
+from gmmtorch.report.maps.raster import MapPanel, height_image, plan, robust_bounds, roof_above, slice_image
 
 
 def wall_map(dim: int) -> BlockEvidence:

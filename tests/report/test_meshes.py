@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.meshes import ellipsoid_mesh, unit_sphere
+from gmmtorch.report.maps.mesh_figures import ellipsoid_mesh, unit_sphere
 
 
 def components(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor]:

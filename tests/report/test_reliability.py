@@ -7,8 +7,8 @@ import pytest
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import Reliability
-from gmmtorch.report.calibration import reliability_figure
 from gmmtorch.report.save import save_figure
+from gmmtorch.report.studies.calibration_figures import reliability_figure
 
 CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gmmtorch.report import auc_memory, variance_threshold
-from gmmtorch.report.raster import busiest_regions
+from gmmtorch.report.maps.raster import busiest_regions
+from gmmtorch.report.studies import auc_memory_figures as auc_memory
+from gmmtorch.report.studies import variance_threshold_figures as variance_threshold
 
 
 def memory_rows() -> list[dict]:

@@ -32,7 +32,7 @@ import torch
 from sharing.schedules import act
 
 from gmmtorch.sharing.journal import Journal
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.replica.replica import Replica
 
 LIVES = 20
 """Of one robot; then another begins with an empty folder."""

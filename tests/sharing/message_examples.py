@@ -11,11 +11,10 @@ import torch
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 
-from gmmtorch.mapping.codec import spatial_order
+from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import encode_announcements
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import (
+from gmmtorch.sharing.messages.announcements import encode_announcements
+from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
     encode_components,
@@ -25,8 +24,7 @@ from gmmtorch.sharing.messages import (
     encode_views,
     quantized_poses,
 )
-from gmmtorch.sharing.record_ids import END, first_key
-from gmmtorch.sharing.record_messages import (
+from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     RecordMessage,
     SupersessionMessage,
@@ -34,6 +32,8 @@ from gmmtorch.sharing.record_messages import (
     pose_of,
     totals_message,
 )
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, first_key
 from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
 
 codecs = pytest.mark.parametrize("codec", CODECS)

@@ -18,9 +18,9 @@ from mapping.random_components import random_components
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing import authorship
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.replica import authorship
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.replica import Replica
 
 MOST_ROUNDS = 8
 """Of announcing and answering without loss, until all should hold the same."""

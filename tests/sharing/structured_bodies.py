@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.mapping.bitstream import BitWriter
-from gmmtorch.mapping.codec import encode_quantized
-from gmmtorch.mapping.lattice import Lattice
-from gmmtorch.mapping.quantization import Quantized, quantize
-from gmmtorch.mapping.thesis_message import UPDATE_TYPE, message_type
-from gmmtorch.sharing.envelope import MAX_BYTES, VERSION, Kind
-from gmmtorch.sharing.record_ids import END
+from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.mapping.codec.component_batch import encode_quantized
+from gmmtorch.mapping.codec.lattice import Lattice
+from gmmtorch.mapping.codec.quantization import Quantized, quantize
+from gmmtorch.mapping.codec.thesis_message import UPDATE_TYPE, message_type
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, VERSION, Kind
+from gmmtorch.sharing.replica.record_keys import END
 
 WIDE = 1 << 62
 _WHOLE = [0, 1, -1, 2, 63, 255, 1023, 1024, 1 << 24, 1 << 28, 1 << 31, 1 << 52, 1 << 60, END - 1, -END + 1]

@@ -13,15 +13,12 @@ from mapping.random_components import random_components, rotations
 from sharing.message_examples import sealed
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.bitstream import BitWriter
-from gmmtorch.mapping.quantization import COUNT_ERROR
-from gmmtorch.sharing.announce_messages import AnnouncementMessage, encode_announcements
-from gmmtorch.sharing.anti_entropy import MOST_PEERS, Backlog
-from gmmtorch.sharing.fields import write_intervals, write_keys
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import MAX_BYTES, decode
-from gmmtorch.sharing.record_ids import END, first_key, keys_of
-from gmmtorch.sharing.record_messages import (
+from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR
+from gmmtorch.sharing.messages.announcements import AnnouncementMessage, encode_announcements
+from gmmtorch.sharing.messages.fields import write_intervals, write_keys
+from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
+from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     SupersessionMessage,
     TotalsMessage,
@@ -29,8 +26,11 @@ from gmmtorch.sharing.record_messages import (
     pose_of,
     totals_message,
 )
-from gmmtorch.sharing.record_names import names_in
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.replica.anti_entropy import MOST_PEERS, Backlog
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of
+from gmmtorch.sharing.replica.record_names import names_in
+from gmmtorch.sharing.replica.replica import Replica
 
 robots = st.integers(0, 1023)
 lives = st.integers(0, (1 << 24) - 1)

@@ -11,23 +11,30 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.sharing import anti_entropy, records, view_peers, view_set
-from gmmtorch.sharing.announce_messages import AnnouncementMessage, encode_announcements
-from gmmtorch.sharing.anti_entropy import PATIENCE
-from gmmtorch.sharing.changes import ChangeLog
-from gmmtorch.sharing.component_table import ComponentTable
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import MAX_BYTES, ViewsHeldMessage, ViewsMessage, decode, encode_components
-from gmmtorch.sharing.record_ids import END, first_key, ids_of
-from gmmtorch.sharing.record_messages import (
+from gmmtorch.sharing import view_peers, view_set
+from gmmtorch.sharing.messages.announcements import AnnouncementMessage, encode_announcements
+from gmmtorch.sharing.messages.message_registry import (
+    MAX_BYTES,
+    ViewsHeldMessage,
+    ViewsMessage,
+    decode,
+    encode_components,
+)
+from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     RecordMessage,
     SupersessionMessage,
     TotalsMessage,
     encode_record,
 )
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.totals import Totals
+from gmmtorch.sharing.replica import anti_entropy, records
+from gmmtorch.sharing.replica.anti_entropy import PATIENCE
+from gmmtorch.sharing.replica.changes import ChangeLog
+from gmmtorch.sharing.replica.component_table import ComponentTable
+from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, first_key, ids_of
+from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
 from gmmtorch.sharing.view_set import ViewSet
 

@@ -15,18 +15,18 @@ from sharing.message_examples import codecs, frame_of_components
 from sharing.replica_model import rows
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.announce_messages import encode_announcements
 from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import (
+from gmmtorch.sharing.messages.announcements import encode_announcements
+from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
     decode,
     encode_components,
     encode_counts,
 )
+from gmmtorch.sharing.replica.intervals import Intervals
 
 seeds = st.integers(0, 10**6)
 

@@ -15,11 +15,11 @@ from sharing.schedules import act, components
 
 from gmmtorch.errors import DataError
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing import authorship, changes
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import decode
-from gmmtorch.sharing.record_messages import SupersessionMessage, TotalsMessage, encode_record
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.messages.record_messages import SupersessionMessage, TotalsMessage, encode_record
+from gmmtorch.sharing.replica import authorship, changes
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.replica import Replica
 
 seeds = st.integers(0, 10**6)
 

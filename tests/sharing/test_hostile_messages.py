@@ -19,16 +19,16 @@ from sharing.message_examples import examples, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping import codec as batches
-from gmmtorch.mapping.bitstream import BitWriter
+from gmmtorch.mapping.codec import component_batch as batches
+from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
+from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.lattice import LARGEST_VARIANCE
-from gmmtorch.mapping.quantization import MOST_POINTS
-from gmmtorch.sharing import messages
-from gmmtorch.sharing.announce_messages import encode_announcements
-from gmmtorch.sharing.component_messages import LARGEST_BATCH
-from gmmtorch.sharing.envelope import FARTHEST, Kind
-from gmmtorch.sharing.messages import (
+from gmmtorch.sharing.messages import message_registry as messages
+from gmmtorch.sharing.messages.announcements import encode_announcements
+from gmmtorch.sharing.messages.component_messages import LARGEST_BATCH
+from gmmtorch.sharing.messages.envelope import FARTHEST, Kind
+from gmmtorch.sharing.messages.message_registry import (
     AnnouncementMessage,
     ComponentsMessage,
     CorrectionMessage,
@@ -47,8 +47,8 @@ from gmmtorch.sharing.messages import (
     encode_points,
     encode_views,
 )
-from gmmtorch.sharing.record_messages import encode_record
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.messages.record_messages import encode_record
+from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.view_announcements import encode_views_held
 from gmmtorch.sharing.view_set import ViewSet
 

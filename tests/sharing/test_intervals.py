@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.intervals import Intervals, excess
+from gmmtorch.sharing.replica.intervals import Intervals, excess
 
 numbers = st.sets(st.integers(0, 40))
 

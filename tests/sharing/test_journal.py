@@ -35,8 +35,8 @@ from gmmtorch.sharing.journal_format import (
     read_log,
     unpack_snapshot,
 )
-from gmmtorch.sharing.messages import encode_components
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.messages.message_registry import encode_components
+from gmmtorch.sharing.replica.replica import Replica
 
 N_KILLS = 5
 """`scripts/soak.sh` has more."""

@@ -23,13 +23,12 @@ from sharing.message_examples import (
 )
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.codec import quantized
+from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.quantization import COUNT_ERROR, MOST_POINTS, quantize
-from gmmtorch.sharing.component_messages import LARGEST_BATCH, fitted
-from gmmtorch.sharing.envelope import FARTHEST, VERSION, Kind
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import (
+from gmmtorch.sharing.messages.component_messages import LARGEST_BATCH, fitted
+from gmmtorch.sharing.messages.envelope import FARTHEST, VERSION, Kind
+from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
     CountsMessage,
     PlanMessage,
@@ -43,7 +42,8 @@ from gmmtorch.sharing.messages import (
     kind_of,
     quantized_poses,
 )
-from gmmtorch.sharing.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
+from gmmtorch.sharing.replica.intervals import Intervals
 
 # -- components --------------------------------------------------------------------------------------------
 

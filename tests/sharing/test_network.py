@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.sharing.link_conditions import LinkConditions, Partition
-from gmmtorch.sharing.network import HEADER_BYTES, Network, Reception, Traffic
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
+from gmmtorch.sharing.transport.simulated_network import HEADER_BYTES, Network, Reception, Traffic
 
 N = 3
 UNLIKELY = 1e-4  # seeds are fixed: what passes once always does

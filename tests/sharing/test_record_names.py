@@ -11,11 +11,11 @@ from sharing.message_examples import examples
 from sharing.schedules import act
 
 from gmmtorch.errors import DataError
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import ComponentsMessage, decode, encode_components
-from gmmtorch.sharing.record_ids import keys_of
-from gmmtorch.sharing.record_names import RECORDS, names_in
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import keys_of
+from gmmtorch.sharing.replica.record_names import RECORDS, names_in
+from gmmtorch.sharing.replica.replica import Replica
 
 
 def decoded_names(datagram: bytes) -> Intervals:

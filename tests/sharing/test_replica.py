@@ -17,10 +17,10 @@ from sharing.schedules import act, components, run_schedule
 
 import gmmtorch as gt
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec import quantized
-from gmmtorch.sharing.messages import MAX_BYTES, decode, encode_components, encode_counts
-from gmmtorch.sharing.records import MOST_SIGHTINGS
-from gmmtorch.sharing.replica import Replica
+from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode, encode_components, encode_counts
+from gmmtorch.sharing.replica.records import MOST_SIGHTINGS
+from gmmtorch.sharing.replica.replica import Replica
 
 N_SCHEDULES = int(os.environ.get("GMMTORCH_SCHEDULES", "8"))
 """`scripts/soak.sh` runs more."""

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, OutputError
-from gmmtorch.sharing.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
-from gmmtorch.sharing.team_key import TeamKey
+from gmmtorch.sharing.transport.security import PLAIN_OVERHEAD, REFUSALS, SEALED_OVERHEAD, Opener, Sealer
+from gmmtorch.sharing.transport.team_key import TeamKey
 
 SECRET = bytes(range(32))
 KEY = TeamKey(SECRET)

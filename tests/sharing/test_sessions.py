@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmmtorch.sharing.sessions import (
+from gmmtorch.sharing.transport.sessions import (
     FRESH_FRAMES,
     FRESH_SECONDS,
     MAX_SESSIONS,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.token_bucket import TokenBucket
+from gmmtorch.sharing.transport.token_bucket import TokenBucket
 
 LEAST = 1200
 rates = st.integers(1, 5000)

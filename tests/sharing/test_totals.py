@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.sharing.count_messages import counts_of
-from gmmtorch.sharing.record_ids import first_key
-from gmmtorch.sharing.record_messages import TotalsMessage
-from gmmtorch.sharing.totals import Totals
+from gmmtorch.sharing.messages.count_messages import counts_of
+from gmmtorch.sharing.messages.record_messages import TotalsMessage
+from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.record_keys import first_key
 
 entries = st.dictionaries(st.integers(0, 12), st.integers(-41, 160), max_size=8)
 acts = st.lists(st.tuples(st.integers(0, 2), entries, st.booleans()), max_size=25)

@@ -16,10 +16,10 @@ from contextlib import ExitStack
 import pytest
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.sharing.network import Network, Traffic, Transport
-from gmmtorch.sharing.security import Sealer
-from gmmtorch.sharing.team_key import TeamKey
-from gmmtorch.sharing.udp import UdpTransport
+from gmmtorch.sharing.transport.security import Sealer
+from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Transport
+from gmmtorch.sharing.transport.team_key import TeamKey
+from gmmtorch.sharing.transport.udp import UdpTransport
 
 KEY = TeamKey(bytes(range(32)))
 GROUP = "239.71.77.7"
@@ -233,7 +233,7 @@ def test_of_too_many_that_wait_the_newest_are_kept(opening):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket has no room for")
 def test_what_the_system_has_no_room_for_is_counted(opening, raw, monkeypatch):
     """The receiving thread is held up until the socket's own buffer has run over."""
-    monkeypatch.setattr("gmmtorch.sharing.udp._BUFFER_BYTES", 1 << 14)
+    monkeypatch.setattr("gmmtorch.sharing.transport.udp._BUFFER_BYTES", 1 << 14)
     b = opening(1)
     sealer, n = Sealer(0), 200
     with b._lock:
@@ -254,7 +254,7 @@ def heard_any(transport: UdpTransport) -> bool:
 
 
 def test_two_robots_with_one_number_are_found_by_all(opening, caplog, monkeypatch):
-    monkeypatch.setattr("gmmtorch.sharing.sessions.FRESH_SECONDS", 0.0)
+    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.0)
     a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
     everybody = [each.address for each in (a, first, second)]
     for each in (a, first, second):

@@ -11,11 +11,17 @@ from hypothesis import strategies as st
 from sharing.message_examples import sealed, views
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.bitstream import BitWriter
-from gmmtorch.sharing.fields import write_intervals, write_keys
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import MAX_BYTES, ViewsHeldMessage, ViewsMessage, decode, encode_views
-from gmmtorch.sharing.record_ids import END, first_key
+from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.sharing.messages.fields import write_intervals, write_keys
+from gmmtorch.sharing.messages.message_registry import (
+    MAX_BYTES,
+    ViewsHeldMessage,
+    ViewsMessage,
+    decode,
+    encode_views,
+)
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, first_key
 from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
 
 DIGEST = bytes(range(1, 9))

@@ -13,12 +13,18 @@ from hypothesis import strategies as st
 from sharing.view_schedules import PlainViews, Team, run_schedule
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.sharing import view_set
-from gmmtorch.sharing.fields import quantized_poses
-from gmmtorch.sharing.intervals import Intervals
-from gmmtorch.sharing.messages import MAX_BYTES, ViewsHeldMessage, ViewsMessage, decode, encode_plan
-from gmmtorch.sharing.record_ids import END, first_key, ids_of
+from gmmtorch.sharing.messages.fields import quantized_poses
+from gmmtorch.sharing.messages.message_registry import (
+    MAX_BYTES,
+    ViewsHeldMessage,
+    ViewsMessage,
+    decode,
+    encode_plan,
+)
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, first_key, ids_of
 from gmmtorch.sharing.view_peers import MOST_PEERS
 from gmmtorch.sharing.view_set import View, ViewSet
 from gmmtorch.sharing.view_table import ViewTable

@@ -19,13 +19,13 @@ import pytest
 from sharing.schedules import components
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
-from gmmtorch.exploration.radio import Radio
-from gmmtorch.sharing import zenoh_transport
-from gmmtorch.sharing.network import Network, Traffic, Transport
-from gmmtorch.sharing.replica import Replica
-from gmmtorch.sharing.security import Sealer
-from gmmtorch.sharing.team_key import TeamKey
-from gmmtorch.sharing.zenoh_transport import ZenohTransport
+from gmmtorch.exploration.robot.radio import Radio
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.transport import zenoh_transport
+from gmmtorch.sharing.transport.security import Sealer
+from gmmtorch.sharing.transport.simulated_network import Network, Traffic, Transport
+from gmmtorch.sharing.transport.team_key import TeamKey
+from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 
 zenoh = pytest.importorskip("zenoh")
 KEY = TeamKey(bytes(range(32)))
@@ -379,7 +379,7 @@ def said_until(transport: ZenohTransport, last: bytes) -> list[bytes]:
 
 FORGETFUL = """
 import sys
-from gmmtorch.sharing.zenoh_transport import ZenohTransport
+from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
 transport = ZenohTransport(1, connect=[sys.argv[1]])
 while not transport.deliver(1, 0.0):
     transport.send(1, [b"x"], 0.0, "maps")

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gmmtorch.sharing.messages import decode
+from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.view_set import View, ViewSet
 
 MOST_ROUNDS = 16

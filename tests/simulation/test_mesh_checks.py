@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.simulation.mesh_checks import checked_triangles
-from gmmtorch.simulation.solids import box
+from gmmtorch.simulation.worlds.mesh_checks import checked_triangles
+from gmmtorch.simulation.worlds.solids import box
 
 CUBE = box((0, 0, 0), (1, 1, 1))
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation import ray_triangles
-from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> Tensor:

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation import ray_bundles, raycast_mesh
-from gmmtorch.simulation.layout import circle
-from gmmtorch.simulation.raycast_mesh import ray_segments, ray_triangles
-from gmmtorch.simulation.solids import ball, box, prism
+from gmmtorch.simulation.sensors import mesh_raycasting as raycast_mesh
+from gmmtorch.simulation.sensors import ray_bundles
+from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments, ray_triangles
+from gmmtorch.simulation.worlds.floor_plan import circle
+from gmmtorch.simulation.worlds.solids import ball, box, prism
 
 DTYPE = torch.float64
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation import depth_camera, laser_2d, sense, simulate_scan, spinning_lidar
+from gmmtorch.simulation import laser_2d, sense, simulate_scan, spinning_lidar
+from gmmtorch.simulation.sensors.range_sensors import depth_camera
 
 
 class Shell:

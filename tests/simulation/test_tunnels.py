@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.tunnels import tunnels
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.tunnels import tunnels
 
 SIZE = (60.0, 60.0, 10.0)
 

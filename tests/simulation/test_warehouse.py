@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.cell_evidence import Box
-from gmmtorch.occupancy.voxelize import occupied_cells
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.solids import box, copies
-from gmmtorch.simulation.warehouse import warehouse, warehouse_start
+from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.voxelize import occupied_cells
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+from gmmtorch.simulation.worlds.solids import box, copies
+from gmmtorch.simulation.worlds.warehouse import warehouse, warehouse_start
 
 SIZES = ((50.0, 40.0, 8.0), (15.0, 12.0, 4.0), (90.0, 85.0, 6.0))
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.simulation import building_2d, building_3d, poses_3d, spinning_lidar
-from gmmtorch.simulation.layout import Footprint, Room, circle, place
+from gmmtorch.simulation.worlds.floor_plan import Footprint, Room, circle, place
 
 SEEDS = range(6)
 CLEARANCE = 0.4

@@ -1,0 +1,234 @@
+"""Files of points, read block by block: .npy, .las, .laz, .pcd, .ply.
+
+A reader checks the header when it is opened, and holds no more than one block of points at a time.
+What a header promises and the file does not hold is a `DataError` that names the file.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from torch import Tensor
+
+from gmmtorch.datasets.point_files.cloud_layout import AXES, Layout, pcd_layout, ply_layout
+from gmmtorch.datasets.point_files.clouds import read_cloud
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+
+
+class Rows(Protocol):
+    """Rows of D numbers, in an order of their own, that can be read again and from anywhere."""
+
+    name: str
+    n_rows: int
+    dim: int
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        """Rows begin, …, end − 1 in blocks (n ≤ size, D)."""
+
+
+class ArrayRows:
+    """The rows of an array or tensor (N, D) in memory."""
+
+    def __init__(self, points: np.ndarray | Tensor, name: str = "points") -> None:
+        self._array = points.detach().cpu().numpy() if isinstance(points, Tensor) else np.asarray(points)
+        self.name = name
+        self.n_rows, self.dim = _table_shape(self._array, name)
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        for first in range(begin, end, size):
+            yield self._array[first : min(first + size, end)]
+
+
+class NpyRows:
+    """The rows of a .npy file, mapped into memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.name = path.stem
+        self.n_rows, self.dim = _table_shape(self._map(), str(path))
+
+    def _map(self) -> np.ndarray:
+        try:
+            mapped: np.ndarray = np.load(self._path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, OSError) as error:
+            raise DataError(
+                f"{self._path} cannot be read as a NumPy array ({error}); it is truncated, or not one of "
+                "plain numbers. Write it again with numpy.save."
+            ) from error
+        return mapped
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        for first in range(begin, end, size):
+            # Mapped anew: the pages of one map would stay resident as they are read.
+            yield self._map()[first : min(first + size, end)]
+
+
+class LasRows:
+    """The points of a LAS or LAZ file, in the file's own frame: scale and offset applied, in float64."""
+
+    dim = 3
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import laspy
+            import lazrs  # noqa: F401  laspy finds it by itself
+        except ImportError as error:
+            raise GmmTorchError(
+                f"{path} cannot be read, because {error.name} is not installed: pip install gmmtorch[formats]"
+            ) from error
+        self._laspy: Any = laspy
+        self._path = path
+        self.name = path.stem
+        with _las_errors(path), laspy.open(path) as reader:
+            self.n_rows = int(reader.header.point_count)
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        if begin >= end:  # laspy cannot seek to the end of a file
+            return
+        with _las_errors(self._path), self._laspy.open(self._path) as reader:
+            reader.seek(begin)
+            for first in range(begin, end, size):
+                wanted = min(size, end - first)
+                points = reader.read_points(wanted)
+                block = np.stack([points.x, points.y, points.z], 1)
+                _check_count(self._path, first, block.shape[0], wanted, self.n_rows)
+                yield block
+
+
+@contextmanager
+def _las_errors(path: Path) -> Iterator[None]:
+    """Whatever laspy and lazrs raise on a damaged file becomes a `DataError`: they share no base class."""
+    try:
+        yield
+    except GmmTorchError:
+        raise
+    except Exception as error:
+        raise DataError(
+            f"{path} cannot be read as LAS or LAZ ({error}); it is truncated or damaged. "
+            "Write or fetch it again."
+        ) from error
+
+
+class RecordRows:
+    """The points of a binary PCD or PLY file, mapped into memory."""
+
+    dim = 3
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self._path = path
+        self.name, self.n_rows = path.stem, layout.n_points
+        self._skip = layout.skip
+        self._record = np.dtype(
+            {
+                "names": list(AXES),
+                "formats": [code for code, _ in layout.axes],
+                "offsets": [offset for _, offset in layout.axes],
+                "itemsize": layout.width,
+            }
+        )
+        held = path.stat().st_size - layout.skip
+        if held < layout.n_points * layout.width:
+            raise DataError(
+                f"{path} announces {layout.n_points} points, but ends after {held} of "
+                f"{layout.n_points * layout.width} bytes; it is truncated. Write or fetch it again."
+            )
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        for first in range(begin, end, size):
+            n = min(size, end - first)
+            offset = self._skip + first * self._record.itemsize
+            records = np.memmap(self._path, self._record, "r", offset, (n,))
+            yield np.stack([records[axis].astype(np.float64) for axis in AXES], 1)
+
+
+class TextRows:
+    """The points of an ascii PCD or PLY file: a line each. Lines before `begin` are read, too."""
+
+    dim = 3
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self._path, self._layout = path, layout
+        self.name, self.n_rows = path.stem, layout.n_points
+
+    def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
+        if begin >= end:
+            return
+        with self._path.open(encoding="ascii", errors="replace") as file:
+            held = (line for line in itertools.islice(file, self._layout.skip, None) if line.strip())
+            lines = itertools.islice(held, begin, None)
+            for first in range(begin, end, size):
+                wanted = min(size, end - first)
+                taken = list(itertools.islice(lines, wanted))
+                _check_count(self._path, first, len(taken), wanted, self.n_rows)
+                yield self._numbers(taken, first)
+
+    def _numbers(self, lines: list[str], first: int) -> np.ndarray:
+        try:
+            # All columns at first, so that a line cut short is seen, whichever column it lost.
+            table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
+        except ValueError as error:
+            raise DataError(f"{self._path}, from point {first} on: {error}; it is damaged.") from error
+        if table.shape[1] != self._layout.width:
+            raise DataError(
+                f"{self._path}: point {first} has {table.shape[1]} numbers; its header announces "
+                f"{self._layout.width}. Write it again."
+            )
+        return table[:, self._layout.axes]
+
+
+def open_rows(path: str | Path) -> Rows:
+    """The points of a .npy, .las, .laz, .pcd or .ply file.
+
+    Raises `MissingDataError` if it is not there, `InvalidArgumentError` for another kind of file, and
+    `DataError` for a damaged one.
+    """
+    path = Path(path).expanduser()
+    readers: dict[str, Callable[[Path], Rows]] = {
+        ".npy": NpyRows,
+        ".las": LasRows,
+        ".laz": LasRows,
+        ".pcd": lambda path: _cloud_rows(path, pcd_layout),
+        ".ply": lambda path: _cloud_rows(path, ply_layout),
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InvalidArgumentError(
+            f"points={path} has an unknown suffix {path.suffix!r}; known are {', '.join(readers)}."
+        )
+    if not path.is_file():
+        what = "is no file" if path.exists() else "does not exist"
+        raise MissingDataError(f"points={path} {what}; give a file of points ({', '.join(readers)}).")
+    return reader(path)
+
+
+def _cloud_rows(path: Path, layout_of: Callable[[Path], Layout | None]) -> Rows:
+    try:
+        layout = layout_of(path)
+    except (ValueError, KeyError, IndexError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error
+    if layout is None:
+        return ArrayRows(read_cloud(path), path.stem)
+    return TextRows(path, layout) if layout.text else RecordRows(path, layout)
+
+
+def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:
+    if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "fiu":
+        raise DataError(
+            f"{name} holds {array.dtype} {array.shape}; expected real numbers of shape (N, D), a point a row."
+        )
+    return array.shape[0], array.shape[1]
+
+
+def _check_count(path: Path, first: int, held: int, wanted: int, announced: int) -> None:
+    if held < wanted:
+        raise DataError(
+            f"{path} announces {announced} points, but ends after {first + held}; it is truncated. "
+            "Write or fetch it again."
+        )

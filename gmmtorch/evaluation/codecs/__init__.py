@@ -1,0 +1,1 @@
+"""Codecs of raw points, which the bytes of mixtures are compared with."""

@@ -1,0 +1,166 @@
+"""Cells and bytes that the codecs of points are made of."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+
+MOST_BITS = 21
+"""Of a cell's number along an axis, so that three fit into 63."""
+_LARGEST_OUTPUT = 1 << 26  # bytes that zstd may unfold to
+
+
+# -- cells -------------------------------------------------------------------------------------------------
+
+
+def checked_points(points: Tensor) -> NDArray[np.float64]:
+    rows = points.detach().double().cpu().numpy()
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise InvalidArgumentError(f"points of shape {rows.shape} must be (N, 3), and finite.")
+    return rows
+
+
+def morton_codes(points: Tensor, resolution: float) -> tuple[Ints, Ints, int]:
+    """Least cell (3,), Morton codes (N,) of the points' cells counted from it, and bits of an axis."""
+    rows = checked_points(points) / resolution
+    if not len(rows):
+        return np.zeros(3, np.int64), np.zeros(0, np.int64), 0
+    if not float(np.abs(rows).max()) < 2.0**52:
+        raise InvalidArgumentError(f"points lie more than 2^52 cells of {resolution} m from the origin.")
+    cells = np.floor(rows).astype(np.int64)
+    corner = cells.min(0)
+    cells -= corner
+    depth = int(cells.max()).bit_length()
+    if depth > MOST_BITS:
+        raise InvalidArgumentError(
+            f"points reach over {int(cells.max()) + 1} cells of {resolution} m; at most {1 << MOST_BITS} "
+            "can be told apart. Take a coarser resolution, or fewer points at once."
+        )
+    spread = [_spread(cells[:, axis]) for axis in range(3)]
+    return corner, spread[0] << 2 | spread[1] << 1 | spread[2], depth
+
+
+_MASKS = [
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+]
+
+
+def _spread(numbers: Ints) -> Ints:
+    """Numbers below 2²¹ with two zeros between their bits."""
+    for shift, mask in _MASKS:
+        numbers = (numbers | numbers << shift) & mask
+    return numbers
+
+
+def _gather(numbers: Ints) -> Ints:
+    """The inverse of `_spread`; bits between are ignored."""
+    numbers = numbers & _MASKS[-1][1]
+    masks = [mask for _, mask in _MASKS[-2::-1]] + [(1 << MOST_BITS) - 1]
+    for (shift, _), mask in zip(_MASKS[::-1], masks, strict=True):
+        numbers = (numbers | numbers >> shift) & mask
+    return numbers
+
+
+def centers(corner: Ints, codes: Ints, resolution: float) -> Tensor:
+    cells = corner + np.stack([_gather(codes >> 2), _gather(codes >> 1), _gather(codes)], 1)
+    return torch.from_numpy((cells + 0.5) * resolution)
+
+
+# -- bytes -------------------------------------------------------------------------------------------------
+
+
+def header(corner: Ints, n: int) -> bytes:
+    """Three whole numbers of either sign and one more, in a byte or a few each."""
+    writer = BitWriter()
+    for value in [*corner.tolist(), n]:
+        writer.number(value)
+    return writer.to_bytes()
+
+
+def read_header(data: bytes) -> tuple[Ints, int, bytes]:
+    """Corner, number, and the bytes after them."""
+    reader = BitReader(data)
+    corner, n = np.array([reader.number() for _ in range(3)]), reader.number()
+    if np.abs(corner.astype(np.float64)).max() > 2.0**53 or n < 0:
+        raise DataError(f"A corner of {corner.tolist()} cells and {n} points: out of range.")
+    return corner, n, data[len(data) - reader.left // 8 :]
+
+
+_GROUPS = 9  # of 7 bits in 63
+
+
+def grouped(numbers: Ints) -> bytes:
+    """Numbers ≥ 0 in groups of 7 bits, a bit for "more" above each; all lowest groups come first."""
+    planes = []
+    while len(numbers):
+        more = numbers > 0x7F
+        planes.append((numbers & 0x7F | more << 7).astype(np.uint8).tobytes())
+        numbers = numbers[more] >> 7
+    return b"".join(planes)
+
+
+def ungrouped(data: bytes, n: int) -> Ints:
+    """The numbers (n,) of `_groups`."""
+    left = np.frombuffer(data, np.uint8).astype(np.int64)
+    if n > len(left):
+        raise DataError(f"{n} numbers are announced, {len(left)} bytes are there.")
+    numbers, longer = np.zeros(n, np.int64), np.arange(n)
+    for group in range(_GROUPS):
+        here, left = left[: len(longer)], left[len(longer) :]
+        if len(here) < len(longer):
+            raise DataError("Numbers are truncated.")
+        numbers[longer] |= (here & 0x7F) << 7 * group
+        longer = longer[here > 0x7F]
+    if len(longer) or len(left):
+        raise DataError("Numbers are too long, or bytes are left over.")
+    return numbers
+
+
+def compressed(data: bytes, level: int) -> bytes:
+    """A zstd frame without magic number, length and checksum."""
+    zstd = library("zstandard")
+    parameters = zstd.ZstdCompressionParameters.from_level(
+        level,
+        source_size=len(data),
+        format=zstd.FORMAT_ZSTD1_MAGICLESS,
+        write_content_size=False,
+        write_checksum=False,
+    )
+    folded: bytes = zstd.ZstdCompressor(compression_params=parameters).compress(data)
+    return folded
+
+
+def decompressed(data: bytes) -> bytes:
+    zstd = library("zstandard")
+    try:
+        frame = zstd.get_frame_parameters(data, format=zstd.FORMAT_ZSTD1_MAGICLESS)
+        if frame.content_size != zstd.CONTENTSIZE_UNKNOWN:  # would be believed, however large
+            raise DataError("The zstd frame says how long it is: it is foreign or damaged.")
+        decompressor = zstd.ZstdDecompressor(format=zstd.FORMAT_ZSTD1_MAGICLESS)
+        unfolded: bytes = decompressor.decompress(data, max_output_size=_LARGEST_OUTPUT)
+    except zstd.ZstdError as error:
+        raise DataError(f"zstd does not read these bytes: {error}.") from error
+    return unfolded
+
+
+def library(name: str) -> Any:
+    """zstandard or DracoPy, which only these comparisons need."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise GmmTorchError(
+            f"Points are compressed with {name}, which does not load ({error}); "
+            "pip install 'gmmtorch[baselines]'."
+        ) from error

@@ -1,0 +1,1 @@
+"""One file for each figure, table or comparison of the thesis."""

@@ -1,0 +1,108 @@
+"""A mixture of a cloud larger than memory, or shared by several processes, and how good it is."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import NamedTuple
+
+from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.estimators import FitOptions
+from gmmtorch.evaluation.events import Event
+from gmmtorch.evaluation.studies.fitting import Material, Row, row_of
+from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.streaming.checkpoints import Checkpoint
+from gmmtorch.mixture.streaming.distributed import ALONE, Processes
+from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream, survey_all
+
+_SPLIT_SALT = 0x5EED  # so that what is held out and what is drawn have nothing to do with each other
+
+
+class Split(NamedTuple):
+    """Sources to learn from and to test on, and how many points are drawn of each (None: all)."""
+
+    train: PointChunks
+    test: PointChunks
+    sample_points: int | None
+
+
+class Streamed(NamedTuple):
+    """The row for results.json, the mixture, and the points drawn of the sources."""
+
+    row: Row
+    mixture: GaussianMixture
+    sample: Material
+
+
+def split_source(source: PointChunks, test_share: float, seed: int, sample_points: int | None) -> Split:
+    """Hold out a random share of the rows. Raises `InvalidArgumentError` for a share outside [0, 1)."""
+    if not 0 <= test_share < 1:
+        raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
+    return Split(
+        source.drawn(test_share, 1.0, seed ^ _SPLIT_SALT),
+        source.drawn(0.0, test_share, seed ^ _SPLIT_SALT),
+        sample_points,
+    )
+
+
+def split_material(material: Material, chunk_points: int) -> Split:
+    """The points of a cloud in memory, split already. As they are there, all of them are drawn."""
+    train, test = (
+        in_memory(points, material.dataset, chunk_points=chunk_points)
+        for points in (material.train, material.test)
+    )
+    return Split(train, test, None)
+
+
+def fit_streamed(
+    split: Split,
+    options: FitOptions,
+    seed: int,
+    *,
+    device: str = "cpu",
+    processes: Processes = ALONE,
+    checkpoint: Checkpoint | None = None,
+    on_event: Event = lambda stage, done, total: None,
+) -> Streamed:
+    """Fit the training source by EM, and score the mixture on both. The row is rank 0's alone to keep.
+
+    Likelihoods are over all points; PSNR2 and components in use are of the points drawn.
+    """
+    train, test = (part.part(processes.rank, processes.size) for part in (split.train, split.test))
+    wanted = None if split.sample_points is None else max(split.sample_points, options.n_components or 1)
+    on_event("reading points", 0, 2)
+    found = survey_all(train, wanted, seed, processes)
+    on_event("reading points", 1, 2)
+    held_out = survey_all(test, wanted, seed, processes)
+    on_event("reading points", 2, 2)
+    sample = Material(split.train.name, found.points, held_out.points)
+
+    def on_iteration(iteration: int, lower_bound: float) -> None:
+        on_event("em", min(iteration, options.max_iter), options.max_iter)
+
+    on_event("em", 0, options.max_iter)
+    mixture = GaussianMixture(**vars(options), random_state=seed)
+    begin = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # whether it converged is in the row
+        fit_stream(
+            mixture,
+            train,
+            found=found,
+            device=device,
+            processes=processes,
+            checkpoint=checkpoint,
+            on_iteration=on_iteration,
+        )
+    seconds = time.perf_counter() - begin
+    on_event("em", options.max_iter, options.max_iter)
+    log_likelihood, n_points = score_stream(mixture, train, processes)
+    held_out_log_likelihood, n_test = score_stream(mixture, test, processes)
+    row: Row = {}
+    if processes.rank == 0:
+        row = row_of(sample, "em", mixture, seconds, seed)
+        row["n_points"] = n_points
+        row["log_likelihood"] = log_likelihood
+        row["held_out_log_likelihood"] = held_out_log_likelihood if n_test else None
+    return Streamed(row, mixture, sample)

@@ -1,0 +1,290 @@
+"""ViewEvaluator: what depth images from many poses are worth, and what one leaves for the next.
+
+A view's beams are few, each with a pencil of the field of view around it. A beam's information is shared
+out over the cells it meets, in proportion to the variance o(1 − o) that it is expected to resolve in
+each, and a cell counts by the part of it that the pencil fills. Where beams crowd, close to the
+camera, a cell is thereby shared among them, and where they are far apart one stands for the cells
+between: the value is a sum over cells, whatever the number of beams.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.information.beam_templates import beam_templates
+from gmmtorch.exploration.information.mutual_information import (
+    banded_csqmi,
+    check_occupancy,
+    check_sigma,
+    depth_kernel,
+    first_block,
+    needed_band,
+    shannon,
+    sharpened,
+)
+from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.occupancy.grid import check_resolution
+
+BLOCK = 4
+"""Cells along the side of a coarse block."""
+
+INFORMATION = ("csqmi", "fsmi")
+
+_CHUNK_VIEWS = 16  # as many as stay in a core's cache
+_WORTHLESS = 1e-4  # cells: a beam that resolves less is left out
+_BEYOND = 1 << 30  # offset of what does not exist
+_IMAGE_ODDS = 100.0  # factor of a cell's odds (FSMI): dozens of an image's pixels see it, not one beam
+
+# A view that has been taken is worth nothing the second time, although it was likely to be blocked before it
+# came to some cells, and although a block is only in part in its field of view: what it did not see is
+# what it cannot see. So a cell counts as measured if it is reached with this probability, and a block
+# if this share of what it still has to tell is.
+_REACHED = 0.05
+_SATURATED = 0.25
+
+
+class ViewValues(NamedTuple):
+    """V views of a window of G coarse blocks, in row-major order of the blocks.
+
+    values: (V,) nats. gain: (V, G) float32, where each view's value lies; rows sum to `values`.
+    measured: (V, G) float32 in [0, 1], the share of what each block still has to tell that the view
+    takes. Once others are planned a view is worth gain @ residual, with the product of their 1 − measured.
+    """
+
+    values: Tensor
+    gain: Tensor
+    measured: Tensor
+
+
+class _Layout(NamedTuple):
+    """What windows of n cells of one shape have in common."""
+
+    shape: tuple[int, ...]
+    n_blocks: int
+    block: Tensor  # (n + 1,) int32, coarse block of each cell; the last stands for what lies outside
+    offsets: Tensor  # (Y, B, C + 1) int32, templates in the flat index
+
+
+class _Window(NamedTuple):
+    """What evaluations of the same surroundings have in common."""
+
+    layout: _Layout
+    occupancy: Tensor  # (n + 1,) float32
+    unresolved: Tensor  # (G,) sum of o(1 − o)
+
+
+class ViewEvaluator:
+    """Information of depth images from poses on a lattice: every `stride`th cell's centre, n_yaws headings.
+
+    Args:
+        horizontal_fov, vertical_fov: radians, in (0, π). The camera looks along the heading, pitch 0.
+        max_range: metres along the beam.
+        resolution: side (m) of the cells of the surroundings.
+        information: of a beam, "csqmi" or "fsmi".
+        n_beams: about how many stand for an image.
+        n_yaws: headings.
+        stride: cells between positions.
+        sigma: standard deviation (m) of a reading (CSQMI).
+        known_free, known_occupied: observed cells below and above are taken for certain: they neither dim
+            what lies behind them nor draw a robot back to what it has seen enough of.
+    """
+
+    def __init__(
+        self,
+        horizontal_fov: float,
+        vertical_fov: float,
+        max_range: float,
+        resolution: float,
+        information: str = "csqmi",
+        n_beams: int = 160,
+        *,
+        n_yaws: int = 16,
+        stride: int = 2,
+        sigma: float = 0.05,
+        known_free: float = 0.05,
+        known_occupied: float = 0.5,
+    ) -> None:
+        if information not in INFORMATION:
+            raise InvalidArgumentError(f"information={information!r} is not one of {', '.join(INFORMATION)}.")
+        check_sigma(sigma)
+        if not 0 <= known_free < known_occupied <= 1:
+            raise InvalidArgumentError(
+                f"known_free={known_free} must be at least 0 and below known_occupied={known_occupied}, "
+                "which is at most 1."
+            )
+        self.resolution = check_resolution(resolution)
+        self.n_yaws = check_whole("n_yaws", n_yaws, 1)
+        self.stride = check_whole("stride", stride, 1)
+        self.information = information
+        self._known = (known_free, known_occupied)
+        templates = beam_templates(
+            horizontal_fov, vertical_fov, max_range, self.resolution, n_beams, self.n_yaws
+        )
+        self.n_beams, n_cells = templates.depths.shape[1:]
+        self._offsets, self._lengths = templates.offsets, templates.lengths
+        self._exists = torch.arange(n_cells) < templates.lengths[..., None]
+        self._leading = templates.leading.movedim(2, 0).contiguous()
+        self._ahead = (templates.offsets > 0).any(2).movedim(2, 0).contiguous()
+        self._volumes = _with_end(templates.volumes.float()).flatten(0, 1)
+        band = needed_band(torch.where(self._exists, templates.depths, math.inf), sigma)
+        self._kernel = depth_kernel(templates.depths, sigma, band, templates.lengths).float().flatten(1, 2)
+        self._layout: _Layout | None = None
+        self._windows: weakref.WeakKeyDictionary[Surroundings, _Window] = weakref.WeakKeyDictionary()
+
+    def keys(self, poses: Tensor) -> Tensor:
+        """Lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
+        if poses.ndim != 2 or poses.shape[1] != 4:
+            raise InvalidArgumentError(
+                f"poses have shape {tuple(poses.shape)}; expected (V, 4): x, y, z, yaw."
+            )
+        poses = poses.double()
+        place = (poses[:, :3] / self.resolution - 0.5) / self.stride
+        if not bool((place.abs() < 2**52).all() & (poses[:, 3].abs() < 2**32).all()):
+            raise InvalidArgumentError(
+                "poses must be finite metres and radians, and fewer than 2⁵² cells from the origin."
+            )
+        yaw = (poses[:, 3:] * (self.n_yaws / (2 * math.pi))).round().long() % self.n_yaws
+        return torch.cat([place.round().long(), yaw], 1)
+
+    def poses(self, keys: Tensor) -> Tensor:
+        """Poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
+        self._check_keys(keys)
+        place = (keys[:, :3] * self.stride + 0.5).double() * self.resolution
+        return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
+
+    def evaluate(self, surroundings: Surroundings, keys: Tensor) -> ViewValues:
+        """Each view (V, 4) by itself. Beams end at the window's border; a camera outside sees nothing."""
+        self._check_keys(keys)
+        window = self._window(surroundings)
+        shape = torch.tensor(surroundings.shape)
+        cameras = keys[:, :3] * self.stride - surroundings.low
+        template = keys[:, 3:] * self.n_beams + torch.arange(self.n_beams)
+        lengths = self._lengths_within(cameras, template, shape)
+        base = (cameras[:, 0] * shape[1] + cameras[:, 1]) * shape[2] + cameras[:, 2]
+        base = torch.where(lengths[:, 0] > 0, base, 0).int()
+        gain = window.unresolved.new_empty(len(keys), window.layout.n_blocks)
+        taken = torch.empty_like(gain)
+        for begin in range(0, len(keys), _CHUNK_VIEWS):
+            part = slice(begin, begin + _CHUNK_VIEWS)
+            gain[part], taken[part] = self._blocks(
+                window, keys[part, 3], base[part], template[part], lengths[part]
+            )
+        enough = (_SATURATED * window.unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
+        return ViewValues(gain.sum(1), gain, taken.div_(enough).clamp_max_(1))
+
+    def residual(self, surroundings: Surroundings, poses: Tensor) -> Tensor:
+        """What views from poses (M, 4), such as teammates have planned, leave of each block (G,) float32."""
+        return residual_of(self.evaluate(surroundings, self.keys(poses)))
+
+    def _check_keys(self, keys: Tensor) -> None:
+        if keys.ndim != 2 or keys.shape[1] != 4 or keys.dtype != torch.int64:
+            raise InvalidArgumentError(
+                f"keys have shape {tuple(keys.shape)} and {keys.dtype}; expected (V, 4) int64, see `keys`."
+            )
+        if len(keys) and not bool(((keys[:, 3] >= 0) & (keys[:, 3] < self.n_yaws)).all()):
+            raise InvalidArgumentError(f"keys name headings outside 0 … {self.n_yaws - 1}; see `keys`.")
+
+    def _window(self, surroundings: Surroundings) -> _Window:
+        window = self._windows.get(surroundings)
+        if window is None:
+            if not math.isclose(surroundings.resolution, self.resolution, rel_tol=1e-9):
+                raise InvalidArgumentError(
+                    f"The surroundings have cells of {surroundings.resolution} m, the evaluator of "
+                    f"{self.resolution} m; give both the same resolution."
+                )
+            if self._layout is None or self._layout.shape != surroundings.shape:
+                self._layout = self._laid_out(surroundings.shape)
+            window = self._windows[surroundings] = self._prepared(surroundings, self._layout)
+        return window
+
+    def _laid_out(self, shape: tuple[int, ...]) -> _Layout:
+        if math.prod(shape) >= _BEYOND:
+            raise InvalidArgumentError(
+                f"A window of {shape} cells is too large; views see at most 2³⁰ cells."
+            )
+        _, ny, nz = shape
+        counts = [-(-n // BLOCK) for n in shape]
+        x, y, z = (torch.arange(n, dtype=torch.int32) // BLOCK for n in shape)
+        block = ((x[:, None, None] * counts[1] + y[:, None]) * counts[2] + z).view(-1)
+        x, y, z = self._offsets.unbind(-1)
+        offsets = torch.where(self._exists, (x * ny + y) * nz + z, _BEYOND)
+        return _Layout(shape, math.prod(counts), _with_end(block), _with_end(offsets, _BEYOND).int())
+
+    def _prepared(self, surroundings: Surroundings, layout: _Layout) -> _Window:
+        occupancy, observed = check_occupancy(surroundings.occupancy).float(), surroundings.observed
+        free, occupied = self._known
+        occupancy = occupancy.masked_fill(observed & (occupancy <= free), 0.0)
+        occupancy.masked_fill_(observed & (occupancy >= occupied), 1.0)
+        occupancy = _with_end(occupancy.view(-1))
+        unresolved = torch.bincount(layout.block, (1 - occupancy).mul_(occupancy), layout.n_blocks)
+        return _Window(layout, occupancy, unresolved)
+
+    def _lengths_within(self, cameras: Tensor, template: Tensor, shape: Tensor) -> Tensor:
+        """Cells (V, B) that each beam has before it leaves the window; none if the camera is outside."""
+        lengths = self._lengths.take(template)
+        for axis in range(3):
+            below = cameras[:, axis]
+            above = shape[axis] - 1 - below
+            inside = (below >= 0) & (above >= 0)
+            farthest = self._leading.shape[-1] - 1
+            ahead = self._ahead[axis].take(template)
+            room = torch.where(ahead, above.clamp(0, farthest)[:, None], below.clamp(0, farthest)[:, None])
+            before = self._leading[axis].take(template * (farthest + 1) + room)
+            lengths = torch.minimum(lengths, before).mul_(inside[:, None])
+        return lengths
+
+    def _blocks(
+        self, window: _Window, yaw: Tensor, base: Tensor, template: Tensor, lengths: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Gain and variance taken, (v, G) each, of a few views."""
+        layout, n_cells = window.layout, len(window.occupancy) - 1
+        cell = layout.offsets.index_select(0, yaw).add_(base[:, None, None])
+        if bool((lengths < self._lengths.take(template)).any()):
+            cell.masked_fill_(torch.arange(cell.shape[-1]) >= lengths[..., None], n_cells)
+        cell = cell.clamp_max_(n_cells).view(-1, cell.shape[-1])  # (N, C + 1), N beams
+        template = template.reshape(-1)
+        occupancy = window.occupancy.index_select(0, cell.view(-1)).view(cell.shape)
+        occupancy[:, -1] = 1  # so that what is left of a beam ends there: the reading without a hit
+        hit = first_block(occupancy)
+        resolved = (1 - occupancy).mul_(hit)  # o (1 − o) of each cell, if it is reached
+        total = resolved.sum(1)
+        beams = (total > _WORTHLESS).nonzero()[:, 0]
+        if len(beams) < len(cell):
+            template, total = template[beams], total[beams]
+            cell, occupancy, hit, resolved = (
+                a.index_select(0, beams) for a in (cell, occupancy, hit, resolved)
+            )
+        information = self._information(hit, occupancy, template)
+        volumes = self._volumes.index_select(0, template)
+        taken = (1 - occupancy).mul_(occupancy)  # by min(reach / _REACHED, 1)
+        taken = torch.minimum(taken, resolved / _REACHED).mul_(volumes)
+        gain = resolved.mul_(volumes).mul_((information / total)[:, None])
+        block = layout.block.index_select(0, cell.view(-1)).view(cell.shape)
+        block = block.add_((beams // self.n_beams * layout.n_blocks).int()[:, None]).view(-1)
+        size = len(yaw) * layout.n_blocks
+        gain = torch.bincount(block, gain.view(-1), size).to(gain)  # of no beam at all, counts of integers
+        taken = torch.bincount(block, taken.view(-1), size).to(taken)
+        return gain.view(len(yaw), -1), taken.view(len(yaw), -1)
+
+    def _information(self, hit: Tensor, occupancy: Tensor, template: Tensor) -> Tensor:
+        """Nats (N,) that each beam tells, by its first hits (N, C + 1)."""
+        if self.information == "fsmi":
+            return shannon(hit, occupancy, _IMAGE_ODDS, 1 / _IMAGE_ODDS)
+        kernel = self._kernel.index_select(1, template)
+        return banded_csqmi(hit, first_block(sharpened(occupancy)), kernel)
+
+
+def residual_of(values: ViewValues) -> Tensor:
+    """What is left of each block (G,) after all of several views: the product of 1 − measured."""
+    return (1 - values.measured).prod(0)
+
+
+def _with_end(cells: Tensor, value: float = 0) -> Tensor:
+    """(..., C) with one more for the reading without a hit."""
+    return torch.cat([cells, torch.full_like(cells[..., :1], value)], -1)

@@ -1,0 +1,1 @@
+"""Missions of a team of robots, simulated or in real time."""

@@ -1,0 +1,173 @@
+"""TeamOptions: how a team explores, everything but the world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.evaluation.codecs.point_codecs import POINT_CODECS
+from gmmtorch.exploration.information.view_evaluator import INFORMATION
+from gmmtorch.exploration.planning.coordination import Coordination
+from gmmtorch.exploration.planning.planners import PLANNERS
+from gmmtorch.exploration.planning.primitives import Dynamics
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule
+from gmmtorch.exploration.robot.heartbeat import Heartbeat
+from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.world.scoring import BeliefRule
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.sharing.messages.envelope import check_codec
+from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
+from gmmtorch.sharing.transport.token_bucket import TokenBucket
+from gmmtorch.simulation.sensors.depth_camera import DepthCamera
+
+_MOST_ROBOTS = 31  # as many bits as say who saw a cell
+_LATE = 5  # mean jitters: less than a hundredth of the datagrams are later
+
+FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
+"""What the thesis calls them."""
+
+
+@dataclass(frozen=True)
+class TeamOptions:
+    """How a team explores, everything but the world.
+
+    framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and
+    search. rate: frames a second (Hz); a robot plans each time it has flown a primitive
+    (`dynamics.duration`). window: cells around a robot, along x, y, z, that it plans in. planner,
+    information, coordination: by name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior:
+    occupancy that the planner expects of unknown cells. rest: when a robot has seen enough. codec: of
+    components, see `sharing.messages`; others than quantized are not repaired after losses. latency …
+    partitions: of the network, see `LinkConditions`. announce_every (s): see `Heartbeat`. budget: bytes a
+    second that a robot sends of its map and views; None: no limit.
+    sample_every: simulated seconds between the numbers kept, to the nearest whole frame. codecs: what the
+    novel points are also encoded with, to compare. margin: metres that robots keep between them. start:
+    (size, 4) poses; None: chosen by the world.
+    """
+
+    framework: str = "gmm_shared"
+    size: int = 3
+    duration: float = 1600.0
+    seed: int = 0
+    rate: float = 1.0
+    camera: DepthCamera = field(default_factory=DepthCamera)
+    dynamics: Dynamics = field(default_factory=Dynamics)
+    belief: BeliefRule = field(default_factory=BeliefRule)
+    novelty: NoveltyRule = field(
+        default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
+    )
+    frame: FrameRule = field(default_factory=FrameRule)
+    window: tuple[int, int, int] = (80, 80, 40)
+    planner: str = "mcts"
+    information: str = "csqmi"
+    n_beams: int = 160
+    coordination: str = "greedy"
+    n_rounds: int = 3
+    planning_prior: float = 0.125
+    rest: RestRule = field(default_factory=RestRule)
+    codec: str = "quantized"
+    latency: float = 0.05
+    jitter: float = 0.0
+    bandwidth: float | None = None
+    loss: float = 0.0
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: tuple[Partition, ...] = ()
+    announce_every: float = 5.0
+    budget: float | None = None
+    sample_every: float = 10.0
+    codecs: tuple[str, ...] = ()
+    margin: float = 0.1
+    start: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.framework not in FRAMEWORKS:
+            raise InvalidArgumentError(f"team={self.framework!r} is not one of {', '.join(FRAMEWORKS)}.")
+        if self.planner not in PLANNERS:
+            raise InvalidArgumentError(f"planner={self.planner!r} is not one of {', '.join(PLANNERS)}.")
+        check_whole("team.size", self.size, 1)
+        if self.size > _MOST_ROBOTS:
+            raise InvalidArgumentError(f"team.size={self.size} is more than the {_MOST_ROBOTS} there may be.")
+        check_whole("seed", self.seed, 0)
+        check_whole("n_beams", self.n_beams, 1)
+        check_codec(self.codec)
+        for name in ("duration", "rate", "sample_every"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero, and finite.")
+        for name in self.codecs:
+            if name not in POINT_CODECS:
+                raise InvalidArgumentError(
+                    f"evaluation.codecs has {name!r}, which is not one of {', '.join(POINT_CODECS)}."
+                )
+        if self.information not in INFORMATION:
+            raise InvalidArgumentError(
+                f"information={self.information!r} is not one of {', '.join(INFORMATION)}."
+            )
+        Coordination(self.coordination, self.n_rounds)  # they check their own
+        Heartbeat(self.announce_every)
+        if self.budget is not None:
+            TokenBucket(self.budget)
+        self.conditions.check_team(self.size)
+        if not 0 <= self.margin < math.inf:
+            raise InvalidArgumentError(f"margin={self.margin} must be finite metres, at least zero.")
+        if not 0 < self.planning_prior < 1:
+            raise InvalidArgumentError(f"planner.prior={self.planning_prior} must be between 0 and 1.")
+        for name, ratio in (
+            ("the planning period in frames", self.dynamics.duration * self.rate),
+            ("the frame period in steps of the dynamics", 1 / (self.rate * self.dynamics.step)),
+        ):
+            if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
+                raise InvalidArgumentError(
+                    f"sensor.rate={self.rate} Hz with robot.duration={self.dynamics.duration} s and "
+                    f"robot.step={self.dynamics.step} s makes {name} {ratio:g}; it must be a whole number."
+                )
+
+        frames = self.duration * self.rate
+        if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
+            near = " or ".join(
+                f"{n / self.rate:g}" for n in (math.floor(frames), math.floor(frames) + 1) if n
+            )
+            raise InvalidArgumentError(
+                f"duration={self.duration} s is no whole number of frames at sensor.rate={self.rate} Hz; "
+                f"take {near}."
+            )
+
+    @property
+    def tick_seconds(self) -> float:
+        return 1 / self.rate
+
+    @property
+    def ticks_per_plan(self) -> int:
+        return round(self.dynamics.duration * self.rate)
+
+    @property
+    def steps_per_tick(self) -> int:
+        return round(self.tick_seconds / self.dynamics.step)
+
+    @property
+    def ticks_per_sample(self) -> int:
+        return max(1, round(self.sample_every * self.rate))
+
+    @property
+    def conditions(self) -> LinkConditions:
+        """Of the network."""
+        return LinkConditions(
+            latency=self.latency,
+            jitter=self.jitter,
+            bandwidth=self.bandwidth,
+            loss=self.loss,
+            duplication=self.duplication,
+            reach=self.reach,
+            partitions=self.partitions,
+        )
+
+    @property
+    def plan_slack(self) -> float:
+        """Seconds that robots wait for the plan of the one before them; none where the network is too slow
+        for all to wait for one another."""
+        slack = 2 * self.latency + _LATE * self.jitter + 0.01
+        return slack if slack * self.size <= self.tick_seconds / 2 else 0.0
+
+    @property
+    def shares(self) -> bool:
+        return self.framework != "grid_isolated"

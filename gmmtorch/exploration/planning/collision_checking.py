@@ -1,0 +1,267 @@
+"""Safety: where a robot's body fits by what is known, and which paths stay there and keep clear of others.
+
+The robot is a sphere. A cell is passable if the robot, its centre anywhere in the cell, touches no cell
+that is not known to be free, and half a cell is kept besides: so a path whose points every cell's width
+are in passable cells is safe in between, too.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.planning.peer_trajectories import Traffic, clear_of
+from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.world.collisions import collides
+from gmmtorch.occupancy.grid import check_resolution
+
+__all__ = [
+    "Traffic",
+    "cells_in_sphere",
+    "clear_of",
+    "collides",
+    "feasible",
+    "inflated",
+    "passable_cells",
+    "surroundings_of",
+]
+
+_SPACING = 1.0
+"""Cells between the points at which a path is checked; half of it is kept around the body besides."""
+_FINE_SPACING = 0.25
+"""The same for a robot that has to leave where it does not fit: there is no room to spare."""
+_STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
+"""A cell with so many hits that are so large a share of its rays holds something, however thin: a rail of a
+twentieth of a cell's width is hit by no more of them."""
+_ROUNDING = 1e-9
+_CHUNK_PAIRS = 1 << 22
+
+
+def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
+    """Cells (nx, ny, nz), bool, in which a sphere's centre may not be: somewhere in such a cell the
+    sphere of `radius` metres reaches into a blocked cell. All that lies outside is blocked.
+
+    Cells i, j, k apart are so if Σ max(|i| − 1, 0)² < (radius / resolution)²: a union of boxes, and a
+    box is one axis after the other.
+    """
+    check_resolution(resolution)
+    if not (math.isfinite(radius) and radius > 0):
+        raise InvalidArgumentError(f"radius={radius} must be above zero metres.")
+    boxes = _covering_boxes((radius / resolution) ** 2 * (1 - _ROUNDING))
+    reach = max(max(box) for box in boxes)
+    padded = torch.nn.functional.pad(blocked, (reach,) * 6, value=True)
+    found = torch.zeros_like(padded)
+    for i, same in itertools.groupby(boxes, key=lambda box: box[0]):
+        slab = _widened(padded, 0, i)
+        for _, j, k in same:
+            found |= _widened(_widened(slab, 1, j), 2, k)
+    inside = slice(reach, -reach)
+    return found[inside, inside, inside].contiguous()
+
+
+def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
+    """Cells (nx, ny, nz), bool, in which the centre of a robot may be that knows these to be free."""
+    return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
+
+
+def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
+    """Cells (K, 3) int64 of the lattice that lie wholly in a sphere, centre (3,) and radius in metres."""
+    axes, squares = [], []
+    for x in center.tolist():
+        index = torch.arange(math.floor((x - radius) / resolution), math.floor((x + radius) / resolution) + 1)
+        near = index.double() * resolution - x
+        far = torch.maximum(near.abs(), (near + resolution).abs())  # of the cell's two faces
+        axes.append(index[far <= radius])
+        squares.append(far[far <= radius].square())
+    x, y, z = squares
+    within = (x[:, None, None] + y[:, None] + z <= radius**2).flatten()
+    return torch.cartesian_prod(*axes)[within]
+
+
+def surroundings_of(
+    low: Tensor,
+    resolution: float,
+    hits: Tensor,
+    misses: Tensor,
+    *,
+    prior: float,
+    planning_prior: float,
+    free_below: float,
+    radius: float,
+    known_free: Tensor | None = None,
+    obstacles: Tensor | None = None,
+) -> Surroundings:
+    """What a planner reads, from the hits H and misses M of dense cells (nx, ny, nz).
+
+    The map's occupancy is θ = (H + N_p)/(H + M + 2N_p), the planner's (H + 2N_p π)/(H + M + 2N_p). A cell
+    is free if observed with θ below `free_below` and hardly ever hit, or if it is known to be free.
+
+    Args:
+        low: (3,) int64, index of the lowest cell on the lattice. resolution: side (m) of the cells.
+        prior: N_p, rays. planning_prior: π, the planner's occupancy of what was not observed.
+        radius: of the robot (m). known_free: (K, 3) int64, cells of the lattice; those of a sphere of
+            √3 (radius + 5/2 resolution) or more make the cell of its centre passable.
+        obstacles: (C, 3) int64, cells of the lattice that are not free whatever is known of them.
+    """
+    for name, value in (("planning_prior", planning_prior), ("free_below", free_below)):
+        if not 0 < value < 1:
+            raise InvalidArgumentError(f"{name}={value} must be a probability above 0 and below 1.")
+    if not (math.isfinite(prior) and prior > 0):
+        raise InvalidArgumentError(f"prior={prior} must be above zero rays.")
+    total = hits + misses
+    observed = total > 0
+    struck = (hits >= _STRUCK_RAYS) & (hits >= _STRUCK_SHARE * total)
+    total += 2 * prior
+    free = observed & ~struck & (hits + prior < free_below * total)
+    for cells, value in ((known_free, True), (obstacles, False)):
+        if cells is not None:
+            inside = ((cells >= low) & (cells < low + torch.tensor(free.shape))).all(1)
+            free[(cells[inside] - low).unbind(1)] = value
+    return Surroundings(
+        low=low,
+        resolution=resolution,
+        occupancy=((hits + 2 * prior * planning_prior) / total).float(),
+        observed=observed,
+        free=free,
+        passable=passable_cells(free, radius, resolution),
+    )
+
+
+def feasible(
+    rollout: Tensor,
+    braking: Tensor,
+    surroundings: Surroundings,
+    traffic: Traffic | None = None,
+    *,
+    start: Tensor | None = None,
+    radius: float | None = None,
+) -> Tensor:
+    """Which (...,) paths are safe: states (..., S, 7), and states (..., B, 7) on the way to rest after them.
+
+    Every point of a path must be in passable cells and clear of the traffic (see `clear_of`). A path that
+    never moves, to turn in place or wait, is always feasible.
+
+    A robot whose own cell has become impassable, as the map changes, may leave it where `start` and
+    `radius` are given. Its body, exactly where it is and not anywhere in its cell, then may touch no
+    cell that is not free, except those that it touches at the start; and it moves away from every point
+    of those: (x − x₀)·(q − x₀) ≤ 0. So nothing known comes closer than it is, or than the body's radius.
+
+    Args:
+        start: (..., 7) or what broadcasts to that: the states before the first step. Without it the way to
+            the first state is not checked.
+        radius: of the robot (m).
+    """
+    states = torch.cat([rollout, braking], -2)
+    origin = None
+    if start is not None:
+        begin = start.to(states).expand(*states.shape[:-2], 7)
+        origin = begin[..., :3]
+        states = torch.cat([begin[..., None, :], states], -2)
+    safe = surroundings.is_passable(_points_along(states, _SPACING * surroundings.resolution)).all(-1)
+    if origin is not None:
+        stuck = ~surroundings.is_passable(origin)
+        safe &= ~stuck
+        if radius is not None:
+            for here in torch.unique(origin[stuck], dim=0):
+                rows = stuck & (origin == here).all(-1)
+                safe[rows] = _leaves(here, states[rows], surroundings, radius)
+    if traffic is not None:
+        places = torch.cat([rollout[..., :3], braking[..., :3]], -2)
+        safe &= clear_of(places, traffic, origin)
+    still = (states[..., :3] == states[..., :1, :3]).flatten(-2).all(-1)
+    return safe | still
+
+
+def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
+    """Boxes of offsets up to (i, j, k) whose union is all with Σ max(|·| − 1, 0)² < square, by rising i."""
+
+    def largest(rest: float) -> int:
+        return math.ceil(math.sqrt(rest)) - 1
+
+    n = largest(square) + 1
+    depth = {
+        (i, j): largest(square - i * i - j * j) for i in range(n) for j in range(n) if i * i + j * j < square
+    }
+    return [
+        (i + 1, j + 1, k + 1)
+        for (i, j), k in depth.items()
+        if depth.get((i + 1, j), -1) < k and depth.get((i, j + 1), -1) < k
+    ]
+
+
+def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
+    """Cells with a blocked one up to `cells` away along an axis; not to be trusted that near the ends."""
+    size, done = blocked.shape[axis], 0
+    while done < cells:
+        shift = min(2 * done + 1, cells - done)  # what is covered so far is 2 · done + 1 wide
+        wider = blocked.clone()
+        wider.narrow(axis, shift, size - shift).logical_or_(blocked.narrow(axis, 0, size - shift))
+        wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
+        blocked, done = wider, done + shift
+    return blocked
+
+
+def _points_along(states: Tensor, spacing: float) -> Tensor:
+    """Points (..., n, 3) along paths (..., L, 7), from which no point of the paths is over spacing / 2 away.
+
+    The first state is left out. Steps are taken for straight; an arc of chord c that turns by φ bends away
+    from it by c φ/8.
+    """
+    place, yaw = states[..., :3], states[..., 3]
+    step = place[..., 1:, :] - place[..., :-1, :]
+    chord = step.square().sum(-1)
+    longest = math.sqrt(float(chord.max())) if chord.numel() else 0.0
+    turn = float((yaw[..., 1:] - yaw[..., :-1]).abs().max()) if chord.numel() else 0.0
+    room = spacing - longest * turn / 4
+    if room <= 0:
+        raise InvalidArgumentError(
+            f"Steps of {longest:.3g} m and {turn:.3g} rad are too long to be checked in cells of "
+            f"{spacing:.3g} m; take a shorter step, or coarser cells."
+        )
+    n = max(1, math.ceil(longest / room))
+    return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
+
+
+def _leaves(here: Tensor, states: Tensor, surroundings: Surroundings, radius: float) -> Tensor:
+    """Which (P,) of paths (P, L, 7) from a point (3,) lead away from all that the body touches there."""
+    resolution = surroundings.resolution
+    if not bool(surroundings.flat_index(here)[1]):
+        return torch.zeros(len(states), dtype=torch.bool)
+    points = _points_along(states, _FINE_SPACING * resolution)
+    radius = radius + _FINE_SPACING / 2 * resolution
+    reach = math.ceil(radius / resolution)
+    blocked = torch.nn.functional.pad(~surroundings.free, (reach,) * 6, value=True)
+    low = surroundings.low - reach
+    touched = _touched(here[None], blocked, low, resolution, radius)
+    cells = touched[1]
+    corners = torch.cartesian_prod(*[torch.tensor([0, 1])] * 3)
+    away = ((cells[:, None] + corners + low).double() * resolution - here).flatten(0, 1)
+    ok = ((points - here) @ away.T <= _ROUNDING).all(-1)
+    blocked[cells.unbind(1)] = False
+    flat = points.reshape(-1, 3)
+    inside = surroundings.flat_index(flat)[1]
+    rows = inside.nonzero().squeeze(1)
+    for part in rows.split(max(1, _CHUNK_PAIRS // (2 * reach + 1) ** 3)):
+        inside[part[_touched(flat[part], blocked, low, resolution, radius)[0]]] = False
+    return (ok & inside.view(ok.shape)).all(-1)
+
+
+def _touched(
+    points: Tensor, blocked: Tensor, low: Tensor, resolution: float, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Rows (T,) of points (N, 3) and cells (T, 3), relative to `low`, that spheres around them reach into."""
+    reach = math.ceil(radius / resolution)
+    offset = torch.arange(-reach, reach + 1)
+    cell = (points / resolution).floor().long()
+    near = (cell[..., None] + offset).double() * resolution - points[..., None]
+    gap = torch.maximum(near, -near - resolution).clamp_min(0).square()  # (N, 3, O), to the faces of each
+    x, y, z = gap.unbind(1)
+    within = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :] < radius**2
+    row, *index = within.nonzero().unbind(1)
+    found = cell[row] - low + torch.stack([offset[i] for i in index], 1)
+    hit = blocked[found.unbind(1)]
+    return row[hit], found[hit]

@@ -1,0 +1,233 @@
+"""Frontiers: where known free space meets the unknown, and the planner that goes there (Yamauchi 1997)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from gmmtorch.exploration.information.view_evaluator import BLOCK
+from gmmtorch.exploration.planning.geodesic import DistanceField
+from gmmtorch.exploration.planning.global_planner import Journey, looks
+from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
+from gmmtorch.exploration.planning.primitives import Primitives
+from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
+from gmmtorch.exploration.robot.local_map import Surroundings
+
+_COARSE = 2
+_SAMPLES = 24  # of a line of sight
+_TURNING = 0.3  # metres that a radian counts for
+_TRIES = 3  # goals that may turn out to be out of reach in one plan
+_GLANCE = 9  # coarse cells along the side of a frontier that is seen at one glance
+_MOST = 20  # clusters looked at in a plan
+_CLOSEST, _FARTHEST = 1.5, 3.0  # metres, level, from which a robot looks at a frontier
+_SAME = 1.0  # metres between the targets of a frontier, before and after it was looked at
+_ABOUT = 2.0  # metres around a remembered frontier within which one must be left
+
+
+class Frontiers(NamedTuple):
+    """K clusters of frontier cells that a robot can look at.
+
+    poses: (K, 4), the nearest place to see each from, towards it. targets: (K, 3), its cell in the middle.
+    sizes: (K,) cells. metres: (K,) from the robot to the place.
+    """
+
+    poses: Tensor
+    targets: Tensor
+    sizes: Tensor
+    metres: Tensor
+
+
+def frontier_cells(surroundings: Surroundings) -> Tensor:
+    """Free cells (nx, ny, nz) bool with a face to one that is neither observed nor free."""
+    unknown = ~(surroundings.observed | surroundings.free)
+    beside = torch.zeros_like(unknown)
+    for axis in range(3):
+        n = unknown.shape[axis] - 1
+        beside.narrow(axis, 0, n).logical_or_(unknown.narrow(axis, 1, n))
+        beside.narrow(axis, 1, n).logical_or_(unknown.narrow(axis, 0, n))
+    return beside & surroundings.free
+
+
+def find_frontiers(
+    surroundings: Surroundings, start: Tensor, exhausted: Tensor, least: int, elevation: float
+) -> Frontiers:
+    """Clusters of at least so many cells that a robot at `start` (3,) can look at, the most promising first.
+
+    Args:
+        exhausted: (E, 3), targets that did not go away when looked at; cells within a metre do not count.
+        elevation: radians above or below the camera up to which it can look at a target.
+    """
+    distances = DistanceField.to(surroundings, start[None], coarse=_COARSE)
+    cells = frontier_cells(surroundings).nonzero()
+    if len(exhausted):
+        cells = cells[torch.cdist(surroundings.centers(cells), exhausted.double()).amin(1) > _SAME]
+    shape = distances.metres.shape
+    counts = torch.zeros(shape, dtype=torch.int64)
+    counts.index_put_(
+        (cells // _COARSE).unbind(1), torch.ones(len(cells), dtype=torch.int64), accumulate=True
+    )
+    label, middles = _parts(distances, counts)
+    n = int(label.max()) + 1 if len(label) else 0
+    sizes = torch.zeros(n, dtype=torch.int64).index_add_(0, label, counts[counts > 0])
+    reached = torch.isfinite(distances.metres)
+    places, metres = _middles(distances, reached.nonzero()), distances.metres[reached].double()
+    apart = (middles - start).norm(dim=1)
+    nearest = torch.full((n,), math.inf, dtype=torch.float64).scatter_reduce_(0, label, apart, "amin")
+    promise = torch.where(sizes >= least, sizes / (1 + nearest), 0.0)
+    found: list[tuple[Tensor, Tensor, float, float]] = []
+    for k in promise.argsort(descending=True, stable=True)[:_MOST].tolist():
+        if promise[k] == 0:
+            break
+        own = middles[label == k]
+        target = own[(own - own.mean(0)).norm(dim=1).argmin()]
+        way = target - places
+        level = way[:, :2].norm(dim=1)
+        can_look = (
+            (level >= _CLOSEST) & (level <= _FARTHEST) & (way[:, 2].abs() <= math.tan(elevation) * level)
+        )
+        can_look[can_look.clone()] = _sees(surroundings, places[can_look], target)
+        if bool(can_look.any()):
+            row = int(metres.masked_fill(~can_look, math.inf).argmin())
+            pose = torch.cat([places[row], torch.atan2(way[row, 1], way[row, 0])[None]])
+            found.append((pose, target, float(sizes[k]), float(metres[row])))
+    return Frontiers(
+        torch.stack([pose for pose, *_ in found]) if found else torch.zeros(0, 4, dtype=torch.float64),
+        torch.stack([target for _, target, *_ in found]) if found else torch.zeros(0, 3, dtype=torch.float64),
+        torch.tensor([size for *_, size, _ in found], dtype=torch.float64),
+        torch.tensor([away for *_, away in found], dtype=torch.float64),
+    )
+
+
+def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Of each coarse frontier cell (n,), by `counts`: which cluster it is of, and its middle (n, 3).
+
+    Connected cells are one frontier, cut by a lattice of cubes small enough to be seen at one glance.
+    """
+    labels, _ = ndimage.label(counts.numpy() > 0, structure=np.ones((3, 3, 3)))
+    cells = (counts > 0).nonzero()
+    cube = cells // _GLANCE
+    rows = torch.cat([torch.from_numpy(labels[labels > 0])[:, None].long(), cube], 1)
+    if len(rows) == 0:
+        return rows[:, 0], _middles(distances, cells)
+    return torch.unique(rows, dim=0, return_inverse=True)[1], _middles(distances, cells)
+
+
+def _sees(surroundings: Surroundings, places: Tensor, target: Tensor) -> Tensor:
+    """Whether all between places (N, 3) and just before a target (3,) is free."""
+    share = torch.linspace(0, 1, _SAMPLES + 1, dtype=torch.float64)[:-1, None]
+    points = places[:, None] + share * (target - places)[:, None]
+    flat, inside = surroundings.flat_index(points)
+    return (surroundings.free.view(-1)[flat] & inside).all(1)
+
+
+def _middles(distances: DistanceField, cells: Tensor) -> Tensor:
+    return distances.origin + (cells + 0.5) * distances.spacing
+
+
+class FrontierPlanner:
+    """Goes to the frontier of the largest size/(1 + distance) and looks at it; keeps to one while it lasts.
+
+    Frontiers left behind are remembered in the view library, their values the sizes, for when the window
+    shows no other.
+
+    Args:
+        least: cells of the smallest frontier. largest: cells from which on more do not count.
+        loyalty: factor by which another frontier must be better than the present one.
+        elevation: radians above or below the camera up to which it can look at a frontier.
+    """
+
+    def __init__(
+        self,
+        primitives: Primitives,
+        least: int = 20,
+        largest: int = 400,
+        loyalty: float = 1.5,
+        elevation: float = 0.4,
+    ) -> None:
+        self._search = TreeSearch(primitives, SearchRule(depth=3, n_rounds=2, n_leaves=24))
+        self._waiting = Waiting(primitives)
+        self._least, self._largest, self._loyalty = least, largest, loyalty
+        self._elevation = elevation
+        self._journey: Journey | None = None
+        self._target = torch.zeros(3, dtype=torch.float64)
+        self._exhausted = torch.zeros(0, 3, dtype=torch.float64)
+
+    def plan(self, task: PlanningTask) -> Plan:
+        here = task.surroundings
+        found = find_frontiers(here, task.state[:3], self._exhausted, self._least, self._elevation)
+        self._give_up(found.targets[looks(task.state, found.poses)])
+        self._forget(task, found)
+        for _ in range(_TRIES):
+            kind = self._choose(task, found)
+            if self._journey is None:
+                break
+            goal = self._journey.goal(task, weight=1.0)
+            branch = None if goal is None else self._search.search(task, goal=goal)
+            if branch is not None and branch.value > 0:
+                self._waiting.over()
+                return Plan(branch.path, branch.braking, branch.views, branch.value, kind)
+            self._give_up(self._target[None])
+        return self._waiting.plan(task)
+
+    def _choose(self, task: PlanningTask, found: Frontiers) -> str:
+        """Settle where to go; returns the kind of plan."""
+        here = task.surroundings
+        if len(self._exhausted):
+            left = torch.cdist(found.targets, self._exhausted).amin(1) >= _SAME
+            found = Frontiers(*(values[left] for values in found))
+        if len(found.sizes) == 0:
+            if self._journey is None:
+                self._journey = Journey.chosen(task, self._least)
+                if self._journey is not None:
+                    self._target = self._journey.pose[:3]
+            return "travel"
+        block = (here.cells_of(found.targets) // BLOCK).clamp_min(0)
+        counts = [-(-n // BLOCK) for n in here.shape]
+        flat = (block[:, 0] * counts[1] + block[:, 1]) * counts[2] + block[:, 2]
+        turn = torch.remainder(found.poses[:, 3] - task.state[3] + math.pi, 2 * math.pi) - math.pi
+        turn = _TURNING * turn.abs()
+        score = found.sizes.clamp_max(self._largest) * task.residual[flat] / (1 + found.metres + turn)
+        same = (found.targets - self._target).norm(dim=1) < _SAME
+        if self._journey is not None:
+            score = torch.where(same, self._loyalty * score, score)
+        row = int(score.argmax())
+        if self._journey is None or not bool(same[row]):
+            size, metres = float(found.sizes[row]), float(found.metres[row])
+            self._journey = Journey(found.poses[row], size, metres, task.now)
+            self._target = found.targets[row]
+        others = torch.arange(len(score)) != row
+        task.library.add(found.poses[others], found.sizes[others], task.now, self._least, most=3)
+        return "explore"
+
+    def _give_up(self, targets: Tensor) -> None:
+        """Never again go to targets (N, 3): they were looked at, or cannot be got to."""
+        self._exhausted = torch.cat([self._exhausted, targets])
+        if bool(((targets - self._target).norm(dim=1) < _SAME).any()):
+            self._journey = None
+
+    def _forget(self, task: PlanningTask, found: Frontiers) -> None:
+        """Remove what the library remembers in the window, where no frontier is left."""
+        known = task.library.candidates()
+        inside = task.surroundings.is_passable(known.poses[:, :3])
+        if len(found.poses):
+            apart = torch.cdist(known.poses[:, :3], found.poses[:, :3]).amin(1)
+            inside &= apart > _ABOUT
+        task.library.remove([known.ids[row] for row in inside.nonzero()[:, 0].tolist()], task.now)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "journey": None if self._journey is None else self._journey.state(),
+            "target": self._target,
+            "exhausted": self._exhausted,
+            "waiting": self._waiting.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
+        self._target, self._exhausted = state["target"], state["exhausted"]
+        self._waiting.restore(state["waiting"])

@@ -1,0 +1,104 @@
+"""Journey: the way to a far view, through the window and beyond it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.exploration.planning.geodesic import DistanceField
+from gmmtorch.exploration.planning.goal import Goal
+from gmmtorch.exploration.planning.planner_interface import PlanningTask
+from gmmtorch.exploration.planning.roadmap import at_the_rim
+
+_REFRESHED = 10.0  # seconds that a way over the roadmap is relied on
+_PATIENCE = 12.0  # seconds without coming closer, after which a robot gives up
+_CLOSER = 0.5  # metres that count as closer
+_THERE = 1.2  # metres from the goal
+_FACING = 0.7  # radians off its heading
+
+
+def looks(state: Tensor, poses: Tensor) -> Tensor:
+    """Whether (...,) a robot in a state (7,) is where poses (..., 4) are, as good as, and looks their way."""
+    off = torch.remainder(state[3] - poses[..., 3] + math.pi, 2 * math.pi) - math.pi
+    return ((state[:3] - poses[..., :3]).norm(dim=-1) < _THERE) & (off.abs() < _FACING)
+
+
+class Journey:
+    """To a view `pose` (4,) worth `value`, `metres` away at the start; `since`: when it last came closer (s).
+
+    Over the roadmap the distance to the goal is known at its nodes; in the window it is worked out cell by
+    cell, from the goal if it is inside, and from the nodes at the window's rim, each with what remains
+    beyond it.
+    """
+
+    def __init__(self, pose: Tensor, value: float, metres: float, now: float) -> None:
+        self.pose, self.value, self.metres = pose, value, metres
+        self._nearest, self.since = math.inf, now
+        self._nodes, self._rest = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+        self._refreshed = -math.inf
+
+    @classmethod
+    def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
+        """To the view of the library with the largest value/(1 + metres), which is taken out of it.
+
+        None if none worth `least` can be reached; views close to those of `given_up` (N, 4) do not count.
+        """
+        known = task.library.candidates()
+        if not known.ids:
+            return None
+        metres = task.roadmap.route(task.state[:3], known.poses[:, :3]).metres
+        if given_up is not None and len(given_up):
+            apart = torch.cdist(known.poses[:, :3], given_up[:, :3]).amin(1)
+            metres = metres.masked_fill(apart < _THERE, math.inf)
+        row = task.library.best(metres, least=least)
+        if row is None:
+            return None
+        task.library.remove([known.ids[row]], task.now)
+        return cls(known.poses[row], float(known.values[row]), float(metres[row]), task.now)
+
+    def put_back(self, task: PlanningTask) -> None:
+        """Leave the view to whoever comes by."""
+        task.library.add(self.pose[None], torch.tensor([self.value]), task.now, 0.0)
+
+    def goal(self, task: PlanningTask, weight: float) -> Goal | None:
+        """Where to go from here; None if the robot is there, or comes no closer."""
+        if bool(looks(task.state, self.pose)):
+            return None
+        goal = Goal(self._field(task), weight, float(self.pose[3]))
+        cost = float(goal.cost(task.state))
+        if cost < self._nearest - _CLOSER:
+            self._nearest, self.since = cost, task.now
+        return None if task.now - self.since > _PATIENCE else goal
+
+    def _field(self, task: PlanningTask) -> DistanceField:
+        if task.now - self._refreshed >= _REFRESHED:
+            self._nodes, self._rest = task.roadmap.reaching(self.pose[:3])
+            self._refreshed = task.now
+        here = task.surroundings
+        rim = at_the_rim(self._nodes, here.box, here.resolution, 1.5 * task.roadmap.spacing)
+        goals = torch.cat([self.pose[None, :3], self._nodes[rim]])
+        offsets = torch.cat([self._rest.new_zeros(1), self._rest[rim]])
+        return DistanceField.to(here, goals, offsets)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "pose": self.pose,
+            "value": self.value,
+            "metres": self.metres,
+            "nearest": self._nearest if math.isfinite(self._nearest) else None,
+            "since": self.since,
+            "nodes": self._nodes,
+            "rest": self._rest,
+            "refreshed": self._refreshed if math.isfinite(self._refreshed) else None,
+        }
+
+    @classmethod
+    def restored(cls, state: dict[str, Any]) -> Journey:
+        journey = cls(state["pose"], float(state["value"]), float(state["metres"]), float(state["since"]))
+        journey._nearest = math.inf if state["nearest"] is None else float(state["nearest"])
+        journey._nodes, journey._rest = state["nodes"], state["rest"]
+        journey._refreshed = -math.inf if state["refreshed"] is None else float(state["refreshed"])
+        return journey

@@ -1,0 +1,264 @@
+"""Planners: tree search over views, frontiers, and chance, on the same primitives and the same safety."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.information.information_discount import Fatigue
+from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.planning.frontier import FrontierPlanner
+from gmmtorch.exploration.planning.global_planner import Journey
+from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
+from gmmtorch.exploration.planning.primitives import Primitives
+from gmmtorch.exploration.planning.tree_search import Found, SearchRule, TreeSearch
+
+__all__ = [
+    "PLANNERS",
+    "FrontierPlanner",
+    "Plan",
+    "Planner",
+    "PlanningTask",
+    "RandomPlanner",
+    "TreePlanner",
+    "TreeRule",
+    "make_planner",
+]
+
+
+_NOTHING = 1e-3  # of the largest value
+_STUCK = 0.3  # metres that a branch must come closer
+_REMEMBERED = 32  # views that were given up
+
+
+@dataclass(frozen=True)
+class TreeRule:
+    """When a robot explores where it is, and when it travels; all values as shares of the largest seen.
+
+    search: of the tree while exploring; travel: while travelling; squeeze: where that comes no closer,
+    for the way alone. little: information a primitive below
+    which a robot looks for something better; plenty: from which on a traveller stays. worthwhile: value of
+    a view that is kept in the library. metre: what a metre on the way to a goal is worth, against
+    information on the way. n_added, n_revalued: views of the library in one plan.
+    """
+
+    search: SearchRule = field(default_factory=SearchRule)
+    travel: SearchRule = field(default_factory=lambda: SearchRule(n_rounds=2, n_leaves=24))
+    squeeze: SearchRule = field(default_factory=lambda: SearchRule(depth=6, n_rounds=6, n_leaves=48))
+    little: float = 0.1
+    plenty: float = 0.25
+    worthwhile: float = 0.15
+    metre: float = 0.2
+    n_added: int = 3
+    n_revalued: int = 6
+
+
+class TreePlanner:
+    """Explores by tree search; with little left around, travels to the best view of the library.
+
+    What a view is worth at all is measured by the largest value seen so far, and what looking in vain has
+    shown not to be there does not count, see `Fatigue`. A robot that travels has
+    taken its goal out of the library, so that nobody else goes there; it puts the goal back when it finds
+    enough to do on the way.
+    """
+
+    def __init__(
+        self, primitives: Primitives, evaluator: ViewEvaluator, rule: TreeRule | None = None
+    ) -> None:
+        self._rule = TreeRule() if rule is None else rule
+        self._evaluator = evaluator
+        self._explore = TreeSearch(primitives, self._rule.search)
+        self._travel = TreeSearch(primitives, self._rule.travel)
+        self._squeeze = TreeSearch(primitives, self._rule.squeeze)
+        self._waiting = Waiting(primitives)
+        self._speed = primitives.dynamics.speed
+        self._duration = primitives.dynamics.duration
+        self._journey: Journey | None = None
+        self._given_up = torch.zeros(0, 4, dtype=torch.float64)
+        self._fatigue, self._weights = Fatigue(), torch.zeros(0)
+        self._largest = 0.0
+        self._branch: list[int] = []
+        self._when = -math.inf
+
+    def plan(self, task: PlanningTask) -> Plan:
+        memory = Memory(task, self._evaluator)
+        here = int(memory.rows(task.state[None, :4].double())[0])
+        self._fatigue.note(task.surroundings, memory.measured(here), task.now)
+        self._weights = self._fatigue.weights(task.surroundings)
+        task = replace(task, residual=task.residual * self._weights)
+        task.library.visit(task.state[None, :4], task.now)
+        self._revalue(task, memory)
+        found = self._on_the_way(task, memory) if self._journey is not None else None
+        if found is None:
+            found = self._around(task, memory)
+        self._note(task, memory, found)
+        if found is None:
+            return self._waiting.plan(task)
+        self._waiting.over()
+        if self._journey is None and found.information <= _NOTHING * self._largest:
+            return self._waiting.rest(task)
+        kind = "explore" if self._journey is None else "travel"
+        return Plan(found.path, found.braking, found.views, found.value, kind)
+
+    def _around(self, task: PlanningTask, memory: Memory) -> Found | None:
+        """Explore, or set out on a journey where that promises more."""
+        found = self._explore.search(task, memory, first=self._rest_of_branch(task))
+        self._measure(memory)
+        rate = _rate(found)
+        if rate > self._rule.little * self._largest:
+            return found
+        journey = Journey.chosen(task, self._rule.worthwhile * self._largest, self._given_up)
+        if journey is None:
+            return found
+        legs = 1 + journey.metres / (self._speed * self._duration)
+        if journey.value / legs <= rate:
+            journey.put_back(task)
+            return found
+        self._journey, self._largest = journey, max(self._largest, journey.value)
+        return self._on_the_way(task, memory) or found
+
+    def _on_the_way(self, task: PlanningTask, memory: Memory) -> Found | None:
+        """Travel on; None where the journey is over, or there is enough to explore here."""
+        journey = self._journey
+        if journey is None:
+            return None
+        value = None
+        if bool(task.surroundings.is_passable(journey.pose[:3])):
+            row = memory.rows(journey.pose[None])
+            value = float(memory.marginal(row, self._weights[None])[0])
+        if value is not None and value < self._rule.worthwhile * self._largest:
+            self._journey = None
+            return None
+        goal = journey.goal(task, self._rule.metre * self._largest)
+        if goal is None:
+            self._give_up(journey)
+            return None
+        found = self._travel.search(task, memory, goal, first=self._rest_of_branch(task))
+        if found is None or found.progress < _STUCK:
+            found = self._squeeze.search(task, goal=goal)
+        if found is None or found.progress < _STUCK:
+            self._give_up(journey)
+            return None
+        if _rate(found) >= self._rule.plenty * self._largest:
+            journey.put_back(task)
+            self._journey = None
+            return None
+        return found
+
+    def _measure(self, memory: Memory) -> None:
+        """Hold the largest value up to date."""
+        _, values = memory.views(self._weights)
+        if len(values):
+            self._largest = max(self._largest, float(values.max()))
+
+    def _give_up(self, journey: Journey) -> None:
+        """Do not go there again: the view was looked from, or cannot be got to."""
+        self._given_up = torch.cat([self._given_up, journey.pose[None]])[-_REMEMBERED:]
+        self._journey = None
+
+    def _rest_of_branch(self, task: PlanningTask) -> list[int]:
+        return self._branch[1:] if task.now > self._when else self._branch
+
+    def _revalue(self, task: PlanningTask, memory: Memory) -> None:
+        ids = task.library.covered(task.surroundings, task.now, self._rule.n_revalued)
+        if ids:
+            known = task.library.candidates()
+            at = {key: row for row, key in enumerate(known.ids)}
+            rows = memory.rows(known.poses[[at[key] for key in ids]])
+            values, _ = memory.marginal(rows, self._weights[None])
+            task.library.revalue(ids, values, task.now, self._rule.worthwhile * self._largest)
+
+    def _note(self, task: PlanningTask, memory: Memory, found: Found | None) -> None:
+        """Remember the branch, and in the library the best of what it leaves."""
+        self._branch, self._when = ([] if found is None else found.actions), task.now
+        poses, values = memory.views(self._weights)
+        self._measure(memory)
+        known = [self._given_up] if found is None else [self._given_up, found.views]
+        if self._journey is not None:
+            known.append(self._journey.pose[None])
+        apart = torch.cdist(poses[:, :3], torch.cat(known)[:, :3])
+        values = values.masked_fill((apart < task.library.spacing).any(1), 0.0)
+        task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "journey": None if self._journey is None else self._journey.state(),
+            "fatigue": self._fatigue.state(),
+            "given_up": self._given_up,
+            "largest": self._largest,
+            "branch": self._branch,
+            "when": self._when if math.isfinite(self._when) else None,
+            "waiting": self._waiting.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
+        self._fatigue.restore(state["fatigue"])
+        self._given_up = state["given_up"]
+        self._largest = float(state["largest"])
+        self._branch = [int(action) for action in state["branch"]]
+        self._when = -math.inf if state["when"] is None else float(state["when"])
+        self._waiting.restore(state["waiting"])
+
+
+_TURNING = 0.1  # metres that a turn in place counts for in a random choice
+
+
+class RandomPlanner:
+    """Keeps to a primitive for a while, then takes another that is feasible, the rather the farther it leads.
+
+    persistence: the chance that it goes on as before, if that is feasible.
+    """
+
+    def __init__(self, primitives: Primitives, persistence: float = 0.7) -> None:
+        if not 0 <= persistence < 1:
+            raise InvalidArgumentError(f"persistence={persistence} must be at least 0 and below 1.")
+        self._primitives, self._persistence = primitives, persistence
+        self._waiting = Waiting(primitives)
+        self._last = -1
+
+    def plan(self, task: PlanningTask) -> Plan:
+        here = options(self._primitives, task.state[None].double(), task, may_escape=True)
+        moved = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1)
+        moved[self._primitives.stop] = 0
+        possible = (moved + _TURNING * (self._primitives.commands[:, 2] != 0)) * here.feasible[0]
+        if not bool(possible.any()):
+            self._last = -1
+            return self._waiting.plan(task)
+        self._waiting.over()
+        goes_on = float(torch.rand((), generator=task.generator)) < self._persistence
+        if not (goes_on and self._last >= 0 and possible[self._last] > 0):
+            self._last = int(torch.multinomial(possible, 1, generator=task.generator))
+        path = here.paths[0, self._last]
+        return Plan(path, here.braking[0, self._last], path[-1:, :4], 0.0, "explore")
+
+    def state(self) -> dict[str, Any]:
+        return {"last": self._last, "waiting": self._waiting.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._last = int(state["last"])
+        self._waiting.restore(state["waiting"])
+
+
+PLANNERS = ("mcts", "frontier", "random")
+
+
+def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator, **rule: Any) -> Planner:
+    """The planner of that name; `rule`: fields of `TreeRule`, or the other planners' own arguments."""
+    if name == "mcts":
+        return TreePlanner(primitives, evaluator, TreeRule(**rule))
+    if name == "frontier":
+        return FrontierPlanner(primitives, **rule)
+    if name == "random":
+        return RandomPlanner(primitives, **rule)
+    raise InvalidArgumentError(f"planner={name!r} is not one of {', '.join(PLANNERS)}.")
+
+
+def _rate(found: Found | None) -> float:
+    """Information a primitive of a branch."""
+    return 0.0 if found is None else found.information / len(found.actions)

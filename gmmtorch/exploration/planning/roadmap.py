@@ -1,0 +1,249 @@
+"""Roadmap: where a robot can travel beyond its window, sparse and coarse."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gmmtorch.errors import check_whole
+from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.occupancy.voxels.cell_evidence import Box
+
+_BLOCK = 8  # nodes along each side of a block of storage
+_PASSABLE = 1
+_EDGES = (2, 4, 8)  # a way on to the next node along x, y, z
+_REACH = 2.5  # node spacings from a point within which it joins the roadmap
+
+
+class Route(NamedTuple):
+    """Ways from a start to M goals. metres: (M,) float64, inf where there is none."""
+
+    metres: Tensor
+    nodes: np.ndarray
+    before: np.ndarray
+    last: np.ndarray
+
+    def path(self, goal: int) -> Tensor:
+        """Nodes (L, 3), metres, that lead from the start to a goal; empty where there is no way."""
+        rows = []
+        node = int(self.last[goal]) if math.isfinite(float(self.metres[goal])) else -1
+        while node >= 0:
+            rows.append(node)
+            node = int(self.before[node])
+        return torch.from_numpy(self.nodes[rows[::-1]])
+
+
+class Roadmap:
+    """Nodes of a lattice `factor` times as coarse as the map's, wherever some cell of one is passable.
+
+    Two nodes that share a face are joined where passable cells meet on it, those that share an edge or
+    a corner where two or three such steps join them. Nodes lie in blocks, so that an update costs what
+    the window does, however large the world; a query costs what has been explored.
+    """
+
+    def __init__(self, factor: int = 4) -> None:
+        self._factor = check_whole("factor", factor, 1)
+        self._resolution = 1.0
+        self._blocks: dict[tuple[int, int, int], np.ndarray] = {}
+        self._cached: _Graph | None = None
+
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        return sum(int(np.count_nonzero(block & _PASSABLE)) for block in self._blocks.values())
+
+    @property
+    def spacing(self) -> float:
+        """Metres between neighbouring nodes."""
+        return self._factor * self._resolution
+
+    def update(self, surroundings: Surroundings) -> None:
+        """Take over what the window shows, nodes that are no longer passable included."""
+        self._resolution, self._cached = surroundings.resolution, None
+        passable, low = surroundings.passable.cpu().numpy(), surroundings.low.cpu().numpy()
+        first = -(-low // self._factor)
+        last = (low + passable.shape) // self._factor
+        if (first >= last).any():
+            return
+        begin = first * self._factor - low
+        whole = tuple(slice(b, b + n) for b, n in zip(begin, (last - first) * self._factor, strict=True))
+        flags, known = _flags(passable[whole], self._factor)
+        for block, inside, outside in _blocks_between(first, last):
+            kept = self._blocks.setdefault(block, np.zeros((_BLOCK,) * 3, np.uint8))
+            kept[inside] = (kept[inside] & ~known[outside]) | flags[outside]
+
+    def route(self, start: Tensor, goals: Tensor) -> Route:
+        """The shortest ways from `start` (3,) to goals (M, 3), metres."""
+        graph = self._graph
+        source, gap = graph.nearest(start.cpu().numpy()[None])
+        ends, rest = graph.nearest(goals.cpu().numpy().reshape(-1, 3))
+        metres, before = graph.from_node(int(source[0]))
+        total = np.full(len(ends), math.inf)
+        joined = ends >= 0
+        total[joined] = metres[ends[joined]] + gap[0] + rest[joined]
+        return Route(torch.from_numpy(total), graph.points, before, ends)
+
+    def reaching(self, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Nodes (N, 3), metres, from which a goal (3,) can be reached, and how far it is (N,)."""
+        graph = self._graph
+        source, gap = graph.nearest(goal.cpu().numpy()[None])
+        metres, _ = graph.from_node(int(source[0]))
+        good = np.isfinite(metres)
+        return torch.from_numpy(graph.points[good]), torch.from_numpy(metres[good] + gap[0])
+
+    @property
+    def _graph(self) -> _Graph:
+        if self._cached is None:
+            self._cached = _Graph.of(self._blocks, self.spacing)
+        return self._cached
+
+    def state(self) -> dict[str, Any]:
+        blocks = sorted(self._blocks)
+        return {
+            "resolution": self._resolution,
+            "blocks": torch.tensor(blocks, dtype=torch.int64).reshape(-1, 3),
+            "flags": torch.from_numpy(
+                np.stack([self._blocks[block] for block in blocks])
+                if blocks
+                else np.zeros((0, *(_BLOCK,) * 3), np.uint8)
+            ),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._resolution, self._cached = float(state["resolution"]), None
+        flags = state["flags"].numpy()
+        self._blocks = {
+            (int(x), int(y), int(z)): flags[row].copy()
+            for row, (x, y, z) in enumerate(state["blocks"].tolist())
+        }
+
+
+def at_the_rim(points: Tensor, box: Box, resolution: float, width: float) -> Tensor:
+    """Which of points (N, 3), metres, lie inside a box of cells, but no deeper than `width` metres."""
+    low, high = box.low.double() * resolution, box.high.double() * resolution
+    depth = torch.minimum(points - low, high - points).amin(-1)
+    return (depth >= 0) & (depth <= width)
+
+
+class _Graph:
+    """The nodes as points (N, 3), metres, in the order of their cells, and the ways between them."""
+
+    def __init__(self, points: np.ndarray, ways: csr_matrix, spacing: float) -> None:
+        self.points, self.ways, self.spacing = points, ways, spacing
+        self._tree = cKDTree(points) if len(points) else None
+
+    @classmethod
+    def of(cls, blocks: dict[tuple[int, int, int], np.ndarray], spacing: float) -> _Graph:
+        cells, flags = _nodes(blocks)
+        return cls((cells + 0.5) * spacing, _ways(cells, flags) * spacing, spacing)
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The node (M,) next to each point and the metres between; −1 and inf where none is near."""
+        if self._tree is None:
+            return np.full(len(points), -1), np.full(len(points), math.inf)
+        gap, node = self._tree.query(points, distance_upper_bound=_REACH * self.spacing)
+        return np.where(np.isfinite(gap), node, -1), gap
+
+    def from_node(self, source: int) -> tuple[np.ndarray, np.ndarray]:
+        """Metres (N,) from a node to all, inf where there is no way, and the node before each."""
+        if source < 0:
+            return np.full(len(self.points), math.inf), np.full(len(self.points), -1)
+        metres, before = dijkstra(self.ways, indices=source, return_predecessors=True)
+        return metres, before
+
+
+def _flags(passable: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each node (a, b, c) uint8: its flags, and which of them the window knows."""
+    node = passable
+    for axis in range(3):
+        node = _any(node, axis, factor)
+    flags = node.astype(np.uint8)
+    known = np.full_like(flags, _PASSABLE + sum(_EDGES))
+    for axis, flag in enumerate(_EDGES):
+        behind = np.take(passable, range(factor - 1, passable.shape[axis] - 1, factor), axis)
+        before = np.take(passable, range(factor, passable.shape[axis], factor), axis)
+        joined = behind & before
+        for other in {0, 1, 2} - {axis}:
+            joined = _any(joined, other, factor)
+        inner = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
+        rim = tuple(slice(-1, None) if a == axis else slice(None) for a in range(3))
+        flags[inner] |= joined.astype(np.uint8) * np.uint8(flag)
+        known[rim] &= np.uint8(255 - flag)  # the next node lies beyond the window
+    return flags, known
+
+
+def _any(values: np.ndarray, axis: int, factor: int) -> np.ndarray:
+    """Whether any of each `factor` in a row along an axis is true."""
+    cut = [slice(None)] * 3
+    parts = []
+    for i in range(factor):
+        cut[axis] = slice(i, None, factor)
+        parts.append(values[tuple(cut)])
+    return np.logical_or.reduce(parts)
+
+
+def _blocks_between(
+    first: np.ndarray, last: np.ndarray
+) -> list[tuple[tuple[int, int, int], tuple[slice, ...], tuple[slice, ...]]]:
+    """Blocks that nodes `first` up to without `last` lie in; of each, its part, and that of the nodes."""
+    ranges = [range(int(a) // _BLOCK, (int(b) - 1) // _BLOCK + 1) for a, b in zip(first, last, strict=True)]
+    found = []
+    for block in itertools.product(*ranges):
+        low = [max(int(a), n * _BLOCK) for a, n in zip(first, block, strict=True)]
+        high = [min(int(b), (n + 1) * _BLOCK) for b, n in zip(last, block, strict=True)]
+        inside = tuple(
+            slice(a - n * _BLOCK, b - n * _BLOCK) for a, b, n in zip(low, high, block, strict=True)
+        )
+        outside = tuple(slice(a - int(f), b - int(f)) for a, b, f in zip(low, high, first, strict=True))
+        found.append((block, inside, outside))
+    return found  # type: ignore[return-value]
+
+
+def _nodes(blocks: dict[tuple[int, int, int], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Cells (N, 3) of the nodes, in lexicographic order, and their flags (N,)."""
+    if not blocks:
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.uint8)
+    corner = np.array(list(blocks)) * _BLOCK
+    stored = np.stack(list(blocks.values()))
+    at = np.stack(np.nonzero(stored & _PASSABLE), 1)
+    cells = corner[at[:, 0]] + at[:, 1:]
+    flags = stored[tuple(at.T)]
+    order = np.lexsort(cells.T[::-1])
+    return cells[order], flags[order]
+
+
+def _ways(cells: np.ndarray, flags: np.ndarray) -> csr_matrix:
+    """Lengths, in node spacings, of the ways between nodes (N, N), both directions."""
+    n = len(cells)
+    if n == 0:
+        return csr_matrix((0, 0))
+    low = cells.min(0)
+    size = cells.max(0) - low + 2  # one to spare, so that a step beyond the end is no other node
+    key = ((cells - low) * [size[1] * size[2], size[2], 1]).sum(1)
+    straight = []
+    for stride, flag in zip((size[1] * size[2], size[2], 1), _EDGES, strict=True):
+        one = np.nonzero(flags & flag)[0]
+        other = np.searchsorted(key, key[one] + stride).clip(max=n - 1)
+        there = key[other] == key[one] + stride
+        one, other = one[there], other[there]
+        step = csr_matrix((np.ones(len(one)), (one, other)), shape=(n, n))
+        straight.append(step + step.T)
+    x, y, z = straight
+    edge = [_either(a @ b, b @ a) for a, b in ((x, y), (x, z), (y, z))]
+    corner = _either(*(a @ b for a, b in zip(edge, (z, y, x), strict=True)))
+    lengths = x + y + z + math.sqrt(2) * (edge[0] + edge[1] + edge[2]) + math.sqrt(3) * corner
+    return csr_matrix(lengths)
+
+
+def _either(*steps: csr_matrix) -> csr_matrix:
+    """1 where any of the matrices has an entry."""
+    total = csr_matrix(sum(steps))
+    total.data[:] = 1
+    return total

@@ -1,0 +1,277 @@
+"""Monte Carlo tree search over motion primitives, its leaves evaluated in batches (thesis 4.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.planning.goal import Goal
+from gmmtorch.exploration.planning.planner_interface import Options, PlanningTask, options
+from gmmtorch.exploration.planning.primitives import Primitives
+
+_FAR = 1e4  # metres
+
+
+@dataclass(frozen=True)
+class SearchRule:
+    """How the tree grows.
+
+    depth: primitives on a branch. n_rounds, n_leaves: batches, and new nodes in each. exploration: c of
+    UCT, as a share of the largest return found so far. discount: of what each further primitive brings.
+    widening: a node tries about as many primitives times √(its visits), the root all.
+    """
+
+    depth: int = 4
+    n_rounds: int = 4
+    n_leaves: int = 32
+    exploration: float = 0.5
+    discount: float = 0.9
+    widening: float = 1.5
+
+    def __post_init__(self) -> None:
+        for name in ("depth", "n_rounds", "n_leaves"):
+            check_whole(name, getattr(self, name), 1)
+        for name in ("exploration", "discount", "widening"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best branch.
+
+    actions: its L primitives. path: (S, 7) and braking: (B, 7) of the first. views: (L, 4), where each ends.
+    value: the return of the whole. information: its part that views bring, undiscounted.
+    progress: metres that the branch comes closer to the goal.
+    """
+
+    actions: list[int]
+    path: Tensor
+    braking: Tensor
+    views: Tensor
+    value: float
+    information: float
+    progress: float
+
+
+@dataclass(slots=True, eq=False)
+class _Node:
+    """A state at the end of a primitive, and what is known of those that follow."""
+
+    number: int
+    parent: _Node | None
+    action: int
+    depth: int
+    untried: list[int] = field(default_factory=list)
+    children: list[_Node] = field(default_factory=list)
+    visits: int = 0
+    total: float = 0.0
+    information: float = 0.0  # of the views up to here
+    value: float = 0.0  # return of the branch up to here
+    closed: bool = False  # nothing below is left to try
+    shut: int = -1  # the round in which nothing below can be chosen
+
+    @property
+    def above(self) -> _Node:
+        """The parent, of all but the root."""
+        if self.parent is None:
+            raise LookupError("The root has no parent.")
+        return self.parent
+
+    def branch(self) -> list[_Node]:
+        """The nodes that lead here, without the root."""
+        node, branch = self, []
+        while node.parent is not None:
+            branch.append(node)
+            node = node.parent
+        return branch[::-1]
+
+
+class TreeSearch:
+    """Searches for the branch of the largest return (thesis 4.3).
+
+    A branch returns what its views bring, given each other and the teammates' plans, and the goal's weight
+    for every metre that it comes closer; the sooner, the more, so that nothing is put off. What the robot
+    sees from where it is counts as seen. The next primitive to try maximises Q̄(a) + c √(ln N / N_a); a leaf
+    counts as visited, with no return, until its round is over.
+    """
+
+    def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
+        self._primitives, self._rule = primitives, rule
+
+    def search(
+        self,
+        task: PlanningTask,
+        memory: Memory | None = None,
+        goal: Goal | None = None,
+        first: Sequence[int] = (),
+    ) -> Found | None:
+        """The best branch; None if no primitive is feasible.
+
+        Args:
+            memory: of what views are worth; None: only the goal counts.
+            goal: where to go; None: only views count.
+            first: primitives of a branch that is tried before all others: what is left of the last plan.
+        """
+        tree = _Tree(self._primitives, self._rule, task, memory, goal)
+        tree.grow(first)
+        return tree.best()
+
+
+class _Tree:
+    """The tree of one search. Node n has row n in each table."""
+
+    def __init__(
+        self,
+        primitives: Primitives,
+        rule: SearchRule,
+        task: PlanningTask,
+        memory: Memory | None,
+        goal: Goal | None,
+    ) -> None:
+        self._primitives, self._rule, self._task = primitives, rule, task
+        self._memory, self._goal = memory, goal
+        start = task.state.double()
+        most = 1 + rule.depth + rule.n_rounds * rule.n_leaves
+        n_primitives = len(primitives.commands)
+        self._states = start.expand(most, 7).clone()
+        self._ends = start.expand(most, n_primitives, 7).clone()  # where primitives lead
+        self._metres = torch.zeros(most, dtype=torch.float64)  # left to the goal
+        self._metres_after = torch.zeros(most, n_primitives, dtype=torch.float64)
+        residual = task.residual[None]
+        if memory is not None:  # the robot has just looked from here: what it did not see then, it will not
+            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
+        self._residuals = residual.expand(most, -1).clone()
+        self._scale = 1e-12  # the largest return found
+        root = _Node(0, None, -1, 0)
+        self._nodes = [root]
+        if goal is not None:
+            self._metres[0] = _finite(goal.cost(start))
+        self._options = options(primitives, start[None], task, may_escape=True)
+        self._open([root], self._options)
+
+    def grow(self, first: Sequence[int]) -> None:
+        """Try a branch, then round after round what looks best."""
+        node = self._nodes[0]
+        for action in first[: self._rule.depth]:
+            if action not in node.untried:
+                break
+            node.untried.remove(action)
+            node = self._child(node, action, 0)
+            self._extend([node])
+        for turn in range(1, self._rule.n_rounds + 1):
+            chosen: list[_Node] = []
+            while len(chosen) < self._rule.n_leaves and (leaf := self._select(turn)) is not None:
+                chosen.append(leaf)
+            if not chosen:
+                break
+            self._extend(chosen, is_last=turn == self._rule.n_rounds)
+
+    def best(self) -> Found | None:
+        """The branch to the node of the largest return, the first of equals."""
+        if len(self._nodes) == 1:
+            return None
+        last = max(self._nodes[1:], key=lambda node: node.value)
+        branch = last.branch()
+        return Found(
+            actions=[node.action for node in branch],
+            path=self._options.paths[0, branch[0].action],
+            braking=self._options.braking[0, branch[0].action],
+            views=self._states[[node.number for node in branch], :4],
+            value=last.value,
+            information=last.information,
+            progress=float(self._metres[0] - self._metres[last.number]),
+        )
+
+    # -- choosing leaves --------------------------------------------------------------------------
+
+    def _select(self, turn: int) -> _Node | None:
+        """A new node below the most promising one; None if there is none left in this round."""
+        root = self._nodes[0]
+        node = root
+        while not root.closed and root.shut != turn:
+            may_widen = len(node.children) < self._width(node)
+            child = None if node.untried and may_widen else self._promising(node, turn)
+            if child is not None:
+                node = child
+            elif node.untried:
+                return self._child(node, node.untried.pop(0), turn)
+            else:
+                node.shut, node.closed = turn, all(child.closed for child in node.children)
+                node = root
+        return None
+
+    def _width(self, node: _Node) -> float:
+        return math.inf if node.parent is None else self._rule.widening * math.sqrt(node.visits)
+
+    def _promising(self, node: _Node, turn: int) -> _Node | None:
+        """The child that UCT prefers, of those that are neither exhausted nor waiting."""
+        c, log_visits = self._rule.exploration * self._scale, math.log(max(node.visits, 1))
+        best, best_score = None, -math.inf
+        for child in node.children:
+            if not child.closed and child.shut != turn:
+                score = child.total / child.visits + c * math.sqrt(log_visits / child.visits)
+                if score > best_score:
+                    best, best_score = child, score
+        return best
+
+    def _child(self, parent: _Node, action: int, turn: int) -> _Node:
+        child = _Node(len(self._nodes), parent, action, parent.depth + 1, shut=turn)
+        parent.children.append(child)
+        self._nodes.append(child)
+        for node in (self._nodes[0], *child.branch()):
+            node.visits += 1
+        return child
+
+    # -- what they are worth, and what follows them -----------------------------------------------
+
+    def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
+        """Place and value new nodes, and find out which primitives can follow them, unless none will."""
+        rows = [node.number for node in nodes]
+        parents = [node.above.number for node in nodes]
+        actions = [node.action for node in nodes]
+        self._states[rows] = self._ends[parents, actions]
+        self._metres[rows] = self._metres_after[parents, actions]
+        gains = [0.0] * len(nodes)
+        if self._memory is not None:
+            views = self._memory.rows(self._states[rows, :4])
+            marginal, self._residuals[rows] = self._memory.marginal(views, self._residuals[parents])
+            gains = marginal.tolist()
+        weight = 0.0 if self._goal is None else self._goal.weight
+        progress = (self._metres[parents] - self._metres[rows]).tolist()
+        for node, gain, metres in zip(nodes, gains, progress, strict=True):
+            later = self._rule.discount ** (node.depth - 1)
+            node.information = node.above.information + gain
+            node.value = node.above.value + later * (gain + weight * metres)
+            self._scale = max(self._scale, node.value)
+            for above in (self._nodes[0], *node.branch()):
+                above.total += node.value
+            node.closed = is_last or node.depth == self._rule.depth
+        for depth in sorted({node.depth for node in nodes if not node.closed}):
+            some = [node for node in nodes if node.depth == depth]
+            states = self._states[[node.number for node in some]]
+            self._open(some, options(self._primitives, states, self._task, after=depth))
+
+    def _open(self, nodes: list[_Node], follow: Options) -> None:
+        """Note what can follow nodes."""
+        rows = [node.number for node in nodes]
+        ends = follow.paths[:, :, -1]
+        self._ends[rows] = ends
+        order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
+        if self._goal is not None:  # what leads towards it first
+            self._metres_after[rows] = order = _finite(self._goal.cost(ends))
+        order = order.masked_fill(~follow.feasible, math.inf).argsort(dim=1, stable=True)
+        count = follow.feasible.sum(1).tolist()
+        for node, actions, n in zip(nodes, order.tolist(), count, strict=True):
+            node.untried, node.closed = actions[:n], n == 0
+
+
+def _finite(metres: Tensor) -> Tensor:
+    """Metres to a goal, more than from anywhere else where there is no way."""
+    return metres.clamp_max(_FAR)

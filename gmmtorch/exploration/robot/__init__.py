@@ -1,0 +1,1 @@
+"""One exploring robot: its map, its planner, its radio."""

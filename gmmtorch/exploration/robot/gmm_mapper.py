@@ -1,0 +1,297 @@
+"""E0: a map of Gaussian components, learned from novel beams and shared (thesis Fig 4.1).
+
+Novelty → learn → update → share → sliding map. Components are immutable once they are learned, by
+whoever learned them; points that they explain later are counts that anybody may add. All robots hold
+the components as they were decoded from the datagrams, the owner too, so that all maps are the same.
+The voxels follow the mixture: each of its changes is cast into them once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.exploration.robot.mapper import Mapper, Memo, Sensed, novel_beams
+from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.world.scoring import BeliefMap
+from gmmtorch.mapping.association import count_explained, summed
+from gmmtorch.mapping.components import Components, packed, unpacked
+from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, common, united
+from gmmtorch.sharing.broadcast import Broadcast
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.simulation.sensors.depth_camera import DepthFrame
+
+_HITS_PER_RAY = 8
+_LEEWAY = 0.5  # cells
+_FRAMES_PER_COUNT = 10  # few large messages, and few looks at what they change
+_EMPTY_LENGTH = 0.75
+_EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
+_EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
+
+
+@dataclass(frozen=True)
+class FrameRule:
+    """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
+
+    rays, shell: rays for each cell that a component hides, and cells before its surface in which they do
+        not speak of free space; see `component_evidence`.
+    update_at: counts of a component are sent once they have grown by this factor.
+    update_stride: every so manieth explained beam is counted, for as many as that leaves out.
+    """
+
+    noise: float = 0.03
+    length: float = 0.6
+    cell: float = 0.15
+    components: int = 200
+    iterations: int = 4
+    rays: float = 4.0
+    shell: float = 0.5
+    update_at: float = 3.0
+    update_stride: int = 11
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length", "cell"):
+            if not getattr(self, name) > 0:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        if not self.rays > 0 or not self.shell >= 0:
+            raise InvalidArgumentError(
+                f"rays={self.rays} must be above zero, shell={self.shell} at least zero."
+            )
+        for name in ("components", "iterations", "update_stride"):
+            check_whole(name, getattr(self, name), 1)
+        if not self.update_at > 1:
+            raise InvalidArgumentError(f"update_at={self.update_at} must be above 1.")
+
+    def cells(self) -> CellRule:
+        """For the returns of a frame."""
+        return CellRule(self.noise, self.length, self.cell, self.components, self.iterations)
+
+    def empty_cells(self) -> CellRule:
+        """For the ends of beams without one: finer, as they end at the edges of what is in sight."""
+        length = _EMPTY_LENGTH * self.length
+        return CellRule(self.noise, length, self.cell, self.components, self.iterations)
+
+
+class MixtureMapper(Mapper):
+    """The map of one robot of a team that shares mixtures.
+
+    shared: the mixture, new; `Replica`, or `Broadcast` for other codecs than its own.
+    """
+
+    def __init__(
+        self,
+        robot: int,
+        local: SlidingVoxelMap,
+        belief: BeliefMap,
+        width: int,
+        novelty: NoveltyRule,
+        rule: FrameRule,
+        memo: Memo,
+        shared: Replica | Broadcast,
+    ) -> None:
+        super().__init__(robot, local, belief, width, novelty, memo)
+        self.shared = shared
+        self.tiles = MixtureTiles()
+        self._rule = rule
+        self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
+        self._due: dict[tuple[int, int], float] = {}  # those that have
+        self._n_frames = 0
+        self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
+
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def center_on(self, position: Tensor) -> None:
+        uncovered = [common(box, self.belief.grid.box) for box in self.local.center_on(position)]
+        boxes = [box for box in uncovered if box is not None]
+        regenerate(self.local, boxes, self.tiles, self._evidence)
+
+    def sense(self, frame: DepthFrame) -> Sensed:
+        # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
+        short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
+        novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
+        self._count(frame, ~novel)
+        self.shared.add(self._learned(frame, novel))
+        self._n_frames += 1
+        if self._n_frames % _FRAMES_PER_COUNT == 0:
+            self.shared.count(self._due)
+            self._due = {}
+        return Sensed(self._follow(), novel)
+
+    def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
+        """The components of the novel beams."""
+        origin, rule = frame.origin[None], self._rule
+        surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
+        empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
+        parts = [surfaces, empty]
+        return Components.concatenate([part for part in parts if len(part)] or parts[:1])
+
+    def _count(self, frame: DepthFrame, known: Tensor) -> None:
+        """Count the beams (N,) that told nothing new, and what has grown enough as due to be told."""
+        nearby = self._seen_from_near(frame.origin)
+        chosen = known.nonzero().squeeze(1)[:: self._rule.update_stride]
+        if nearby is None or len(chosen) == 0:
+            return
+        weight = float(self._rule.update_stride)
+        counted = nearby
+        for max_range in (False, True):
+            ends = frame.ends[chosen[frame.is_hit[chosen] != max_range]]
+            counted = count_explained(
+                counted, ends, frame.origin, self._novelty.distance, None, max_range, weight
+            ).components
+        gain = counted.support - nearby.support
+        for row in (gain > 0).nonzero().squeeze(1).tolist():
+            key = (int(nearby.ids[row, 0]), int(nearby.ids[row, 1]))
+            total = self._gained.pop(key, 0.0) + float(gain[row])
+            if total >= (self._rule.update_at - 1) * float(nearby.support[row]):
+                self._due[key] = self._due.get(key, 0.0) + total
+            else:
+                self._gained[key] = total
+
+    def _seen_from_near(self, origin: Tensor) -> Components | None:
+        """Components with all their counts, of batches seen from close to a place (3,)."""
+        middle = self._place(origin)
+        near = [
+            batch
+            for offset in itertools.product((-1, 0, 1), repeat=3)
+            for batch in self._places.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
+        ]
+        return summed(Components.concatenate(near)) if near else None
+
+    def _place(self, origin: Tensor) -> tuple[int, ...]:
+        """Which cell of the index of origins a place (3,) is in."""
+        return tuple((origin / self._novelty.distance).floor().long().tolist())
+
+    # -- the team ---------------------------------------------------------------------------------
+
+    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+        taken = [item.datagram for item in heard if self.shared.receive(item.datagram, item.message)]
+        self._follow()
+        return taken
+
+    def datagrams(self, budget: int | None = None) -> list[bytes]:
+        return self.shared.datagrams(budget=budget)
+
+    def announcements(self) -> list[bytes]:
+        return self.shared.announcements()
+
+    @property
+    def version(self) -> int:
+        return self.shared.version
+
+    @property
+    def held(self) -> Intervals:
+        return self.shared.held
+
+    @property
+    def is_behind(self) -> bool:
+        return bool(self.shared.missing)
+
+    def digest(self) -> bytes:
+        return self.shared.digest()
+
+    def _follow(self) -> list[CellEvidence]:
+        """Enter what the mixture has come to hold; the evidence of it, in parts."""
+        changes = self.shared.changes()
+        if changes.rebuilt:
+            return self._start_over()
+        batches = [*changes.added, changes.gained]
+        return [self._enter(batch) for batch in batches if len(batch)]
+
+    def _start_over(self) -> list[CellEvidence]:
+        """Cast the whole mixture anew, once components were moved, or others took their place. None of it is
+        evidence that nobody had."""
+        self.local.clear()
+        self.belief.clear()
+        self.tiles, self._places = MixtureTiles(), {}
+        everything = self.shared.components()
+        if len(everything):
+            self._enter(everything)
+        return []
+
+    def _enter(self, batch: Components) -> CellEvidence:
+        """Keep a batch of components, or of counts that are added to some; returns what it says."""
+        self._keep(batch)
+        grid = self.belief.grid
+        evidence = self._memo(_name(batch), lambda: self._evidence(batch, grid.resolution, grid.box))
+        self._add(evidence)
+        return evidence
+
+    def _keep(self, batch: Components) -> None:
+        self.tiles.add(len(self.tiles), batch)
+        for place in {self._place(origin) for origin in batch.origins}:
+            self._places.setdefault(place, []).append(batch)
+
+    def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
+        """What components say of the cells of a box."""
+        rule = self._rule
+        surfaces, empty = (
+            batch.selected((batch.max_range == kind).nonzero().squeeze(1)) for kind in (False, True)
+        )
+        parts = []
+        if len(surfaces):
+            parts.append(
+                component_evidence(
+                    surfaces,
+                    resolution,
+                    box,
+                    rays_per_cell=rule.rays,
+                    shell=rule.shell,
+                    hits_per_ray=_HITS_PER_RAY,
+                    thinned=True,
+                )
+            )
+        if len(empty):
+            rays = _EMPTY_RAYS * rule.rays
+            parts.append(
+                component_evidence(
+                    empty, resolution, box, rays_per_cell=rays, cutoff=_EMPTY_CUTOFF, thinned=True
+                )
+            )
+        return united(parts) if parts else CellEvidence.empty()
+
+    # -- the whole --------------------------------------------------------------------------------
+
+    def components(self) -> Components:
+        """All components with all their counts, in the order of their ids."""
+        return self.shared.components()
+
+    def state(self) -> dict[str, Any]:
+        return {
+            **super().state(),
+            "shared": self.shared.state(),
+            "batches": packed([batch for _, batch in self.tiles.items()]),
+            "gained": [[*key, count] for key, count in self._gained.items()],
+            "due": [[*key, count] for key, count in self._due.items()],
+            "n_frames": self._n_frames,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        super().restore(state)
+        self.shared.restore(state["shared"])
+        for batch in unpacked(state["batches"]):
+            self._keep(batch)
+        self._gained, self._due = (
+            {(int(robot), int(number)): count for robot, number, count in state[name]}
+            for name in ("gained", "due")
+        )
+        self._n_frames = int(state["n_frames"])
+
+
+def _name(batch: Components) -> bytes:
+    """Of all that a batch says: components that were corrected have the ids and the support that they had."""
+    digest = hashlib.blake2b(digest_size=16)
+    for value in vars(batch).values():
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.digest()

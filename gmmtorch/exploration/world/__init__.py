@@ -1,0 +1,1 @@
+"""The simulated world of a mission: truth, visibility, free space, collisions, scores."""

@@ -1,0 +1,138 @@
+"""One evaluator for all teams: entropy over the observable cells as evidence comes in, and the truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from sklearn.metrics import roc_auc_score
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
+from gmmtorch.occupancy.thresholds import Thresholds
+from gmmtorch.occupancy.voxels.block_grid import BlockGrid
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, flat_index
+
+
+@dataclass(frozen=True)
+class BeliefRule:
+    """How evidence becomes probability, the same for every team and for the evaluator.
+
+    prior: N_p of `occupancy_probability`. clamp: probabilities are kept within [clamp, 1 − clamp]: no
+    number of rays makes a cell more certain than that. free, occupied: a cell is called free below the
+    one, occupied above the other, unknown between.
+    """
+
+    prior: float = 1.0
+    clamp: float = 0.05
+    free: float = 0.2
+    occupied: float = 0.65
+
+    def __post_init__(self) -> None:
+        check_prior(self.prior)
+        if not 0 <= self.clamp < 0.5:
+            raise InvalidArgumentError(f"clamp={self.clamp} must be at least 0 and below 0.5.")
+        Thresholds(self.free, self.occupied)  # checks them
+
+    def probability(self, hits: Tensor, misses: Tensor) -> Tensor:
+        """Occupancy of cells with so many hits and misses, any shape."""
+        return occupancy_probability(hits, misses, self.prior).clamp(self.clamp, 1 - self.clamp)
+
+    def entropy(self, hits: Tensor, misses: Tensor) -> Tensor:
+        """Bits of each cell: 1 where nothing is known."""
+        return bernoulli_entropy(self.probability(hits, misses))
+
+    def classes(self, probability: Tensor) -> Tensor:
+        """`CellClass` values, int8."""
+        return Thresholds(self.free, self.occupied).classify(probability)
+
+
+_MARGIN = 8  # cells around a world in which evidence is kept, though it is not scored
+
+
+class BeliefMap:
+    """Evidence of a bounded world in blocks, and its entropy over the observable cells (MATH: H = Σ h(p)).
+
+    The entropy follows every addition from the cells that it touches, so that its cost does not grow
+    with the world.
+
+    Args:
+        observable: (nx, ny, nz) bool over `box`: cells that a sensor could ever see.
+    """
+
+    def __init__(self, resolution: float, box: Box, observable: Tensor, rule: BeliefRule) -> None:
+        # Noise puts a wall that lies in the bounds on either side of them: that must not count as unseen.
+        self.grid = BlockGrid(resolution, Box(box.low - _MARGIN, box.high + _MARGIN))
+        self.rule = rule
+        self._low = box.low
+        self._observable = observable.reshape(-1)
+        self._shape = box.shape
+        self.observable_bits = float(observable.sum())
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all evidence."""
+        self.grid = BlockGrid(self.grid.resolution, self.grid.box)
+        self.entropy_bits = self.observable_bits
+        self.known_bits = 0.0  # off the entropy of all cells, observable or not, as a robot can tell
+        self.n_observed = 0
+
+    def add(self, evidence: CellEvidence) -> Tensor:
+        """Count evidence in; returns which of its cells (C,) are observable."""
+        h, m = self.grid.add(evidence)
+        chosen = self._is_observable(evidence.cells)
+        gone = self.rule.entropy(h, m) - self.rule.entropy(h + evidence.hits, m + evidence.misses)
+        self.known_bits += float(gone.sum(dtype=torch.float64))
+        self.entropy_bits -= float(gone[chosen].sum(dtype=torch.float64))
+        self.n_observed += int((h + m == 0)[chosen].sum())
+        return chosen
+
+    def _is_observable(self, cells: Tensor) -> Tensor:
+        flat, inside = flat_index(cells - self._low, self._shape)
+        return inside & self._observable[flat]
+
+    def probability(self, cells: Tensor) -> Tensor:
+        """Occupancy (C,) of cells (C, 3)."""
+        return self.rule.probability(*self.grid.at(cells))
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "grid": self.grid.state(),
+            "entropy_bits": self.entropy_bits,
+            "known_bits": self.known_bits,
+            "n_observed": self.n_observed,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.grid.restore(state["grid"])
+        self.entropy_bits = float(state["entropy_bits"])
+        self.known_bits = float(state["known_bits"])
+        self.n_observed = int(state["n_observed"])
+
+
+def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, float | None]:
+    """AUC and mean cross-entropy (bits a cell) of a map against the truth, over given cells (C, 3)."""
+    p = belief.probability(cells).double()
+    right = torch.where(occupied, p, 1 - p).clamp_min(torch.finfo(torch.float64).tiny)
+    both = bool(occupied.any()) and not bool(occupied.all())
+    return {
+        "auc": float(roc_auc_score(occupied.numpy(), p.numpy())) if both else None,
+        "cross_entropy_bits": float(-(right.log2()).mean()),
+    }
+
+
+def disagreement(maps: list[BeliefMap], cells: Tensor) -> float | None:
+    """Share of cells (C, 3) that two of the maps put into different classes; None for a single map."""
+    if len(maps) < 2 or len(cells) == 0:
+        return None
+    classes = torch.stack([m.rule.classes(m.probability(cells)) for m in maps])
+    return float((classes != classes[0]).any(0).double().mean())
+
+
+def overlap(seen_by: Tensor) -> float:
+    """Share of the cells seen by any robot that were seen by two or more; `seen_by` counts robots."""
+    seen = int((seen_by > 0).sum())
+    return int((seen_by > 1).sum()) / seen if seen else math.nan

@@ -1,0 +1,1 @@
+"""Registration: the rigid motion that lays one map over another."""

@@ -1,0 +1,1 @@
+"""The binary format of components, in map files and in messages."""

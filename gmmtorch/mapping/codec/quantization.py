@@ -1,0 +1,173 @@
+"""Components as whole numbers, and back: what the codec writes.
+
+Means and covariances go to the `lattice`; a count is a power of 2^(1/4), to half a step, or none; the
+shares that sightings have of a component are powers of 2^(−1/2) of its largest; origins are multiples of
+2⁻⁸ m. Each number is rounded by itself, so that components may be regrouped without further loss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.codec import lattice
+from gmmtorch.mapping.codec.lattice import FARTHEST, PER_OCTAVE, Lattice
+from gmmtorch.mapping.components import Components
+
+ORIGIN_STEP = 2.0**-8
+"""Metres. An origin moves by half of it on each axis at most."""
+SHARES_PER_OCTAVE = 2
+LEAST_SHARE = 15
+"""Steps: shares below 2^(−15/2) of the component's largest, 1/181, become that."""
+LEAST_COUNT, LARGEST_COUNT = -10 * PER_OCTAVE, 40 * PER_OCTAVE
+"""Steps: 2⁻¹⁰ and 2⁴⁰ points. Less than half the least is none; more than the largest is refused."""
+MOST_POINTS = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
+NO_COUNT = LEAST_COUNT - 1
+"""Stands for no points."""
+COUNT_ERROR = lattice.DEVIATION_ERROR
+"""Largest relative error of a count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quantized:
+    """K components, S origins and E sightings as whole numbers, int64 on the CPU.
+
+    places: means and covariances; count (K,): log2 of the support in steps, or `NO_COUNT`;
+    max_range (K,) bool; ids (K, 2); origins (S, D) in steps, each once, all used;
+    sightings (K,): how many each component has; of each sighting, by component: seen_from (E,), its
+    origin; share (E,): −log2 of its share of the component's largest, in steps.
+    """
+
+    places: Lattice
+    count: Tensor
+    max_range: Tensor
+    ids: Tensor
+    origins: Tensor
+    sightings: Tensor
+    seen_from: Tensor
+    share: Tensor
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def arranged(self, rows: Tensor) -> Quantized:
+        """The components of distinct rows (J,) in that order, their origins rising by coordinates."""
+        n = self.sightings[rows]
+        begins = (self.sightings.cumsum(0) - self.sightings)[rows]
+        kept = torch.repeat_interleave(begins - (n.cumsum(0) - n), n) + torch.arange(int(n.sum()))
+        origins, seen_from = torch.unique(self.origins[self.seen_from[kept]], dim=0, return_inverse=True)
+        return replace(
+            self,
+            places=self.places.taken(rows),
+            count=self.count[rows],
+            max_range=self.max_range[rows],
+            ids=self.ids[rows],
+            origins=origins,
+            sightings=n,
+            seen_from=seen_from,
+            share=self.share[kept],
+        )
+
+    def restored(self) -> Components:
+        """The components, float64 on the CPU."""
+        means, covariances = self.places.restored()
+        support = torch.where(self.count == NO_COUNT, 0.0, lattice.power(self.count.clamp_min(LEAST_COUNT)))
+        seen_by = torch.repeat_interleave(self.sightings)
+        weight = lattice.power(-self.share * (PER_OCTAVE // SHARES_PER_OCTAVE))
+        total = support.new_zeros(len(support)).index_add_(0, seen_by, weight)
+        return Components(
+            means=means,
+            covariances=covariances,
+            support=support,
+            max_range=self.max_range,
+            ids=self.ids,
+            origins=self.origins.double() * ORIGIN_STEP,
+            seen_by=seen_by,
+            seen_from=self.seen_from,
+            seen_count=weight * (support / total)[seen_by],
+        )
+
+
+def quantize(components: Components) -> Quantized:
+    """The nearest whole numbers.
+
+    Sightings are put in order of their components; of origins, those that round to the same
+    place become one, and those that nothing was seen from are left out. Raises
+    `InvalidArgumentError` for what is too large to be stored: see `lattice` and `LARGEST_COUNT`.
+    """
+    c = components
+    places = lattice.nearest(c.means.double().cpu(), c.covariances.double().cpu())
+    count = _count_steps(c.support.double().cpu())
+    seen_by, seen_from, seen_count = c.seen_by.cpu(), c.seen_from.cpu(), c.seen_count.double().cpu()
+    largest = _largest(seen_count, seen_by, len(c))
+    told = ((seen_count > 0) | (largest[seen_by] == 0)).nonzero().squeeze(1)
+    told = told[torch.argsort(seen_by[told], stable=True)]
+    seen_by, seen_from, seen_count = seen_by[told], seen_from[told], seen_count[told]
+
+    steps = _origin_steps(c.origins.double().cpu())
+    distinct, place = _first_uses(steps)
+    used, seen_from = torch.unique(place[seen_from], return_inverse=True)
+    origins = steps[distinct[used]]
+    # Two origins of a component that have become one are one sighting.
+    kept, pair = _first_uses(seen_by * len(origins) + seen_from)
+    seen_count = seen_count.new_zeros(len(kept)).index_add_(0, pair, seen_count)
+    seen_by, seen_from = seen_by[kept], seen_from[kept]
+    return Quantized(
+        places=places,
+        count=count,
+        max_range=c.max_range.cpu(),
+        ids=c.ids.cpu(),
+        origins=origins,
+        sightings=torch.bincount(seen_by, minlength=len(c)),
+        seen_from=seen_from,
+        share=_share_steps(seen_count, seen_by, count),
+    )
+
+
+def _count_steps(support: Tensor) -> Tensor:
+    bad = ~((support >= 0) & (support <= MOST_POINTS))
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"support[{first}]={float(support[first])} cannot be stored; it must be from 0 to "
+            f"{MOST_POINTS:g}."
+        )
+    least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
+    steps = (torch.log2(support.clamp_min(least)) * PER_OCTAVE).round().long()
+    return torch.where(support < least / 2, NO_COUNT, steps)
+
+
+def _origin_steps(origins: Tensor) -> Tensor:
+    bad = ~(origins.abs() <= FARTHEST).all(1)
+    if bool(bad.any()):
+        first = int(bad.nonzero()[0])
+        raise InvalidArgumentError(
+            f"origins[{first}] is {origins[first].tolist()}; coordinates up to {FARTHEST:g} m can be stored."
+        )
+    return (origins / ORIGIN_STEP).round().long()
+
+
+def _share_steps(count: Tensor, seen_by: Tensor, component_count: Tensor) -> Tensor:
+    """−log2 (E,) of each count's share of its component's largest, in steps; 0 where there is no count."""
+    share = count / _largest(count, seen_by, len(component_count))[seen_by].clamp_min(1e-300)
+    steps = (-torch.log2(share.clamp_min(1e-300)) * SHARES_PER_OCTAVE).round().long().clamp(0, LEAST_SHARE)
+    nothing = (component_count == NO_COUNT)[seen_by] | (share == 0)
+    return torch.where(nothing, 0, steps)
+
+
+def _largest(values: Tensor, owner: Tensor, n: int) -> Tensor:
+    return values.new_zeros(n).scatter_reduce_(0, owner, values, "amax")
+
+
+def _first_uses(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Where each distinct row of (N, …) stands first, in order; and which of those each row is."""
+    distinct, which = torch.unique(rows, dim=0, return_inverse=True)
+    places = torch.arange(len(rows))
+    first = torch.full((len(distinct),), len(rows)).scatter_reduce_(0, which, places, "amin")
+    order = torch.argsort(first)
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order))
+    return first[order], rank[which]

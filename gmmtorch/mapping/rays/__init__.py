@@ -1,0 +1,1 @@
+"""Rays drawn from the components of a map."""

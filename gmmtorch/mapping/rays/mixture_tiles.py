@@ -1,0 +1,127 @@
+"""MixtureTiles: a robot's whole mixture, found again by where its rays went."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from typing import NamedTuple
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.index.culling import reach
+from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+
+_REACH = 3.0  # deviations around the means that count as near
+_MOST_TILES = 4096  # a batch that lies in more is looked at in every search
+
+
+class _Batch(NamedTuple):
+    key: Hashable
+    components: Components
+    low: list[float]  # corners of the box around its rays, metres
+    high: list[float]
+
+
+class MixtureTiles:
+    """Batches of components, each of one message or frame, hashed in cubes by the box around their rays.
+
+    A search costs in proportion to what lies near, not to what there is. Batches never change.
+
+    Args:
+        tile: side (m) of the cubes.
+    """
+
+    def __init__(self, tile: float = 8.0) -> None:
+        if not 0 < tile < math.inf:
+            raise InvalidArgumentError(f"tile={tile} must be finite metres above zero.")
+        self.tile = tile
+        self._batches: list[_Batch] = []
+        self._keys: set[Hashable] = set()
+        self._tiles: dict[tuple[int, ...], list[int]] = {}  # the batches in each, as they came
+        self._everywhere: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._batches)
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._keys
+
+    def items(self) -> Iterator[tuple[Hashable, Components]]:
+        """All batches in the order in which they came."""
+        return ((batch.key, batch.components) for batch in self._batches)
+
+    def all(self) -> Components:
+        """All components, in that order."""
+        return Components.concatenate([batch.components for batch in self._batches] or [Components.empty(3)])
+
+    def add(self, key: Hashable, components: Components) -> None:
+        """Enter a batch; raises `InvalidArgumentError` for a key that is taken, components that are not in
+        three dimensions, and means, covariances or origins that are not finite."""
+        if key in self._keys:
+            raise InvalidArgumentError(f"key={key!r} already names a batch, and batches do not change.")
+        if components.dim != 3:
+            raise InvalidArgumentError(f"components have {components.dim} dimensions; tiles need 3.")
+        low, high = [0.0] * 3, [0.0] * 3
+        if len(components.seen_by):
+            lows, highs = reach(components.cones(), _REACH)
+            low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
+            if not all(map(math.isfinite, (*low, *high))):
+                raise InvalidArgumentError(f"The components of key={key!r} hold NaN or infinite values.")
+            spans = self._spans(low, high)
+            if math.prod(map(len, spans)) > _MOST_TILES:
+                self._everywhere.append(len(self._batches))
+            else:
+                for place in itertools.product(*spans):
+                    self._tiles.setdefault(place, []).append(len(self._batches))
+        self._keys.add(key)
+        self._batches.append(_Batch(key, components, low, high))
+
+    def near(self, box: Box, resolution: float) -> list[tuple[Hashable, Components]]:
+        """Batches with rays that may come to a box of cells of side `resolution` (m), as they came.
+
+        Rays that end within three deviations of their means: those of `component_rays` do.
+        """
+        low = [x * resolution for x in box.low.tolist()]
+        high = [x * resolution for x in box.high.tolist()]
+        spans = self._spans(low, high)
+        found = set(self._everywhere)
+        if math.prod(map(len, spans)) < len(self._tiles):
+            for place in itertools.product(*spans):
+                found.update(self._tiles.get(place, ()))
+        else:  # fewer tiles hold anything
+            for place, numbers in self._tiles.items():
+                if all(x in span for x, span in zip(place, spans, strict=True)):
+                    found.update(numbers)
+        batches = [self._batches[number] for number in sorted(found)]
+        return [
+            (batch.key, batch.components)
+            for batch in batches
+            if all(a <= d and c <= b for a, b, c, d in zip(batch.low, batch.high, low, high, strict=True))
+        ]
+
+    def _spans(self, low: list[float], high: list[float]) -> list[range]:
+        """The tiles along each axis from one corner to the other, metres."""
+        return [
+            range(math.floor(a / self.tile), math.floor(b / self.tile) + 1)
+            for a, b in zip(low, high, strict=True)
+        ]
+
+
+def regenerate(
+    sliding: SlidingVoxelMap,
+    boxes: Iterable[Box],
+    tiles: MixtureTiles,
+    evidence: Callable[[Components, float, Box], CellEvidence] = component_evidence,
+) -> None:
+    """Fill boxes of the window that were uncovered, and are empty, from the mixture (thesis Fig 4.2).
+
+    Rays are trimmed to the boxes, so that nothing is counted twice. `evidence` of components, at a
+    resolution, in a box.
+    """
+    for box in boxes:
+        near = [components for _, components in tiles.near(box, sliding.resolution)]
+        if near:
+            sliding.add(evidence(Components.concatenate(near), sliding.resolution, box))

@@ -1,0 +1,1 @@
+"""Expectation maximization: exact, truncated and stepwise, with its initializations (thesis 2.1)."""

@@ -1,0 +1,263 @@
+"""The conjugate posterior of a mixture: its weights' Dirichlet, its components' Gaussian–Wishart.
+
+    p(μ_k, Λ_k) = N(μ_k | m₀, (β₀Λ_k)⁻¹) Wishart(Λ_k | W₀, ν₀)
+    p(π)        = Dirichlet(γ₀, …, γ₀), or, a Dirichlet process, π_k = v_k Π_{j<k} (1 − v_j) with
+                  sticks v_k ~ Beta(1, γ₀)
+
+Given the moments of each component's points, the posterior has the same form (`update`). Its
+expected log-density is that of Gaussians with other weights (`expected_log_density`), so the E-step
+of variational Bayes is EM's (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+class Prior(NamedTuple):
+    """γ₀ (), β₀ (), m₀ (D,), ν₀ () and W₀⁻¹ (D, D), of which one point's share is about W₀⁻¹/ν₀."""
+
+    concentration: Tensor
+    mean_precision: Tensor
+    mean: Tensor
+    degrees_of_freedom: Tensor
+    covariance: Tensor
+
+
+class Posterior(NamedTuple):
+    """What is known of K components.
+
+    concentration: (2, K), the Beta parameters of each stick, or (1, K), the Dirichlet's;
+    mean_precision: β (K,), so many points each mean is known from; means: m (K, D);
+    degrees_of_freedom: ν (K,); covariances: W⁻¹/ν (K, D, D), the inverse of the expected precision.
+    """
+
+    concentration: Tensor
+    mean_precision: Tensor
+    means: Tensor
+    degrees_of_freedom: Tensor
+    covariances: Tensor
+
+
+def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Tensor:
+    """Covariance (D, D) of points about the origin, their mean.
+
+    Where the points are flat their variance is `thickness` (m²) instead of zero.
+    """
+    total = float(weight.sum())
+    # Below two points there is no unbiased estimate; W/2 goes on from where W − 1 leaves off.
+    covariance = (points * weight[:, None]).T @ points / max(total - 1, total / 2)
+    variances, directions = torch.linalg.eigh(covariance)
+    if float(variances[0]) > 1e-14 * float(variances[-1]):
+        return covariance
+    return (directions * variances.clamp_min(thickness)) @ directions.T
+
+
+def update(prior: Prior, moments: Parameters, process: bool) -> Posterior:
+    """The posterior given N_k points (K,) in each component, their means and their covariances.
+
+    `moments` has N_k in place of weights; process: a Dirichlet process rather than a Dirichlet.
+    Bishop (10.58)–(10.63); Blei & Jordan (18)–(19).
+    """
+    count, mean, covariance = moments
+    mean_precision = prior.mean_precision + count
+    degrees_of_freedom = prior.degrees_of_freedom + count
+    offset = mean - prior.mean
+    pull = count * prior.mean_precision / mean_precision
+    scatter = prior.covariance + count[:, None, None] * covariance
+    scatter = scatter + pull[:, None, None] * offset[:, :, None] * offset[:, None, :]
+    return Posterior(
+        _sticks(prior.concentration, count) if process else (prior.concentration + count)[None],
+        mean_precision,
+        (prior.mean_precision * prior.mean + count[:, None] * mean) / mean_precision[:, None],
+        degrees_of_freedom,
+        scatter / degrees_of_freedom[:, None, None],
+    )
+
+
+def _sticks(concentration: Tensor, count: Tensor) -> Tensor:
+    """Beta parameters (2, K): 1 + N_k points took stick k, and γ₀ + Σ_{j>k} N_j passed it."""
+    later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
+    return torch.stack([1 + count, concentration + later])
+
+
+def expected_weights(concentration: Tensor) -> Tensor:
+    """E[π] (K,); of a Dirichlet process, those of the K sticks, scaled to add up to one."""
+    if concentration.shape[0] == 1:
+        return concentration[0] / concentration.sum()
+    share = concentration / concentration.sum(0)
+    passed = torch.cat([share.new_ones(1), share[1].cumprod(0)[:-1]])
+    return share[0] * passed / (share[0] * passed).sum()
+
+
+def expected_log_weights(concentration: Tensor) -> Tensor:
+    """E[log π] (K,). Bishop (10.66); of sticks, E[log v_k] + Σ_{j<k} E[log(1 − v_j)]."""
+    expected = torch.digamma(concentration)
+    if concentration.shape[0] == 1:
+        return expected[0] - torch.digamma(concentration.sum())
+    expected = expected - torch.digamma(concentration.sum(0))
+    return expected[0] + torch.cat([expected.new_zeros(1), expected[1].cumsum(0)[:-1]])
+
+
+def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
+    """ω (K,) and Gaussians such that E[log π_k + log N(x | μ_k, Λ_k⁻¹)] = ω_k + log N(x | m_k, Σ_k).
+
+    Σ = E[Λ]⁻¹; ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66).
+    """
+    dim = posterior.means.shape[1]
+    dof = posterior.degrees_of_freedom
+    steps = torch.arange(dim, dtype=dof.dtype, device=dof.device)
+    log_det = torch.digamma(0.5 * (dof[:, None] - steps)).sum(1) - dim * torch.log(0.5 * dof)
+    weight = expected_log_weights(posterior.concentration)
+    weight = weight + 0.5 * (log_det - dim / posterior.mean_precision)
+    # Whatever is a million nats below takes no part, and must not be infinite.
+    weight = weight.clamp_min(float(weight.max()) - 1e6)
+    return weight, Parameters(torch.ones_like(weight), posterior.means, posterior.covariances)
+
+
+def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Parameters) -> Tensor:
+    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with these moments (N_k, x̄_k, S_k)."""
+    count, mean, covariance = moments
+    factors = safe_cholesky(gaussians.covariances)
+    whiten = inverse_factor(factors)
+    offset = mean - gaussians.means
+    second = covariance + offset[:, :, None] * offset[:, None, :]
+    squared = (whiten @ whiten.transpose(-2, -1) * second).sum((1, 2))
+    half_log_det = torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
+    return (count * (log_weight - half_log_det - 0.5 * (mean.shape[1] * _LOG_2PI + squared))).sum()
+
+
+def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
+    """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` has seen.
+
+    The ratio of the two distributions' normalisers, and (2π)^(−ND/2). With the entropy of the
+    responsibilities added it is the lower bound of log p(X), once q(θ) is optimal for them. With
+    sticks it is that of the whole process: components beyond the K-th have no points, and the prior.
+    """
+    dim = prior.mean.shape[0]
+    scatter = posterior.covariances * posterior.degrees_of_freedom[:, None, None]
+    components = _log_wishart(posterior.degrees_of_freedom, scatter)
+    components = components - _log_wishart(prior.degrees_of_freedom[None], prior.covariance[None])
+    components = components + 0.5 * dim * torch.log(prior.mean_precision / posterior.mean_precision)
+    sticks = posterior.concentration
+    if sticks.shape[0] == 2:
+        first = torch.stack([torch.ones_like(prior.concentration), prior.concentration])[:, None]
+        weights = (_log_dirichlet(sticks) - _log_dirichlet(first)).sum()
+    else:
+        weights = _log_dirichlet(sticks[0]) - _log_dirichlet(prior.concentration.expand(sticks.shape[1]))
+    return components.sum() + weights - 0.5 * n_points * dim * _LOG_2PI
+
+
+def _log_wishart(degrees_of_freedom: Tensor, scatter: Tensor) -> Tensor:
+    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), scatter W⁻¹ (K, D, D). Bishop (B.79)."""
+    dim = scatter.shape[-1]
+    log_det = 2 * torch.log(safe_cholesky(scatter).diagonal(dim1=-2, dim2=-1)).sum(1)
+    half = 0.5 * degrees_of_freedom
+    return half * (dim * math.log(2) - log_det) + torch.mvlgamma(half, dim)
+
+
+def _log_dirichlet(concentration: Tensor) -> Tensor:
+    """log of the multivariate beta function, over the first axis."""
+    return torch.lgamma(concentration).sum(0) - torch.lgamma(concentration.sum(0))
+
+
+def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
+    """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D).
+
+    Its scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
+    """
+    k, dim = posterior.means.shape
+    dof = posterior.degrees_of_freedom + 1 - dim
+    ratio = posterior.degrees_of_freedom / dof * (1 + 1 / posterior.mean_precision)
+    factors = safe_cholesky(posterior.covariances * ratio[:, None, None])
+    whiten = inverse_factor(factors)
+    constant = (
+        torch.lgamma(0.5 * (dof + dim)) - torch.lgamma(0.5 * dof) - 0.5 * dim * torch.log(math.pi * dof)
+    )
+    constant = constant - torch.log(factors.diagonal(dim1=-2, dim2=-1)).sum(1)
+    constant = constant + torch.log(expected_weights(posterior.concentration))
+
+    def joint(part: Tensor) -> Tensor:
+        offset = part[:, None, :] - posterior.means
+        squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
+        return constant - 0.5 * (dof + dim) * torch.log1p(squared / dof)
+
+    rows = max(1, em.CHUNK_ELEMENTS // k)
+    return torch.cat([torch.logsumexp(joint(part), 1) for part in points.split(rows)])
+
+
+# -- variational Bayes --------------------------------------------------------------------------------
+
+
+def variational_step(
+    points: Tensor,
+    sample_weight: Tensor,
+    prior: Prior,
+    process: bool,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+) -> em.Step:
+    """One iteration for `em.run_em`: from moments to the moments of the next responsibilities.
+
+    Moments are `Parameters` with N_k, in points, in place of weights; `reg_covar` (m²) is part of
+    their covariances. The bound (nats a point) is that of the moments returned.
+    """
+    features = em.quadratic_features(points)
+    total = float(sample_weight.sum())
+
+    def step(moments: Parameters) -> tuple[Parameters, float]:
+        log_weight, gaussians = expected_log_density(update(prior, moments, process))
+        found, value = _expected_moments(
+            features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
+        )
+        posterior = update(prior, found, process)
+        entropy = value - assigned_log_density(_without(found, reg_covar), log_weight, gaussians)
+        return found, float(entropy + log_evidence(prior, posterior, total)) / total
+
+    return step
+
+
+def _expected_moments(
+    features: Tensor,
+    points: Tensor,
+    sample_weight: Tensor,
+    log_weight: Tensor,
+    gaussians: Parameters,
+    reg_covar: float,
+    softmax_dtype: torch.dtype,
+) -> tuple[Parameters, Tensor]:
+    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n log of what they are normalised by.
+
+    As two products of `features`, or, where these would cancel, directly from `points`.
+    """
+    weights = torch.exp(log_weight - log_weight.max())
+    unnormalised = gaussians._replace(weights=weights)
+    if not em.is_ill_conditioned(unnormalised):
+        natural = em.natural_parameters(gaussians)
+        natural[:, 0] += log_weight
+        sums, value = em.expectation(features, sample_weight, natural, softmax_dtype)
+        found = em.maximization(sums, reg_covar)
+        found = found._replace(weights=sums[:, 0])
+        least = torch.linalg.eigvalsh(found.covariances)[:, 0]
+        second = sums[:, 1:].abs().amax(1) / sums[:, 0].clamp_min(1e-300)
+        lost = torch.finfo(least.dtype).eps * second > 1e-6 * least
+        if not bool((lost & (sums[:, 0] > 1e-9)).any()):
+            return found, value
+    found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
+    total = sample_weight.sum()
+    return found._replace(weights=found.weights * total), value + log_weight.max() * total
+
+
+def _without(moments: Parameters, reg_covar: float) -> Parameters:
+    eye = torch.eye(moments.means.shape[1], dtype=moments.means.dtype, device=moments.means.device)
+    return moments._replace(covariances=moments.covariances - reg_covar * eye)

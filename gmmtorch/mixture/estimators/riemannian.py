@@ -1,0 +1,307 @@
+"""Riemannian optimisation of a Gaussian mixture's likelihood (Hosseini & Sra, 2015 and 2020; thesis 2.1.5).
+
+With y = [x; 1] a component is one zero-mean Gaussian of a (D+1) × (D+1) covariance S_k, which at the
+optimum holds [[Σ + μμᵀ, μ], [μᵀ, 1]]. What is maximised, over (SPD manifold)^K and log-weights η, is
+
+    f = Σ_n p_n log Σ_k softmax(η)_k q(x_n | S_k) / Σ_n p_n,
+    log q(x | S) = ½ − D/2 log 2π − ½ log|S| − ½ (yᵀS⁻¹y + ε tr Σ⁻¹).
+
+ε = `reg_covar` is the variance (m²) of a blur: log q is then the expected log-density of a point
+scattered isotropically about x, as it is of a cell of points in `em`. It bounds f, and the M-step of
+f is EM's: what EM adds to the covariance is ε, in the E-step too. S_k may have a last entry s ≠ 1;
+q is then a Gaussian times √(e/s) e^(−1/2s) ≤ 1, so f bounds the mixture's likelihood from below.
+
+The metric is the affine-invariant one. S_k is kept as a frame H_k with H_k S_k H_kᵀ = I, and tangent
+vectors as symmetric matrices Ξ in that frame. The exponential map is S ← H⁻¹ exp(Ξ) H⁻ᵀ, that is
+H ← exp(−Ξ/2) H; the inner product is tr(Ξ Ξ'), and parallel transport along the geodesic is the
+identity. So quasi-Newton steps on the manifold are Euclidean ones on the entries of Ξ. In the frame
+the gradient is ½ (H M_k Hᵀ − N_k I), M_k = Σ γ yyᵀ: the statistics of an E-step, and N_k/2 times the
+step that EM takes. That factor, undone, is the first guess of the inverse Hessian.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from gmmtorch.errors import NumericalError, check_whole
+from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, triangle_indices, unpack_symmetric
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.initialization import INITIALIZATIONS, start
+from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.estimators.ascent import SOLVERS, ascend
+from gmmtorch.mixture.validation import (
+    Array,
+    RandomState,
+    as_generator,
+    check_choice,
+    check_enough,
+    check_number,
+)
+
+_LONGEST_GUESS = 2.0  # of ‖Ξ‖ where nothing is known of the curvature
+_LEAST_SHARE = 0.1  # of 1/K: what a component counts for in that guess, at least
+_LONGEST_STEP = 4.0  # of ‖Ξ‖: variances change by e⁴ at most
+
+
+class RiemannianGaussianMixture(MixtureEstimator):
+    """Gaussian mixture by L-BFGS or conjugate gradients on the manifold of covariances.
+
+    Good where components overlap and the tolerance is tight: five clusters that hide one another
+    (20 000 points, tol=1e-6) take 55 iterations and 0.30 s to the likelihood that takes EM 294 and
+    0.76 s. On surfaces, which overlap little, it is EM's equal from k-means (20 000 points of a
+    lidar scan, K=100: 0.7 s either way, held-out −3.48 and −3.51 nats) and no match for it from
+    random points (PSNR2 89 and 93 dB).
+
+    Args:
+        n_components: K, at most the number of points.
+        tol: converged when an iteration gains less, and an EM step would, too (nats a point).
+        reg_covar: ε, the variance of a blur of the points, in the square of their unit (m²): what
+            EM adds to each variance.
+        max_iter: iterations at most, in each start.
+        n_init: starts; the one with the best likelihood is kept.
+        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        solver: "lbfgs", or "cg" for conjugate gradients.
+        memory: how many steps L-BFGS remembers.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
+        dtype: of the exponentials. In "float32" an ascent ends where rises are below 1e-8 nats.
+
+    `lower_bounds_` holds the mean log-likelihood of the blurred points after each iteration.
+    """
+
+    def __init__(
+        self,
+        n_components: int = 1,
+        *,
+        tol: float = 1e-3,
+        reg_covar: float = 1e-6,
+        max_iter: int = 100,
+        n_init: int = 1,
+        init_params: str = "kmeans",
+        solver: str = "lbfgs",
+        memory: int = 10,
+        random_state: RandomState = None,
+        dtype: str = "float64",
+    ) -> None:
+        nn.Module.__init__(self)
+        self.n_components = n_components
+        self.tol = tol
+        self.reg_covar = reg_covar
+        self.max_iter = max_iter
+        self.n_init = n_init
+        self.init_params = init_params
+        self.solver = solver
+        self.memory = memory
+        self.random_state = random_state
+        self.dtype = dtype
+
+    def fit(
+        self,
+        X: Array,
+        y: Any = None,
+        sample_weight: Array | None = None,
+        on_iteration: Callable[[int, float], None] | None = None,
+    ) -> RiemannianGaussianMixture:
+        """Learn the mixture of points X (N, D).
+
+        Args:
+            X: points, finite.
+            y: ignored, as in scikit-learn.
+            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
+            on_iteration: called with the iteration (from 1) and the mean log-likelihood.
+
+        Raises:
+            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
+                number of points of non-zero weight.
+            NumericalError: a component collapsed, as happens with reg_covar = 0.
+        """
+        points, weight, center = self._prepare(X, sample_weight)
+        blur, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
+        likelihood = Likelihood(points, weight, blur, dtype)
+        generator = as_generator(self.random_state)
+        best: tuple[Iterate, list[float], bool] | None = None
+        for _ in range(self.n_init):
+            first = start(self.init_params, points, weight, self.n_components, blur, generator)
+            found = ascend(
+                likelihood.at(first),
+                SOLVERS[self.solver](self.memory),
+                tol=float(self.tol),
+                max_iter=self.max_iter,
+                on_iteration=on_iteration,
+            )
+            if best is None or found[0].value > best[0].value:
+                best = found
+        assert best is not None
+        peak, values, converged = best
+        mixture = peak.parameters()
+        safe_cholesky(mixture.covariances)
+        if blur == 0:
+            check_thickness(mixture, points)
+        self._keep(mixture, center, values, converged)
+        self._warn_unless_converged("The ascent")
+        return self
+
+    def check_parameters(self, n_points: int | None = None) -> None:
+        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
+        for name in ("n_components", "max_iter", "n_init", "memory"):
+            check_whole(name, getattr(self, name), 1)
+        for name in ("tol", "reg_covar"):
+            check_number(name, getattr(self, name))
+        choices: dict[str, Collection[str]] = {
+            "init_params": INITIALIZATIONS,
+            "solver": SOLVERS,
+            "dtype": em.SOFTMAX_DTYPES,
+        }
+        for name, known in choices.items():
+            check_choice(name, getattr(self, name), known)
+        as_generator(self.random_state)
+        check_enough(self.n_components, n_points)
+
+
+# -- the function, and the manifold it lives on ---------------------------------------------------
+
+
+class Frames(NamedTuple):
+    """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖².
+
+    linear: A (K, D+1, D); means: μ (K, D); offset: b (K, D+1).
+    """
+
+    linear: Tensor
+    means: Tensor
+    offset: Tensor
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """f of centred points (N, D) of weights (N,), float64. blur: ε, m²."""
+
+    points: Tensor
+    weight: Tensor
+    blur: float
+    softmax_dtype: torch.dtype = torch.float64
+
+    def at(self, parameters: Parameters) -> Iterate:
+        """f at a mixture: S_k of its means and covariances, with s = 1."""
+        weights, means, covariances = parameters
+        whiten = inverse_factor(safe_cholesky(covariances)).mT
+        linear = nn.functional.pad(whiten, (0, 0, 0, 1))
+        offset = nn.functional.pad(torch.zeros_like(means), (0, 1), value=1.0)
+        return self.evaluate(Frames(linear, means, offset), torch.log(weights.clamp_min(1e-300)))
+
+    def evaluate(self, frames: Frames, log_weights: Tensor) -> Iterate:
+        """f and its gradient at frames of K components and log-weights η (K,), of any norm."""
+        linear, means, offset = frames
+        log_weights = torch.log_softmax(log_weights, 0)
+        whiten = torch.linalg.qr(linear).R  # Σ⁻¹ = RᵀR
+        inverse = inverse_factor(whiten.mT).contiguous()
+        covariances = inverse @ inverse.mT
+        length = offset.square().sum(1)
+        blurred = self.blur * linear @ linear.mT
+        log_factor = 0.5 * (1 + length.log() - length - blurred.diagonal(dim1=-2, dim2=-1).sum(-1))
+        count, first, second, value = self._moments(
+            Parameters((log_weights + log_factor).exp(), means, covariances)
+        )
+        # H M Hᵀ, from moments about the means.
+        mixed = (linear @ first[:, :, None]) * offset[:, None, :]
+        scatter = linear @ second @ linear.mT + mixed + mixed.mT
+        scatter = scatter + count[:, None, None] * (offset[:, :, None] * offset[:, None, :] + blurred)
+        eye = torch.eye(offset.shape[1], dtype=offset.dtype, device=offset.device)
+        rise = 0.5 * (scatter - count[:, None, None] * eye)
+        share = log_weights.exp()
+        gradient = pack_tangent(rise, count - share)
+        # 2/N_k makes EM's step of the gradient. Bounded, so that a component with few points does not leap.
+        size = torch.stack([count, share], 1).clamp_min(_LEAST_SHARE / len(count))
+        scale = torch.cat([2 / size[:, :1].expand(-1, gradient.shape[1] - 1), 1 / size.amax(1, True)], 1)
+        reach = (scale * gradient)[:, :-1].norm(dim=1, keepdim=True) / _LONGEST_GUESS
+        scale[:, :-1] /= reach.clamp_min(1)
+        return Iterate(self, frames, covariances, log_weights, value, gradient, scale)
+
+    def _moments(self, parameters: Parameters) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Of responsibilities γ, over Σp: N (K,), Σγ(x−μ) (K, D), Σγ(x−μ)(x−μ)ᵀ (K, D, D); and f."""
+        means, total = parameters.means, self.weight.sum()
+        dim = means.shape[1]
+        if em.is_ill_conditioned(parameters):
+            sums, value = em.direct_sums(self.points, self.weight, parameters)
+            count, first = sums[:, 0], sums[:, 1:] - sums[:, :1] * means
+            second = em.direct_scatter(self.points, self.weight, parameters, means)
+        else:
+            natural = em.natural_parameters(parameters)
+            sums, value = em.expectation(self._features, self.weight, natural, self.softmax_dtype)
+            count, first = sums[:, 0], sums[:, 1 : 1 + dim] - sums[:, :1] * means
+            mixed = (first + 0.5 * count[:, None] * means)[:, :, None] * means[:, None, :]
+            second = unpack_symmetric(sums[:, 1 + dim :], dim) - mixed - mixed.mT
+        return count / total, first / total, second / total, float(value / total)
+
+    @functools.cached_property
+    def _features(self) -> Tensor:
+        return em.quadratic_features(self.points)
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A point of the manifold, f and its gradient there. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
+
+    A row holds the entries of Ξ, as `pack_tangent` has them, and the change of η.
+    """
+
+    likelihood: Likelihood
+    frames: Frames
+    covariances: Tensor
+    log_weights: Tensor
+    value: float
+    gradient: Tensor
+    inverse_hessian: Tensor
+
+    def bounded(self, direction: Tensor) -> Tensor:
+        """A component whose points are leaving it may be sent anywhere by what was learned before."""
+        return direction / (direction.norm(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1)
+
+    def move(self, tangent: Tensor) -> Iterate:
+        """H ← exp(−Ξ/2) H and η ← η + its change; then x is taken about the new means."""
+        matrices, change = unpack_tangent(tangent, self.frames.offset.shape[1])
+        spread = torch.linalg.matrix_exp(-0.5 * matrices)
+        linear = spread @ self.frames.linear
+        offset = (spread @ self.frames.offset[:, :, None]).squeeze(-1)
+        basis, factor = torch.linalg.qr(linear)
+        along = basis.mT @ offset[:, :, None]
+        shift = torch.linalg.solve_triangular(factor, along, upper=True).squeeze(-1)
+        offset = offset - (basis @ along).squeeze(-1)
+        frames = Frames(linear, self.frames.means - shift, offset)
+        return self.likelihood.evaluate(frames, self.log_weights + change)
+
+    def parameters(self) -> Parameters:
+        """The mixture, with s = 1."""
+        return Parameters(self.log_weights.exp(), self.frames.means, self.covariances)
+
+
+def pack_tangent(matrices: Tensor, change: Tensor) -> Tensor:
+    """Rows [Ξ, Δη] of symmetric Ξ (K, D+1, D+1) and Δη (K,); their products add up to tr ΞΞ' + Δη Δη'."""
+    rows, cols = triangle_indices(matrices.shape[-1], matrices.device)
+    entries = pack_symmetric(matrices) * torch.where(rows == cols, 1.0, math.sqrt(2)).to(matrices)
+    return torch.cat([entries, change[:, None]], 1)
+
+
+def unpack_tangent(tangent: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Ξ (K, D+1, D+1) and Δη (K,); the inverse of `pack_tangent`. size: D + 1."""
+    rows, cols = triangle_indices(size, tangent.device)
+    entries = tangent[:, :-1] / torch.where(rows == cols, 1.0, math.sqrt(2)).to(tangent)
+    return unpack_symmetric(entries, size), tangent[:, -1]
+
+
+def check_thickness(parameters: Parameters, points: Tensor) -> None:
+    """Raise `NumericalError` if a component is thinner than the points' coordinates are exact."""
+    least = (16 * torch.finfo(points.dtype).eps * points.abs().max()) ** 2
+    thin = (torch.linalg.eigvalsh(parameters.covariances)[:, 0] <= least) & (parameters.weights > 0)
+    if bool(thin.any()):
+        raise NumericalError(
+            f"covariances[{int(thin.nonzero()[0])}] collapsed: its points span less than the space; "
+            "raise reg_covar (1e-6 m² is usual)."
+        )

@@ -1,0 +1,1 @@
+"""Mixtures with fewer components: merging and pruning (thesis 2.1.4)."""

@@ -1,0 +1,211 @@
+"""Evidence of arbitrary regions: any simple polygon in 2D, any closed triangle mesh in 3D.
+
+The same two surface integrals as for cells, over the region's boundary. For a region that is not convex
+**misses are the expected number of times that rays leave it**: a ray that passes through twice counts
+twice, one that ends inside counts for the passes before that. Where the region is convex that is
+the expected number of rays that pass through it and end beyond.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.forms.cone.box_mass import MassPatches
+from gmmtorch.occupancy.forms.cone.mahalanobis import cross, dot
+from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
+from gmmtorch.occupancy.forms.flux.face_flux import FacePatches
+from gmmtorch.occupancy.index.culling import Whitened, candidate_pairs
+
+_CHUNK_FACES = 1 << 16
+
+
+class Boundary(NamedTuple):
+    """The boundary of a region, outwards oriented.
+
+    starts (F, D): first corner of each segment (2D) or triangle (3D), world metres.
+    edges (F, D−1, D): from it to the other corners. Segments run counter-clockwise about the region;
+    edge 0 × edge 1 of a triangle points outwards.
+    """
+
+    starts: Tensor
+    edges: Tensor
+
+    @classmethod
+    def of_polygon(cls, vertices: Tensor) -> Boundary:
+        """The boundary of a simple polygon of vertices (V, 2), in order, either way round.
+
+        Raises `InvalidArgumentError` for fewer than three vertices or ones that are not finite, and
+        `DataError` for a polygon that crosses or touches itself, or has no area.
+        """
+        vertices = vertices.double()
+        _check_vertices(vertices, 2)
+        edges = vertices.roll(-1, 0) - vertices
+        if bool((edges == 0).all(1).any()):
+            raise DataError("The polygon repeats a vertex; drop what is degenerate.")
+        _check_simple(vertices.detach(), edges.detach())
+        area = 0.5 * _cross_2d(vertices - vertices[0], edges).sum()
+        if not bool(area != 0):
+            raise DataError("The polygon has no area; give one that goes round a region.")
+        if bool(area < 0):
+            vertices = vertices.flip(0)
+            edges = vertices.roll(-1, 0) - vertices
+        return cls(vertices, edges[:, None])
+
+    @classmethod
+    def of_mesh(cls, vertices: Tensor, triangles: Tensor) -> Boundary:
+        """The boundary of a closed mesh: vertices (V, 3), triangles (F, 3) of their indices, whose
+        corners run counter-clockwise as seen from outside.
+
+        Raises `InvalidArgumentError` for other shapes, vertices that are not finite and indices of no
+        vertex, and `DataError` for a mesh that is open, inconsistent or inverted.
+        """
+        vertices = vertices.double()
+        _check_vertices(vertices, 3)
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.is_floating_point():
+            raise InvalidArgumentError(
+                f"triangles has shape {tuple(triangles.shape)} and dtype {triangles.dtype}; expected (F, 3) "
+                "vertex indices."
+            )
+        triangles = triangles.long()
+        if len(triangles) == 0 or int(triangles.min()) < 0 or int(triangles.max()) >= len(vertices):
+            raise InvalidArgumentError(f"triangles must index the {len(vertices)} vertices, from 0 on.")
+        _check_closed(triangles, len(vertices))
+        corners = vertices[triangles]
+        edges = corners[:, 1:] - corners[:, :1]
+        volume = torch.linalg.det(corners - vertices[0]).sum() / 6
+        if not bool(volume > 0):
+            raise DataError(
+                f"The mesh encloses {float(volume):.3g} m³: it is flat or inside out; reverse the corners "
+                "of its triangles."
+            )
+        return cls(corners[:, 0], edges)
+
+
+def region_flux(
+    cones: Cones,
+    boundary: Boundary,
+    cutoff: float = CUTOFF,
+    *,
+    tolerance: float = TOLERANCE,
+    dtype: torch.dtype = torch.float64,
+) -> tuple[Tensor, Tensor]:
+    """hits and misses of one region, scalars: the rays that end in it, and how often rays leave it.
+
+    Arguments as in `flux.flux_evidence`. Differentiable in the boundary and the cones.
+    """
+    check_tolerance(tolerance)
+    if boundary.starts.shape[1] != cones.dim:
+        raise InvalidArgumentError(
+            f"boundary is {boundary.starts.shape[1]}-dimensional, but the cones are {cones.dim}-dimensional."
+        )
+    counts, white = cones.counts.double(), Whitened.of(cones)
+    corners = torch.cat([boundary.starts[:, None], boundary.starts[:, None] + boundary.edges], 1).detach()
+    low, high = corners.flatten(0, 1).amin(0), corners.flatten(0, 1).amax(0)
+    reached = [cone for _, cone in candidate_pairs(cones, low[None], high[None], cutoff)]
+    hits, misses = torch.zeros_like(counts), torch.zeros_like(counts)
+    for cone in torch.cat(reached or [counts.new_empty(0, dtype=torch.int64)]).split(_CHUNK_FACES):
+        per_pass = max(1, _CHUNK_FACES // max(1, len(cone)))
+        for face in torch.arange(len(corners), device=cone.device).split(per_pass):
+            both = torch.cartesian_prod(face, cone).reshape(-1, 2).T
+            out, mass = _face_integrals(white, boundary, both[0], both[1], cutoff, tolerance, dtype)
+            misses = misses.index_add(0, both[1], out)
+            hits = hits.index_add(0, both[1], mass)
+    # The masses above faces add up to what is in the region, to rounding and quadrature.
+    return (counts * ~cones.max_range) @ hits.clamp_min(0), counts @ misses
+
+
+def _face_integrals(
+    white: Whitened,
+    boundary: Boundary,
+    face: Tensor,
+    cone: Tensor,
+    cutoff: float,
+    tolerance: float,
+    dtype: torch.dtype,
+) -> tuple[Tensor, Tensor]:
+    """Flux out through each face (P,), and the signed mass above it."""
+    part = white.take(cone)
+    start, edge = boundary.starts[face].T, boundary.edges[face].permute(1, 2, 0)
+    triangular = len(edge) == 2
+    center = start if triangular else start + 0.5 * edge[0]
+    ray = center - part.origin
+    offset, edges = part.apply(center - part.mean), torch.stack([part.apply(e) for e in edge])
+
+    height = dot(ray, cross(edge[0], edge[1])) if triangular else cross(ray, edge[0])[0]
+    strength = height * torch.exp(-part.log_norm)
+    out = (strength > 0).nonzero().squeeze(1)
+    tensors = (part.apply(ray), offset, edges, strength)
+    faces = FacePatches(cutoff, *(x[..., out].to(dtype) for x in tensors), triangular=triangular)
+    flux = torch.zeros_like(strength).index_add(0, out, integrate(faces, faces.ray, tolerance).double())
+
+    upward = torch.zeros_like(offset)
+    upward[0] = 1.0
+    area = -dot(cross(edges[0], edges[1]), upward) if triangular else cross(edges[0], upward)[0]
+    span = torch.full_like(area, torch.inf)
+    parts = (x.to(dtype) for x in (offset, edges, upward, span, area))
+    sections = MassPatches(cutoff, *parts, triangular=triangular)
+    return flux, integrate(sections, sections.offset, tolerance).double()
+
+
+def _check_vertices(vertices: Tensor, dim: int) -> None:
+    if vertices.ndim != 2 or vertices.shape[1] != dim or len(vertices) <= dim:
+        raise InvalidArgumentError(
+            f"vertices has shape {tuple(vertices.shape)}; expected (V, {dim}), V at least {dim + 1}."
+        )
+    if not bool(torch.isfinite(vertices).all()):
+        raise InvalidArgumentError("vertices must be finite metres; drop what is not.")
+
+
+def _cross_2d(a: Tensor, b: Tensor) -> Tensor:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _check_simple(vertices: Tensor, edges: Tensor) -> None:
+    """Raises `DataError` where two edges that are not neighbours meet, or neighbours fold back."""
+    n = len(vertices)
+    following = edges.roll(-1, 0)
+    folded = (_cross_2d(edges, following) == 0) & ((edges * following).sum(1) < 0)
+    index = torch.arange(n, device=vertices.device)
+    for first in range(n):  # one row of the V × V table at a time
+        apart = (index > first + 1) & ~((first == 0) & (index == n - 1))
+        other = index[apart]
+        to_ends = torch.stack([vertices[other], vertices[(other + 1) % n]]) - vertices[first]
+        side = _cross_2d(edges[first], to_ends)
+        from_other = torch.stack([vertices[first], vertices[(first + 1) % n]])[:, None] - vertices[other]
+        back = _cross_2d(edges[other], from_other)
+        parallel = (side == 0).all(0)
+        along = (to_ends @ edges[first]) / (edges[first] @ edges[first])
+        overlapping = (along.amin(0) <= 1) & (along.amax(0) >= 0)
+        met = torch.where(parallel, overlapping, (side.prod(0) <= 0) & (back.prod(0) <= 0))
+        if bool(met.any()):
+            raise DataError(
+                f"The polygon's edges {first} and {int(other[met][0])} meet; give a simple polygon."
+            )
+    if bool(folded.any()):
+        raise DataError(f"The polygon folds back on itself after edge {int(folded.nonzero()[0])}.")
+
+
+def _check_closed(triangles: Tensor, n_vertices: int) -> None:
+    """Raises `DataError` unless every edge is run through as often one way as the other."""
+    tail, head = triangles.flatten(), triangles.roll(-1, 1).flatten()
+    if bool((tail == head).any()):
+        raise DataError("A triangle repeats a vertex; drop degenerate triangles.")
+    forward, count = torch.unique(tail * n_vertices + head, return_counts=True)
+    backward = torch.unique(head * n_vertices + tail)
+    if bool((count > 1).any()):
+        edge = int(forward[count > 1][0])
+        raise DataError(
+            f"Edge ({edge // n_vertices}, {edge % n_vertices}) runs the same way in more than one "
+            "triangle: the mesh is not consistently oriented."
+        )
+    if not torch.equal(forward, backward):
+        edge = int(forward[~torch.isin(forward, backward)][0])
+        raise DataError(
+            f"Edge ({edge // n_vertices}, {edge % n_vertices}) has a triangle on one side only: "
+            "close the mesh, or merge vertices that coincide."
+        )

@@ -1,0 +1,1 @@
+"""Sparse voxels that store evidence, and the traversal of rays through them."""

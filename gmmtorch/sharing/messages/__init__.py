@@ -1,0 +1,1 @@
+"""The messages that robots send, byte by byte."""

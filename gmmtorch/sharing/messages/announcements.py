@@ -1,0 +1,75 @@
+"""What a replica holds, announced in datagrams. See docs/messages.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed, split
+from gmmtorch.sharing.messages.fields import read_intervals, read_number, write_intervals, write_number
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import END, LARGEST_INCARNATION, LARGEST_ROBOT
+
+
+@dataclass(frozen=True, eq=False)
+class AnnouncementMessage:
+    """Of the keys from `begin` to `end` − 1, `sender`, in its life `incarnation`, holds just these."""
+
+    sender: int
+    incarnation: int
+    begin: int
+    end: int
+    held: Intervals
+
+    @property
+    def scope(self) -> Intervals:
+        return Intervals.span(self.begin, self.end)
+
+
+def encode_announcements(
+    sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
+) -> list[bytes]:
+    """Datagrams that say what is held, and by it what is not: one at least.
+
+    Each says so of a part of all keys of its own, so that any of them may get lost. Raises
+    `InvalidArgumentError` for what is out of range.
+    """
+    _check_speaker(sender, incarnation)
+    if not Intervals.span(0, END).covers(held):
+        raise InvalidArgumentError(f"held={held!r} goes beyond the keys that robots give.")
+    n = len(held)
+
+    def part(begin: int, end: int) -> bytes:
+        first = int(held.edges[2 * begin]) if begin else 0
+        last = int(held.edges[2 * end]) - 1 if end < n else END - 1
+        writer = BitWriter()
+        for name, value in (("sender", sender), ("incarnation", incarnation)):
+            write_number(writer, name, value)
+        writer.number(first)
+        writer.number(last - first)
+        write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
+        return sealed(Kind.ANNOUNCEMENT, writer.to_bytes())
+
+    return split(n, part, "interval", max_bytes) if n else [part(0, 0)]
+
+
+def read_announcement(body: bytes) -> AnnouncementMessage:
+    reader = BitReader(body)
+    sender, incarnation = read_number(reader), read_number(reader)
+    _check_speaker(sender, incarnation)
+    begin = reader.number()
+    end = begin + reader.number() + 1
+    if not 0 <= begin < end <= END:
+        raise DataError(f"An announcement of the keys from {begin} to {end}: it is damaged.")
+    held = read_intervals(reader, begin, end)
+    reader.finish()
+    return AnnouncementMessage(sender, incarnation, begin, end, held)
+
+
+def _check_speaker(sender: int, incarnation: int) -> None:
+    if sender > LARGEST_ROBOT or incarnation > LARGEST_INCARNATION:
+        raise InvalidArgumentError(
+            f"sender={sender} in its life incarnation={incarnation}: robots go to {LARGEST_ROBOT}, lives to "
+            f"{LARGEST_INCARNATION}."
+        )

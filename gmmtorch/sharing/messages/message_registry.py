@@ -1,0 +1,122 @@
+"""All that robots say during a mission: one `decode`, and an encoder for each kind of message.
+
+A datagram stands alone, has at most 1200 bytes, and is checked before it is believed: see
+docs/messages.md, which has the format byte by byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.sharing import view_announcements
+from gmmtorch.sharing.messages import (
+    announcements,
+    component_messages,
+    count_messages,
+    point_messages,
+    record_messages,
+    view_messages,
+)
+from gmmtorch.sharing.messages.announcements import AnnouncementMessage
+from gmmtorch.sharing.messages.component_messages import ComponentsMessage, encode_components
+from gmmtorch.sharing.messages.count_messages import CountsMessage, encode_counts
+from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, opened
+from gmmtorch.sharing.messages.fields import quantized_poses
+from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
+from gmmtorch.sharing.messages.record_messages import CorrectionMessage, SupersessionMessage, TotalsMessage
+from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
+from gmmtorch.sharing.view_announcements import ViewsHeldMessage
+
+__all__ = [
+    "CODECS",
+    "MAX_BYTES",
+    "AnnouncementMessage",
+    "ComponentsMessage",
+    "CorrectionMessage",
+    "CountsMessage",
+    "Message",
+    "PlanMessage",
+    "PointsMessage",
+    "SupersessionMessage",
+    "TotalsMessage",
+    "ViewsHeldMessage",
+    "ViewsMessage",
+    "decode",
+    "encode_components",
+    "encode_counts",
+    "encode_plan",
+    "encode_points",
+    "encode_views",
+    "kind_of",
+    "quantized_poses",
+]
+
+Message = (
+    ComponentsMessage
+    | CountsMessage
+    | PointsMessage
+    | ViewsMessage
+    | PlanMessage
+    | AnnouncementMessage
+    | SupersessionMessage
+    | TotalsMessage
+    | CorrectionMessage
+    | ViewsHeldMessage
+)
+
+_READERS: dict[Kind, Callable[[bytes], Message]] = {
+    Kind.COMPONENTS: component_messages.read_quantized,
+    Kind.FLOAT_COMPONENTS: component_messages.read_float,
+    Kind.THESIS_COMPONENTS: component_messages.read_thesis,
+    Kind.COUNTS: count_messages.read_quantized_counts,
+    Kind.FLOAT_COUNTS: count_messages.read_float_counts,
+    Kind.THESIS_COUNTS: count_messages.read_thesis_counts,
+    Kind.POINTS: point_messages.read_points,
+    Kind.VIEWS: view_messages.read_views,
+    Kind.PLAN: view_messages.read_plan,
+    Kind.ANNOUNCEMENT: announcements.read_announcement,
+    Kind.SUPERSESSION: record_messages.read_supersession,
+    Kind.TOTALS: record_messages.read_totals,
+    Kind.CORRECTION: record_messages.read_correction,
+    Kind.VIEWS_HELD: view_announcements.read_views_held,
+}
+
+
+_NAMES: dict[Kind, str] = {
+    Kind.COMPONENTS: "components",
+    Kind.FLOAT_COMPONENTS: "components",
+    Kind.THESIS_COMPONENTS: "components",
+    Kind.COUNTS: "counts",
+    Kind.FLOAT_COUNTS: "counts",
+    Kind.THESIS_COUNTS: "counts",
+    Kind.TOTALS: "counts",
+    Kind.POINTS: "points",
+    Kind.VIEWS: "views",
+    Kind.PLAN: "plans",
+    Kind.ANNOUNCEMENT: "announcements",
+    Kind.VIEWS_HELD: "announcements",
+    Kind.SUPERSESSION: "supersessions",
+    Kind.CORRECTION: "corrections",
+}
+
+
+def kind_of(datagram: bytes) -> str:
+    """What a datagram is of, for the books: of one that `decode` can read."""
+    return _NAMES[Kind(datagram[0] & 15)]
+
+
+def decode(datagram: bytes) -> Message:
+    """What a datagram says; tensors on the CPU.
+
+    Raises `DataError`, and nothing else, for bytes that are no message, or say what no encoder of this
+    version would; and takes memory that `MAX_BYTES` bounds.
+    """
+    kind, body = opened(datagram)
+    try:
+        return _READERS[kind](body)
+    except DataError:
+        raise
+    except (GmmTorchError, ValueError, ArithmeticError, LookupError, RuntimeError) as error:
+        # Readers name what is wrong. The others are for what nobody has thought of: the robot goes on.
+        raise DataError(f"The datagram is damaged: {error}") from error

@@ -1,0 +1,225 @@
+"""Records of a replicated map that are no components, as datagrams: supersessions, totals, corrections.
+
+See docs/messages.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.linalg import check_rigid
+from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
+from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT
+from gmmtorch.sharing.messages.count_messages import count_steps, counts_of
+from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, sealed
+from gmmtorch.sharing.messages.fields import (
+    read_intervals,
+    read_keys,
+    read_number,
+    write_intervals,
+    write_keys,
+    write_number,
+)
+from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of_robot, robot_of
+
+RECORD_BYTES = 1000
+"""Longest record: so all fit where encryption takes its share of a datagram."""
+_POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
+_UNIT = 1e-9
+
+
+def check_size(max_bytes: int) -> None:
+    """Raises `InvalidArgumentError` unless datagrams of so many bytes at most hold any record."""
+    if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
+        raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")
+
+
+@dataclass(frozen=True, eq=False)
+class SupersessionMessage:
+    """Record `key`: where all of `new` is held, `old` counts no more. All are keys of one robot."""
+
+    key: int
+    old: Intervals
+    new: Intervals
+
+
+@dataclass(frozen=True, eq=False)
+class TotalsMessage:
+    """Record `key`: all points that one life of a robot has counted to components of these keys (J,).
+
+    steps (J,): as in `mapping.quantization`. Of two totals of a component the larger is the later.
+    """
+
+    key: int
+    components: Ints
+    steps: Ints
+
+    @property
+    def totals(self) -> np.ndarray:
+        """Points (J,)."""
+        return counts_of(self.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionMessage:
+    """Record `key`: the robot's components `moved` (keys), those of its scan, belong where `pose` takes them.
+
+    pose: position and (cos, sin) of the yaw (4,), or position and unit quaternion x, y, z, w (7,): the
+    motion from where they were published. Of two of one scan the higher version counts, then the higher key.
+    """
+
+    key: int
+    scan: int
+    version: int
+    moved: Intervals
+    pose: Tensor
+
+    @property
+    def dim(self) -> int:
+        return {n: dim for dim, n in _POSE_NUMBERS.items()}[len(self.pose)]
+
+    def transform(self) -> Tensor:
+        """The motion (D+1, D+1)."""
+        matrix = torch.eye(self.dim + 1, dtype=torch.float64)
+        matrix[:-1, -1] = self.pose[: self.dim]
+        if self.dim == 2:
+            cos, sin = self.pose[2:].tolist()
+            turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+        else:
+            turn = torch.from_numpy(Rotation.from_quat(self.pose[3:].numpy()).as_matrix())
+        matrix[:-1, :-1] = turn
+        return matrix
+
+
+RecordMessage = SupersessionMessage | TotalsMessage | CorrectionMessage
+_Record = TypeVar("_Record", bound=RecordMessage)
+
+
+def encode_record(record: RecordMessage) -> bytes:
+    """The datagram of a record. It may be longer than `RECORD_BYTES`; who makes records sees to that.
+
+    Raises `InvalidArgumentError` for what no receiver would believe.
+    """
+    _checked(record)
+    writer = BitWriter()
+    writer.number(record.key)
+    base = first_key(robot_of(record.key))
+    if isinstance(record, SupersessionMessage):
+        write_intervals(writer, record.old, base)
+        write_intervals(writer, record.new, base)
+        return sealed(Kind.SUPERSESSION, writer.to_bytes())
+    if isinstance(record, TotalsMessage):
+        order = np.argsort(record.components)
+        write_keys(writer, record.components[order])
+        writer.column(record.steps[order])
+        return sealed(Kind.TOTALS, writer.to_bytes())
+    write_number(writer, "scan", record.scan)
+    write_number(writer, "version", record.version)
+    writer.one(int(record.dim == 3), 1)
+    writer.fixed(record.pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
+    write_intervals(writer, record.moved, base)
+    return sealed(Kind.CORRECTION, writer.to_bytes())
+
+
+def read_supersession(body: bytes) -> SupersessionMessage:
+    reader = BitReader(body)
+    key, keys = _read_key(reader)
+    old, new = (read_intervals(reader, *keys.pairs()[0]) for _ in range(2))
+    reader.finish()
+    return _checked(SupersessionMessage(key, old, new))
+
+
+def read_totals(body: bytes) -> TotalsMessage:
+    reader = BitReader(body)
+    key, _ = _read_key(reader)
+    components = read_keys(reader)
+    steps = reader.column(len(components))
+    reader.finish()
+    return _checked(TotalsMessage(key, components, steps))
+
+
+def read_correction(body: bytes) -> CorrectionMessage:
+    reader = BitReader(body)
+    key, keys = _read_key(reader)
+    scan, version = read_number(reader), read_number(reader)
+    dim = 2 + reader.one(1)
+    halves = reader.fixed(2 * _POSE_NUMBERS[dim], 32)
+    moved = read_intervals(reader, *keys.pairs()[0])
+    reader.finish()
+    pose = torch.from_numpy(halves.astype("<u4").view("<f8").astype(np.float64))
+    return _checked(CorrectionMessage(key, scan, version, moved, pose))
+
+
+def _read_key(reader: BitReader) -> tuple[int, Intervals]:
+    """A record's key, and all that its robot may give."""
+    key = reader.number()
+    if not 0 <= key < END:
+        raise DataError(f"Record {key} is out of range: it is damaged.")
+    return key, keys_of_robot(robot_of(key))
+
+
+def _checked(record: _Record) -> _Record:
+    """Itself, if it says what a record may, whoever writes or reads it; else `InvalidArgumentError`."""
+    key = record.key
+    if not 0 <= key < END:
+        raise InvalidArgumentError(f"key={key} names no record: keys go from 0 to {END - 1}.")
+    mine = keys_of_robot(robot_of(key))
+    if isinstance(record, SupersessionMessage):
+        old, new = record.old, record.new
+        if not old or key in old or key in new or old & new or not mine.covers(old | new):
+            raise InvalidArgumentError(
+                f"Record {key} supersedes {old!r} by {new!r}: it is to supersede records of its robot, at "
+                "least one, by others of it, and neither them nor itself."
+            )
+    elif isinstance(record, TotalsMessage):
+        names, steps = record.components, record.steps
+        if len(np.unique(names)) != len(names) or len(steps) != len(names):
+            raise InvalidArgumentError(f"Record {key} has {len(steps)} totals of {names.tolist()}: one each.")
+        if len(names) and not 0 <= int(names.min()) <= int(names.max()) < END:
+            raise InvalidArgumentError(f"Record {key} counts points of what no robot can have named.")
+        if len(names) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
+            raise InvalidArgumentError(f"Record {key} counts from {steps.min()} to {steps.max()} steps.")
+    elif not (_is_motion(record.pose) and mine.covers(record.moved)):
+        raise InvalidArgumentError(
+            f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it is to move components of "
+            f"its robot, by up to {FARTHEST:g} m on each axis and a turn of unit length."
+        )
+    return record
+
+
+def _is_motion(pose: Tensor) -> bool:
+    """Whether it is one as in a `CorrectionMessage`."""
+    for dim, n in _POSE_NUMBERS.items():
+        if pose.shape == (n,):
+            near = bool((pose[:dim].abs() <= FARTHEST).all())
+            return near and abs(float(pose[dim:].norm()) - 1) <= _UNIT
+    return False
+
+
+def totals_message(key: int, totals: dict[int, float]) -> TotalsMessage:
+    """Record `key` of totals by the keys of components, rounded as counts are."""
+    components = np.array(sorted(totals), np.int64)
+    counts = torch.tensor([totals[int(name)] for name in components], dtype=torch.float64)
+    return TotalsMessage(key, components, count_steps(counts))
+
+
+def pose_of(transform: Tensor) -> Tensor:
+    """The pose of a `CorrectionMessage` of a rigid motion (3, 3) or (4, 4). Raises if it is none."""
+    if transform.shape not in ((3, 3), (4, 4)):
+        raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
+    rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)
+    if not bool((translation.abs() <= FARTHEST).all()):
+        raise InvalidArgumentError(f"transform moves by {translation.tolist()}; {FARTHEST:g} m is the most.")
+    if len(rotation) == 2:
+        turn = rotation[:, 0] / rotation[:, 0].norm()
+    else:
+        turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
+    return torch.cat([translation, turn]) + 0.0  # no −0

@@ -1,0 +1,324 @@
+"""The replicated set: records that are added, and forgotten when others supersede them."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+
+from gmmtorch.errors import DataError
+from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.messages.record_messages import (
+    RECORD_BYTES,
+    CorrectionMessage,
+    RecordMessage,
+    SupersessionMessage,
+    TotalsMessage,
+    encode_record,
+)
+from gmmtorch.sharing.replica.changes import ChangeLog, Changes
+from gmmtorch.sharing.replica.component_table import ComponentTable, fingerprints, most_sightings
+from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.materialized_view import corrected, with_gains
+from gmmtorch.sharing.replica.record_keys import keys_of, robot_of
+from gmmtorch.sharing.replica.rejections import RefusedError
+
+MOST_SIGHTINGS = 48
+"""Of a component: so one by itself fits into `RECORD_BYTES`, and can be passed on."""
+MOST_COMPONENTS = 1 << 20
+MOST_OTHERS = 1 << 12
+"""Records that are no components."""
+MOST_ENTRIES = 1 << 19
+"""Of these records, all together: totals, and intervals; 16 bytes each, of totals twice. So 16 MiB: eight
+thousand totals of each of 64 robots."""
+MOST_INTERVALS = 1 << 14
+"""Of what is held, and of what supersessions that wait may add: more than a team leaves where datagrams are
+lost, and a bound on memory."""
+_PIECE = 128
+"""Components of a batch that is restored: dropping one costs as much as its batch is large."""
+
+_Record = TypeVar("_Record", bound=RecordMessage)
+
+
+class Records:
+    """All that a robot knows of a shared map: a set of records that only grows.
+
+    held: every key that is or was here, and every one that is superseded: what need not be sent here.
+    A supersession takes effect where all of its successors are held. Its old records are forgotten at
+    once then, as who lacks them needs only the supersession and the successors, which are here. So
+    what counts depends on what is held, and not on the order in which it came.
+
+    There is room for so much of what others say; what the robot itself says is never refused for want of it.
+
+    dim: 2 or 3; None: that of the first components.
+    """
+
+    def __init__(self, dim: int | None = None, most_components: int = MOST_COMPONENTS) -> None:
+        self.dim = self._dim_asked = dim
+        self._most = most_components
+        self.held = Intervals.empty()
+        self.dead = Intervals.empty()
+        self.table = ComponentTable(dim or 3)
+        self.totals = Totals()
+        self.others: dict[int, RecordMessage] = {}
+        self.datagrams: dict[int, bytes] = {}  # of the others, as all robots write them
+        self.version = 0
+        """Rises with every change."""
+        self._kinds: dict[type, dict[int, RecordMessage]] = {}  # the others by kind
+        self._n_entries = 0  # of the others
+        self._waiting: dict[int, SupersessionMessage] = {}  # for successors
+        self._log = ChangeLog()
+        self._view: tuple[int, Components] | None = None
+
+    # -- growing ----------------------------------------------------------------------------------
+
+    def add_components(self, components: Components, bounded: bool = True) -> Intervals:
+        """Take in components that are on the codec's lattice; returns their keys. All or none.
+
+        bounded: whether only as far as there is room.
+
+        Raises `RefusedError`: "conflict", where a key is held with other content; "full"; "unfit", where they
+        are of another dimension, or seen from more than `MOST_SIGHTINGS` places.
+        """
+        keys = keys_of(components.ids)
+        if not len(keys):
+            return Intervals.empty()
+        if components.dim != (self.dim or components.dim) or most_sightings(components) > MOST_SIGHTINGS:
+            raise RefusedError(
+                "unfit",
+                robot_of(int(keys[0])),
+                f"Components in {components.dim}D, seen from up to {most_sightings(components)} places; "
+                f"this map is in {self.dim or components.dim}D, and {MOST_SIGHTINGS} places are the most.",
+            )
+        fresh = ~self.held.contains(keys)
+        if not fresh.all():
+            self._check_same(keys[~fresh], components.selected(torch.from_numpy(np.flatnonzero(~fresh))))
+            components = components.selected(torch.from_numpy(np.flatnonzero(fresh)))
+        if bounded and len(self.table) + len(components) > self._most:
+            raise _full(int(keys[0]))
+        added = Intervals.of(keys[fresh])
+        held = self._with(added, bounded)
+        self.table.add(keys[fresh], components)
+        self._hold(held)
+        self.dim = components.dim
+        return added if fresh.all() else Intervals.of(keys)
+
+    def add_record(self, record: RecordMessage, bounded: bool = True) -> Intervals:
+        """Take in another record; returns its key. Raises `RefusedError`, as `add_components` does."""
+        key, robot, datagram = record.key, robot_of(record.key), encode_record(record)
+        span = Intervals.span(key, key + 1)
+        if key in self.held:
+            if key in self.table or self.datagrams.get(key, datagram) != datagram:
+                raise _conflict(key)
+            return span
+        unfit = isinstance(record, CorrectionMessage) and record.dim != (self.dim or record.dim)
+        if unfit or len(datagram) > RECORD_BYTES:
+            raise RefusedError(
+                "unfit", robot, f"Record {key} is too long, or of another dimension than this map."
+            )
+        if bounded and not self._has_room(record):
+            raise _full(key)
+        held = self._with(span, bounded)
+        self.others[key], self.datagrams[key] = record, datagram
+        self._kinds.setdefault(type(record), {})[key] = record
+        self._n_entries += _n_entries(record)
+        if isinstance(record, SupersessionMessage):
+            self._waiting[key] = record
+        elif isinstance(record, TotalsMessage):
+            self.totals.add(record)
+            self._log.counted(record.components)
+        else:
+            self._moved(record)
+        self._hold(held)
+        return span
+
+    def _has_room(self, record: RecordMessage) -> bool:
+        if len(self.others) >= MOST_OTHERS or self._n_entries + _n_entries(record) > MOST_ENTRIES:
+            return False
+        if not isinstance(record, SupersessionMessage):
+            return True
+        waiting = sum(len(one.old) for one in self._waiting.values())
+        return len(self.held) + waiting + len(record.old) <= MOST_INTERVALS
+
+    def _with(self, added: Intervals, bounded: bool) -> Intervals:
+        """What is held then, if there is room."""
+        held = self.held | added
+        if bounded and len(held) > max(len(self.held), MOST_INTERVALS):
+            raise _full(added.pairs()[0][0])
+        return held
+
+    def _check_same(self, keys: Ints, again: Components) -> None:
+        """Components of keys (K,) that are held already have come again."""
+        for key, print_ in zip(keys.tolist(), fingerprints(again), strict=True):
+            if key in self.others or (key in self.table and self.table.print_of(key) != print_):
+                raise _conflict(key)
+
+    def _hold(self, held: Intervals) -> None:
+        """Hold what was held and more, and forget what is superseded by it."""
+        if held == self.held:
+            return
+        self.version += 1
+        here, buried = held, Intervals.empty()
+        while ready := [s for s in self._waiting.values() if held.covers(s.new)]:
+            for supersession in ready:
+                del self._waiting[supersession.key]
+                buried |= supersession.old
+            held |= buried
+        if buried:
+            self._bury((here & buried) - self.dead)
+        self.held, self.dead = held, self.dead | buried
+
+    def _bury(self, gone: Intervals) -> None:
+        """Forget these records, which are here."""
+        keys = gone.numbers()
+        shapes = self.table.holds(keys)
+        if shapes.any():
+            self.table.drop(keys[shapes])
+            self._log.broken()
+        totals = []
+        for key in keys[~shapes].tolist():
+            record = self.others.pop(key)
+            del self.datagrams[key], self._kinds[type(record)][key]
+            self._n_entries -= _n_entries(record)
+            self._waiting.pop(key, None)
+            if isinstance(record, TotalsMessage):
+                totals.append(record)
+                self._log.counted(record.components)
+            elif isinstance(record, CorrectionMessage):
+                self._moved(record)
+        self.totals.drop(totals)
+
+    def _moved(self, correction: CorrectionMessage) -> None:
+        """A correction has come, or has gone."""
+        if (correction.moved & self.held) - self.dead:
+            self._log.broken()
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def of(self, kind: type[_Record]) -> list[_Record]:
+        """The records of a kind that count, by key."""
+        found = self._kinds.get(kind, {})
+        return [cast(_Record, found[key]) for key in sorted(found)]
+
+    def effective(self) -> list[SupersessionMessage]:
+        """Supersessions whose successors are all held."""
+        return [record for record in self.of(SupersessionMessage) if record.key not in self._waiting]
+
+    def live(self) -> Intervals:
+        """Keys whose records are here."""
+        return self.held - self.dead
+
+    def components(self) -> Components:
+        """All components that count, by key, with all counts, where they belong."""
+        if self._view is None or self._view[0] != self.version:
+            keys = self.table.keys()
+            if not len(keys):
+                return Components.empty(self.dim or 3)
+            gain = torch.from_numpy(self.totals.sums(keys))
+            plain = with_gains(self.table.taken(keys), gain)
+            self._view = self.version, corrected(plain, keys, self.of(CorrectionMessage))
+        return self._view[1]
+
+    def changes(self) -> Changes:
+        """What has come to be known since the last call."""
+        return self._log.taken(self.table, self.totals, self.of(CorrectionMessage))
+
+    def break_off(self) -> None:
+        """Whoever follows the changes has to start over."""
+        self._log = ChangeLog(rebuilt=True)
+
+    def digest(self) -> bytes:
+        """16 bytes: equal if all that is held, and all that counts, is equal to the bit."""
+        digest = hashlib.blake2b(self.held.edges.astype("<i8").tobytes(), digest_size=16)
+        keys = self.table.keys()
+        names = keys.astype("<i8").tobytes()
+        for row, print_ in enumerate(self.table.prints(keys.tolist())):
+            digest.update(names[8 * row : 8 * row + 8] + print_)
+        for key in sorted(self.others):
+            digest.update(self.datagrams[key])
+        return digest.digest()
+
+    # -- keeping ----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        keys = self.table.keys()
+        components = self.table.taken(keys) if len(keys) else Components.empty(self.dim or 3)
+        datagrams = [self.datagrams[key] for key in sorted(self.others)]
+        return {
+            "dim": self.dim,
+            "held": self.held.stored(),
+            "components": dict(vars(components)),
+            "record_bytes": torch.tensor([len(datagram) for datagram in datagrams], dtype=torch.int64),
+            "records": torch.frombuffer(bytearray(b"".join(datagrams) or b"\0"), dtype=torch.uint8),
+            "log": self._log.state(self.table),
+        }
+
+    def restore(self, state: dict[str, Any], robot: int) -> None:
+        """Hold what `state` says, of this robot and others. Raises `DataError` where it is damaged, of
+        another dimension, or has more components of others than there is room for; nothing has changed then.
+        """
+        if None not in (asked := self._dim_asked, dim := state["dim"]) and asked != dim:
+            raise DataError(f"The state is of a map in {dim}D, this is one with dim={asked}.")
+        fresh = Records(asked if dim is None else dim, self._most)
+        fresh._dim_asked = asked
+        components = Components(**state["components"]).checked()
+        if (n := int((components.ids[:, 0] != robot).sum())) > self._most:
+            raise DataError(f"The state has {n} components of others, with most_components={self._most}.")
+        if fingerprints(quantized(components)) != fingerprints(components):
+            raise DataError("Components are not as the codec leaves them: the state is damaged.")
+        keys, log = keys_of(components.ids), state["log"]
+        untold = [batch.numpy() for batch in log["keys"].split(log["sizes"].tolist())]
+        if not np.isin(log["keys"].numpy(), keys).all():
+            raise DataError("Components that came are not there: the state is damaged.")
+        told = np.flatnonzero(~np.isin(keys, log["keys"].numpy()))
+        pieces = [told[begin : begin + _PIECE] for begin in range(0, len(told), _PIECE)]
+        row_of = dict(zip(keys.tolist(), range(len(keys)), strict=True))
+        pieces += [np.array([row_of[key] for key in batch.tolist()], np.int64) for batch in untold]
+        for piece in pieces:
+            fresh.add_components(components.selected(torch.from_numpy(piece)), bounded=False)
+        data, at = state["records"].numpy().tobytes(), 0
+        for n_bytes in state["record_bytes"].tolist():
+            fresh.add_record(_record(data[at : at + n_bytes]), bounded=False)
+            at += n_bytes
+        held = fresh.held | Intervals.loaded(state["held"])
+        fresh.dead = held - fresh.live()
+        fresh._hold(held)
+        fresh._log = ChangeLog.restored(log, len(pieces) - len(untold))
+        fresh.version = self.version + 1
+        fresh._view = None
+        vars(self).update(vars(fresh))
+
+
+def _n_entries(record: RecordMessage) -> int:
+    """How much of `MOST_ENTRIES` a record takes."""
+    if isinstance(record, TotalsMessage):
+        return len(record.components)
+    if isinstance(record, SupersessionMessage):
+        return len(record.old) + len(record.new)
+    return len(record.moved)
+
+
+def _record(datagram: bytes) -> RecordMessage:
+    message = decode(datagram)
+    if not isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+        raise DataError("A record is none: the state is damaged.")
+    return message
+
+
+def _conflict(key: int) -> RefusedError:
+    robot = robot_of(key)
+    return RefusedError(
+        "conflict",
+        robot,
+        f"Record {key} of robot {robot} has come with two contents: two robots say that they are "
+        f"robot {robot}. Give each a number of its own.",
+    )
+
+
+def _full(key: int) -> RefusedError:
+    return RefusedError("full", robot_of(key), f"Record {key} would take more memory than a map is allowed.")

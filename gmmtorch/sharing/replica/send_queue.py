@@ -1,0 +1,77 @@
+"""Datagrams of the records that are due, in the order in which they matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from gmmtorch.mapping.codec.quantization import quantize
+from gmmtorch.sharing.messages.component_messages import fitted
+from gmmtorch.sharing.messages.record_messages import TotalsMessage
+from gmmtorch.sharing.replica.anti_entropy import Packet
+from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.materialized_view import information
+from gmmtorch.sharing.replica.record_keys import keys_of, lives
+from gmmtorch.sharing.replica.records import Records
+
+_RUN = 96
+"""Components with consecutive numbers that go, or wait, together: about a datagram."""
+
+
+def packets(
+    records: Records, due: Intervals, ready: Sequence[Packet], max_bytes: int, by_information: bool
+) -> Iterator[Packet]:
+    """What supersedes or moves others, then components, then counts; of components those that are `ready` as
+    they are. What is due is not superseded.
+
+    Components go by their keys, which takes the fewest bytes; or the most informative first, by short
+    runs of consecutive keys, which takes few more.
+    """
+    due &= records.held
+    if not due:
+        return
+    ready = [packet for packet in ready if len(packet[0]) <= max_bytes and due.covers(packet[1])]
+    for _, keys in ready:
+        due -= keys
+    numbers = due.numbers()
+    shapes = records.table.holds(numbers)
+    others = [records.others[key] for key in numbers[~shapes].tolist()]
+    for record in others:
+        if not isinstance(record, TotalsMessage):
+            yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
+    for run in _in_order(records, numbers[shapes], ready, by_information):
+        if isinstance(run, tuple):
+            yield run
+        else:
+            for datagram, part in fitted(quantize(records.table.taken(run)), max_bytes):
+                yield datagram, Intervals.of(keys_of(part.ids))
+    for record in others:
+        if isinstance(record, TotalsMessage):
+            yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
+
+
+def _in_order(
+    records: Records, keys: Ints, ready: Sequence[Packet], by_information: bool
+) -> list[Packet | Ints]:
+    """Packets that are ready, and runs of the other keys, in the order in which they go."""
+    runs = _runs(keys, _RUN if by_information else None)
+    found: list[Packet | Ints] = [*ready, *runs]
+    members = [*(packet[1].numbers() for packet in ready), *runs]
+    if by_information:
+        rank = [-float(information(records.table.taken(one)).sum()) for one in members]
+    else:
+        rank = [float(one[0]) for one in members]
+    return [found[row] for row in np.argsort(np.array(rank), kind="stable")]
+
+
+def _runs(keys: Ints, most: int | None) -> list[Ints]:
+    """Rising keys (N,) in runs of one life each; where `most` is given, of so many consecutive ones."""
+    if not len(keys):
+        return []
+    breaks = np.diff(lives(keys)) != 0  # their sequences are far apart: together they take many bits
+    if most is not None:
+        breaks |= np.diff(keys) != 1
+    parts = np.split(keys, np.flatnonzero(breaks) + 1)
+    step = most or len(keys)
+    return [part[begin : begin + step] for part in parts for begin in range(0, len(part), step)]

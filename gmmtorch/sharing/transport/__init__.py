@@ -1,0 +1,1 @@
+"""How datagrams travel: a simulated network, UDP and Zenoh, with encryption."""

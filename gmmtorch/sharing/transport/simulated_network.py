@@ -1,0 +1,289 @@
+"""Networks that carry datagrams between robots: what any transport offers, and a simulated one."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import torch
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.sharing.messages.envelope import MAX_BYTES
+from gmmtorch.sharing.transport.link_conditions import LinkConditions
+
+HEADER_BYTES = 28
+"""Of a datagram on the wire: 20 of IPv4, 8 of UDP."""
+
+_OTHER_SEED = 0x5851F42D4C957F2D  # makes other numbers of the same seed
+
+
+class Transport(Protocol):
+    """What a mission needs of a network. Datagrams may be lost, but are never changed."""
+
+    def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
+        """Broadcast datagrams at the time `now` (s); `kind` says what they are, for the books."""
+
+    def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
+        """(sender, datagram) of all that has come to a robot up to `now` and was not delivered before."""
+        ...
+
+
+class Traffic(NamedTuple):
+    """What has been sent, each broadcast counted once, however many hear it."""
+
+    datagrams: int = 0
+    bytes: int = 0
+
+    @property
+    def wire_bytes(self) -> int:
+        """With the headers of UDP and IPv4."""
+        return self.bytes + HEADER_BYTES * self.datagrams
+
+
+class Reception(NamedTuple):
+    """What became of the datagrams of others on their way to a receiver.
+
+    datagrams, bytes: delivered, copies among them. duplicated: second copies that the network made. lost,
+    cut_off (by a partition), out_of_reach: what will never come. With what is still on its way,
+
+        sent by others + duplicated = datagrams + lost + cut_off + out_of_reach + in flight.
+    """
+
+    datagrams: int = 0
+    bytes: int = 0
+    duplicated: int = 0
+    lost: int = 0
+    cut_off: int = 0
+    out_of_reach: int = 0
+
+
+class _Arrival(NamedTuple):
+    """A datagram on its way to one robot; sorted by time, then in the order of sending."""
+
+    time: float
+    order: int
+    sender: int
+    datagram: bytes
+
+
+class Network:
+    """A simulated broadcast network of `n_robots`, whose links are all as `conditions` say.
+
+    A sender's datagrams leave one after another, each taking its bytes on the wire over `bandwidth`; what
+    is sent faster than that waits its turn, without limit. To each other robot a datagram then comes
+    `latency` and an exponential time of mean `jitter` after it has left, and, with probability
+    `duplication`, a second time, as late as chance makes it; or never, if that robot
+
+    1. is out of `reach` of the sender when `send` is called;
+    2. is cut off: a partition is in force between them at any time from when the datagram begins to leave
+       to when it would arrive, so what is in the air at the cut is lost. Of two copies the second may be
+       cut off alone; a datagram whose first copy is cut off has no second;
+    3. loses it, with probability `loss`.
+
+    A sender's datagrams come in order without jitter, and with it overtake one another wherever the later
+    one is less late by more than lies between them. Draws of loss have a generator of their own, so the
+    same `seed` loses the same whatever else the conditions are. What is delivered is forgotten.
+    """
+
+    def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:
+        """conditions: as they are by default, if None. seed: of all that is drawn."""
+        self.n_robots = check_whole("n_robots", n_robots, 1)
+        self.conditions = LinkConditions() if conditions is None else conditions
+        self.conditions.check_team(self.n_robots)
+        seed = check_whole("seed", seed, 0)
+        self._losses = torch.Generator().manual_seed(seed)
+        self._delays = torch.Generator().manual_seed(seed ^ _OTHER_SEED)
+        self._busy_until = [-math.inf] * self.n_robots
+        self._queues: list[list[_Arrival]] = [[] for _ in range(self.n_robots)]
+        self._positions: list[list[float]] | None = None
+        self._n_sent = 0
+        self._traffic: dict[tuple[int, str], Traffic] = {}
+        self._received: list[Counter[str]] = [Counter() for _ in range(self.n_robots)]
+
+    def place(self, positions: torch.Tensor) -> None:
+        """Say where the robots are from now on, (n_robots, D), metres; `reach` needs it, nothing else."""
+        if positions.ndim != 2 or len(positions) != self.n_robots or not positions.isfinite().all():
+            raise InvalidArgumentError(
+                f"positions of shape {tuple(positions.shape)} must be finite metres, one row for each of "
+                f"{self.n_robots} robots."
+            )
+        self._positions = positions.double().tolist()
+
+    def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
+        """Broadcast datagrams of at most 1200 bytes at the time `now` (s); see `Transport`."""
+        self._check("sender", sender, now)
+        for data in datagrams:
+            if not isinstance(data, bytes) or len(data) > MAX_BYTES:
+                size = f"{len(data)} bytes" if isinstance(data, bytes) else type(data).__name__
+                raise InvalidArgumentError(f"A datagram is {size}; it must be bytes, {MAX_BYTES} at most.")
+        others = [robot for robot in range(self.n_robots) if robot != sender]
+        near = self._near(sender, others)
+        for data in datagrams:
+            begin, left = self._transmission(sender, len(data), now)
+            lost = self.conditions.draw_losses(len(others), self._losses)
+            delays = self.conditions.draw_delays(len(others), self._delays)
+            for robot, is_near, is_lost, times in zip(others, near, lost, delays, strict=True):
+                copies = [_Arrival(left + time, self._n_sent, sender, data) for time in times]
+                self._carry(copies, robot, begin, is_near, is_lost)
+            self._n_sent += 1
+        before = self._traffic.get((sender, kind), Traffic())
+        n_bytes = sum(map(len, datagrams))
+        self._traffic[sender, kind] = Traffic(before.datagrams + len(datagrams), before.bytes + n_bytes)
+
+    def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
+        """(sender, datagram) in the order of arrival, at equal times in that of sending; see `Transport`."""
+        self._check("robot", robot, now)
+        queue, delivered = self._queues[robot], []
+        while queue and queue[0].time <= now:
+            arrival = heapq.heappop(queue)
+            delivered.append((arrival.sender, arrival.datagram))
+        self._received[robot]["datagrams"] += len(delivered)
+        self._received[robot]["bytes"] += sum(len(data) for _, data in delivered)
+        return delivered
+
+    def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
+        """What has been sent, of one sender or all, of one kind or all."""
+        chosen = [
+            traffic
+            for (who, what), traffic in self._traffic.items()
+            if sender in (None, who) and kind in (None, what)
+        ]
+        return Traffic(sum(t.datagrams for t in chosen), sum(t.bytes for t in chosen))
+
+    def reception(self, robot: int | None = None) -> Reception:
+        """Of what was sent to one robot, or to all: there each broadcast counts for every receiver."""
+        if robot is not None:
+            self._check("robot", robot)
+        chosen = self._received if robot is None else [self._received[robot]]
+        return Reception(*(sum(books[field] for books in chosen) for field in Reception._fields))
+
+    @property
+    def n_datagrams(self) -> int:
+        return self.traffic().datagrams
+
+    @property
+    def n_bytes(self) -> int:
+        """Of all datagrams, without headers."""
+        return self.traffic().bytes
+
+    @property
+    def n_wire_bytes(self) -> int:
+        """Of all datagrams, with the headers of UDP and IPv4."""
+        return self.traffic().wire_bytes
+
+    @property
+    def bytes_by_kind(self) -> dict[str, int]:
+        """Bytes without headers, by the kind that the senders gave, sorted."""
+        return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
+
+    def books(self, robot: int) -> dict[str, Any]:
+        """What one robot has sent and received, for results; the names are those of a real transport's."""
+        sent, got = self.traffic(robot), self.reception(robot)
+        kinds = sorted(kind for who, kind in self._traffic if who == robot)
+        return {
+            "bytes_sent": sent.bytes,
+            "datagrams": sent.datagrams,
+            "bytes_by_kind": {kind: self.traffic(robot, kind).bytes for kind in kinds},
+            "wire_bytes": sent.wire_bytes,
+            "wire_bytes_received": Traffic(got.datagrams, got.bytes).wire_bytes,
+            "refused": {},
+            "failures": {},
+            "dropped": 0,
+            "namesakes": {},
+        }
+
+    @property
+    def n_in_flight(self) -> int:
+        """Datagrams on their way, one for each robot that will hear it."""
+        return sum(map(len, self._queues))
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs: what is on its way, the books, positions, and the generators."""
+        arrivals = [(robot, arrival) for robot, queue in enumerate(self._queues) for arrival in sorted(queue)]
+        datagrams = {arrival.order: arrival.datagram for _, arrival in arrivals}
+        return {
+            "losses": self._losses.get_state(),
+            "delays": self._delays.get_state(),
+            "positions": self._positions,
+            "busy_until": torch.tensor(self._busy_until, dtype=torch.float64),
+            "n_sent": self._n_sent,
+            "traffic": [[sender, kind, *traffic] for (sender, kind), traffic in self._traffic.items()],
+            "received": [list(self.reception(robot)) for robot in range(self.n_robots)],
+            "payload": torch.frombuffer(bytearray(b"".join(datagrams.values()) + b"\0"), dtype=torch.uint8),
+            "datagrams": [[order, len(data)] for order, data in datagrams.items()],
+            "arrivals": [[robot, a.time, a.order, a.sender] for robot, a in arrivals],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state` of a network with as many robots, and the same conditions."""
+        busy_until = state["busy_until"].tolist()
+        if len(busy_until) != self.n_robots:
+            raise InvalidArgumentError(
+                f"state is of {len(busy_until)} robots; this network has n_robots={self.n_robots}."
+            )
+        payload, datagrams, begin = bytes(state["payload"].numpy()), {}, 0
+        for order, size in state["datagrams"]:
+            datagrams[order] = payload[begin : begin + size]
+            begin += size
+        queues: list[list[_Arrival]] = [[] for _ in range(self.n_robots)]
+        for robot, time, order, sender in state["arrivals"]:
+            queues[robot].append(_Arrival(time, order, sender, datagrams[order]))
+        self._queues = queues  # each was sorted, so it is a heap
+        self._busy_until, self._n_sent = busy_until, state["n_sent"]
+        self._traffic = {(sender, kind): Traffic(n, size) for sender, kind, n, size in state["traffic"]}
+        self._received = [
+            Counter(dict(zip(Reception._fields, counts, strict=True))) for counts in state["received"]
+        ]
+        self._positions = state["positions"]
+        self._losses.set_state(state["losses"])
+        self._delays.set_state(state["delays"])
+
+    def _near(self, sender: int, others: Sequence[int]) -> list[bool]:
+        """Whether each of the others is in reach."""
+        reach, positions = self.conditions.reach, self._positions
+        if reach is None:
+            return [True] * len(others)
+        if positions is None:
+            raise InvalidArgumentError(f"reach={reach} m needs positions; call place() before send().")
+        return [math.dist(positions[sender], positions[robot]) <= reach for robot in others]
+
+    def _transmission(self, sender: int, n_bytes: int, now: float) -> tuple[float, float]:
+        """When a datagram begins to leave its sender, and has left."""
+        if self.conditions.bandwidth is None:
+            return now, now
+        begin = max(now, self._busy_until[sender])
+        self._busy_until[sender] = begin + (n_bytes + HEADER_BYTES) / self.conditions.bandwidth
+        return begin, self._busy_until[sender]
+
+    def _carry(
+        self, copies: list[_Arrival], receiver: int, begin: float, is_near: bool, is_lost: bool
+    ) -> None:
+        """Queue what will come of the copies of a datagram that leaves at `begin`; book the rest."""
+        books, (first, *second) = self._received[receiver], copies
+
+        def cut(copy: _Arrival) -> bool:
+            return self.conditions.cut(copy.sender, receiver, begin, copy.time)
+
+        if not is_near:
+            books["out_of_reach"] += 1
+        elif cut(first):
+            books["cut_off"] += 1
+        elif is_lost:
+            books["lost"] += 1
+        else:
+            heapq.heappush(self._queues[receiver], first)
+            for copy in second:
+                books["duplicated"] += 1
+                if cut(copy):
+                    books["cut_off"] += 1
+                else:
+                    heapq.heappush(self._queues[receiver], copy)
+
+    def _check(self, name: str, robot: int, now: float = 0.0) -> None:
+        if check_whole(name, robot, 0) >= self.n_robots:
+            raise InvalidArgumentError(f"{name}={robot} must be below n_robots={self.n_robots}.")
+        if not math.isfinite(now):
+            raise InvalidArgumentError(f"now={now} must be a finite time in seconds.")

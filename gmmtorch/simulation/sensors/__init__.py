@@ -1,0 +1,1 @@
+"""Simulated range sensors: laser, lidar and depth camera, and the paths they move along."""

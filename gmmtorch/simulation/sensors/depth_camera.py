@@ -1,0 +1,161 @@
+"""DepthCamera: the forward-looking depth camera of a flying robot, and the frames that it takes.
+
+World frame: metres, z up. Camera frame: x forward along the heading, y left, z up, at the robot's centre;
+the camera turns with the robot's yaw alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.scan import Scan
+from gmmtorch.simulation.sensors.range_sensors import pixel_rays
+from gmmtorch.simulation.worlds.mesh_world import MeshWorld
+
+_CLOSEST_READING = 1e-3
+_TEAMMATE_MARGIN = 0.05
+"""Metres around a teammate in which nothing is believed: its outline is no sharper than that."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """What one depth image says, world frame, metres.
+
+    origin: (3,) the camera's centre. ends: (N, 3) float64, where beams end. is_hit: (N,) bool, the beam
+    ended at a surface; else it met nothing up to its end. pixel: (N,) int64 rising, row-major index from
+    the top left of the image; beams that say nothing are absent.
+    """
+
+    origin: Tensor
+    ends: Tensor
+    is_hit: Tensor
+    pixel: Tensor
+
+    def scan(self) -> Scan:
+        """The frame as a scan: surfaces, and ends of free beams."""
+        return Scan(self.ends[self.is_hit], self.origin, self.ends[~self.is_hit])
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A pinhole depth camera whose noise grows with the square of depth, as triangulation's does.
+
+    Attributes:
+        width, height: pixels, evenly spaced on the image plane.
+        horizontal_fov, vertical_fov: angles (rad) from edge to edge of the image, below π.
+        max_range: what lies at this distance (m) along a beam, or beyond, is not seen.
+        noise: a depth of z metres along the optical axis has standard deviation noise · z² metres.
+        dropout: share of the pixels that yield nothing.
+
+    Raises `InvalidArgumentError` for values without meaning, such as a camera with no field of view.
+    """
+
+    width: int = 160
+    height: int = 120
+    horizontal_fov: float = 1.5184
+    vertical_fov: float = 1.0123
+    max_range: float = 6.0
+    noise: float = 0.0015
+    dropout: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_whole("width", self.width, 1)
+        check_whole("height", self.height, 1)
+        for name in ("horizontal_fov", "vertical_fov"):
+            if not 0 < getattr(self, name) < math.pi:
+                raise InvalidArgumentError(
+                    f"{name}={getattr(self, name)} must be an angle above 0 and below π radians: "
+                    "a camera needs a field of view."
+                )
+        if not (math.isfinite(self.max_range) and self.max_range > _CLOSEST_READING):
+            raise InvalidArgumentError(
+                f"max_range={self.max_range} must be a distance above {_CLOSEST_READING} metres."
+            )
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise InvalidArgumentError(f"noise={self.noise} must be zero or more, metres per square metre.")
+        if not 0 <= self.dropout < 1:
+            raise InvalidArgumentError(f"dropout={self.dropout} must be a share of the pixels in [0, 1).")
+
+    @cached_property
+    def directions(self) -> Tensor:
+        """Unit vectors (height · width, 3) of the beams in the camera frame, row by row from the top left."""
+        focal = (
+            self.width / 2 / math.tan(self.horizontal_fov / 2),
+            self.height / 2 / math.tan(self.vertical_fov / 2),
+        )
+        return pixel_rays(self.width, self.height, focal)
+
+    def sense(
+        self,
+        world: MeshWorld,
+        pose: Tensor,
+        others: Tensor,
+        radius: float,
+        generator: torch.Generator,
+    ) -> DepthFrame:
+        """The frame taken at a pose.
+
+        A beam of range r and depth z is off by noise · z² · r/z. Readings of `max_range` or more become
+        beams that met nothing up to there. Dropped beams are absent, and so are those that reach a
+        teammate before anything else. The same number of random draws is spent whatever is seen.
+
+        Args:
+            pose: (4,) x, y, z, yaw. others: (M, 3) centres of the teammates' bodies.
+            radius: of a teammate's body (m).
+        """
+        _check_finite("pose", pose, (4,))
+        _check_finite("others", others, (len(others), 3))
+        origin, directions = pose[:3].double(), self._turned(float(pose[3]))
+        error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
+        kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
+        truth = world.distances(origin, directions, threads=torch.get_num_threads())
+        reach = truth.clamp_max(self.max_range)
+        reading = reach + error * reach.square() * self.directions[:, 0]  # z = r · directions[:, 0]
+        is_hit = (truth < self.max_range) & (reading < self.max_range)
+        reading = torch.where(is_hit, reading.clamp_min(_CLOSEST_READING), self.max_range)
+        if len(others):
+            kept &= _distance_to_spheres(others - origin, radius + _TEAMMATE_MARGIN, directions) >= reach
+        pixel = kept.nonzero().squeeze(1)
+        ends = torch.addcmul(origin, directions[pixel], reading[pixel, None])
+        return DepthFrame(origin, ends, is_hit[pixel], pixel)
+
+    def image(self, frame: DepthFrame) -> Tensor:
+        """Depth (height, width), metres along the optical axis, of a frame that this camera took.
+
+        Infinite where a beam met nothing, NaN where it says nothing.
+        """
+        depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64)
+        reading = (frame.ends - frame.origin).norm(dim=1) * self.directions[frame.pixel, 0]
+        depth[frame.pixel] = torch.where(frame.is_hit, reading, math.inf)
+        return depth.view(self.height, self.width)
+
+    def _turned(self, yaw: float) -> Tensor:
+        """The beams' directions (N, 3) in the world frame."""
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turn = torch.tensor([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        return self.directions @ turn
+
+
+def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:
+    """Metres (N,) from the origin along directions (N, 3) to the first of spheres at (M, 3), or inf.
+
+    Zero where the origin lies in one.
+    """
+    along = directions @ centers.T
+    distance = centers.square().sum(1)
+    # |t u − c|² = ρ² has the roots t = u·c ± √((u·c)² − |c|² + ρ²).
+    root = along.square() - distance + radius**2
+    meets = (root >= 0) & (along > 0)
+    entry = torch.where(meets, along - root.clamp_min(0).sqrt(), math.inf)
+    return torch.where(distance <= radius**2, 0.0, entry).amin(1)
+
+
+def _check_finite(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
+        raise InvalidArgumentError(f"{name}={value.tolist()} must be finite, of shape {shape}, in metres.")
