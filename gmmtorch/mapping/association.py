@@ -9,9 +9,9 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
+from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import whitening
-from gmmtorch.sorting import number_distinct
 
 _LEAST_DISTANCE = 1e-6  # squared Mahalanobis: at a mean itself the thesis's shares are undefined
 _PAIRS_AT_ONCE = 1 << 20
@@ -70,7 +70,7 @@ def summed(components: Components) -> Components:
     For components that were each seen from one place, of which some rows add counts to others.
     """
     robot, sequence = components.ids.unbind(1)
-    row, n_ids = number_distinct(robot * (int(sequence.max()) + 1 if len(robot) else 1) + sequence)
+    row, n_ids = dense_ranks(robot * (int(sequence.max()) + 1 if len(robot) else 1) + sequence)
     order = torch.arange(len(components), device=row.device)
     first = torch.full_like(order[:n_ids], len(components)).scatter_reduce_(0, row, order, "amin")
     support = components.support.new_zeros(n_ids).index_add_(0, row, components.support)

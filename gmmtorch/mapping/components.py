@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import check_symmetric, safe_cholesky
+from gmmtorch.linalg import argsort, check_symmetric, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.scan import ArrayLike
-from gmmtorch.sorting import argsort
 
 _PER_COMPONENT = ("means", "covariances", "support", "max_range", "ids")
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.files import write_bytes
-from gmmtorch.linalg import check_rigid
+from gmmtorch.linalg import argsort, check_rigid
 from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
@@ -26,7 +26,6 @@ from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
-from gmmtorch.sorting import argsort
 
 Learning = WindowedRule | IncrementalRule
 _KINDS: dict[type[Learning], str] = {WindowedRule: "windowed", IncrementalRule: "incremental"}

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import CUTOFF
 from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
@@ -16,7 +17,6 @@ from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
-from gmmtorch.sorting import number_distinct
 
 _CHUNK_BEAMS = 1 << 14
 
@@ -102,7 +102,7 @@ def _of_beams(
     ray = torch.cat([*(r for _, r in passed), hit])
     ended = torch.zeros_like(ray, dtype=torch.bool)
     ended[ray.shape[0] - hit.shape[0] :] = True
-    number, n_cells = number_distinct(voxel)
+    number, n_cells = dense_ranks(voxel)
     flat = torch.zeros(n_cells, dtype=torch.int64, device=voxel.device).scatter_(0, number, voxel)
     index = torch.stack(
         [flat // stride % size for stride, size in zip(strides.tolist(), shape, strict=True)], 1

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.linalg import count_distinct, dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
-from gmmtorch.sorting import count_distinct, number_distinct
 
 _KEY_BITS = 20  # of a cell's coordinate within its key
 _MOST_CELLS = (1 << _KEY_BITS) - 2  # along the longest side
@@ -40,7 +40,7 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     weight = points.new_ones(n) if weight is None else weight
     if n <= max_cells:
         return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
-    member, n_cells = number_distinct(_cell_keys(points, max_cells, finest))
+    member, n_cells = dense_ranks(_cell_keys(points, max_cells, finest))
     n_features = 1 + points.shape[1] + points.shape[1] * (points.shape[1] + 1) // 2
     sums = points.new_zeros(n_cells, n_features)
     for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):

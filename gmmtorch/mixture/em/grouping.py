@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.linalg import pack_symmetric
+from gmmtorch.linalg import argsort, largest_indices, pack_symmetric
 from gmmtorch.mixture.em.exact import (
     CHUNK_ELEMENTS,
     Parameters,
@@ -18,7 +18,6 @@ from gmmtorch.mixture.em.exact import (
     quadratic_features,
     shift_features,
 )
-from gmmtorch.sorting import argsort, largest
 
 _SAMPLES = 64  # rows of a group asked which components matter, at most
 _BUILD_ROWS = 1 << 18
@@ -137,7 +136,7 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
         score = joint.amax(1)
         own = torch.arange(part.start, part.stop, device=score.device)
         score[own - part.start, own] = torch.inf
-        chosen.append(largest(score, n_candidates))
+        chosen.append(largest_indices(score, n_candidates))
     return torch.cat(chosen)
 
 

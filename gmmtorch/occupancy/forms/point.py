@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import safe_cholesky
+from gmmtorch.linalg import argsort, safe_cholesky
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.forms.radial import tail_moment
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.index.hulls import sum_of
 from gmmtorch.occupancy.protocol import check_queries
-from gmmtorch.sorting import argsort
 
 CHUNK_PAIRS = 1 << 16
 """Pairs of point and cone worked on at once: bounds the memory, not the result."""

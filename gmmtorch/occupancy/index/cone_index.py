@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import argsort, dense_ranks
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.index.hulls import Hulls
-from gmmtorch.sorting import argsort, number_distinct
 
 _ENTRIES_PER_CONE = {2: 64, 3: 512}  # bounds memory and the time to build, in proportion to the map
 _SPAN = 4  # buckets along an axis that a cone's search begins with, at most
@@ -70,7 +70,7 @@ class ConeIndex:
             cone, cell, self.side = _search(hulls, lattice, budget)
         key = self._pack(cell)
         order = argsort(key)
-        bucket, n_buckets = number_distinct(key[order])
+        bucket, n_buckets = dense_ranks(key[order])
         self.entries = cone[order]
         self.starts = torch.zeros(n_buckets + 1, dtype=torch.int64, device=key.device)
         self.starts[1:] = torch.cumsum(torch.bincount(bucket, minlength=n_buckets), 0)
