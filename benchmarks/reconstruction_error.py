@@ -37,7 +37,7 @@ from gmmtorch.evaluation.codecs.point_codecs import Draco, Octree, PointCodec
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.team_setup import assemble, coordination_of
-from gmmtorch.exploration.robot.mapper import Sensed
+from gmmtorch.exploration.robot.mapper import FrameUpdate
 from gmmtorch.exploration.world.world import open_world
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
@@ -77,7 +77,7 @@ class Recorded(Mission):
             mission.watch,
         )
 
-    def _encoded(self, frame: DepthFrame, sensed: Sensed) -> dict[str, int]:
+    def _encoded(self, frame: DepthFrame, sensed: FrameUpdate) -> dict[str, int]:
         for kept, kind in ((self.returns, frame.is_hit), (self.ends, ~frame.is_hit)):
             ends = frame.ends[sensed.novel & kind]
             if len(ends):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.exploration.mission.mission import Mission
-    from gmmtorch.exploration.mission.snapshots import Moment
+    from gmmtorch.exploration.mission.snapshots import Snapshot
     from gmmtorch.exploration.world.world import World
     from gmmtorch.mapping.components import Components
     from gmmtorch.report.exploration.mission_maps import TeamSnapshot
@@ -30,7 +30,7 @@ class MissionRecorder:
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
-        from gmmtorch.exploration.mission.snapshots import Album
+        from gmmtorch.exploration.mission.snapshots import Snapshots
         from gmmtorch.report.exploration.mission_tensorboard import MissionBoard
         from gmmtorch.report.tensorboard_writer import Board
 
@@ -39,7 +39,7 @@ class MissionRecorder:
         self._live = MissionBoard(self._board) if self._board is not None else None
         self._n_told = 0  # samples
         self._components: Components | None = None  # at the mission's end
-        self.album = Album(self._content)
+        self.album = Snapshots(self._content)
 
     def sample(self, mission: Mission) -> None:
         """Take note of a mission that has just noted its own numbers."""
@@ -123,7 +123,7 @@ class MissionRecorder:
             content["cells"] = stored.cells[occupied].int()
         return content
 
-    def _snapshot(self, mission: Mission, moment: Moment, paths: list[Tensor]) -> TeamSnapshot:
+    def _snapshot(self, mission: Mission, moment: Snapshot, paths: list[Tensor]) -> TeamSnapshot:
         """A moment as the picture of the team's map shows it: components within the band of heights."""
         from gmmtorch.report.exploration.mission_maps import TeamSnapshot
 

@@ -138,7 +138,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     from gmmtorch.exploration.mission.options import TeamOptions
     from gmmtorch.exploration.planning.primitives import Dynamics
     from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-    from gmmtorch.exploration.robot.stopping_criterion import RestRule
+    from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
     from gmmtorch.exploration.world.scoring import BeliefRule
     from gmmtorch.mapping.novelty import NoveltyRule
     from gmmtorch.simulation.sensors.depth_camera import DepthCamera
@@ -170,7 +170,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
             coordination=variant.get("coordination", config.coordination),
             n_rounds=config.rounds,
             planning_prior=variant.get("planning_prior", config.planner.prior),
-            rest=RestRule(config.planner.rest),
+            rest=StoppingRule(config.planner.rest),
             codec=variant.get("codec", config.codec),
             **_network(config, variant),
             **{name: variant.get(option, config.network[option]) for option, name in OF_ROBOTS.items()},

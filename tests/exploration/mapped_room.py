@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule, MixtureMapper
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
@@ -38,15 +38,15 @@ def frame(place: tuple[float, ...], yaw: float, seed: int = 0, max_range: float 
     return DepthFrame(origin, origin + depth[:, None] * turned, depth < max_range, torch.arange(len(d)))
 
 
-def mapper(robot: int = 0, codec: str = "replica", memo: Memo | None = None, **options: Any) -> MixtureMapper:
+def mapper(robot: int = 0, codec: str = "replica", memo: Memo | None = None, **options: Any) -> GmmMapper:
     """One with a `Replica`, or with a `Broadcast` in a codec."""
     local = SlidingVoxelMap(0.2, (64, 64, 32))
     local.center_on(torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
-    return MixtureMapper(robot, local, belief, CAMERA.width, NOVELTY, rule, memo, shared)
+    return GmmMapper(robot, local, belief, CAMERA.width, NOVELTY, rule, memo, shared)
 
 
-def heard(*datagrams: bytes, sender: int = 0) -> list[Heard]:
-    return [Heard(sender, datagram, decode(datagram)) for datagram in datagrams]
+def heard(*datagrams: bytes, sender: int = 0) -> list[ReceivedMessage]:
+    return [ReceivedMessage(sender, datagram, decode(datagram)) for datagram in datagrams]

@@ -21,13 +21,13 @@ from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkp
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.agent import Agent
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.initial_free_space import Launch
+from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
@@ -40,7 +40,7 @@ from gmmtorch.sharing.messages.message_registry import (
 from gmmtorch.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
-LAUNCH = Launch(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])
+LAUNCH = InitialFreeSpace(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])
 PRIMITIVES = Primitives(TeamOptions().dynamics)
 EVALUATOR = ViewEvaluator(
     CAMERA.horizontal_fov, CAMERA.vertical_fov, CAMERA.max_range, resolution=0.2, n_beams=20
@@ -181,7 +181,7 @@ def test_whatever_is_sound_is_taken_as_it_is(kind: str) -> None:
         assert bool((part >= 0).all())
     one.learn(frame(*PLACES[1]), 1e3)
     one.survey(1e3)
-    one.propose(1e3, [0, 1, 2, 900], Traffic.of([]))
+    one.propose(1e3, [0, 1, 2, 900], PeerTrajectories.of([]))
     one.tell_plan(1e3, 1)
 
 
@@ -269,7 +269,7 @@ def test_plans_are_of_teammates_who_speak_for_themselves() -> None:
 def fly(one: Agent, now: float, number: int, rests: bool) -> None:
     one.robot.rests = lambda now: rests  # type: ignore[method-assign]
     one.survey(now)
-    one.propose(now, [], Traffic.of([]))
+    one.propose(now, [], PeerTrajectories.of([]))
     one.settle()
     one.tell_plan(now, number)
     one.robot.advance(0, 100)
@@ -304,7 +304,7 @@ def test_a_robot_that_moves_tells_every_plan_and_where_it_comes_to_rest(tmp_path
 def test_a_plan_needs_a_survey() -> None:
     one, _ = agent()
     with pytest.raises(RuntimeError, match="survey"):
-        one.propose(0.0, [], Traffic.of([]))
+        one.propose(0.0, [], PeerTrajectories.of([]))
     one.settle()
     one.tell_plan(0.0, 1)
 

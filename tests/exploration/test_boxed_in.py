@@ -16,22 +16,22 @@ from torch import Tensor
 from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, Waiting, is_boxed_in
 from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.world import World
 
 OPTIONS = replace(
-    SMALL, framework="grid_isolated", size=1, duration=160.0, rate=0.5, rest=RestRule(0.5, window=40.0)
+    SMALL, framework="grid_isolated", size=1, duration=160.0, rate=0.5, rest=StoppingRule(0.5, window=40.0)
 )
 SHUT = 136.0  # seconds
 
 
-def around(place: Tensor) -> Traffic:
+def around(place: Tensor) -> PeerTrajectories:
     """Others on all sides of a place (3,): wherever it leads, a way comes closer to one of them."""
     sides = torch.cat([torch.eye(3), -torch.eye(3)]).double()
-    return Traffic.of([(place + 0.5 * side)[None] for side in sides], 3.0)
+    return PeerTrajectories.of([(place + 0.5 * side)[None] for side in sides], 3.0)
 
 
 # -- one plan ---------------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def test_boxed_in_is_who_can_only_turn() -> None:
     assert is_boxed_in(PRIMITIVES, free.task(generator, around(free.state[:3])))
     tight = seen(Explorer.at(hollow(9, 9, 9), (0.9, 0.9, 0.9, 0.4)))
     tight.start = torch.full((3,), -50.0, dtype=torch.float64)  # nothing is free but what was seen to be
-    assert bool(tight.surroundings().is_passable(tight.state[:3]))
+    assert bool(tight.local_map().is_passable(tight.state[:3]))
     assert is_boxed_in(PRIMITIVES, tight.task(generator))
 
 
@@ -94,8 +94,10 @@ def shut_in(agent: Agent, until: float) -> None:
     """Until then others are on all sides of it."""
     propose = agent.propose
 
-    def boxed(now: float, fixed: Collection[int], traffic: Traffic, since: float | None = None) -> Plan:
-        return propose(now, fixed, around(agent.robot.position) if now < until else traffic, since)
+    def boxed(
+        now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
+    ) -> Plan:
+        return propose(now, fixed, around(agent.robot.position) if now < until else peers, since)
 
     agent.propose = boxed  # type: ignore[method-assign]
 
@@ -134,7 +136,9 @@ def test_who_could_have_flown_rests(world: World) -> None:
     mission = assemble(world, OPTIONS)
     agent = mission.agents[0]
 
-    def stand(now: float, fixed: Collection[int], traffic: Traffic, since: float | None = None) -> Plan:
+    def stand(
+        now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
+    ) -> Plan:
         path = agent.robot.state[None].repeat(PRIMITIVES.dynamics.n_steps, 1)
         agent._plan = Plan(path, path[-1:], path[-1:, :4], 0.0, "explore")
         return agent._plan

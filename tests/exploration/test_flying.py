@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from gmmtorch.exploration.mission.flying import FlyingNode, _ahead
 from gmmtorch.exploration.mission.node import run_paced
 from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.world.world import World
 from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.messages.message_registry import PlanMessage, encode_plan
@@ -103,9 +103,9 @@ def flown_beside(node: FlyingNode, plans: list[PlanMessage], age: float, monkeyp
     seen: dict[str, Any] = {}
     propose = node.agent.propose
 
-    def noted(now: float, fixed: Any, traffic: Traffic, since: float | None = None) -> Any:
-        seen.update(fixed=fixed, traffic=traffic, since=since)
-        return propose(now, fixed, traffic, since)
+    def noted(now: float, fixed: Any, peers: PeerTrajectories, since: float | None = None) -> Any:
+        seen.update(fixed=fixed, peers=peers, since=since)
+        return propose(now, fixed, peers, since)
 
     monkeypatch.setattr(node.agent, "propose", noted)
     for one in plans:
@@ -120,9 +120,9 @@ def test_it_plans_around_what_it_has_heard(world, monkeypatch):
         node = flying(0, world, TEAM, link)
         told = [plan(10, sender=4), plan(3, sender=2)]
         seen = flown_beside(node, told, 0.4, monkeypatch)
-        paths = seen["traffic"].paths
+        paths = seen["peers"].paths
         assert paths[..., 0].tolist() == [[3.0] * 8, [3, 4, 5, 6, 7, 8, 9, 10]]
-        assert seen["traffic"].separation == pytest.approx(0.7)
+        assert seen["peers"].separation == pytest.approx(0.7)
         assert sorted(seen["fixed"]) == [2, 4]
         assert seen["since"] == 48.0
 
@@ -133,8 +133,8 @@ def test_strange_plans_do_not_end_it(world, monkeypatch, strange, age):
     with transports(1) as (link,):
         node = flying(0, world, TEAM, link)
         seen = flown_beside(node, [strange], age, monkeypatch)
-        assert len(seen["traffic"]) == (len(strange.path) > 0)
-        assert seen["traffic"].paths.shape[1] <= 1000
+        assert len(seen["peers"]) == (len(strange.path) > 0)
+        assert seen["peers"].paths.shape[1] <= 1000
 
 
 def test_views_are_told_as_often_as_it_plans_and_no_more(world, monkeypatch):

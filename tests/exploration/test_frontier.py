@@ -10,12 +10,12 @@ from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, RESOLUTION, Explorer
 
 from gmmtorch.exploration.planning.frontier import find_frontiers, frontier_cells
 from gmmtorch.exploration.planning.planners import make_planner
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 NONE = torch.zeros(0, 3, dtype=torch.float64)
 
 
-def half_known() -> Surroundings:
+def half_known() -> LocalMap:
     """An open hall of 8 × 4 × 2 m, of which the half at low x has been seen."""
     observed = torch.zeros(40, 20, 10, dtype=torch.bool)
     observed[:20] = True
@@ -25,7 +25,7 @@ def half_known() -> Surroundings:
     passable = free.clone()
     passable[18:], passable[:3], passable[:, :3], passable[:, -3:] = False, False, False, False
     passable[..., :3], passable[..., -3:] = False, False
-    return Surroundings(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, passable)
+    return LocalMap(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, passable)
 
 
 def test_frontier_cells_are_free_cells_next_to_the_unknown():
@@ -33,7 +33,7 @@ def test_frontier_cells_are_free_cells_next_to_the_unknown():
     observed = torch.rand(7, 6, 5, generator=generator) < 0.6
     free = (torch.rand(7, 6, 5, generator=generator) < 0.5) & observed
     free[0, 0, 0], observed[0, 0, 0] = True, False  # known to be free without having been seen
-    here = Surroundings(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, free)
+    here = LocalMap(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, free)
     found = frontier_cells(here)
     for cell in itertools.product(*(range(n) for n in free.shape)):
         beside = []
@@ -79,7 +79,7 @@ def test_what_was_given_up_is_no_frontier_again():
 def test_nothing_unknown_means_no_frontier():
     here = half_known()
     known = torch.ones_like(here.observed)
-    here = Surroundings(here.low, RESOLUTION, here.occupancy, known, here.free, here.passable)
+    here = LocalMap(here.low, RESOLUTION, here.occupancy, known, here.free, here.passable)
     found = find_frontiers(here, torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64), NONE, 20, 0.4)
     assert [len(values) for values in found] == [0, 0, 0, 0]
 

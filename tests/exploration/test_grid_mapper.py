@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _recent
 from gmmtorch.exploration.robot.mapper import Memo
-from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
@@ -71,8 +71,8 @@ def believed(one: GridMapper) -> Tensor:
     return torch.stack(one.belief.grid.dense(BOX))
 
 
-def heard(*datagrams: bytes, sender: int = 1) -> list[Heard]:
-    return [Heard(sender, datagram, decode(datagram)) for datagram in datagrams]
+def heard(*datagrams: bytes, sender: int = 1) -> list[ReceivedMessage]:
+    return [ReceivedMessage(sender, datagram, decode(datagram)) for datagram in datagrams]
 
 
 def said(view: DepthFrame, sender: int = 1, number: int = 0) -> list[bytes]:

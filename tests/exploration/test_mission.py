@@ -18,7 +18,7 @@ from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.mission_results import row_of, with_times
 from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.world import World
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, cast_evidence
@@ -171,13 +171,13 @@ def test_a_lone_grid_is_the_sum_of_its_frames(world: World, monkeypatch: pytest.
 
 def test_robots_that_learn_too_little_come_to_rest_and_stay_there(world: World) -> None:
     # Nearly all that a window can bring is asked of each: the second is less, and the first was the best.
-    mission = flown(world, replace(SMALL, rest=RestRule(0.99, window=4.0), duration=64.0))
+    mission = flown(world, replace(SMALL, rest=StoppingRule(0.99, window=4.0), duration=64.0))
     assert all(robot.returns.rests for robot in mission.robots)
     for robot, path in zip(mission.robots, mission.trajectories, strict=True):
         assert robot.state[4:].tolist() == [0, 0, 0]
         assert torch.equal(path[-1], path[-4])
         assert not torch.equal(path[0], path[-1])
-    awake = flown(world, replace(SMALL, rest=RestRule(0.0), duration=24.0))
+    awake = flown(world, replace(SMALL, rest=StoppingRule(0.0), duration=24.0))
     assert not any(robot.returns.rests for robot in awake.robots)
 
 

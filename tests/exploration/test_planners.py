@@ -19,7 +19,7 @@ from exploration.voxel_worlds import (
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.global_planner import Journey
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.planning.planners import (
     PLANNERS,
@@ -62,7 +62,7 @@ def test_paths_are_feasible_and_touch_nothing(name, world):
         assert plan.kind in ("explore", "travel", "wait")
         assert not bool(plan.braking[-1, 4:].any())
         start, radius = task.state, PRIMITIVES.dynamics.radius
-        assert bool(feasible(plan.path, plan.braking, task.surroundings, start=start, radius=radius))
+        assert bool(feasible(plan.path, plan.braking, task.local_map, start=start, radius=radius))
         assert explorer.clearance(torch.cat([plan.path, plan.braking])[:, :3]) > 0.3
         explorer.follow(plan)
 
@@ -163,7 +163,9 @@ def test_a_moving_robot_whose_way_is_shut_brakes(name):
     explorer = Explorer.at(hollow(60, 20, 13), (3.0, 2.0, 1.2, 0.0))
     explorer.state[4] = 1.5
     around = torch.tensor([[x, 2.0, 1.2] for x in (1.6, 4.6)], dtype=torch.float64)
-    task = explorer.task(torch.Generator().manual_seed(0), Traffic.of([p[None] for p in around], 3.0))
+    task = explorer.task(
+        torch.Generator().manual_seed(0), PeerTrajectories.of([p[None] for p in around], 3.0)
+    )
     plan = planner_named(name).plan(task)
     assert plan.kind == "wait"
     n = len(plan.braking)

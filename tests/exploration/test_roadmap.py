@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.exploration.planning.geodesic import geodesic
 from gmmtorch.exploration.planning.roadmap import Roadmap, at_the_rim
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 WINDOW = (24, 24, 12)
 
@@ -144,7 +144,7 @@ def test_restored_it_answers_as_before():
 
 
 def test_the_rim_of_a_window():
-    here: Surroundings = surroundings_from(torch.ones(10, 10, 10, dtype=torch.bool), (5, 5, 5))
+    here: LocalMap = surroundings_from(torch.ones(10, 10, 10, dtype=torch.bool), (5, 5, 5))
     points = torch.tensor(
         [[1.1, 2.0, 2.0], [2.0, 2.0, 2.0], [0.9, 2.0, 2.0], [2.0, 2.9, 2.0]], dtype=torch.float64
     )

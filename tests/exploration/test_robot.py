@@ -14,7 +14,7 @@ from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.initial_free_space import Launch
+from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
@@ -50,7 +50,7 @@ def robot(start_radius: float = 0.0) -> Robot:
         0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
     )
     mapper.center_on(START[:3])
-    launch = Launch(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
+    launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
     return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch)
 
 
@@ -163,12 +163,12 @@ def test_a_retreat_takes_its_way_off_the_trail() -> None:
 def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     one = robot()
     everywhere(one, 0.0, 50.0)
-    free = one.surroundings(0.125, 0.3)
+    free = one.local_map(0.125, 0.3)
     wall = torch.tensor([[4.5, 3.1, 1.5], [4.5, 3.3, 1.5]], dtype=torch.float64)
     thin = torch.tensor([[2.1, 3.1, 1.5]], dtype=torch.float64)  # the end of an empty beam
     ends, is_hit = torch.cat([wall, thin]), torch.tensor([True, True, False])
     one._remember(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
-    found = one.surroundings(0.125, 0.3)
+    found = one.local_map(0.125, 0.3)
     taken = free.free & ~found.free
     cells = (wall / 0.2).floor().long()
     assert (taken.nonzero() + found.low).tolist() == cells.tolist()
@@ -181,15 +181,15 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     nothing = DepthFrame(START[:3], ends[2:], is_hit[2:], torch.arange(1))
     for _ in range(20):
         one._remember(nothing)
-    assert not bool(one.surroundings(0.125, 0.3).is_passable(wall).any())
+    assert not bool(one.local_map(0.125, 0.3).is_passable(wall).any())
     elsewhere = DepthFrame(START[:3], wall[:1] + 1.0, is_hit[:1], torch.arange(1))
     for _ in range(12):
         one._remember(elsewhere)
-    assert bool(one.surroundings(0.125, 0.3).is_passable(wall).all())
+    assert bool(one.local_map(0.125, 0.3).is_passable(wall).all())
 
 
 def test_around_the_start_it_is_free_though_nothing_was_seen() -> None:
-    found = robot(start_radius=1.4).surroundings(0.125, 0.3)
+    found = robot(start_radius=1.4).local_map(0.125, 0.3)
     centers = found.centers(found.free.nonzero())
     assert len(centers) > 100
     assert float((centers - START[:3]).norm(dim=1).max()) <= 1.4
@@ -228,7 +228,7 @@ def test_a_restored_robot_goes_on_alike() -> None:
     assert twin.path_length == one.path_length == pytest.approx(4 * 0.3 + 4 * 0.4)
     assert torch.equal(twin.state, one.state)
     assert torch.equal(twin.braking, one.braking)
-    a, b = (each.surroundings(0.125, 0.3) for each in (one, twin))
+    a, b = (each.local_map(0.125, 0.3) for each in (one, twin))
     for name in ("low", "occupancy", "observed", "free", "passable"):
         assert torch.equal(getattr(a, name), getattr(b, name))
     assert torch.equal(one.mapper.belief.grid.dense(BOX)[0], twin.mapper.belief.grid.dense(BOX)[0])
@@ -246,4 +246,4 @@ def test_what_happens_later_does_not_change_a_checkpoint() -> None:
     twin.restore(state)
     assert torch.equal(twin.state, path[3])
     assert twin.path_length == pytest.approx(2 * 0.3 + 2 * 0.4)
-    assert not bool(twin.surroundings(0.125, 0.3).observed.any())
+    assert not bool(twin.local_map(0.125, 0.3).observed.any())

@@ -18,7 +18,7 @@ from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
 from gmmtorch.exploration.planning.geodesic import DistanceField
 from gmmtorch.exploration.planning.goal import Goal
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
@@ -40,7 +40,7 @@ class MadeUp:
     def poses(self, keys: torch.Tensor) -> torch.Tensor:
         return torch.cat([keys[:, :3] * 0.5, keys[:, 3:] * (math.pi / 4)], 1).double()
 
-    def evaluate(self, surroundings, keys: torch.Tensor) -> ViewValues:
+    def evaluate(self, local_map, keys: torch.Tensor) -> ViewValues:
         self.calls.append(keys)
         gain, measured = [], []
         for key in keys.tolist():
@@ -56,8 +56,8 @@ def task_in(
     values = {
         "robot": 0,
         "state": torch.tensor([*position, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64),
-        "surroundings": surroundings_from(passable),
-        "traffic": NOBODY,
+        "local_map": surroundings_from(passable),
+        "peers": NOBODY,
         "residual": torch.ones(N_BLOCKS),
         "library": ViewLibrary(0),
         "roadmap": Roadmap(),
@@ -84,8 +84,8 @@ def all_branches(task: PlanningTask, depth: int) -> list[tuple[int, ...]]:
         for actions, state in level:
             paths = PRIMITIVES.rollout(state[None])
             braking = PRIMITIVES.braking(paths[:, :, -1])
-            traffic = task.traffic.later(10 * step)
-            safe = feasible(paths, braking, task.surroundings, traffic, start=state[None, None])[0]
+            peers = task.peers.later(10 * step)
+            safe = feasible(paths, braking, task.local_map, peers, start=state[None, None])[0]
             following += [((*actions, a), paths[0, a, -1]) for a in safe.nonzero()[:, 0].tolist()]
         found += [actions for actions, _ in following]
         level = following
@@ -208,7 +208,7 @@ def test_the_rest_of_the_last_branch_is_tried_first():
 def test_with_a_goal_it_comes_closer_the_sooner_the_better():
     task = task_in(ROOM, MIDDLE)
     goal_at = torch.tensor([[4.6, 3.4, 1.4]], dtype=torch.float64)
-    goal = Goal(DistanceField.to(task.surroundings, goal_at), weight=2.0, yaw=1.5)
+    goal = Goal(DistanceField.to(task.local_map, goal_at), weight=2.0, yaw=1.5)
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, goal=goal)
     assert found is not None
     assert found.information == 0
@@ -239,7 +239,7 @@ def test_the_cost_to_the_goal_counts_the_way_and_the_turns():
 
 def test_traffic_is_kept_clear_of_when_it_comes():
     other = torch.tensor([[2.9, 2.7, 1.2]], dtype=torch.float64)
-    task = task_in(ROOM, MIDDLE, traffic=Traffic.of([other]))
+    task = task_in(ROOM, MIDDLE, peers=PeerTrajectories.of([other]))
     free = TreeSearch(PRIMITIVES, SearchRule(depth=1, n_rounds=1)).search(
         task_in(ROOM, MIDDLE), Memory(task, MadeUp(0))
     )

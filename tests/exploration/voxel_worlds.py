@@ -10,25 +10,25 @@ from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, surroundings_of
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, local_map_of
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planners import Plan, Planner, PlanningTask
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
 
 RESOLUTION = 0.2
 PRIMITIVES = Primitives(Dynamics())
 EVALUATOR = ViewEvaluator(math.radians(87), math.radians(58), 6.0, RESOLUTION, n_beams=120)
-NOBODY = Traffic.of([])
+NOBODY = PeerTrajectories.of([])
 
 
-def surroundings_from(passable: Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> Surroundings:
-    """Surroundings in which all is known: passable cells are free."""
+def surroundings_from(passable: Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> LocalMap:
+    """LocalMap in which all is known: passable cells are free."""
     known = torch.ones_like(passable)
     occupancy = torch.where(passable, 0.0, 1.0)
-    return Surroundings(torch.tensor(low), RESOLUTION, occupancy, known, passable, passable)
+    return LocalMap(torch.tensor(low), RESOLUTION, occupancy, known, passable, passable)
 
 
 def hollow(nx: int, ny: int, nz: int) -> Tensor:
@@ -104,8 +104,8 @@ class Explorer:
         self.misses[at] += evidence.misses
         self.seen.append(float(((self.hits + self.misses) > 0).float().mean()))
 
-    def surroundings(self) -> Surroundings:
-        return surroundings_of(
+    def local_map(self) -> LocalMap:
+        return local_map_of(
             torch.zeros(3, dtype=torch.int64),
             RESOLUTION,
             self.hits.clone(),
@@ -117,12 +117,12 @@ class Explorer:
             known_free=cells_in_sphere(self.start, 1.3, RESOLUTION),
         )
 
-    def task(self, generator: torch.Generator, traffic: Traffic = NOBODY) -> PlanningTask:
-        surroundings = self.surroundings()
-        self.roadmap.update(surroundings)
+    def task(self, generator: torch.Generator, peers: PeerTrajectories = NOBODY) -> PlanningTask:
+        local_map = self.local_map()
+        self.roadmap.update(local_map)
         n_blocks = math.prod(-(-n // 4) for n in self.solid.shape)
         return PlanningTask(
-            0, self.state, surroundings, traffic, torch.ones(n_blocks), self.library, self.roadmap,
+            0, self.state, local_map, peers, torch.ones(n_blocks), self.library, self.roadmap,
             self.now, generator,
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import BLOCK
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 _EXTENT = 1 << 20  # blocks along each axis that keys can tell apart
 
@@ -29,21 +29,21 @@ class Fatigue:
         self._weights = torch.zeros(0)
         self._when = -math.inf
 
-    def note(self, surroundings: Surroundings, measured: Tensor, now: float) -> None:
+    def note(self, local_map: LocalMap, measured: Tensor, now: float) -> None:
         """What the view from here, measured (G,), claims although it was just taken; once at each time."""
         if now <= self._when:
             return
         self._when = now
         looked = measured > 0
         fresh = 1 - self._decay * measured[looked].cpu()
-        keys = torch.cat([self._keys, _keys(surroundings)[looked.cpu()]])
+        keys = torch.cat([self._keys, _keys(local_map)[looked.cpu()]])
         factors = torch.cat([self._weights, fresh])
         self._keys, row = torch.unique(keys, return_inverse=True)
         self._weights = torch.ones(len(self._keys)).scatter_reduce_(0, row, factors, "prod")
 
-    def weights(self, surroundings: Surroundings) -> Tensor:
+    def weights(self, local_map: LocalMap) -> Tensor:
         """Weights (G,) float32 of the window's blocks."""
-        keys = _keys(surroundings)
+        keys = _keys(local_map)
         if len(self._keys) == 0:
             return torch.ones(len(keys))
         row = torch.searchsorted(self._keys, keys).clamp_max(len(self._keys) - 1)
@@ -58,11 +58,10 @@ class Fatigue:
         self._when = -math.inf if state["when"] is None else float(state["when"])
 
 
-def _keys(surroundings: Surroundings) -> Tensor:
+def _keys(local_map: LocalMap) -> Tensor:
     """What names each block (G,) of a window, in row-major order, wherever the window is."""
-    first = surroundings.low.cpu() // BLOCK
+    first = local_map.low.cpu() // BLOCK
     x, y, z = (
-        (torch.arange(-(-n // BLOCK)) + low) % _EXTENT
-        for n, low in zip(surroundings.shape, first, strict=True)
+        (torch.arange(-(-n // BLOCK)) + low) % _EXTENT for n, low in zip(local_map.shape, first, strict=True)
     )
     return ((x[:, None, None] * _EXTENT + y[:, None]) * _EXTENT + z).reshape(-1)

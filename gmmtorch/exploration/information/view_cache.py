@@ -13,7 +13,7 @@ class Memory:
     """What lattice poses are worth, for the length of a plan."""
 
     def __init__(self, task: PlanningTask, evaluator: ViewEvaluator) -> None:
-        self._surroundings, self._evaluator = task.surroundings, evaluator
+        self._local_map, self._evaluator = task.local_map, evaluator
         self._row: dict[tuple[int, ...], int] = {}
         self._keys: list[Tensor] = []
         n_blocks = len(task.residual)
@@ -29,7 +29,7 @@ class Memory:
                 self._row[name] = len(self._row)
                 new.append(i)
         if new:
-            values = self._evaluator.evaluate(self._surroundings, keys[new])
+            values = self._evaluator.evaluate(self._local_map, keys[new])
             self._gain = torch.cat([self._gain, values.gain])
             self._left = torch.cat([self._left, 1 - values.measured])
             self._keys.append(keys[new])

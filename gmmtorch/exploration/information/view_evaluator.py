@@ -28,7 +28,7 @@ from gmmtorch.exploration.information.mutual_information import (
     shannon,
     sharpened,
 )
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.grid import check_resolution
 
 BLOCK = 4
@@ -72,7 +72,7 @@ class _Layout(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """What evaluations of the same surroundings have in common."""
+    """What evaluations of the same local map have in common."""
 
     layout: _Layout
     occupancy: Tensor  # (n + 1,) float32
@@ -85,7 +85,7 @@ class ViewEvaluator:
     Args:
         horizontal_fov, vertical_fov: radians, in (0, π). The camera looks along the heading, pitch 0.
         max_range: metres along the beam.
-        resolution: side (m) of the cells of the surroundings.
+        resolution: side (m) of the cells of the local map.
         information: of a beam, "csqmi" or "fsmi".
         n_beams: about how many stand for an image.
         n_yaws: headings.
@@ -135,7 +135,7 @@ class ViewEvaluator:
         band = needed_band(torch.where(self._exists, templates.depths, math.inf), sigma)
         self._kernel = depth_kernel(templates.depths, sigma, band, templates.lengths).float().flatten(1, 2)
         self._layout: _Layout | None = None
-        self._windows: weakref.WeakKeyDictionary[Surroundings, _Window] = weakref.WeakKeyDictionary()
+        self._windows: weakref.WeakKeyDictionary[LocalMap, _Window] = weakref.WeakKeyDictionary()
 
     def keys(self, poses: Tensor) -> Tensor:
         """Lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
@@ -158,12 +158,12 @@ class ViewEvaluator:
         place = (keys[:, :3] * self.stride + 0.5).double() * self.resolution
         return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
 
-    def evaluate(self, surroundings: Surroundings, keys: Tensor) -> ViewValues:
+    def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
         """Each view (V, 4) by itself. Beams end at the window's border; a camera outside sees nothing."""
         self._check_keys(keys)
-        window = self._window(surroundings)
-        shape = torch.tensor(surroundings.shape)
-        cameras = keys[:, :3] * self.stride - surroundings.low
+        window = self._window(local_map)
+        shape = torch.tensor(local_map.shape)
+        cameras = keys[:, :3] * self.stride - local_map.low
         template = keys[:, 3:] * self.n_beams + torch.arange(self.n_beams)
         lengths = self._lengths_within(cameras, template, shape)
         base = (cameras[:, 0] * shape[1] + cameras[:, 1]) * shape[2] + cameras[:, 2]
@@ -178,9 +178,9 @@ class ViewEvaluator:
         enough = (_SATURATED * window.unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
         return ViewValues(gain.sum(1), gain, taken.div_(enough).clamp_max_(1))
 
-    def residual(self, surroundings: Surroundings, poses: Tensor) -> Tensor:
+    def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
         """What views from poses (M, 4), such as teammates have planned, leave of each block (G,) float32."""
-        return residual_of(self.evaluate(surroundings, self.keys(poses)))
+        return residual_of(self.evaluate(local_map, self.keys(poses)))
 
     def _check_keys(self, keys: Tensor) -> None:
         if keys.ndim != 2 or keys.shape[1] != 4 or keys.dtype != torch.int64:
@@ -190,17 +190,17 @@ class ViewEvaluator:
         if len(keys) and not bool(((keys[:, 3] >= 0) & (keys[:, 3] < self.n_yaws)).all()):
             raise InvalidArgumentError(f"keys name headings outside 0 … {self.n_yaws - 1}; see `keys`.")
 
-    def _window(self, surroundings: Surroundings) -> _Window:
-        window = self._windows.get(surroundings)
+    def _window(self, local_map: LocalMap) -> _Window:
+        window = self._windows.get(local_map)
         if window is None:
-            if not math.isclose(surroundings.resolution, self.resolution, rel_tol=1e-9):
+            if not math.isclose(local_map.resolution, self.resolution, rel_tol=1e-9):
                 raise InvalidArgumentError(
-                    f"The surroundings have cells of {surroundings.resolution} m, the evaluator of "
+                    f"The local_map have cells of {local_map.resolution} m, the evaluator of "
                     f"{self.resolution} m; give both the same resolution."
                 )
-            if self._layout is None or self._layout.shape != surroundings.shape:
-                self._layout = self._laid_out(surroundings.shape)
-            window = self._windows[surroundings] = self._prepared(surroundings, self._layout)
+            if self._layout is None or self._layout.shape != local_map.shape:
+                self._layout = self._laid_out(local_map.shape)
+            window = self._windows[local_map] = self._prepared(local_map, self._layout)
         return window
 
     def _laid_out(self, shape: tuple[int, ...]) -> _Layout:
@@ -216,8 +216,8 @@ class ViewEvaluator:
         offsets = torch.where(self._exists, (x * ny + y) * nz + z, _BEYOND)
         return _Layout(shape, math.prod(counts), _with_end(block), _with_end(offsets, _BEYOND).int())
 
-    def _prepared(self, surroundings: Surroundings, layout: _Layout) -> _Window:
-        occupancy, observed = check_occupancy(surroundings.occupancy).float(), surroundings.observed
+    def _prepared(self, local_map: LocalMap, layout: _Layout) -> _Window:
+        occupancy, observed = check_occupancy(local_map.occupancy).float(), local_map.observed
         free, occupied = self._known
         occupancy = occupancy.masked_fill(observed & (occupancy <= free), 0.0)
         occupancy.masked_fill_(observed & (occupancy >= occupied), 1.0)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, Message, ViewsMessage, quantized_poses
 from gmmtorch.sharing.replica.record_keys import first_key, robot_of
 from gmmtorch.sharing.view_set import ViewSet
@@ -125,12 +125,12 @@ class ViewLibrary:
             seen = _is_near(poses[:, None], known.poses, reach, turn).any(0)
             self.remove([known.ids[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
-    def covered(self, surroundings: Surroundings, now: float, most: int, age: float = 10.0) -> list[Id]:
+    def covered(self, local_map: LocalMap, now: float, most: int, age: float = 10.0) -> list[Id]:
         """Views in the window not valued for `age` seconds, the longest first, `most` at most."""
         known = self.candidates()
         if not known.ids:
             return []
-        inside = surroundings.is_passable(known.poses[:, :3]).tolist()
+        inside = local_map.is_passable(known.poses[:, :3]).tolist()
         views = self._set.views
         seen = ((self._checked.get(name, views[_key(name)].stamp), name) for name in known.ids)
         due = sorted(pair for pair, there in zip(seen, inside, strict=True) if there and pair[0] <= now - age)

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.forgiving_journal import ForgivingJournal
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.gmm_mapper import MixtureMapper
+from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.world.collisions import collides, finely
 from gmmtorch.exploration.world.world import World
 from gmmtorch.files import write_npz
@@ -103,8 +103,8 @@ class FlyingNode:
             for number, plan in sorted(plans.items())
             if len(plan.path)
         ]
-        traffic = Traffic.of(paths, 2 * options.dynamics.radius + options.margin)
-        agent.propose(now, list(plans), traffic, since=now - options.dynamics.duration)
+        peers = PeerTrajectories.of(paths, 2 * options.dynamics.radius + options.margin)
+        agent.propose(now, list(plans), peers, since=now - options.dynamics.duration)
         agent.settle()
         agent.tell_plan(now, self._n_ticks // options.ticks_per_plan)
         self._tell_views(now)
@@ -195,7 +195,7 @@ class FlyingNode:
         files: dict[str, tuple[str, Callable[[Path], object]]] = {
             "trajectory": ("trajectory.npz", functools.partial(write_npz, poses=poses))
         }
-        if isinstance(mapper, MixtureMapper) and len(components := mapper.components()):
+        if isinstance(mapper, GmmMapper) and len(components := mapper.components()):
             made = GaussianMap.of(components, robot=self.robot)
             files["map"] = f"map{made.suffix}", made.save
         return files
@@ -211,7 +211,7 @@ def _ahead(plan: PlanMessage, age: float, step: float) -> Tensor:
     """Where a teammate is one step (s) from now, two, … (S, 3), by a plan that was heard `age` seconds ago.
 
     Its pose of each time is the plan's next in time, at most half a step of the plan off, which
-    `traffic.clear_of` allows for.
+    `peers.clear_of` allows for.
     """
     n = len(plan.path)
     left = n * plan.step - age

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.exploration.mission.flying import FlyingNode
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
 
 _PATIENCE = 2.0  # seconds for datagrams that are on their way
@@ -79,11 +79,11 @@ class Serving:
         elif do == "survey":
             agent.survey(about["now"])
         elif do == "propose":
-            traffic = Traffic(
+            peers = PeerTrajectories(
                 torch.tensor(about["paths"], dtype=torch.float64).reshape(-1, about["steps"], 3),
                 about["separation"],
             )
-            plan = agent.propose(about["now"], about["fixed"], traffic)
+            plan = agent.propose(about["now"], about["fixed"], peers)
             return {name: v.tolist() if isinstance(v, Tensor) else v for name, v in vars(plan).items()}
         elif do == "settle":
             agent.settle()
@@ -201,8 +201,8 @@ class RemotePilot:
     def survey(self, now: float) -> None:
         self.do("survey", now=now)
 
-    def propose(self, now: float, fixed: Collection[int], traffic: Traffic) -> Plan:
-        paths, separation = traffic.paths, traffic.separation
+    def propose(self, now: float, fixed: Collection[int], peers: PeerTrajectories) -> Plan:
+        paths, separation = peers.paths, peers.separation
         answer = self.do(
             "propose",
             now=now,

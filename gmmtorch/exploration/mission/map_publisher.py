@@ -1,4 +1,4 @@
-"""Publication: which of a robot's records stand for its own map."""
+"""MapPublisher: which of a robot's records stand for its own map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gmmtorch.sharing.replica.component_table import fingerprints
 from gmmtorch.sharing.replica.replica import Replica
 
 
-class Publication:
+class MapPublisher:
     """Keeps what a replica holds of its robot equal to a map that grows and changes.
 
     `Replica.add` does so for a map of one life. Here components are known by what they say, so it goes on

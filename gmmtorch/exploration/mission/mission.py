@@ -16,7 +16,7 @@ from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.planning.planning_round import take_turns
 from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.mapper import Sensed
+from gmmtorch.exploration.robot.mapper import FrameUpdate
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.collisions import collides, finely, meets_others
 from gmmtorch.exploration.world.scoring import BeliefMap
@@ -148,7 +148,7 @@ class Mission:
         for agent in self.agents:
             agent.listen(self.now)
 
-    def _encoded(self, frame: DepthFrame, sensed: Sensed) -> dict[str, int]:
+    def _encoded(self, frame: DepthFrame, sensed: FrameUpdate) -> dict[str, int]:
         """Bytes that the novel beams of a frame take by other codecs: returns, and ends of the others."""
         sizes = dict.fromkeys(self.options.codecs, 0)
         for kind in (frame.is_hit, ~frame.is_hit):

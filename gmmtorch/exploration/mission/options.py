@@ -13,7 +13,7 @@ from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.exploration.planning.primitives import Dynamics
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.exploration.robot.heartbeat import Heartbeat
-from gmmtorch.exploration.robot.stopping_criterion import RestRule
+from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.scoring import BeliefRule
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.sharing.messages.envelope import check_codec
@@ -64,7 +64,7 @@ class TeamOptions:
     coordination: str = "greedy"
     n_rounds: int = 3
     planning_prior: float = 0.125
-    rest: RestRule = field(default_factory=RestRule)
+    rest: StoppingRule = field(default_factory=StoppingRule)
     codec: str = "quantized"
     latency: float = 0.05
     jitter: float = 0.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from gmmtorch.errors import DataError, OutputError, check_whole
 from gmmtorch.exploration.mission.forgiving_journal import ForgivingJournal
-from gmmtorch.exploration.mission.map_publisher import Publication
+from gmmtorch.exploration.mission.map_publisher import MapPublisher
 from gmmtorch.exploration.mission.mission_progress import Progress
 from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.robot.radio import Radio
@@ -70,7 +70,7 @@ class ReplayNode:
         self.watch = Stopwatch()
         self._scans, self._transport = scans, transport
         self._logbook = self.radio.logbook = None if journal is None else ForgivingJournal(journal)
-        self._publication = Publication(replica)
+        self._publication = MapPublisher(replica)
         self._keep_every = check_whole("keep_every", keep_every, 1)
         about = {"robot": replica.robot, "keep_every": keep_every, "n_scans": self.n_scans}
         about |= {"learning": self.map.state()["learning"], **(facts or {})}

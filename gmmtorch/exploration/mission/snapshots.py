@@ -1,4 +1,4 @@
-"""Album: a few moments of a mission, spread over what was learned, however long that took."""
+"""Snapshots: a few moments of a mission, spread over what was learned, however long that took."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gmmtorch.exploration.mission.mission import Mission
 _MOST = 16
 
 
-class Moment(NamedTuple):
+class Snapshot(NamedTuple):
     """tick: of the mission. bits: of the observable entropy that had gone. content: what was taken."""
 
     tick: int
@@ -18,7 +18,7 @@ class Moment(NamedTuple):
     content: dict[str, Any]
 
 
-class Album:
+class Snapshots:
     """Keeps at most 17 moments: the first it is shown, the end, and what lies between at about even steps of
     entropy.
 
@@ -32,7 +32,7 @@ class Album:
     def __init__(self, take: Callable[[Mission], dict[str, Any]]) -> None:
         self._take = take
         self._step = 0.0  # bits
-        self.moments: list[Moment] = []
+        self.moments: list[Snapshot] = []
 
     def look(self, mission: Mission) -> None:
         """See a mission after a step of it, and keep the moment if it is due."""
@@ -41,7 +41,7 @@ class Album:
             return
         if len(self.moments) == _MOST:
             self._thin()
-        self.moments.append(Moment(mission.tick, bits, self._take(mission)))
+        self.moments.append(Snapshot(mission.tick, bits, self._take(mission)))
 
     def _thin(self) -> None:
         first, *others = self.moments
@@ -51,7 +51,7 @@ class Album:
             if moment.bits >= self.moments[-1].bits + self._step:
                 self.moments.append(moment)
 
-    def chosen(self, shares: Sequence[float] = (0.2, 0.5, 0.8)) -> list[Moment]:
+    def chosen(self, shares: Sequence[float] = (0.2, 0.5, 0.8)) -> list[Snapshot]:
         """The moments, in their order, at which about these shares had gone of what has gone in the end, and
         the end; fewer if there are not so many."""
         *left, end = self.moments
@@ -66,4 +66,4 @@ class Album:
 
     def restore(self, state: dict[str, Any]) -> None:
         self._step = float(state["step"])
-        self.moments = [Moment(int(tick), float(bits), content) for tick, bits, content in state["moments"]]
+        self.moments = [Snapshot(int(tick), float(bits), content) for tick, bits, content in state["moments"]]

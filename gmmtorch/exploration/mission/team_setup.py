@@ -18,9 +18,9 @@ from gmmtorch.exploration.planning.planners import make_planner
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.gmm_mapper import MixtureMapper
+from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.robot.grid_mapper import GridMapper
-from gmmtorch.exploration.robot.initial_free_space import launch_from
+from gmmtorch.exploration.robot.initial_free_space import initial_free_space
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap
@@ -107,7 +107,7 @@ def make_agent(
         n_beams=options.n_beams,
     )
     primitives = Primitives(options.dynamics)
-    launch = launch_from(world, pose[:3].double(), primitives)
+    launch = initial_free_space(world, pose[:3].double(), primitives)
     if launch is None:
         raise InvalidArgumentError(
             f"pose={pose.tolist()} is no place that a robot can fly off from; move it."
@@ -155,4 +155,4 @@ def _mapper(
         shared = Replica(number, dim=3, incarnation=incarnation)
     else:
         shared = Broadcast(number, options.codec)
-    return MixtureMapper(number, local, belief, width, options.novelty, options.frame, evidence, shared)
+    return GmmMapper(number, local, belief, width, options.novelty, options.frame, evidence, shared)

@@ -28,7 +28,7 @@ from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.mission_results import row_of
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.pace import Pace, Paces, pace_of
-from gmmtorch.exploration.mission.snapshots import Album
+from gmmtorch.exploration.mission.snapshots import Snapshots
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.files import check_writable, write_json, write_npz
@@ -132,7 +132,7 @@ def run_mission(
     trial: Trial,
     world: World | None = None,
     on_sample: OnSample | None = None,
-    album: Album | None = None,
+    album: Snapshots | None = None,
 ) -> tuple[Mission, dict[str, Any]]:
     """Run a trial, from its checkpoint if there is one; returns the mission at its end and its row.
 

@@ -14,20 +14,20 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.peer_trajectories import Traffic, clear_of
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, clear_of
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.exploration.world.collisions import collides
 from gmmtorch.occupancy.grid import check_resolution
 
 __all__ = [
-    "Traffic",
+    "PeerTrajectories",
     "cells_in_sphere",
     "clear_of",
     "collides",
     "feasible",
     "inflated",
+    "local_map_of",
     "passable_cells",
-    "surroundings_of",
 ]
 
 _SPACING = 1.0
@@ -82,7 +82,7 @@ def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
     return torch.cartesian_prod(*axes)[within]
 
 
-def surroundings_of(
+def local_map_of(
     low: Tensor,
     resolution: float,
     hits: Tensor,
@@ -94,7 +94,7 @@ def surroundings_of(
     radius: float,
     known_free: Tensor | None = None,
     obstacles: Tensor | None = None,
-) -> Surroundings:
+) -> LocalMap:
     """What a planner reads, from the hits H and misses M of dense cells (nx, ny, nz).
 
     The map's occupancy is θ = (H + N_p)/(H + M + 2N_p), the planner's (H + 2N_p π)/(H + M + 2N_p). A cell
@@ -121,7 +121,7 @@ def surroundings_of(
         if cells is not None:
             inside = ((cells >= low) & (cells < low + torch.tensor(free.shape))).all(1)
             free[(cells[inside] - low).unbind(1)] = value
-    return Surroundings(
+    return LocalMap(
         low=low,
         resolution=resolution,
         occupancy=((hits + 2 * prior * planning_prior) / total).float(),
@@ -134,15 +134,15 @@ def surroundings_of(
 def feasible(
     rollout: Tensor,
     braking: Tensor,
-    surroundings: Surroundings,
-    traffic: Traffic | None = None,
+    local_map: LocalMap,
+    peers: PeerTrajectories | None = None,
     *,
     start: Tensor | None = None,
     radius: float | None = None,
 ) -> Tensor:
     """Which (...,) paths are safe: states (..., S, 7), and states (..., B, 7) on the way to rest after them.
 
-    Every point of a path must be in passable cells and clear of the traffic (see `clear_of`). A path that
+    Every point of a path must be in passable cells and clear of the peers (see `clear_of`). A path that
     never moves, to turn in place or wait, is always feasible.
 
     A robot whose own cell has become impassable, as the map changes, may leave it where `start` and
@@ -161,17 +161,17 @@ def feasible(
         begin = start.to(states).expand(*states.shape[:-2], 7)
         origin = begin[..., :3]
         states = torch.cat([begin[..., None, :], states], -2)
-    safe = surroundings.is_passable(_points_along(states, _SPACING * surroundings.resolution)).all(-1)
+    safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
     if origin is not None:
-        stuck = ~surroundings.is_passable(origin)
+        stuck = ~local_map.is_passable(origin)
         safe &= ~stuck
         if radius is not None:
             for here in torch.unique(origin[stuck], dim=0):
                 rows = stuck & (origin == here).all(-1)
-                safe[rows] = _leaves(here, states[rows], surroundings, radius)
-    if traffic is not None:
+                safe[rows] = _leaves(here, states[rows], local_map, radius)
+    if peers is not None:
         places = torch.cat([rollout[..., :3], braking[..., :3]], -2)
-        safe &= clear_of(places, traffic, origin)
+        safe &= clear_of(places, peers, origin)
     still = (states[..., :3] == states[..., :1, :3]).flatten(-2).all(-1)
     return safe | still
 
@@ -226,16 +226,16 @@ def _points_along(states: Tensor, spacing: float) -> Tensor:
     return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
 
 
-def _leaves(here: Tensor, states: Tensor, surroundings: Surroundings, radius: float) -> Tensor:
+def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) -> Tensor:
     """Which (P,) of paths (P, L, 7) from a point (3,) lead away from all that the body touches there."""
-    resolution = surroundings.resolution
-    if not bool(surroundings.flat_index(here)[1]):
+    resolution = local_map.resolution
+    if not bool(local_map.flat_index(here)[1]):
         return torch.zeros(len(states), dtype=torch.bool)
     points = _points_along(states, _FINE_SPACING * resolution)
     radius = radius + _FINE_SPACING / 2 * resolution
     reach = math.ceil(radius / resolution)
-    blocked = torch.nn.functional.pad(~surroundings.free, (reach,) * 6, value=True)
-    low = surroundings.low - reach
+    blocked = torch.nn.functional.pad(~local_map.free, (reach,) * 6, value=True)
+    low = local_map.low - reach
     touched = _touched(here[None], blocked, low, resolution, radius)
     cells = touched[1]
     corners = torch.cartesian_prod(*[torch.tensor([0, 1])] * 3)
@@ -243,7 +243,7 @@ def _leaves(here: Tensor, states: Tensor, surroundings: Surroundings, radius: fl
     ok = ((points - here) @ away.T <= _ROUNDING).all(-1)
     blocked[cells.unbind(1)] = False
     flat = points.reshape(-1, 3)
-    inside = surroundings.flat_index(flat)[1]
+    inside = local_map.flat_index(flat)[1]
     rows = inside.nonzero().squeeze(1)
     for part in rows.split(max(1, _CHUNK_PAIRS // (2 * reach + 1) ** 3)):
         inside[part[_touched(flat[part], blocked, low, resolution, radius)[0]]] = False

@@ -16,7 +16,7 @@ from gmmtorch.exploration.planning.global_planner import Journey, looks
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 _COARSE = 2
 _SAMPLES = 24  # of a line of sight
@@ -42,19 +42,19 @@ class Frontiers(NamedTuple):
     metres: Tensor
 
 
-def frontier_cells(surroundings: Surroundings) -> Tensor:
+def frontier_cells(local_map: LocalMap) -> Tensor:
     """Free cells (nx, ny, nz) bool with a face to one that is neither observed nor free."""
-    unknown = ~(surroundings.observed | surroundings.free)
+    unknown = ~(local_map.observed | local_map.free)
     beside = torch.zeros_like(unknown)
     for axis in range(3):
         n = unknown.shape[axis] - 1
         beside.narrow(axis, 0, n).logical_or_(unknown.narrow(axis, 1, n))
         beside.narrow(axis, 1, n).logical_or_(unknown.narrow(axis, 0, n))
-    return beside & surroundings.free
+    return beside & local_map.free
 
 
 def find_frontiers(
-    surroundings: Surroundings, start: Tensor, exhausted: Tensor, least: int, elevation: float
+    local_map: LocalMap, start: Tensor, exhausted: Tensor, least: int, elevation: float
 ) -> Frontiers:
     """Clusters of at least so many cells that a robot at `start` (3,) can look at, the most promising first.
 
@@ -62,10 +62,10 @@ def find_frontiers(
         exhausted: (E, 3), targets that did not go away when looked at; cells within a metre do not count.
         elevation: radians above or below the camera up to which it can look at a target.
     """
-    distances = DistanceField.to(surroundings, start[None], coarse=_COARSE)
-    cells = frontier_cells(surroundings).nonzero()
+    distances = DistanceField.to(local_map, start[None], coarse=_COARSE)
+    cells = frontier_cells(local_map).nonzero()
     if len(exhausted):
-        cells = cells[torch.cdist(surroundings.centers(cells), exhausted.double()).amin(1) > _SAME]
+        cells = cells[torch.cdist(local_map.centers(cells), exhausted.double()).amin(1) > _SAME]
     shape = distances.metres.shape
     counts = torch.zeros(shape, dtype=torch.int64)
     counts.index_put_(
@@ -90,7 +90,7 @@ def find_frontiers(
         can_look = (
             (level >= _CLOSEST) & (level <= _FARTHEST) & (way[:, 2].abs() <= math.tan(elevation) * level)
         )
-        can_look[can_look.clone()] = _sees(surroundings, places[can_look], target)
+        can_look[can_look.clone()] = _sees(local_map, places[can_look], target)
         if bool(can_look.any()):
             row = int(metres.masked_fill(~can_look, math.inf).argmin())
             pose = torch.cat([places[row], torch.atan2(way[row, 1], way[row, 0])[None]])
@@ -117,12 +117,12 @@ def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
     return torch.unique(rows, dim=0, return_inverse=True)[1], _middles(distances, cells)
 
 
-def _sees(surroundings: Surroundings, places: Tensor, target: Tensor) -> Tensor:
+def _sees(local_map: LocalMap, places: Tensor, target: Tensor) -> Tensor:
     """Whether all between places (N, 3) and just before a target (3,) is free."""
     share = torch.linspace(0, 1, _SAMPLES + 1, dtype=torch.float64)[:-1, None]
     points = places[:, None] + share * (target - places)[:, None]
-    flat, inside = surroundings.flat_index(points)
-    return (surroundings.free.view(-1)[flat] & inside).all(1)
+    flat, inside = local_map.flat_index(points)
+    return (local_map.free.view(-1)[flat] & inside).all(1)
 
 
 def _middles(distances: DistanceField, cells: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ class FrontierPlanner:
         self._exhausted = torch.zeros(0, 3, dtype=torch.float64)
 
     def plan(self, task: PlanningTask) -> Plan:
-        here = task.surroundings
+        here = task.local_map
         found = find_frontiers(here, task.state[:3], self._exhausted, self._least, self._elevation)
         self._give_up(found.targets[looks(task.state, found.poses)])
         self._forget(task, found)
@@ -176,7 +176,7 @@ class FrontierPlanner:
 
     def _choose(self, task: PlanningTask, found: Frontiers) -> str:
         """Settle where to go; returns the kind of plan."""
-        here = task.surroundings
+        here = task.local_map
         if len(self._exhausted):
             left = torch.cdist(found.targets, self._exhausted).amin(1) >= _SAME
             found = Frontiers(*(values[left] for values in found))
@@ -213,7 +213,7 @@ class FrontierPlanner:
     def _forget(self, task: PlanningTask, found: Frontiers) -> None:
         """Remove what the library remembers in the window, where no frontier is left."""
         known = task.library.candidates()
-        inside = task.surroundings.is_passable(known.poses[:, :3])
+        inside = task.local_map.is_passable(known.poses[:, :3])
         if len(found.poses):
             apart = torch.cdist(known.poses[:, :3], found.poses[:, :3]).amin(1)
             inside &= apart > _ABOUT

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.grid import check_resolution
 
 _AROUND = list(itertools.product((-1, 0, 1), repeat=3))
@@ -31,23 +31,23 @@ class DistanceField:
 
     @classmethod
     def to(
-        cls, surroundings: Surroundings, goals: Tensor, offsets: Tensor | None = None, coarse: int = 2
+        cls, local_map: LocalMap, goals: Tensor, offsets: Tensor | None = None, coarse: int = 2
     ) -> DistanceField:
         """The distance to the nearest of goals (M, 3), metres; `offsets` (M,): what remains beyond each.
 
         Goals outside the window do not count; where none is inside, all is inf.
         """
-        _, inside = surroundings.flat_index(goals)
-        cells = surroundings.cells_of(goals[inside])
+        _, inside = local_map.flat_index(goals)
+        cells = local_map.cells_of(goals[inside])
         metres = geodesic(
-            surroundings.passable,
+            local_map.passable,
             cells,
-            surroundings.resolution,
+            local_map.resolution,
             None if offsets is None else offsets[inside],
             coarse,
         )
-        origin = surroundings.low.double() * surroundings.resolution
-        return cls(origin, coarse * surroundings.resolution, metres)
+        origin = local_map.low.double() * local_map.resolution
+        return cls(origin, coarse * local_map.resolution, metres)
 
     def at(self, points: Tensor) -> Tensor:
         """Metres (...,) float64 from points (..., 3): the least of going on from the cell that holds

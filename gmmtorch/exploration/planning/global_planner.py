@@ -77,7 +77,7 @@ class Journey:
         if task.now - self._refreshed >= _REFRESHED:
             self._nodes, self._rest = task.roadmap.reaching(self.pose[:3])
             self._refreshed = task.now
-        here = task.surroundings
+        here = task.local_map
         rim = at_the_rim(self._nodes, here.box, here.resolution, 1.5 * task.roadmap.spacing)
         goals = torch.cat([self.pose[None, :3], self._nodes[rim]])
         offsets = torch.cat([self._rest.new_zeros(1), self._rest[rim]])

@@ -1,4 +1,4 @@
-"""Traffic: where the other robots have committed to be, and which paths keep clear of them."""
+"""PeerTrajectories: where the other robots have committed to be, and which paths keep clear of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gmmtorch.errors import InvalidArgumentError
 
 
 @dataclass(frozen=True, eq=False)
-class Traffic:
+class PeerTrajectories:
     """Committed paths of other robots.
 
     paths: (M, T, 3) float64, metres, world frame: each robot's position after 1, 2, …, T ≥ 1 steps of the
@@ -34,8 +34,8 @@ class Traffic:
             raise InvalidArgumentError(f"separation={self.separation} must be above zero metres.")
 
     @classmethod
-    def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> Traffic:
-        """Traffic on paths (T_i, 3) of any lengths, at least one position each."""
+    def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> PeerTrajectories:
+        """PeerTrajectories on paths (T_i, 3) of any lengths, at least one position each."""
         longest = max((len(path) for path in paths), default=1)
         padded = [path[torch.arange(longest).clamp_max(len(path) - 1)] for path in paths]
         return cls(torch.stack(padded) if padded else torch.zeros(0, 1, 3, dtype=torch.float64), separation)
@@ -43,13 +43,13 @@ class Traffic:
     def __len__(self) -> int:
         return len(self.paths)
 
-    def later(self, steps: int) -> Traffic:
-        """The traffic for a path that begins that many steps from now."""
-        return Traffic(self.paths[:, min(steps, self.paths.shape[1] - 1) :], self.separation)
+    def later(self, steps: int) -> PeerTrajectories:
+        """The peers for a path that begins that many steps from now."""
+        return PeerTrajectories(self.paths[:, min(steps, self.paths.shape[1] - 1) :], self.separation)
 
 
-def clear_of(path: Tensor, traffic: Traffic, start: Tensor | None = None) -> Tensor:
-    """Which (...,) of paths (..., L, 3), positions after 1, 2, …, L steps, keep clear of the traffic.
+def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None) -> Tensor:
+    """Which (...,) of paths (..., L, 3), positions after 1, 2, …, L steps, keep clear of the peers.
 
     After step L a robot stays where it is. At step k its distance from another robot must be at least the
     separation, plus how far that robot is from its place at step k one step earlier and later, plus half
@@ -57,13 +57,13 @@ def clear_of(path: Tensor, traffic: Traffic, start: Tensor | None = None) -> Ten
     robot is up to half a step early or late. With `start` (..., 3), where the path begins, a robot that is
     too close already may move, as long as it is at no step closer than it would be by staying.
     """
-    if len(traffic) == 0:
+    if len(peers) == 0:
         return torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
-    n_path, n_traffic = path.shape[-2], traffic.paths.shape[1]
+    n_path, n_traffic = path.shape[-2], peers.paths.shape[1]
     # After the shorter of the two ends, one robot rests.
     n = max(n_path, n_traffic)
-    there = traffic.paths[:, torch.arange(n).clamp_max(n_traffic - 1)]
-    least = traffic.separation + _longer_step(there)
+    there = peers.paths[:, torch.arange(n).clamp_max(n_traffic - 1)]
+    least = peers.separation + _longer_step(there)
     own = path if start is None else torch.cat([start[..., None, :], path], -2)
     sway = _longer_step(own)[..., own.shape[-2] - n_path :] / 2
     clear = torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)

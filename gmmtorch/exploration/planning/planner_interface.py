@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 LEAST = 0.05
 """Metres of a way that leads anywhere."""
@@ -24,16 +24,16 @@ LEAST = 0.05
 class PlanningTask:
     """What a robot knows when it plans.
 
-    robot: its number. state: (7,), where it will be when the plan begins. traffic: of the others.
-    residual: (G,) float32, information that teammates' plans leave in each block of the surroundings.
+    robot: its number. state: (7,), where it will be when the plan begins. peers: of the others.
+    residual: (G,) float32, information that teammates' plans leave in each block of the local map.
     now: (s). generator: of the planner's random choices. trail: (N, 3), metres, where the robot flew lately,
     the latest last.
     """
 
     robot: int
     state: Tensor
-    surroundings: Surroundings
-    traffic: Traffic
+    local_map: LocalMap
+    peers: PeerTrajectories
     residual: Tensor
     library: ViewLibrary
     roadmap: Roadmap
@@ -88,8 +88,8 @@ def options(
     safe = feasible(
         paths,
         braking,
-        task.surroundings,
-        task.traffic.later(after * dynamics.n_steps) if after else task.traffic,
+        task.local_map,
+        task.peers.later(after * dynamics.n_steps) if after else task.peers,
         start=states[:, None],
         radius=dynamics.radius if may_escape else None,
     )

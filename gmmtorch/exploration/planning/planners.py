@@ -88,8 +88,8 @@ class TreePlanner:
     def plan(self, task: PlanningTask) -> Plan:
         memory = Memory(task, self._evaluator)
         here = int(memory.rows(task.state[None, :4].double())[0])
-        self._fatigue.note(task.surroundings, memory.measured(here), task.now)
-        self._weights = self._fatigue.weights(task.surroundings)
+        self._fatigue.note(task.local_map, memory.measured(here), task.now)
+        self._weights = self._fatigue.weights(task.local_map)
         task = replace(task, residual=task.residual * self._weights)
         task.library.visit(task.state[None, :4], task.now)
         self._revalue(task, memory)
@@ -128,7 +128,7 @@ class TreePlanner:
         if journey is None:
             return None
         value = None
-        if bool(task.surroundings.is_passable(journey.pose[:3])):
+        if bool(task.local_map.is_passable(journey.pose[:3])):
             row = memory.rows(journey.pose[None])
             value = float(memory.marginal(row, self._weights[None])[0])
         if value is not None and value < self._rule.worthwhile * self._largest:
@@ -165,7 +165,7 @@ class TreePlanner:
         return self._branch[1:] if task.now > self._when else self._branch
 
     def _revalue(self, task: PlanningTask, memory: Memory) -> None:
-        ids = task.library.covered(task.surroundings, task.now, self._rule.n_revalued)
+        ids = task.library.covered(task.local_map, task.now, self._rule.n_revalued)
         if ids:
             known = task.library.candidates()
             at = {key: row for row, key in enumerate(known.ids)}

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.planning.coordination import Coordination
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
 
 
@@ -26,7 +26,7 @@ class Pilot(Protocol):
 
     def listen(self, now: float) -> None: ...
     def survey(self, now: float) -> None: ...
-    def propose(self, now: float, fixed: Collection[int], traffic: Traffic) -> Plan: ...
+    def propose(self, now: float, fixed: Collection[int], peers: PeerTrajectories) -> Plan: ...
     def settle(self) -> None: ...
     def tell_plan(self, now: float, number: int) -> None: ...
     def tell_views(self, now: float) -> None: ...
@@ -62,8 +62,8 @@ def take_turns(
         tell(fixed)
         pilot = pilots[robot]
         pilot.listen(now + options.plan_slack * len(fixed))
-        traffic = _traffic(pilots, robot, fixed, proposed, coordination, options)
-        proposed[robot] = pilot.propose(now, fixed, traffic)
+        peers = _peer_trajectories(pilots, robot, fixed, proposed, coordination, options)
+        proposed[robot] = pilot.propose(now, fixed, peers)
         return proposed[robot]
 
     plans = coordination.coordinate(range(len(pilots)), plan_of, generator)
@@ -75,14 +75,14 @@ def take_turns(
     return plans
 
 
-def _traffic(
+def _peer_trajectories(
     pilots: Sequence[Pilot],
     robot: int,
     fixed: Mapping[int, Plan],
     proposed: Mapping[int, Plan],
     coordination: Coordination,
     options: TeamOptions,
-) -> Traffic:
+) -> PeerTrajectories:
     """Where the others may be: on what they settled on or proposed, or braking if that may change."""
     is_final = coordination.name != "distributed_greedy"
     paths = []
@@ -94,4 +94,4 @@ def _traffic(
             paths.append(torch.cat([plan.path, plan.braking])[:, :3])
         if plan is None or not (is_final or other.number in fixed):
             paths.append(other.braking[:, :3])
-    return Traffic.of(paths, 2 * options.dynamics.radius + options.margin)
+    return PeerTrajectories.of(paths, 2 * options.dynamics.radius + options.margin)

@@ -21,7 +21,7 @@ def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
     all longer than the gap. Where it has flown, it fits: it goes back slowly, easing in and out, so that it
     is at rest at the end, with s(t) = L (1 − cos πt/T)/2 metres flown of L.
     """
-    if bool(task.state[4:].any()) or bool(task.surroundings.is_passable(task.state[:3])):
+    if bool(task.state[4:].any()) or bool(task.local_map.is_passable(task.state[:3])):
         return None
     if not is_boxed_in(primitives, task):
         return None
@@ -33,7 +33,7 @@ def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
     n = dynamics.n_steps
     share = (1 - torch.cos(torch.arange(1, n + 1, dtype=torch.float64) * (math.pi / n))) / 2
     places = _along(way, share)
-    if not bool(clear_of(places, task.traffic, task.state[:3])):
+    if not bool(clear_of(places, task.peers, task.state[:3])):
         return None
     path = task.state.repeat(n, 1)
     path[:, :3] = places

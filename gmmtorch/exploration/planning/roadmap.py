@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box
 
 _BLOCK = 8  # nodes along each side of a block of storage
@@ -64,10 +64,10 @@ class Roadmap:
         """Metres between neighbouring nodes."""
         return self._factor * self._resolution
 
-    def update(self, surroundings: Surroundings) -> None:
+    def update(self, local_map: LocalMap) -> None:
         """Take over what the window shows, nodes that are no longer passable included."""
-        self._resolution, self._cached = surroundings.resolution, None
-        passable, low = surroundings.passable.cpu().numpy(), surroundings.low.cpu().numpy()
+        self._resolution, self._cached = local_map.resolution, None
+        passable, low = local_map.passable.cpu().numpy(), local_map.low.cpu().numpy()
         first = -(-low // self._factor)
         last = (low + passable.shape) // self._factor
         if (first >= last).any():

@@ -12,12 +12,12 @@ from torch import Tensor
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.stopwatch import Stopwatch
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import retreat
-from gmmtorch.exploration.robot.local_map import Surroundings
-from gmmtorch.exploration.robot.mapper import Memo, Sensed
+from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.exploration.robot.radio import Logbook, Radio
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
@@ -40,7 +40,7 @@ _OF_VIEWS = (ViewsMessage, ViewsHeldMessage)
 
 class Agent:
     """Senses, talks, and plans. All that it knows of its team is what its transport brings; who flies
-    close by, a short-range beacon tells (`traffic` in `propose`).
+    close by, a short-range beacon tells (`peers` in `propose`).
 
     Args:
         robot: what it knows and does. transport: its end of the network.
@@ -71,7 +71,7 @@ class Agent:
         # Of its own, so that what one robot draws does not depend on what others do.
         seed = options.seed * _SEEDS + robot.number
         self._generator = torch.Generator().manual_seed(seed)
-        self._surroundings: Surroundings | None = None
+        self._local_map: LocalMap | None = None
         self._rests = False
         self._plan: Plan | None = None
         self._told: Tensor | None = None  # where it stays, as teammates were told
@@ -110,7 +110,7 @@ class Agent:
                 mesh, self.robot.state[:4], others, self.options.dynamics.radius, self._generator
             )
 
-    def learn(self, frame: DepthFrame, now: float) -> Sensed:
+    def learn(self, frame: DepthFrame, now: float) -> FrameUpdate:
         """Take in a frame, and tell the team."""
         with self._timed("mapping"):
             sensed = self.robot.sense(frame)
@@ -179,18 +179,16 @@ class Agent:
         """Look at the map around: what the plan is made from, whatever comes in meanwhile."""
         robot, options = self.robot, self.options
         with self._timed("planning"):
-            self._surroundings = robot.surroundings(
-                options.planning_prior, options.dynamics.radius, options.window
-            )
+            self._local_map = robot.local_map(options.planning_prior, options.dynamics.radius, options.window)
             self._rests = robot.rests(now)
-            robot.roadmap.update(self._surroundings)
+            robot.roadmap.update(self._local_map)
 
     def propose(
-        self, now: float, fixed: Collection[int], traffic: Traffic, since: float | None = None
+        self, now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
     ) -> Plan:
         """A plan from the last survey, given the views of the teammates whose plans are fixed, as far as they
         have come `since` (s); None: now."""
-        if self._surroundings is None:
+        if self._local_map is None:
             raise RuntimeError("survey() comes before propose().")
         with self._timed("planning"):
             known = [
@@ -201,10 +199,10 @@ class Agent:
             task = PlanningTask(
                 robot=self.number,
                 state=self.robot.state,
-                surroundings=self._surroundings,
-                traffic=traffic,
+                local_map=self._local_map,
+                peers=peers,
                 residual=self._evaluator.residual(
-                    self._surroundings, torch.cat(known) if known else torch.zeros(0, 4)
+                    self._local_map, torch.cat(known) if known else torch.zeros(0, 4)
                 ),
                 library=self.robot.library,
                 roadmap=self.robot.roadmap,

@@ -17,8 +17,8 @@ from typing import Any
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.robot.mapper import Mapper, Memo, Sensed, novel_beams
-from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
+from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.association import count_explained, summed
 from gmmtorch.mapping.components import Components, packed, unpacked
@@ -84,7 +84,7 @@ class FrameRule:
         return CellRule(self.noise, length, self.cell, self.components, self.iterations)
 
 
-class MixtureMapper(Mapper):
+class GmmMapper(Mapper):
     """The map of one robot of a team that shares mixtures.
 
     shared: the mixture, new; `Replica`, or `Broadcast` for other codecs than its own.
@@ -117,7 +117,7 @@ class MixtureMapper(Mapper):
         boxes = [box for box in uncovered if box is not None]
         regenerate(self.local, boxes, self.tiles, self._evidence)
 
-    def sense(self, frame: DepthFrame) -> Sensed:
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
         # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
@@ -127,7 +127,7 @@ class MixtureMapper(Mapper):
         if self._n_frames % _FRAMES_PER_COUNT == 0:
             self.shared.count(self._due)
             self._due = {}
-        return Sensed(self._follow(), novel)
+        return FrameUpdate(self._follow(), novel)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams."""
@@ -175,7 +175,7 @@ class MixtureMapper(Mapper):
 
     # -- the team ---------------------------------------------------------------------------------
 
-    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+    def receive(self, heard: Sequence[ReceivedMessage]) -> list[bytes]:
         taken = [item.datagram for item in heard if self.shared.receive(item.datagram, item.message)]
         self._follow()
         return taken

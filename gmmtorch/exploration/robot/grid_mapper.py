@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.robot.mapper import Mapper, Memo, Sensed, novel_beams
-from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
+from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.novelty import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
@@ -64,7 +64,7 @@ class GridMapper(Mapper):
         for box in self.local.center_on(position):
             self.local.add_dense(box, *self.belief.grid.dense(box))
 
-    def sense(self, frame: DepthFrame) -> Sensed:
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box)
         parts, datagrams = [], []
         if self._shared and bool(novel.any()):
@@ -83,9 +83,9 @@ class GridMapper(Mapper):
         )
         for part in parts:
             self._add(part)
-        return Sensed(parts, novel)
+        return FrameUpdate(parts, novel)
 
-    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+    def receive(self, heard: Sequence[ReceivedMessage]) -> list[bytes]:
         frames: dict[tuple[int, int], list[bytes]] = {}
         for item in heard:
             if isinstance(item.message, PointsMessage) and self._is_new(item.message):

@@ -1,4 +1,4 @@
-"""Launch: what a robot knows of the place where it is set down, and of the way from there to open space."""
+"""The free space around a robot's start, and the way from there to open space."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, feasible, passable_cells
 from gmmtorch.exploration.planning.planner_interface import LEAST
 from gmmtorch.exploration.planning.primitives import Primitives
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
@@ -42,7 +42,7 @@ class Place(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Launch:
+class InitialFreeSpace:
     """What a robot is told when it is set down.
 
     known_free: (K, 3) int64, cells of the lattice that are free. trail: (N, 3), metres, from where it can
@@ -53,7 +53,7 @@ class Launch:
     trail: Tensor
 
 
-def launch_from(world: Place, place: Tensor, primitives: Primitives) -> Launch | None:
+def initial_free_space(world: Place, place: Tensor, primitives: Primitives) -> InitialFreeSpace | None:
     """How a robot gets off from a place (3,), where it touches nothing; None if it cannot.
 
     Where there is room, it knows the sphere around it to be free that reaches to the nearest surface. That
@@ -73,8 +73,8 @@ def launch_from(world: Place, place: Tensor, primitives: Primitives) -> Launch |
     fits = bool(truth.is_passable(place))
     if fits and bool(_lead_off(here, truth, primitives)[0]):
         if _is_passable_by(sphere, truth, radius, place):
-            return Launch(sphere, here)
-        return Launch(torch.cat([sphere, _free_near(place, needed, truth)]), here)
+            return InitialFreeSpace(sphere, here)
+        return InitialFreeSpace(torch.cat([sphere, _free_near(place, needed, truth)]), here)
     if fits:
         return None
     there = _nearest_way_off(world, place, truth, primitives)
@@ -82,10 +82,10 @@ def launch_from(world: Place, place: Tensor, primitives: Primitives) -> Launch |
         return None
     n = max(2, math.ceil(float((place - there).norm()) / _STEP) + 1)
     trail = torch.lerp(there, place, torch.linspace(0, 1, n, dtype=torch.float64)[:, None])
-    return Launch(torch.cat([sphere, _free_near(there, needed, truth)]), trail)
+    return InitialFreeSpace(torch.cat([sphere, _free_near(there, needed, truth)]), trail)
 
 
-def _truth(world: Place, place: Tensor, reach: float) -> Surroundings:
+def _truth(world: Place, place: Tensor, reach: float) -> LocalMap:
     """What a robot would know that had seen everything within `reach` metres of a place (3,)."""
     resolution = world.resolution
     low = torch.maximum(((place - reach) / resolution).floor().long(), world.box.low)
@@ -96,10 +96,10 @@ def _truth(world: Place, place: Tensor, reach: float) -> Surroundings:
     free = world.observable[window] & ~world.occupied[window]
     known = torch.ones_like(free)
     passable = passable_cells(free, world.robot_radius, resolution)
-    return Surroundings(low, resolution, (~free).float(), known, free, passable)
+    return LocalMap(low, resolution, (~free).float(), known, free, passable)
 
 
-def _is_passable_by(known_free: Tensor, truth: Surroundings, radius: float, place: Tensor) -> bool:
+def _is_passable_by(known_free: Tensor, truth: LocalMap, radius: float, place: Tensor) -> bool:
     """Whether a robot knows that it fits at a place (3,), by these cells (K, 3) alone."""
     cells = known_free - truth.low
     inside = ((cells >= 0) & (cells < torch.tensor(truth.shape))).all(1)
@@ -109,14 +109,14 @@ def _is_passable_by(known_free: Tensor, truth: Surroundings, radius: float, plac
     return bool(passable_cells(free, radius, truth.resolution).view(-1)[flat])
 
 
-def _free_near(place: Tensor, reach: float, truth: Surroundings) -> Tensor:
+def _free_near(place: Tensor, reach: float, truth: LocalMap) -> Tensor:
     """Free cells (K, 3) of the lattice that lie wholly within `reach` metres of a place (3,)."""
     cells = cells_in_sphere(place, reach, truth.resolution)
     flat, inside = truth.flat_index((cells + 0.5).double() * truth.resolution)
     return cells[truth.free.view(-1)[flat] & inside]
 
 
-def _lead_off(places: Tensor, truth: Surroundings, primitives: Primitives) -> Tensor:
+def _lead_off(places: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor:
     """Whether something that leads anywhere is safe, from rest at each of places (P, 3), at some yaw."""
     yaw = torch.arange(_YAWS, dtype=torch.float64) * (2 * math.pi / _YAWS)
     states = torch.zeros(len(places), _YAWS, 7, dtype=torch.float64)
@@ -128,9 +128,7 @@ def _lead_off(places: Tensor, truth: Surroundings, primitives: Primitives) -> Te
     return (safe & leads).view(len(places), _YAWS * len(primitives)).any(1)
 
 
-def _nearest_way_off(
-    world: Place, place: Tensor, truth: Surroundings, primitives: Primitives
-) -> Tensor | None:
+def _nearest_way_off(world: Place, place: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor | None:
     """The nearest centre (3,) of a cell to fly off from, to which a robot at a place (3,) can be moved."""
     centers = truth.centers(truth.passable.nonzero())
     off = (centers - place).norm(dim=1)

@@ -1,4 +1,4 @@
-"""Surroundings: what a robot knows of the space around it, as its planner reads it."""
+"""LocalMap: what a robot knows of the space around it, as its planner reads it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gmmtorch.occupancy.voxels.cell_evidence import Box
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class LocalMap:
     """A dense snapshot (nx, ny, nz) of the sliding map, in the order of the lattice.
 
     low: (3,) int64, index of the lowest cell; cell c is [c, c + 1)·resolution, world frame.

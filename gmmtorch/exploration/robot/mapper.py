@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.exploration.robot.radio import Heard
+from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.novelty import NoveltyRule
@@ -25,7 +25,7 @@ T = TypeVar("T")
 _BLOCK = 3  # pixels along the side of those that one beam speaks for
 
 
-class Sensed(NamedTuple):
+class FrameUpdate(NamedTuple):
     """What a frame has brought.
 
     evidence: what it adds to the robot's own map, in parts.
@@ -91,11 +91,11 @@ class Mapper(ABC):
         """Move the window along with the robot at (3,), and fill what it uncovers from what is known."""
 
     @abstractmethod
-    def sense(self, frame: DepthFrame) -> Sensed:
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
         """Learn from a frame of the robot's own camera."""
 
     @abstractmethod
-    def receive(self, heard: Sequence[Heard]) -> list[bytes]:
+    def receive(self, heard: Sequence[ReceivedMessage]) -> list[bytes]:
         """Learn from what teammates sent; returns the datagrams that were understood."""
 
     @abstractmethod

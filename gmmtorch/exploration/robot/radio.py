@@ -12,7 +12,7 @@ from gmmtorch.sharing.transport.simulated_network import Transport
 from gmmtorch.sharing.transport.token_bucket import TokenBucket
 
 
-class Heard(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A datagram as it arrived, and what it says."""
 
     sender: int
@@ -87,7 +87,7 @@ class Radio:
         for kind, some in by_kind.items():
             self.transport.send(self.robot, some, now, kind)
 
-    def hear(self, now: float) -> list[Heard]:
+    def hear(self, now: float) -> list[ReceivedMessage]:
         """What has come by `now`, and can be understood, sorted by sender, which no longer tells who was
         quicker."""
         arrived = sorted(self.transport.deliver(self.robot, now), key=lambda pair: pair[0])
@@ -95,7 +95,7 @@ class Radio:
         heard = []
         for sender, datagram in arrived:
             try:
-                heard.append(Heard(sender, datagram, self._decode(datagram)))
+                heard.append(ReceivedMessage(sender, datagram, self._decode(datagram)))
             except DataError:
                 self.n_damaged += 1
         return heard

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import surroundings_of
+from gmmtorch.exploration.planning.collision_checking import local_map_of
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner
 from gmmtorch.exploration.planning.recovery import shortened
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.initial_free_space import Launch
-from gmmtorch.exploration.robot.local_map import Surroundings
-from gmmtorch.exploration.robot.mapper import Mapper, Sensed
-from gmmtorch.exploration.robot.stopping_criterion import DiminishingReturns, RestRule
+from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
+from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper
+from gmmtorch.exploration.robot.stopping_criterion import StoppingCriterion, StoppingRule
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
@@ -41,8 +41,8 @@ class Robot:
         planner: Planner,
         library: ViewLibrary,
         roadmap: Roadmap,
-        launch: Launch,
-        rest: RestRule | None = None,
+        launch: InitialFreeSpace,
+        rest: StoppingRule | None = None,
     ) -> None:
         self.number = number
         self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
@@ -56,7 +56,7 @@ class Robot:
         self._recent: deque[Tensor] = deque(maxlen=_REMEMBERED)
         self._kind = ""  # of the plan it follows
         self.trail = launch.trail.clone()
-        self.returns = DiminishingReturns(rest)
+        self.returns = StoppingCriterion(rest)
         self._learned = 0.0
 
     @property
@@ -87,7 +87,7 @@ class Robot:
         moved = (way[1:] - way[:-1]).norm(dim=1) > _STANDING
         self.trail = torch.cat([self.trail, flown[moved]])[-_TRAIL:]
 
-    def sense(self, frame: DepthFrame) -> Sensed:
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
         """Learn from a frame of its camera."""
         self.mapper.center_on(self.position)
         before = self.mapper.belief.known_bits
@@ -114,15 +114,15 @@ class Robot:
         hit[(cells - low).unbind(1)] = True
         self._recent.append(hit.nonzero() + low)
 
-    def surroundings(
+    def local_map(
         self, planning_prior: float, radius: float, window: tuple[int, int, int] | None = None
-    ) -> Surroundings:
+    ) -> LocalMap:
         """What the planner is given to read: so many cells around the robot, or all of its local map."""
         local, rule = self.mapper.local, self.mapper.belief.rule
         box = local.box if window is None else local.around(self.position, window)
         hits, misses = local.evidence(box)
         recent = list(self._recent)
-        return surroundings_of(
+        return local_map_of(
             box.low,
             local.resolution,
             hits,

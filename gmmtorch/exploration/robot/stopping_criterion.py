@@ -13,7 +13,7 @@ _NEWS = 0.25  # of the best window: what teammates must find before a robot that
 
 
 @dataclass(frozen=True)
-class RestRule:
+class StoppingRule:
     """A robot rests once what it learned in the last `window` seconds is below `share` of the most it ever
     learned in as many; 0: never. A window should be longer than a way across the map."""
 
@@ -27,7 +27,7 @@ class RestRule:
             raise InvalidArgumentError(f"window={self.window} must be above zero seconds, and finite.")
 
 
-class DiminishingReturns:
+class StoppingCriterion:
     """Follows what a robot learns, and says whether it should rest.
 
     Views promise more than they bring where only slivers are left that no camera resolves, and a
@@ -38,9 +38,9 @@ class DiminishingReturns:
     Time in which it was boxed in does not count: nothing it could have done would have taught it more.
     """
 
-    def __init__(self, rule: RestRule | None = None) -> None:
+    def __init__(self, rule: StoppingRule | None = None) -> None:
         self.rests = False
-        self._rule = RestRule() if rule is None else rule
+        self._rule = StoppingRule() if rule is None else rule
         self._noted: deque[tuple[float, float]] = deque()  # time (s) and bits learned, a window of them
         self._best = 0.0
         self._known = 0.0  # bits, when it came to rest

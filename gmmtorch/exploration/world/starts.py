@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.planning.primitives import Primitives
-from gmmtorch.exploration.robot.initial_free_space import Place, launch_from
+from gmmtorch.exploration.robot.initial_free_space import Place, initial_free_space
 from gmmtorch.exploration.world.observable import viewpoints
 
 _ROOMY = 1.0
@@ -54,7 +54,7 @@ def start_poses(world: _World, n: int, spacing: float, at: Tensor | None, primit
             "team.start; if there should be more room, has the mesh a floor?"
         )
     for _ in range(_TRIES):
-        stuck = [place for place in found if launch_from(world, place, primitives) is None]
+        stuck = [place for place in found if initial_free_space(world, place, primitives) is None]
         if not stuck:
             ahead = centers.mean(0) - found[0]
             yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(n) * (2 * math.pi / n)
@@ -101,7 +101,7 @@ def _fault(world: _World, others: Tensor, place: Tensor, primitives: Primitives)
     gap = (others - place).norm(dim=1)
     if bool((gap <= 2 * world.robot_radius).any()):
         return f"touches the robot of team.start[{int(gap.argmin())}]"
-    launch = launch_from(world, place, primitives)
+    launch = initial_free_space(world, place, primitives)
     flown = place if launch is None else launch.trail[0]
     if not bool(world.navigable[((flown / world.resolution).floor().long() - world.box.low).unbind()]):
         if not bool(torch.isfinite(world.mesh.distances(place, _DOWN[None])).all()):
@@ -123,7 +123,7 @@ def _instead(world: _World, others: Tensor, pose: Tensor, primitives: Primitives
     for _ in range(_TRIES):
         if len(places) == 0:
             break
-        if launch_from(world, places[0], primitives) is not None:
+        if initial_free_space(world, places[0], primitives) is not None:
             return f"move it, for instance to {_text(torch.cat([places[0], pose[3:]]))}"
         places = places[(places - places[0]).norm(dim=1) > 2 * world.resolution]
     return "no place near it is better; take a smaller radius, finer cells or slower robots"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.geodesic import DistanceField, coarsened, geodesic
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 
@@ -36,9 +36,9 @@ def by_dijkstra(open_cells: torch.Tensor, starts: dict[tuple[int, ...], float]) 
     return found
 
 
-def surroundings(passable: torch.Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> Surroundings:
+def local_map(passable: torch.Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> LocalMap:
     known = torch.ones_like(passable)
-    return Surroundings(torch.tensor(low), 0.2, known.float(), known, passable, passable)
+    return LocalMap(torch.tensor(low), 0.2, known.float(), known, passable, passable)
 
 
 @given(
@@ -86,7 +86,7 @@ def test_a_passage_one_cell_wide_is_open_and_a_wall_two_cells_thick_is_closed():
 def test_a_detour_is_as_long_as_it_looks():
     passable = torch.ones(40, 40, 6, dtype=torch.bool)
     passable[18:22, :30] = False
-    here = surroundings(passable, low=(-20, -20, -3))
+    here = local_map(passable, low=(-20, -20, -3))
     goal = torch.tensor([[-3.0, -3.0, 0.0]], dtype=torch.float64)
     field = DistanceField.to(here, goal)
     start = torch.tensor([3.0, -3.0, 0.0], dtype=torch.float64)
@@ -98,7 +98,7 @@ def test_a_detour_is_as_long_as_it_looks():
 @given(seed=st.integers(0, 200))
 def test_never_shorter_than_a_straight_line_nor_much_longer_in_the_open(seed):
     generator = torch.Generator().manual_seed(seed)
-    here = surroundings(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
+    here = local_map(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
     corner = here.low.double() * 0.2
     size = torch.tensor([4.0, 3.2, 2.0], dtype=torch.float64)
     goal, point = corner + torch.rand(2, 3, generator=generator, dtype=torch.float64) * size
@@ -110,7 +110,7 @@ def test_never_shorter_than_a_straight_line_nor_much_longer_in_the_open(seed):
 def test_the_way_ahead_comes_closer_cell_by_cell():
     passable = torch.ones(40, 40, 6, dtype=torch.bool)
     passable[18:22, :30] = False
-    field = DistanceField.to(surroundings(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
+    field = DistanceField.to(local_map(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
     point = torch.tensor([[7.0, 1.0, 0.6]], dtype=torch.float64)
     before = float(field.at(point))
     for _ in range(60):
@@ -129,7 +129,7 @@ def test_the_way_ahead_comes_closer_cell_by_cell():
 def test_where_there_is_no_way():
     passable = torch.ones(20, 8, 8, dtype=torch.bool)
     passable[8:12] = False
-    here = surroundings(passable)
+    here = local_map(passable)
     field = DistanceField.to(here, torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64))
     points = torch.tensor([[3.5, 0.5, 0.5], [1e9, 0.0, 0.0], [0.7, 0.5, 0.5]], dtype=torch.float64)
     metres, ahead = field.way(points, 3)

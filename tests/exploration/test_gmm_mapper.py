@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
-from gmmtorch.exploration.robot.gmm_mapper import FrameRule, MixtureMapper
-from gmmtorch.exploration.robot.mapper import Memo, Sensed
+from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
+from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
@@ -35,7 +35,7 @@ from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 
-def replica_of(one: MixtureMapper) -> Replica:
+def replica_of(one: GmmMapper) -> Replica:
     assert isinstance(one.shared, Replica)
     return one.shared
 
@@ -49,7 +49,7 @@ def by_kind(datagrams: list[bytes]) -> tuple[list[bytes], list[bytes]]:
     return parts[0], parts[1]
 
 
-def flown(codec: str = "replica", robot: int = 0) -> tuple[MixtureMapper, list[Sensed], list[bytes]]:
+def flown(codec: str = "replica", robot: int = 0) -> tuple[GmmMapper, list[FrameUpdate], list[bytes]]:
     """A mapper that has been to all places, thrice, so that it has counts to send; and all that it said."""
     one = mapper(robot, codec)
     sensed, said = [], []
@@ -60,16 +60,16 @@ def flown(codec: str = "replica", robot: int = 0) -> tuple[MixtureMapper, list[S
 
 
 @pytest.fixture(scope="module")
-def flight() -> tuple[MixtureMapper, list[Sensed], list[bytes]]:
+def flight() -> tuple[GmmMapper, list[FrameUpdate], list[bytes]]:
     return flown()
 
 
 @pytest.fixture(scope="module")
-def broadcast_flight() -> tuple[MixtureMapper, list[Sensed], list[bytes]]:
+def broadcast_flight() -> tuple[GmmMapper, list[FrameUpdate], list[bytes]]:
     return flown("quantized")
 
 
-def anew(one: MixtureMapper) -> MixtureMapper:
+def anew(one: GmmMapper) -> GmmMapper:
     """A mapper that has all components of another at once, cast from scratch."""
     other = mapper(9)
     if len(one.components()):
@@ -86,7 +86,7 @@ def assert_same_components(one: Components, other: Components, exact: bool = Tru
     assert torch.equal(one.origins[one.seen_from], other.origins[other.seen_from])
 
 
-def assert_same_evidence(one: MixtureMapper, other: MixtureMapper) -> None:
+def assert_same_evidence(one: GmmMapper, other: GmmMapper) -> None:
     for a, b in zip(one.belief.grid.dense(BOX), other.belief.grid.dense(BOX), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-4)
     for a, b in zip(one.local.evidence(), other.local.evidence(), strict=True):
@@ -179,7 +179,7 @@ def test_a_window_that_wanders_is_filled_with_what_all_components_say() -> None:
     assert float(torch.stack(one.belief.grid.dense(BOX)).sum()) > refilled
 
 
-def assert_window_is_that_of_the_belief(one: MixtureMapper) -> None:
+def assert_window_is_that_of_the_belief(one: GmmMapper) -> None:
     """In every cell of the window that the belief has, too."""
     box = common(one.local.box, BOX)
     assert box is not None
@@ -349,7 +349,7 @@ def test_a_stride_counts_for_those_it_leaves_out() -> None:
 # -- counts -------------------------------------------------------------------------------------------
 
 
-def first_batch() -> tuple[MixtureMapper, list[bytes]]:
+def first_batch() -> tuple[GmmMapper, list[bytes]]:
     one = mapper(codec="float")
     one.sense(frame(*PLACES[0]))
     return one, one.datagrams()
@@ -417,7 +417,7 @@ def test_counts_of_two_robots_with_the_same_sequence_are_told_apart() -> None:
 # -- what changes what was said -------------------------------------------------------------------------
 
 
-def remembering(memo: Memo) -> tuple[MixtureMapper, MixtureMapper]:
+def remembering(memo: Memo) -> tuple[GmmMapper, GmmMapper]:
     """One that has seen two places, and one that has heard of them, who share what they work out."""
     speaker, listener = (mapper(robot, memo=memo) for robot in range(2))
     for place in PLACES[:2]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gmmtorch.exploration.mission.snapshots import Album
+from gmmtorch.exploration.mission.snapshots import Snapshots
 
 OBSERVABLE = 1e6
 
@@ -20,7 +20,9 @@ CURVES: dict[str, Callable[[float], float]] = {
 }
 
 
-def flown(album: Album, learned: Callable[[float], float], n: int, begin: int = 0, end: int = 0) -> Album:
+def flown(
+    album: Snapshots, learned: Callable[[float], float], n: int, begin: int = 0, end: int = 0
+) -> Snapshots:
     """Shown the ticks after `begin`, up to `end` (0: the last) of a mission of n."""
     for tick in range(begin + 1, (end or n) + 1):
         union = SimpleNamespace(observable_bits=OBSERVABLE, entropy_bits=OBSERVABLE * (1 - learned(tick / n)))
@@ -29,8 +31,8 @@ def flown(album: Album, learned: Callable[[float], float], n: int, begin: int = 
     return album
 
 
-def album() -> Album:
-    return Album(lambda mission: {"taken at": mission.tick})
+def album() -> Snapshots:
+    return Snapshots(lambda mission: {"taken at": mission.tick})
 
 
 @pytest.mark.parametrize("n", [100, 1600])

@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator, ViewValues, residual_of
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 FOV = (1.5184, 1.0123)
 RESOLUTION = 0.2
 
 
-def surroundings(occupancy, observed, low=(0, 0, 0), resolution=RESOLUTION):
+def local_map(occupancy, observed, low=(0, 0, 0), resolution=RESOLUTION):
     free = observed & (occupancy < 0.2)
-    return Surroundings(torch.tensor(low), resolution, occupancy.float(), observed, free, free)
+    return LocalMap(torch.tensor(low), resolution, occupancy.float(), observed, free, free)
 
 
 def random_map(shape, seed, low=(0, 0, 0)):
@@ -34,7 +34,7 @@ def random_map(shape, seed, low=(0, 0, 0)):
     occupancy[kind > 0.3] = 0.02
     occupancy[kind > 0.9] = 0.97
     occupancy = torch.where(kind > 0.93, between, occupancy)
-    return surroundings(occupancy, kind > 0.3, low)
+    return local_map(occupancy, kind > 0.3, low)
 
 
 def hall(shape=(80, 80, 32), known=14, low=(-40, -40, -16), prior=0.125):
@@ -44,11 +44,11 @@ def hall(shape=(80, 80, 32), known=14, low=(-40, -40, -16), prior=0.125):
     occupancy = torch.full(shape, prior)
     occupancy[observed] = 0.02
     occupancy[observed & (y == 6) & ((x - 2).abs() > 2)] = 0.9
-    return surroundings(occupancy, observed, low)
+    return local_map(occupancy, observed, low)
 
 
 def unknown(shape=(72, 72, 36), low=(-36, -36, -18), prior=0.125):
-    return surroundings(torch.full(shape, prior), torch.zeros(shape, dtype=torch.bool), low)
+    return local_map(torch.full(shape, prior), torch.zeros(shape, dtype=torch.bool), low)
 
 
 def all_headings(evaluator, cell=(0, 0, 0)):
@@ -290,7 +290,7 @@ def test_known_space_is_worth_nothing(evaluator):
     generator = torch.Generator().manual_seed(0)
     shape = (40, 36, 21)
     occupancy = torch.where(torch.rand(shape, generator=generator) < 0.05, 0.9, 0.01)
-    known = surroundings(occupancy, torch.ones(shape, dtype=torch.bool), (-20, -18, -10))
+    known = local_map(occupancy, torch.ones(shape, dtype=torch.bool), (-20, -18, -10))
     values = evaluator.evaluate(known, all_headings(evaluator))
     assert values.values.tolist() == [0.0] * 16
     assert not bool(values.gain.any())
@@ -303,10 +303,10 @@ def test_what_lies_behind_a_wall_is_worth_nothing(evaluator):
     observed[:61] = True
     occupancy = torch.full(shape, 0.125)
     occupancy[:60], occupancy[60] = 0.01, 0.95
-    walled = surroundings(occupancy, observed, (-40, -30, -15))
+    walled = local_map(occupancy, observed, (-40, -30, -15))
     assert float(evaluator.evaluate(walled, torch.tensor([[5, 0, 0, 0]])).values) == 0
     occupancy[60] = 0.01
-    opened = surroundings(occupancy, observed, (-40, -30, -15))
+    opened = local_map(occupancy, observed, (-40, -30, -15))
     assert float(evaluator.evaluate(opened, torch.tensor([[5, 0, 0, 0]])).values) > 100
 
 
@@ -336,7 +336,7 @@ def test_moving_the_lattice_changes_nothing(shift, seed):
     evaluator = ViewEvaluator(*FOV, 2.0, RESOLUTION, n_beams=30, n_yaws=4)
     here = random_map((15, 14, 9), seed)
     cells = tuple(2 * 10**6 * s for s in shift)  # 1600 km away at most
-    there = Surroundings(
+    there = LocalMap(
         torch.tensor(cells), here.resolution, here.occupancy, here.observed, here.free, here.passable
     )
     keys = torch.tensor([[3, 3, 2, 0], [4, 3, 2, 1], [0, 0, 0, 2], [9, 3, 2, 3]])
@@ -423,10 +423,10 @@ def test_what_cannot_be_evaluated_is_refused():
         with pytest.raises(InvalidArgumentError, match="keys"):
             evaluator.evaluate(around, keys)
     key = torch.zeros(1, 4, dtype=torch.int64)
-    coarse = surroundings(torch.full((4, 4, 4), 0.1), torch.zeros(4, 4, 4, dtype=torch.bool), (0, 0, 0), 0.3)
+    coarse = local_map(torch.full((4, 4, 4), 0.1), torch.zeros(4, 4, 4, dtype=torch.bool), (0, 0, 0), 0.3)
     with pytest.raises(InvalidArgumentError, match="resolution"):
         evaluator.evaluate(coarse, key)
-    broken = surroundings(torch.full((4, 4, 4), math.nan), torch.zeros(4, 4, 4, dtype=torch.bool))
+    broken = local_map(torch.full((4, 4, 4), math.nan), torch.zeros(4, 4, 4, dtype=torch.bool))
     with pytest.raises(InvalidArgumentError, match="occupancy"):
         evaluator.evaluate(broken, key)
     for options, match in (

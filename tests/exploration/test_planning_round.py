@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.planning.planning_round import take_turns
 
@@ -34,7 +34,7 @@ class Recorder:
     def __init__(self, number: int, log: list[tuple[str, int, Any]], values: list[float]) -> None:
         self.number, self._log, self._values = number, log, values
         self.braking = states(2, -float(number + 1))
-        self.traffic: list[Traffic] = []
+        self.peers: list[PeerTrajectories] = []
 
     def _note(self, name: str, *about: Any) -> None:
         self._log.append((name, self.number, about))
@@ -45,10 +45,10 @@ class Recorder:
     def survey(self, now: float) -> None:
         self._note("survey", now)
 
-    def propose(self, now: float, fixed: Collection[int], traffic: Traffic) -> Plan:
+    def propose(self, now: float, fixed: Collection[int], peers: PeerTrajectories) -> Plan:
         self._note("propose", now, sorted(fixed))
-        self.traffic.append(traffic)
-        x = 100.0 * self.number + len(self.traffic)
+        self.peers.append(peers)
+        x = 100.0 * self.number + len(self.peers)
         return Plan(states(3, x), states(1, x + 0.5), states(1, x)[:, :4], self._values.pop(0), "explore")
 
     def settle(self) -> None:
@@ -112,7 +112,7 @@ def test_plans_are_told_once_and_before_those_listen_who_plan_after_them(name: s
 def test_everybody_follows_the_last_plan_that_it_proposed(name: str, seed: int) -> None:
     pilots, _, plans = taken(name, seed)
     for robot, plan in plans.items():
-        assert plan.path[0, 0] == 100 * robot + len(pilots[robot].traffic)
+        assert plan.path[0, 0] == 100 * robot + len(pilots[robot].peers)
 
 
 def test_who_plans_after_whom() -> None:
@@ -149,11 +149,11 @@ def test_traffic_is_where_the_others_may_be(name: str, seed: int) -> None:
                 expected.append([planned] * 3 + [planned + 0.5])
             if not n_proposed[other] or (name == "distributed_greedy" and other not in fixed):
                 expected.append([braking] * 2)
-        traffic = pilots[robot].traffic[n_proposed[robot]]
-        assert len(traffic) == len(expected)
-        for path, xs in zip(traffic.paths[:, :, 0].tolist(), expected, strict=True):
+        peers = pilots[robot].peers[n_proposed[robot]]
+        assert len(peers) == len(expected)
+        for path, xs in zip(peers.paths[:, :, 0].tolist(), expected, strict=True):
             assert path == xs + [xs[-1]] * (len(path) - len(xs))
-        assert traffic.separation == pytest.approx(2 * OPTIONS.dynamics.radius + 0.25)
+        assert peers.separation == pytest.approx(2 * OPTIONS.dynamics.radius + 0.25)
         n_proposed[robot] += 1
 
 
@@ -168,4 +168,4 @@ def test_a_robot_alone_plans_and_tells() -> None:
     plans = take_turns([pilot], Coordination("greedy"), OPTIONS, NOW, 3, torch.Generator())
     assert [what for what, *_ in log] == ["survey", "listen", "propose", "settle", "tell_plan", "tell_views"]
     assert list(plans) == [0]
-    assert len(pilot.traffic[0]) == 0
+    assert len(pilot.peers[0]) == 0

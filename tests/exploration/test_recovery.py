@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import surroundings_of
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.collision_checking import local_map_of
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.recovery import retreat, shortened
@@ -34,7 +34,7 @@ def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> Pla
     """A robot at rest at HERE, in a world that it takes for occupied, or free."""
     hits = torch.zeros(SHAPE) if free else torch.full(SHAPE, 30.0)
     misses = torch.full(SHAPE, 50.0) if free else torch.zeros(SHAPE)
-    surroundings = surroundings_of(
+    local_map = local_map_of(
         torch.zeros(3, dtype=torch.int64),
         0.2,
         hits,
@@ -47,12 +47,12 @@ def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> Pla
     )
     given = {
         "state": torch.cat([HERE, torch.tensor([0.7, 0, 0, 0], dtype=torch.float64)]),
-        "traffic": Traffic.of([]),
+        "peers": PeerTrajectories.of([]),
         **changes,
     }
     return PlanningTask(
         robot=0,
-        surroundings=surroundings,
+        local_map=local_map,
         residual=torch.ones(500),
         library=ViewLibrary(0),
         roadmap=Roadmap(),
@@ -105,7 +105,7 @@ def test_else_it_does_not(case: str) -> None:
         "it fits": task(free=True),
         "it moves": task(state=moving),
         "no trail": task(trail=HERE[None]),
-        "somebody is there": task(traffic=Traffic.of([behind[None]])),
+        "somebody is there": task(peers=PeerTrajectories.of([behind[None]])),
     }
     assert retreat(PRIMITIVES, tasks[case]) is None
     assert retreat(PRIMITIVES, task()) is not None

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.robot.stopping_criterion import DiminishingReturns, RestRule
+from gmmtorch.exploration.robot.stopping_criterion import StoppingCriterion, StoppingRule
 
 GAINS = st.lists(st.floats(0, 100), min_size=1, max_size=60)
 
 
-def rests_by_the_book(gains: list[float], every: float, rule: RestRule) -> int | None:
+def rests_by_the_book(gains: list[float], every: float, rule: StoppingRule) -> int | None:
     """After which of the notes a robot rests, that nobody tells anything."""
     times = [i * every for i in range(len(gains))]
     learned = [sum(gains[: i + 1]) for i in range(len(gains))]
@@ -29,8 +29,8 @@ def rests_by_the_book(gains: list[float], every: float, rule: RestRule) -> int |
 
 @given(gains=GAINS, every=st.sampled_from([1.0, 2.0, 7.0]), share=st.sampled_from([0.0, 0.1, 0.6, 0.9]))
 def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
-    rule = RestRule(share, window=10.0)
-    returns, learned = DiminishingReturns(rule), 0.0
+    rule = StoppingRule(share, window=10.0)
+    returns, learned = StoppingCriterion(rule), 0.0
     expected = rests_by_the_book(gains, every, rule)
     for i, gain in enumerate(gains):
         learned += gain
@@ -47,8 +47,8 @@ def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
 )
 def test_time_in_which_it_was_boxed_in_does_not_count(gains, share):
     """What it did otherwise, put end to end, is all that it goes by; what it learned meanwhile counts."""
-    rule = RestRule(share, window=10.0)
-    returns, learned = DiminishingReturns(rule), 0.0
+    rule = StoppingRule(share, window=10.0)
+    returns, learned = StoppingCriterion(rule), 0.0
     told: list[float] = []  # of the notes that count
     since = 0.0
     for i, (gain, boxed_in) in enumerate(gains):
@@ -64,7 +64,7 @@ def test_time_in_which_it_was_boxed_in_does_not_count(gains, share):
 
 
 def test_boxed_in_for_ever_it_never_rests_and_keeps_nothing_of_it():
-    returns = DiminishingReturns(RestRule(0.9, window=10.0))
+    returns = StoppingCriterion(StoppingRule(0.9, window=10.0))
     for now in (0, 5, 9):
         returns.note(now, 100.0 * now, 0.0)
     size = len(returns.state()["noted"])
@@ -79,9 +79,9 @@ def test_boxed_in_for_ever_it_never_rests_and_keeps_nothing_of_it():
     assert returns.rests
 
 
-def resting() -> DiminishingReturns:
+def resting() -> StoppingCriterion:
     """At rest at 30 s, having learned 100 bits in its best 10 s, with 150 known."""
-    returns = DiminishingReturns(RestRule(0.05, window=10.0))
+    returns = StoppingCriterion(StoppingRule(0.05, window=10.0))
     for now, learned in ((0, 0), (10, 100), (20, 110), (30, 110)):
         assert not returns.rests
         returns.note(now, learned, 40.0 + learned)
@@ -103,14 +103,14 @@ def test_news_wake_it_for_a_window_at_least():
 
 
 def test_a_share_of_nothing_never_rests():
-    returns = DiminishingReturns(RestRule(0.0, window=4.0))
+    returns = StoppingCriterion(StoppingRule(0.0, window=4.0))
     for now in range(50):
         returns.note(now, 0.0, 0.0)
     assert not returns.rests
 
 
 def test_its_state_is_all_there_is():
-    one, other = resting(), DiminishingReturns(RestRule(0.05, window=10.0))
+    one, other = resting(), StoppingCriterion(StoppingRule(0.05, window=10.0))
     other.restore(one.state())
     for now, known in ((33, 160.0), (34, 190.0), (36, 190.0), (44, 190.0), (46, 190.0)):
         one.note(now, 110, known)
@@ -131,4 +131,4 @@ def test_its_state_is_all_there_is():
 )
 def test_what_cannot_be(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
-        RestRule(**options)
+        StoppingRule(**options)

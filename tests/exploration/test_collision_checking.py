@@ -16,11 +16,11 @@ from gmmtorch.exploration.planning.collision_checking import (
     cells_in_sphere,
     feasible,
     inflated,
-    surroundings_of,
+    local_map_of,
 )
-from gmmtorch.exploration.planning.peer_trajectories import Traffic
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.robot.local_map import Surroundings
+from gmmtorch.exploration.robot.local_map import LocalMap
 
 LIBRARY = Primitives(Dynamics())
 RADIUS, CELL = 0.3, 0.2
@@ -32,11 +32,9 @@ def seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def known(
-    blocked: Tensor, low: Tensor = LOW, resolution: float = CELL, radius: float = RADIUS
-) -> Surroundings:
-    """Surroundings in which all is free but the blocked cells."""
-    return surroundings_of(
+def known(blocked: Tensor, low: Tensor = LOW, resolution: float = CELL, radius: float = RADIUS) -> LocalMap:
+    """LocalMap in which all is free but the blocked cells."""
+    return local_map_of(
         low,
         resolution,
         100.0 * blocked,
@@ -127,7 +125,7 @@ def test_probabilities_are_those_of_pseudo_counts():
     hits = torch.tensor([0.0, 0, 3, 0.5, 1, 0.5, 1]).view(7, 1, 1).expand(7, 4, 4)
     misses = torch.tensor([0.0, 9, 1, 0, 18, 7, 20]).view(7, 1, 1).expand(7, 4, 4)
     given_hits, given_misses = hits.clone(), misses.clone()
-    found = surroundings_of(
+    found = local_map_of(
         torch.tensor([1, 2, 3]), 0.5, given_hits, given_misses,
         prior=0.5, planning_prior=0.125, free_below=0.25, radius=0.3,
     )  # fmt: skip
@@ -148,7 +146,7 @@ def test_known_free_spheres_free_the_cells_that_lie_wholly_in_them(seed, radius,
     low = torch.tensor([-4 + far, 3, -6])
     center = (low + torch.rand(3, generator=generator, dtype=torch.float64) * 9) * CELL
     nothing = torch.zeros(9, 8, 10)
-    found = surroundings_of(
+    found = local_map_of(
         low, CELL, nothing, nothing,
         prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS,
         known_free=cells_in_sphere(center, radius, CELL),
@@ -166,7 +164,7 @@ def test_a_large_enough_start_sphere_lets_a_robot_leave():
     for radius in (0.2, 0.3, 0.5):
         for seed in range(5):
             center = torch.rand(3, generator=seeded(seed), dtype=torch.float64)
-            found = surroundings_of(
+            found = local_map_of(
                 LOW, CELL, nothing, nothing, prior=1.0, planning_prior=0.125, free_below=0.25,
                 radius=radius, known_free=cells_in_sphere(center, math.sqrt(3) * (radius + 2.5 * CELL), CELL),
             )  # fmt: skip
@@ -175,7 +173,7 @@ def test_a_large_enough_start_sphere_lets_a_robot_leave():
 
 def test_cells_of_recent_returns_are_never_free():
     obstacles = torch.tensor([[-20, -20, -8], [0, 3, 2], [0, 3, 2], [-25, 0, 0], [24, 0, 0], [0, 0, 99]])
-    found = surroundings_of(
+    found = local_map_of(
         LOW, CELL, torch.zeros(SHAPE), torch.full(SHAPE, 50.0),
         prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS, obstacles=obstacles,
         known_free=cells_in_sphere(torch.tensor([0.1, 0.7, 0.5]), 1.0, CELL),
@@ -192,7 +190,7 @@ def test_probabilities_and_priors_are_checked(bad):
     (name,) = bad
     settings = {"prior": 1.0, "planning_prior": 0.125, "free_below": 0.25, **bad}
     with pytest.raises(InvalidArgumentError, match=f"{name}="):
-        surroundings_of(LOW, CELL, torch.zeros(SHAPE), torch.zeros(SHAPE), radius=RADIUS, **settings)
+        local_map_of(LOW, CELL, torch.zeros(SHAPE), torch.zeros(SHAPE), radius=RADIUS, **settings)
 
 
 def test_passable_cells_keep_half_a_cell_more_than_the_body():
@@ -208,27 +206,27 @@ def test_passable_cells_keep_half_a_cell_more_than_the_body():
 def test_in_the_open_every_primitive_is_feasible():
     state = torch.tensor([0.05, 0.1, 0.0, 0.3, 1.2, 0.4, -0.8], dtype=torch.float64)
     state = state.expand(3, 7)
-    surroundings = known(torch.zeros(60, 60, 40, dtype=torch.bool), torch.tensor([-30, -30, -20]))
+    local_map = known(torch.zeros(60, 60, 40, dtype=torch.bool), torch.tensor([-30, -30, -20]))
     rollout = LIBRARY.rollout(state)
     braking = LIBRARY.braking(rollout[..., -1, :])
-    assert feasible(rollout, braking, surroundings).shape == (3, 25)
-    assert bool(feasible(rollout, braking, surroundings, start=state[:, None]).all())
+    assert feasible(rollout, braking, local_map).shape == (3, 25)
+    assert bool(feasible(rollout, braking, local_map, start=state[:, None]).all())
 
 
 def test_beyond_what_is_known_nothing_is_feasible_but_to_stay():
     state = torch.tensor([0.1, 0.1, 0.1, 0.0, 0, 0, 0], dtype=torch.float64)
     nothing = torch.zeros(SHAPE)
-    unknown = surroundings_of(
+    unknown = local_map_of(
         LOW, CELL, nothing, nothing, prior=1.0, planning_prior=0.125, free_below=0.25, radius=RADIUS
     )
     elsewhere = known(torch.zeros(SHAPE, dtype=torch.bool), LOW + 10_000)
     in_place = (LIBRARY.commands[:, :2] == 0).all(1)
     rollout, braking, _ = with_start(state)
-    traffic = Traffic.of([state[None, :3] + 0.1])
-    for surroundings in (unknown, elsewhere):
+    peers = PeerTrajectories.of([state[None, :3] + 0.1])
+    for local_map in (unknown, elsewhere):
         for more in ({}, {"start": state}, {"start": state, "radius": RADIUS}):
-            for others in (None, traffic):
-                assert torch.equal(feasible(rollout, braking, surroundings, others, **more), in_place)
+            for others in (None, peers):
+                assert torch.equal(feasible(rollout, braking, local_map, others, **more), in_place)
 
 
 @given(seed=st.integers(0, 10**6), density=st.floats(0.0005, 0.006))
@@ -236,7 +234,7 @@ def test_the_body_touches_only_free_cells_on_a_feasible_path_to_rest(seed, densi
     generator = seeded(seed)
     blocked = torch.rand(SHAPE, generator=generator) < density
     blocked[20:29, 20:29, 8:17] = False
-    surroundings = known(blocked)
+    local_map = known(blocked)
     limits = torch.tensor([1, 1, 1, 3, 1.5, 0.75, 1.2], dtype=torch.float64)
     state = (
         (torch.rand(7, generator=generator, dtype=torch.float64) * 2 - 1)
@@ -245,7 +243,7 @@ def test_the_body_touches_only_free_cells_on_a_feasible_path_to_rest(seed, densi
     )
     state[4] = state[4].abs()
     rollout, braking, whole = with_start(state)
-    good = feasible(rollout, braking, surroundings, start=state)
+    good = feasible(rollout, braking, local_map, start=state)
     points = fine_path(whole[good], 10).flatten(0, 1)
     inside = torch.floor(points / CELL).long() - LOW
     margin = math.ceil(RADIUS / CELL) - 1
@@ -273,14 +271,12 @@ def test_a_path_is_checked_between_its_states_and_while_braking():
     assert LIBRARY.commands[straight].tolist() == [1.5, 0, 0]
     # Only the cells in x from 0.0 to 0.2 m are forbidden, which lie between two states.
     xs = whole[straight, :, 0]
-    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
-    between = surroundings.passable.clone()
+    local_map = known(torch.zeros(SHAPE, dtype=torch.bool))
+    between = local_map.passable.clone()
     gap = [c for c in range(-4, 10) if not bool(((xs / CELL).floor() == c).any())]
     between[gap[0] - int(LOW[0])] = False
-    pierced = Surroundings(
-        LOW, CELL, surroundings.occupancy, surroundings.observed, surroundings.free, between
-    )
-    assert bool(feasible(rollout, braking, surroundings, start=state)[straight])
+    pierced = LocalMap(LOW, CELL, local_map.occupancy, local_map.observed, local_map.free, between)
+    assert bool(feasible(rollout, braking, local_map, start=state)[straight])
     assert not bool(feasible(rollout, braking, pierced, start=state)[straight])
     # A wall that only the way to rest runs into.
     wall = torch.zeros(SHAPE, dtype=torch.bool)
@@ -288,10 +284,10 @@ def test_a_path_is_checked_between_its_states_and_while_braking():
     assert bool(feasible(rollout, rollout[:, -1:], known(wall), start=state)[straight])
     assert not bool(feasible(rollout, braking, known(wall), start=state)[straight])
     # And the way to the first state, if the start is known.
-    first = surroundings.passable.clone()
+    first = local_map.passable.clone()
     first[int((-1.0 + 0.12) // CELL) - int(LOW[0])] = False
-    assert bool(surroundings.is_passable(state[:3]))
-    ahead = Surroundings(LOW, CELL, surroundings.occupancy, surroundings.observed, surroundings.free, first)
+    assert bool(local_map.is_passable(state[:3]))
+    ahead = LocalMap(LOW, CELL, local_map.occupancy, local_map.observed, local_map.free, first)
     assert not bool(feasible(rollout, braking, ahead, start=state)[straight])
 
 
@@ -323,44 +319,44 @@ def test_a_robot_that_no_longer_fits_leaves_the_way_that_is_open():
     blocked[22] = True  # a wall at x from −0.4 to −0.2 m; the robot's cell is [0, 0.2)
     for x, seen in ((0.02, False), (0.19, True)):
         state = torch.tensor([x, 0.1, 0.1, 0, 0, 0, 0], dtype=torch.float64)
-        surroundings = known(blocked)
-        assert not bool(surroundings.is_passable(state[:3]))
+        local_map = known(blocked)
+        assert not bool(local_map.is_passable(state[:3]))
         forward = LIBRARY.commands[:, 0] > 0
         for yaw, leaves in ((0.0, True), (math.pi, False), (math.pi / 2, seen)):
             state[3] = yaw
             rollout, braking, whole = with_start(state)
-            good = feasible(rollout, braking, surroundings, start=state, radius=RADIUS)
+            good = feasible(rollout, braking, local_map, start=state, radius=RADIUS)
             straight = int((LIBRARY.commands == torch.tensor([1.5, 0, 0])).all(1).nonzero())
             assert bool(good[straight]) == leaves
             if not leaves:
                 assert float(fine_path(whole[good])[..., 0].min()) >= x - 1e-9
-            unaided = feasible(rollout, braking, surroundings, start=state)
+            unaided = feasible(rollout, braking, local_map, start=state)
             assert not bool(unaided[forward].any())
 
 
 def test_many_robots_are_answered_as_one_by_one():
     blocked = torch.rand(SHAPE, generator=seeded(5)) < 0.004
-    surroundings = known(blocked)
+    local_map = known(blocked)
     generator = seeded(6)
     states = torch.rand(12, 7, generator=generator, dtype=torch.float64) * 2 - 1
     states[:, 4:] = 0
     rollout = LIBRARY.rollout(states)
     braking = LIBRARY.braking(rollout[..., -1, :])
-    traffic = Traffic.of([torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)])
-    together = feasible(rollout, braking, surroundings, traffic, start=states[:, None], radius=RADIUS)
-    stuck = ~surroundings.is_passable(states[:, :3])
+    peers = PeerTrajectories.of([torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)])
+    together = feasible(rollout, braking, local_map, peers, start=states[:, None], radius=RADIUS)
+    stuck = ~local_map.is_passable(states[:, :3])
     assert 0 < int(stuck.sum()) < 12
     for i in range(12):
-        alone = feasible(rollout[i], braking[i], surroundings, traffic, start=states[i], radius=RADIUS)
+        alone = feasible(rollout[i], braking[i], local_map, peers, start=states[i], radius=RADIUS)
         assert torch.equal(together[i], alone)
 
 
 def test_traffic_is_kept_clear_of():
-    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
+    local_map = known(torch.zeros(SHAPE, dtype=torch.bool))
     state = torch.zeros(7, dtype=torch.float64)
     rollout, braking, whole = with_start(state)
     parked = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64)
-    good = feasible(rollout, braking, surroundings, Traffic.of([parked[None]]), start=state)
+    good = feasible(rollout, braking, local_map, PeerTrajectories.of([parked[None]]), start=state)
     nearest = (fine_path(whole) - parked).norm(dim=-1).amin(1)
     assert bool((nearest[good] >= 0.7).all())
     assert not bool(good[0])
@@ -376,8 +372,8 @@ def test_cells_much_finer_than_the_steps_are_refused():
 
 
 def test_no_paths_are_answered_with_none():
-    surroundings = known(torch.zeros(SHAPE, dtype=torch.bool))
+    local_map = known(torch.zeros(SHAPE, dtype=torch.bool))
     none = torch.zeros(0, 7, dtype=torch.float64)
     rollout = LIBRARY.rollout(none)
     braking = LIBRARY.braking(rollout[..., -1, :])
-    assert feasible(rollout, braking, surroundings, start=none[:, None], radius=RADIUS).shape == (0, 25)
+    assert feasible(rollout, braking, local_map, start=none[:, None], radius=RADIUS).shape == (0, 25)

@@ -15,7 +15,7 @@ from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble, start_poses
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.robot.initial_free_space import launch_from
+from gmmtorch.exploration.robot.initial_free_space import initial_free_space
 from gmmtorch.exploration.world.world import World
 from gmmtorch.simulation.worlds.solids import box
 
@@ -51,7 +51,7 @@ def place(*coordinates: float) -> torch.Tensor:
 
 def test_with_room_it_knows_the_sphere_that_is_clear_and_no_more(hall: World) -> None:
     here = place(5.1, 4.3, 1.7)
-    launch = launch_from(hall, here, PRIMITIVES)
+    launch = initial_free_space(hall, here, PRIMITIVES)
     assert launch is not None
     assert torch.equal(launch.trail, here[None])
     clear = min(float(hall.mesh.clearance(here[None])), 3**0.5 * (0.3 + 2.5 * 0.2))
@@ -64,7 +64,7 @@ def test_what_it_is_told_is_true_and_the_way_touches_nothing(
     hall: World, x: float, y: float, z: float, seed: int
 ) -> None:
     against = [place(0.42, y, z), place(x, 7.78, z), place(x, y, 0.42)][seed]
-    launch = launch_from(hall, against, PRIMITIVES)
+    launch = initial_free_space(hall, against, PRIMITIVES)
     assert launch is not None
     cells = launch.known_free - hall.box.low
     assert bool((cells >= 0).all())

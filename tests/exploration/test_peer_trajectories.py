@@ -1,4 +1,4 @@
-"""Traffic and collisions: against distances at finely spaced times, and arithmetic."""
+"""PeerTrajectories and collisions: against distances at finely spaced times, and arithmetic."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.peer_trajectories import Traffic, clear_of
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, clear_of
 from gmmtorch.exploration.world.collisions import collides, meets_others
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.solids import box
@@ -43,7 +43,7 @@ def test_clear_paths_are_clear_at_all_times_and_if_the_others_are_early_or_late(
     generator = torch.Generator().manual_seed(seed)
     others = [walk(n, generator) for n in lengths]
     paths = torch.stack([walk(n_path, generator) for _ in range(20)])
-    clear = clear_of(paths, Traffic.of(others, 0.7))
+    clear = clear_of(paths, PeerTrajectories.of(others, 0.7))
     time = torch.arange(FINE, 16 * FINE, dtype=torch.float64) / FINE
     for other in others:
         apart = (at(paths, time) - at(other, time + shift)).norm(dim=-1).amin(1)
@@ -53,11 +53,11 @@ def test_clear_paths_are_clear_at_all_times_and_if_the_others_are_early_or_late(
 def test_far_from_all_others_everything_is_clear_and_on_their_paths_nothing():
     generator = torch.Generator().manual_seed(0)
     other = walk(10, generator)
-    traffic = Traffic.of([other])
+    peers = PeerTrajectories.of([other])
     paths = torch.stack([other + 30, other, other.flip(0)])
-    assert clear_of(paths, traffic).tolist() == [True, False, False]
-    assert clear_of(paths, Traffic.of([])).tolist() == [True, True, True]
-    assert len(Traffic.of([])) == 0
+    assert clear_of(paths, peers).tolist() == [True, False, False]
+    assert clear_of(paths, PeerTrajectories.of([])).tolist() == [True, True, True]
+    assert len(PeerTrajectories.of([])) == 0
 
 
 def test_paths_that_cross_at_different_times_are_clear():
@@ -65,16 +65,18 @@ def test_paths_that_cross_at_different_times_are_clear():
     east = along * torch.tensor([1.0, 0, 0])
     through = torch.tensor([[3.0, 0, 0]], dtype=torch.float64) + (along - 4.5) * torch.tensor([0, 1.0, 0])
     late = east - torch.tensor([4.0, 0, 0])
-    assert clear_of(torch.stack([late, through]), Traffic.of([through])).tolist() == [True, False]
+    assert clear_of(torch.stack([late, through]), PeerTrajectories.of([through])).tolist() == [True, False]
 
 
 def test_where_another_comes_to_rest_stays_taken():
     waiting = torch.zeros(3, 3, dtype=torch.float64)
     coming = torch.linspace(6, 0.2, 15, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
-    assert not bool(clear_of(waiting[None], Traffic.of([coming])))  # it arrives after the path has ended
-    assert not bool(clear_of(coming[None], Traffic.of([waiting])))  # it arrives where one rests
+    assert not bool(
+        clear_of(waiting[None], PeerTrajectories.of([coming]))
+    )  # it arrives after the path has ended
+    assert not bool(clear_of(coming[None], PeerTrajectories.of([waiting])))  # it arrives where one rests
     aside = coming + torch.tensor([0, 1.0, 0])
-    assert bool(clear_of(aside[None], Traffic.of([waiting])))
+    assert bool(clear_of(aside[None], PeerTrajectories.of([waiting])))
 
 
 def test_a_robot_that_is_too_close_may_stay_or_move_away():
@@ -82,39 +84,39 @@ def test_a_robot_that_is_too_close_may_stay_or_move_away():
     start = torch.tensor([0.5, 0, 0], dtype=torch.float64)
     step = torch.arange(1, 6, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0, 0])
     paths = torch.stack([start.expand(5, 3), start + step, start - step, start + step.roll(1, 1)])
-    traffic = Traffic.of([other])
-    assert clear_of(paths, traffic, start.expand(4, 3)).tolist() == [True, True, False, True]
-    assert clear_of(paths, traffic).tolist() == [False, False, False, False]
+    peers = PeerTrajectories.of([other])
+    assert clear_of(paths, peers, start.expand(4, 3)).tolist() == [True, True, False, True]
+    assert clear_of(paths, peers).tolist() == [False, False, False, False]
 
 
 def test_moving_robots_keep_farther_apart_than_resting_ones():
     rest = torch.tensor([[0.75, 0, 0]], dtype=torch.float64).expand(1, 4, 3)
     other = torch.zeros(1, 3, dtype=torch.float64)
-    assert bool(clear_of(rest, Traffic.of([other])))
+    assert bool(clear_of(rest, PeerTrajectories.of([other])))
     sweep = torch.arange(4, dtype=torch.float64)[:, None] * torch.tensor([0, 0.3, 0])
-    assert not bool(clear_of(rest, Traffic.of([sweep])))
-    assert not bool(clear_of(rest + sweep, Traffic.of([other])))
+    assert not bool(clear_of(rest, PeerTrajectories.of([sweep])))
+    assert not bool(clear_of(rest + sweep, PeerTrajectories.of([other])))
 
 
 def test_later_traffic_is_the_same_traffic_from_then_on():
     generator = torch.Generator().manual_seed(3)
     other = walk(8, generator)
-    traffic = Traffic.of([other, walk(5, generator)])
-    assert torch.equal(traffic.later(3).paths[0], other[3:])
-    assert torch.equal(traffic.later(50).paths[0], other[-1:])
-    assert traffic.paths.shape == (2, 8, 3)
-    assert torch.equal(traffic.paths[1, 4:], traffic.paths[1, 4:5].expand(4, 3))
+    peers = PeerTrajectories.of([other, walk(5, generator)])
+    assert torch.equal(peers.later(3).paths[0], other[3:])
+    assert torch.equal(peers.later(50).paths[0], other[-1:])
+    assert peers.paths.shape == (2, 8, 3)
+    assert torch.equal(peers.paths[1, 4:], peers.paths[1, 4:5].expand(4, 3))
 
 
 @pytest.mark.parametrize("paths", [torch.zeros(2, 3), torch.zeros(2, 0, 3), torch.full((1, 1, 3), math.nan)])
 def test_traffic_that_is_nowhere_is_refused(paths):
     with pytest.raises(InvalidArgumentError, match="paths"):
-        Traffic(paths)
+        PeerTrajectories(paths)
 
 
 def test_separation_must_be_a_distance():
     with pytest.raises(InvalidArgumentError, match="separation="):
-        Traffic.of([], 0.0)
+        PeerTrajectories.of([], 0.0)
 
 
 def test_a_robot_collides_where_a_surface_is_within_its_radius():

@@ -1,4 +1,4 @@
-"""Publication: whatever a map becomes, and wherever lives of its robot end, its records are the map."""
+"""MapPublisher: whatever a map becomes, and wherever lives of its robot end, its records are the map."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.schedules import components
 
-from gmmtorch.exploration.mission.map_publisher import Publication
+from gmmtorch.exploration.mission.map_publisher import MapPublisher
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.replica.replica import Replica
 
@@ -32,7 +32,7 @@ def empty() -> Components:
 @given(seed=st.integers(0, 10**6))
 def test_records_are_the_map_in_one_life_and_all_that_changes_is_said(seed):
     rng, replica, observer = random.Random(seed), Replica(3), Replica(9)
-    publication, known = Publication(replica), empty()
+    publication, known = MapPublisher(replica), empty()
     for _ in range(6):
         before, known = content(known), grown(rng, known)
         n = replica.n_components
@@ -58,7 +58,7 @@ def test_a_life_goes_on_where_another_was_cut_off_and_says_no_more_than_it_must(
         remembered = [datagram for datagram in everything(team) if rng.random() < 0.7]
         for datagram in remembered:
             replica.receive(datagram)
-        publication = Publication(replica)
+        publication = MapPublisher(replica)
         for _ in range(2):
             known = grown(rng, known)
             publication.update(known, whole=False)
@@ -94,7 +94,7 @@ def everything(replica: Replica) -> list[bytes]:
 
 def test_counts_of_others_do_not_make_it_say_anything_again():
     rng, replica, other = random.Random(0), Replica(3), Replica(4)
-    publication, known = Publication(replica), components(random.Random(1), 5)
+    publication, known = MapPublisher(replica), components(random.Random(1), 5)
     publication.update(known, whole=True)
     for datagram in replica.datagrams():
         other.receive(datagram)
@@ -113,8 +113,8 @@ def test_components_of_others_are_left_alone():
     for datagram in other.datagrams():
         assert replica.receive(datagram)
     known = components(random.Random(2), 3)
-    Publication(replica).update(known, whole=True)
+    MapPublisher(replica).update(known, whole=True)
     assert content(replica.components()) == content(known, other.components())
     again = replace(known, support=known.support * 2, seen_count=known.seen_count * 2)
-    Publication(replica).update(again, whole=True)
+    MapPublisher(replica).update(again, whole=True)
     assert content(replica.components()) == content(again, other.components())
