@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.scan import Scan

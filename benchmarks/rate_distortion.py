@@ -50,6 +50,7 @@ from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.learning.incremental import cell_rule
 from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.save import save_figure
@@ -150,7 +151,7 @@ MIXTURES = {  # how the same components are written, and for how many of them it
 def measure_mixtures(task: Task) -> Rows:
     """A row for each way to write the same components."""
     frames, asked = material(task.dataset, task.folder, task.n_frames)
-    rule = IncrementalRule().fitted([frame.scan for frame in frames]).cells()
+    rule = cell_rule(IncrementalRule().fitted([frame.scan for frame in frames]))
     rule = replace(
         rule,
         length=rule.length / FINER,

@@ -24,7 +24,8 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.mapping.learning.windowed import WindowedRule, learn_window
+from gmmtorch.mapping.learning.rules import WindowedRule
+from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays

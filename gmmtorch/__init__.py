@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
-    from gmmtorch.mapping.learning.incremental import IncrementalRule as IncrementalRule
-    from gmmtorch.mapping.learning.windowed import WindowedRule as WindowedRule
-    from gmmtorch.mapping.novelty import NoveltyRule as NoveltyRule
+    from gmmtorch.mapping.learning.rules import IncrementalRule as IncrementalRule
+    from gmmtorch.mapping.learning.rules import NoveltyRule as NoveltyRule
+    from gmmtorch.mapping.learning.rules import WindowedRule as WindowedRule
     from gmmtorch.mixture.depth_image import fit_depth_image as fit_depth_image
     from gmmtorch.mixture.estimators.deconvolved import (
         DeconvolvedGaussianMixture as DeconvolvedGaussianMixture,
@@ -52,15 +52,15 @@ _HOMES = {
     "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
     "GmmTorchError": "gmmtorch.errors",
     "HierarchicalGaussianMixture": "gmmtorch.mixture.estimators.trees.hierarchical",
-    "IncrementalRule": "gmmtorch.mapping.learning.incremental",
-    "NoveltyRule": "gmmtorch.mapping.novelty",
+    "IncrementalRule": "gmmtorch.mapping.learning.rules",
+    "NoveltyRule": "gmmtorch.mapping.learning.rules",
     "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
     "RiemannianGaussianMixture": "gmmtorch.mixture.estimators.riemannian",
     "Scan": "gmmtorch.scan",
     "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.estimators.sliced_wasserstein",
     "VariationalGaussianMixture": "gmmtorch.mixture.estimators.variational",
     "VoxelGrid": "gmmtorch.occupancy.grid",
-    "WindowedRule": "gmmtorch.mapping.learning.windowed",
+    "WindowedRule": "gmmtorch.mapping.learning.rules",
     "fit_depth_image": "gmmtorch.mixture.depth_image",
     "merge": "gmmtorch.mixture.reduction.merge",
     "prune": "gmmtorch.mixture.reduction.pruning",

@@ -14,7 +14,7 @@ from gmmtorch.cli import common
 if TYPE_CHECKING:
     from gmmtorch.evaluation.methods import MapFactory
     from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
-    from gmmtorch.mapping.novelty import NoveltyRule
+    from gmmtorch.mapping.learning.rules import NoveltyRule
 
 _ANSWERING = ("n_samples", "sampling", "prior", "cutoff", "hit_length", "codec")
 
@@ -75,8 +75,7 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
 
 def _rule(options: dict[str, Any], dtype: str) -> Learning:
     """The learning rule of the options `map.*` that are left."""
-    from gmmtorch.mapping.learning.incremental import IncrementalRule
-    from gmmtorch.mapping.learning.windowed import WindowedRule
+    from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 
     if options.pop("name") != "incremental":
         return WindowedRule(**options, dtype=dtype)
@@ -87,7 +86,7 @@ def _rule(options: dict[str, Any], dtype: str) -> Learning:
 def _novelty(options: Any) -> NoveltyRule:
     """The rule of the options `map.novelty`, whose names and types no schema has checked."""
     from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.mapping.novelty import NoveltyRule
+    from gmmtorch.mapping.learning.rules import NoveltyRule
 
     chosen: DictConfig = OmegaConf.structured(NoveltyRule)
     OmegaConf.set_readonly(chosen, False)  # as the dataclass is

@@ -140,7 +140,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     from gmmtorch.exploration.robot.gmm_mapper import FrameRule
     from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
     from gmmtorch.exploration.world.scoring import BeliefRule
-    from gmmtorch.mapping.novelty import NoveltyRule
+    from gmmtorch.mapping.learning.rules import NoveltyRule
     from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)

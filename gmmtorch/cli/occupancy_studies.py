@@ -83,7 +83,7 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, keep: Keep) ->
     from gmmtorch.evaluation import methods as contenders
     from gmmtorch.evaluation.studies import auc_memory
     from gmmtorch.evaluation.studies.auc_memory import Sized
-    from gmmtorch.mapping.query import check_method
+    from gmmtorch.mapping.query_options import check_method
     from gmmtorch.report.studies import auc_memory_figures as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))
@@ -119,7 +119,7 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
     import torch
 
     from gmmtorch.evaluation.studies import variance_threshold
-    from gmmtorch.mapping.query import check_method
+    from gmmtorch.mapping.query_options import check_method
     from gmmtorch.report.studies import variance_threshold_figures as report
 
     options = _options(config)
@@ -166,7 +166,7 @@ def _pose_correction(config: DictConfig, device: str, on_event: Event, keep: Kee
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.evaluation import held_out as occupancy
     from gmmtorch.evaluation.studies import pose_correction
-    from gmmtorch.mapping.query import METHODS, check_method
+    from gmmtorch.mapping.query_options import METHODS, check_method
     from gmmtorch.report.studies import pose_correction_figures as report
 
     protocol = occupancy.Protocol(**common.as_options(config.evaluation))

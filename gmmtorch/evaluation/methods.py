@@ -18,7 +18,7 @@ from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import METHODS
+from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.protocol import OccupancyMap
 
 MapFactory = Callable[[float], OccupancyMap]

@@ -18,10 +18,11 @@ from gmmtorch.linalg import argsort, check_rigid
 from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.learning.incremental import IncrementalRule, absorb, absorb_depth, depth_scan
-from gmmtorch.mapping.learning.windowed import WindowedRule
-from gmmtorch.mapping.novelty import NoveltyRule
-from gmmtorch.mapping.query import Answering, Answers, check_method
+from gmmtorch.mapping.learning.incremental import absorb, absorb_depth, depth_scan
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
+from gmmtorch.mapping.learning.windowed import learn_window
+from gmmtorch.mapping.query import Answers
+from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -57,7 +58,7 @@ class GaussianMap(nn.Module):
         robot: first half of the components' ids.
         codec: how components are written, and so what is answered from: "quantized", some 10 bytes
             each, or "float", every number as it is.
-        answering: further options of `Answering`: prior, cutoff, n_samples, …
+        answering: further options of `QueryOptions`: prior, cutoff, n_samples, …
 
     Asking a map does not change it: scans of a window that is not full yet are learned from for the
     answer, and again when the window is. What an answer needs is prepared at the first question
@@ -100,7 +101,7 @@ class GaussianMap(nn.Module):
         self.codec = codec
         self.resolution = check_resolution(resolution)
         self.method = method
-        self.answering = Answering(random_state=random_state, **answering)
+        self.answering = QueryOptions(random_state=random_state, **answering)
         self.random_state = int(random_state)
         self.robot = check_whole("robot", robot, 0)
         self._pending: list[Scan] = []
@@ -239,7 +240,7 @@ class GaussianMap(nn.Module):
         if isinstance(self.learning, IncrementalRule):
             learned = absorb(known, self._pending, self.learning, self._size)
         else:
-            learned = self.learning.absorb(known, self._pending, generator)
+            learned = Components.concatenate([known, learn_window(self._pending, self.learning, generator)])
         return self._numbered(learned)
 
     def _numbered(self, learned: Components) -> Components:

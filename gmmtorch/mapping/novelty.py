@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -11,49 +10,13 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.cones import CUTOFF
-from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
+from gmmtorch.mapping.learning.rules import NoveltyRule
+from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
-from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
 
 _CHUNK_BEAMS = 1 << 14
-
-
-@dataclass(frozen=True)
-class NoveltyRule:
-    """When a beam is novel, and which components explain a point that is.
-
-    resolution: side (m) of the cells whose entropy counts.
-    threshold: bits by which a beam must lower the entropy of the cells that it crosses.
-    observed: rays, hits and misses, from which on a cell counts as observed; a beam through any that
-        is not is novel.
-    prior, cutoff: of the evidence, see `occupancy_probability` and `point_evidence`.
-    explained: squared Mahalanobis distance up to which a component explains a point (d_ll of the
-        thesis); None: the 95 % quantile of χ² of as many dimensions as there are.
-    distance: metres between a sensor and one of a component's origins up to which the component
-        explains the free space before the point, too (d_s of the thesis).
-    """
-
-    resolution: float = 0.1
-    threshold: float = 1.0
-    observed: float = 1.0
-    prior: float = 1.0
-    cutoff: float = CUTOFF
-    explained: float | None = None
-    distance: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_resolution(self.resolution)
-        check_prior(self.prior)
-        for name in ("threshold", "observed", "distance"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")
-        for name in ("cutoff", "explained"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InvalidArgumentError(f"{name}={value} must be finite, above zero.")
 
 
 def entropy_reduction(components: Components, scan: Scan, rule: NoveltyRule) -> tuple[Tensor, Tensor]:

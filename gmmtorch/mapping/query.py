@@ -2,74 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.evidence import Evidence, check_prior, occupancy_probability
+from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
 from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
-from gmmtorch.occupancy.forms.monte_carlo import SAMPLINGS, Sampling, sample_rays
+from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
-from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid
+from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 
-Method = Literal["point", "flux", "cone", "monte_carlo"]
-METHODS: tuple[str, ...] = get_args(Method)
-
 _RAYS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
-
-
-@dataclass(frozen=True)
-class Answering:
-    """How a map answers; none of it changes what a map knows.
-
-    prior: N_p of (3.9), counts given to either outcome before any evidence.
-    cutoff: standard deviations beyond which a component is taken to end. None: 3 where components stand
-        for many points, so that tails do not claim space that nothing saw; `CUTOFF` where they stand for
-        few, which do not tell where a surface ends.
-    hit_length: ℓ (m): the occupancy of a cell of side h weighs its hits by ℓ/h, as if cells were so deep.
-        Of a thin surface a ray ends in one cell of many that it would have passed: this puts θ on the
-        right side of ½ and hardly changes the order. None: h, so that hits are counts.
-    n_samples: Monte Carlo rays drawn from the whole map.
-    sampling: "sobol", "stratified" or "plain".
-    random_state: seed of the rays.
-    memory_limit: bytes that evidence may take.
-    compiled: use torch.compile where there is a compiled form.
-    """
-
-    prior: float = 1.0
-    cutoff: float | None = CUTOFF
-    hit_length: float | None = None
-    n_samples: int = 1_000_000
-    sampling: Sampling = "sobol"
-    random_state: int = 0
-    memory_limit: int = MEMORY_LIMIT
-    compiled: bool = False
-
-    def __post_init__(self) -> None:
-        check_prior(self.prior)
-        for name in ("n_samples", "memory_limit"):
-            check_whole(name, getattr(self, name), 1)
-        check_whole("random_state", self.random_state, 0)
-        if self.cutoff is not None and not 0 < self.cutoff < float("inf"):
-            raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
-        if self.hit_length is not None and not 0 < self.hit_length < float("inf"):
-            raise InvalidArgumentError(f"hit_length={self.hit_length} must be metres above zero, or null.")
-        if self.sampling not in SAMPLINGS:
-            raise InvalidArgumentError(f"sampling={self.sampling!r} is not one of {', '.join(SAMPLINGS)}.")
-
-
-def check_method(method: str) -> None:
-    """Raises for a form of evidence that is not known."""
-    if method not in METHODS:
-        raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
 
 
 def fitting_cutoff(cones: Cones) -> float:
@@ -81,7 +29,7 @@ def fitting_cutoff(cones: Cones) -> float:
 class Answers:
     """What these cones say of space. What is costly is made once, when it is first asked for."""
 
-    def __init__(self, cones: Cones, options: Answering) -> None:
+    def __init__(self, cones: Cones, options: QueryOptions) -> None:
         self.cones = cones
         self.options = options
         self.cutoff = fitting_cutoff(cones) if options.cutoff is None else options.cutoff

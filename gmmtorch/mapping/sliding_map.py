@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.cell_evidence import (

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 import warnings
-from collections.abc import Collection
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import check_choice as check_choice
+from gmmtorch.errors import check_number as check_number
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 
@@ -36,20 +35,6 @@ def as_generator(random_state: RandomState) -> torch.Generator:
             "a numpy RandomState or a torch Generator."
         )
     return generator
-
-
-def check_number(name: str, value: object, most: float = math.inf, above: bool = False) -> None:
-    """Raise `InvalidArgumentError` unless `value` is a finite number from 0, or `above` it, to `most`."""
-    number = float(value) if isinstance(value, numbers.Real) else math.nan
-    if not (0 <= number <= most and number < math.inf) or (above and number == 0):
-        limit = "above 0" if above else "of at least 0" if most == math.inf else f"from 0 to {most:g}"
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
-
-
-def check_choice(name: str, value: object, known: Collection[str]) -> None:
-    """Raise `InvalidArgumentError` unless `value` is one of the `known`, which the error lists."""
-    if not isinstance(value, str) or value not in known:
-        raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
 
 
 def check_enough(n_components: int, n_points: int | None) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import check_prior as check_prior
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS, traverse
 
@@ -20,14 +21,6 @@ class CellClass(IntEnum):
     UNKNOWN = -1
     FREE = 0
     OCCUPIED = 1
-
-
-def check_prior(prior: float) -> float:
-    """The prior count; raises `InvalidArgumentError` when it is negative or not finite."""
-    value = float(prior)
-    if not (math.isfinite(value) and value >= 0):
-        raise InvalidArgumentError(f"prior={prior} must be a count of at least zero; the thesis uses 1.")
-    return value
 
 
 def occupancy_probability(hits: Tensor, misses: Tensor, prior: float = 1.0) -> Tensor:

@@ -10,22 +10,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import check_resolution as check_resolution
 
 BYTES_PER_CELL = 16
 """Hits and misses of one cell, float64 each."""
 
 MEMORY_LIMIT = 4 << 30
 """Bytes of evidence a grid may hold unless the caller says otherwise."""
-
-
-def check_resolution(resolution: float) -> float:
-    """The resolution as a float; raises unless it is finite and above zero."""
-    value = float(resolution)
-    if not (math.isfinite(value) and value > 0):
-        raise InvalidArgumentError(
-            f"resolution={resolution} is not a cell size; give metres above zero, such as 0.1."
-        )
-    return value
 
 
 @dataclass(frozen=True)

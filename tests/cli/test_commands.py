@@ -27,7 +27,7 @@ from command_runs import (
 import gmmtorch
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
 Run = Callable[..., Finished]

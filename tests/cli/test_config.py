@@ -35,9 +35,8 @@ from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.mission.trials import WorldOptions
 from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
-from gmmtorch.mapping.query import Answering
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.query_options import QueryOptions
 from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
 
@@ -296,7 +295,7 @@ def test_a_map_takes_what_the_options_offer_with_the_same_defaults(name):
     assert options == {"cutoff": None, "hit_length": 1}
     assert (made.answering.cutoff, made.answering.hit_length) == (5, None)
     limits = {"random_state", "memory_limit", "compiled"}  # which are runtime.* and the seed
-    assert {item.name for item in fields(Answering)} == limits | {
+    assert {item.name for item in fields(QueryOptions)} == limits | {
         "prior",
         "cutoff",
         "hit_length",

@@ -9,7 +9,7 @@ from gmmtorch.evaluation.methods import Form, MapFactory, methods
 from gmmtorch.evaluation.studies import auc_memory
 from gmmtorch.evaluation.studies.auc_memory import Sized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 
 PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
 

@@ -14,7 +14,7 @@ from gmmtorch.evaluation.held_out import Protocol
 from gmmtorch.evaluation.split import perturb_poses, pose_perturbations
 from gmmtorch.evaluation.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.scan import Scan
 
 NOISE = (0.3, 0.1)

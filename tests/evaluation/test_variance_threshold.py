@@ -9,7 +9,7 @@ from evaluation.pillar_room import room_scans
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.studies.variance_threshold import ThresholdStudy, decided, on_lines, run
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 
 
 def test_shares_are_those_counted_by_hand():

@@ -12,7 +12,7 @@ from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box
 from gmmtorch.sharing.broadcast import Broadcast

@@ -13,7 +13,7 @@ from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
 from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_counts, encode_points

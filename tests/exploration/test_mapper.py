@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.robot.mapper import Memo, novel_beams
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame

@@ -23,7 +23,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.exploration.mission.node import TwinError, check_number, run_paced
 from gmmtorch.exploration.mission.replay import ReplayNode
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
+from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.replica.replica import Replica

@@ -18,7 +18,7 @@ from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
 from gmmtorch.sharing.messages.message_registry import PlanMessage

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.scan import Scan
 
 FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)

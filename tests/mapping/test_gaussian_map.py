@@ -16,8 +16,7 @@ from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.scan import Scan
 
 BUFFERS = [

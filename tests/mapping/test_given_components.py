@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import METHODS
+from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.grid import VoxelGrid
 
 PARTS = ("means", "covariances", "support", "origins")

@@ -19,10 +19,9 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule, absorb, absorb_depth
+from gmmtorch.mapping.learning.incremental import absorb, absorb_depth
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
-from gmmtorch.mapping.learning.windowed import WindowedRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.scan import Scan

@@ -15,9 +15,8 @@ from occupancy.protocol_contract import dims, empty_scan, lattice, open_scan, sh
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.novelty import NoveltyRule
-from gmmtorch.mapping.query import METHODS
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
+from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.scan import Scan
 
 TIGHT = replace(FINE, n_components=9)

@@ -11,7 +11,8 @@ from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice,
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import METHODS, Answering, Answers, fitting_cutoff
+from gmmtorch.mapping.query import Answers, fitting_cutoff
+from gmmtorch.mapping.query_options import METHODS, QueryOptions
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import VoxelGrid
 
@@ -190,5 +191,5 @@ def test_a_cutoff_that_is_not_given_follows_the_points_of_the_components():
     assert fitting_cutoff(cones(1000.0, 40.0, 3.0)) == CUTOFF
     assert fitting_cutoff(cones(0.0, 0.0, 70.0)) == 3
     assert fitting_cutoff(cones()) == CUTOFF
-    fixed = Answers(cones(1000.0), Answering(cutoff=4.0))
-    assert (fixed.cutoff, Answers(cones(1000.0), Answering(cutoff=None)).cutoff) == (4, 3)
+    fixed = Answers(cones(1000.0), QueryOptions(cutoff=4.0))
+    assert (fixed.cutoff, Answers(cones(1000.0), QueryOptions(cutoff=None)).cutoff) == (4, 3)

@@ -19,8 +19,7 @@ from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 
 codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 
 
 @dims

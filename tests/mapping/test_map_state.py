@@ -9,9 +9,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import DataError
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 
 RULES = {
     "windowed": WindowedRule(window=3, max_origins=1),  # which draws the origins that it keeps

@@ -15,8 +15,7 @@ from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import IncrementalRule
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 

@@ -20,7 +20,8 @@ from gmmtorch.localization.overlap_ascent import Ascent
 from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule, learn_window
+from gmmtorch.mapping.learning.rules import WindowedRule
+from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mixture.em.exact import Parameters
 
 dims = pytest.mark.parametrize("dim", [2, 3])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from occupancy.exact_dda import voxels_left
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, cast_evidence, united
 

@@ -18,7 +18,7 @@ from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.codec.component_batch import encode, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

@@ -16,7 +16,8 @@ from sklearn.base import clone
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
+from gmmtorch.mapping.learning.windowed import flatness_rule
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import surface_rule as component_count
 from gmmtorch.mixture.em.partition import FlatnessRule
@@ -159,12 +160,12 @@ def test_cells_ask_for_about_as_many_components_as_their_points(monkeypatch):
 
 def test_maps_cut_by_the_same_rule():
     """But for what they choose themselves: a length, and single points of several surfaces in 2D."""
-    plane, space = (WindowedRule(noise=0.02).flatness(dim) for dim in (2, 3))
+    plane, space = (flatness_rule(WindowedRule(noise=0.02), dim) for dim in (2, 3))
     assert plane == FlatnessRule(0.04, 0.3, 6, 1, None, 3.0)
     assert space == FlatnessRule(0.04, 0.3, 20, 20, None, 3.0)
     assert surface_rule(0.02, 3) == FlatnessRule(0.04, math.inf, 20, 20, None, 2.0)
     assert surface_rule(0.02, 3, 50.0).min_weight == 50
-    assert WindowedRule(min_points=9.0, n_components=4, length=1.0).flatness(3) == FlatnessRule(
+    assert flatness_rule(WindowedRule(min_points=9.0, n_components=4, length=1.0), 3) == FlatnessRule(
         0.02, 1.0, 9, 9, 4, 10.0
     )
 

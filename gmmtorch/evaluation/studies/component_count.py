@@ -37,7 +37,7 @@ from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.studies.fitting import Material, OnRows, Row, row_of
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.windowed import WindowedRule
+from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mixture.em.surface_rule import surface_pieces
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture

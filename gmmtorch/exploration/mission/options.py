@@ -15,7 +15,7 @@ from gmmtorch.exploration.robot.gmm_mapper import FrameRule
 from gmmtorch.exploration.robot.heartbeat import Heartbeat
 from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.scoring import BeliefRule
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.sharing.messages.envelope import check_codec
 from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
 from gmmtorch.sharing.transport.token_bucket import TokenBucket

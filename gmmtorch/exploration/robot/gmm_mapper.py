@@ -23,7 +23,7 @@ from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.association import count_explained, summed
 from gmmtorch.mapping.components import Components, packed, unpacked
 from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, cast_evidence
 from gmmtorch.sharing.messages.envelope import loaded, stored, within

@@ -14,7 +14,7 @@ from gmmtorch.errors import check_whole
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.novelty import NoveltyRule
+from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
 from gmmtorch.sharing.messages.message_registry import Message, decode

@@ -4,117 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets.depth_frames import back_project
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import limit_origins
-from gmmtorch.mapping.novelty import NoveltyRule, novel_beams
+from gmmtorch.mapping.novelty import novel_beams
 from gmmtorch.scan import Scan
 
 
-@dataclass(frozen=True)
-class IncrementalRule:
-    """How scans are added to a map. What is None is taken from the first scans, see `fitted`.
-
-    noise: standard deviation of the range sensor (m); its square is the least variance of a component,
-        and pieces of twice that thickness count as flat.
-    length: largest standard deviation (m) along a component where it is learned; merging may exceed it.
-    cell: side (m) of the cells that points are summed into before EM.
-    window: neighbouring scans that are learned together.
-    window_components: components of a window at most.
-    iterations: of EM on a window's cells.
-    n_components, max_bytes: the budget, of the whole map; either, both, or none.
-    max_origins, mean_origins: sensor positions kept for a component, at most and on average; see
-        `sightings.limit_origins`.
-    max_cost: squared Hellinger distance up to which components are merged even if there is room.
-    novelty: learn only from beams that tell something new, and count the points that components
-        explain already to those (the thesis's way); None learns from all.
-    """
-
-    noise: float | None = None
-    length: float | None = None
-    cell: float | None = None
-    window: int | None = None
-    window_components: int = 500
-    iterations: int = 6
-    n_components: int | None = None
-    max_bytes: int | None = None
-    max_origins: int = 8
-    mean_origins: float | None = 2.0
-    max_cost: float | None = None
-    novelty: NoveltyRule | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("noise", "length", "cell"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InvalidArgumentError(f"{name}={value} must be above zero metres, or null.")
-        for name in ("window_components", "iterations", "max_origins"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("window", "n_components", "max_bytes"):
-            if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), 1)
-        if self.mean_origins is not None and not 1 <= self.mean_origins < math.inf:
-            raise InvalidArgumentError(f"mean_origins={self.mean_origins} must be at least 1, or null.")
-        if self.max_cost is not None and not 0 <= self.max_cost < 1:
-            raise InvalidArgumentError(
-                f"max_cost={self.max_cost} must be at least 0 (equal) and below 1 (no overlap)."
-            )
-
-    def fitted(self, scans: Sequence[Scan]) -> IncrementalRule:
-        """The rule with what is None taken from scans, such as the first ones of a map.
-
-        Sensors differ in scale: lengths are in proportion to the median range r of the scans, and a window
-        is as many of them as hold enough points to learn surfaces from. Measured on a depth camera, two
-        lidars and a laser; scans without a return settle nothing.
-        """
-        ranges = [(scan.points - scan.origin).norm(dim=1) for scan in scans if len(scan.points)]
-        if not ranges or None not in (self.noise, self.length, self.cell, self.window):
-            return self
-        scale = _SCALES[scans[0].dim]
-        r = max(float(torch.cat(ranges).median()), _LEAST_RANGE)
-        per_scan = sum(map(len, ranges)) / len(ranges)
-        return replace(
-            self,
-            noise=_rounded(r * scale.noise) if self.noise is None else self.noise,
-            length=_rounded(r * scale.length) if self.length is None else self.length,
-            cell=_rounded(r * scale.cell) if self.cell is None else self.cell,
-            window=max(8, min(40, round(scale.points / per_scan))) if self.window is None else self.window,
-        )
-
-    def cells(self) -> CellRule:
-        """Of a rule that is `fitted`, what a window is learned by."""
-        if self.noise is None or self.length is None or self.cell is None:
-            raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
-        return CellRule(self.noise, self.length, self.cell, self.window_components, self.iterations)
-
-
-def _rounded(length: float) -> float:
-    """To three digits, which take few bytes in a file."""
-    return float(f"{length:.3g}")
-
-
-class _Scale(NamedTuple):
-    """Lengths in shares of the median range; points that a window holds."""
-
-    noise: float
-    length: float
-    cell: float
-    points: float
-
-
-_SCALES = {2: _Scale(1 / 175, 1 / 12, 1 / 175, 5e3), 3: _Scale(1 / 350, 1 / 4, 1 / 40, 2e5)}
-_LEAST_RANGE = 0.01  # metres
+def cell_rule(rule: IncrementalRule) -> CellRule:
+    """What a window is learned by, of a rule that is `fitted`."""
+    if rule.noise is None or rule.length is None or rule.cell is None:
+        raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
+    return CellRule(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations)
 
 
 def absorb(
@@ -192,7 +103,7 @@ def _rule_of(scans: Sequence[Scan], rule: IncrementalRule) -> CellRule:
     """Scans of nothing but beams without return say as much of the scale by where those were cut off."""
     if rule.noise is None or rule.length is None or rule.cell is None:
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
-    return rule.cells()
+    return cell_rule(rule)
 
 
 def _explain(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import UNNUMBERED, Components
+from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool
@@ -17,60 +17,18 @@ from gmmtorch.mixture.em.surface_rule import surface_rule
 from gmmtorch.scan import Scan
 
 
-@dataclass(frozen=True)
-class WindowedRule:
-    """How a window of scans becomes components.
-
-    noise: standard deviation of the range sensor (m); its square is the least variance of a
-        component, and pieces of twice that thickness count as flat.
-    length: largest standard deviation (m) along a component.
-    min_points: fewest points a component is made of; None: 6 in 2D, 20 in 3D.
-    n_components: components of a window at most; None: as many as the surfaces ask for.
-    max_origins: sensor positions kept for a component, sampled by their counts.
-    iterations: of EM, which starts from the flat pieces and so needs few.
-    max_cells: more points than this are first summed into cells.
-    window: neighbouring scans that are learned from together.
-    dtype: of the exponentials in EM, "float32" or "float64".
-    """
-
-    noise: float = 0.01
-    length: float = 0.3
-    min_points: float | None = None
-    n_components: int | None = None
-    max_origins: int = 8
-    iterations: int = 5
-    max_cells: int = 20_000
-    window: int = 20
-    dtype: str = "float32"
-
-    def __post_init__(self) -> None:
-        for name in ("noise", "length"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
-        for name in ("max_origins", "iterations", "max_cells", "window"):
-            check_whole(name, getattr(self, name), 1)
-        if self.n_components is not None:
-            check_whole("n_components", self.n_components, 1)
-        if self.min_points is not None and not 1 <= self.min_points < float("inf"):
-            raise InvalidArgumentError(f"min_points={self.min_points} must be at least 1, or null.")
-        if self.dtype not in em.SOFTMAX_DTYPES:
-            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(em.SOFTMAX_DTYPES)}.")
-
-    def flatness(self, dim: int) -> FlatnessRule:
-        # In 2D a few points that span several surfaces are better told apart, down to single ones
-        # (5 % of intel, 0.1 m: AUC 0.948 against 0.940); in 3D that only adds components.
-        rule = surface_rule(self.noise, dim, self.min_points)
-        return replace(
-            rule,
-            length=self.length,
-            min_weight_thick=1 if dim == 2 else rule.min_weight,
-            max_components=self.n_components,
-            apart=10 * self.length,
-        )
-
-    def absorb(self, known: Components, scans: Sequence[Scan], generator: torch.Generator) -> Components:
-        """The components of a map, and those of a window of scans, not numbered yet."""
-        return Components.concatenate([known, learn_window(scans, self, generator)])
+def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
+    """When a piece of a window's points is cut further, in `dim` dimensions."""
+    # In 2D a few points that span several surfaces are better told apart, down to single ones
+    # (5 % of intel, 0.1 m: AUC 0.948 against 0.940); in 3D that only adds components.
+    least = surface_rule(rule.noise, dim, rule.min_points)
+    return replace(
+        least,
+        length=rule.length,
+        min_weight_thick=1 if dim == 2 else least.min_weight,
+        max_components=rule.n_components,
+        apart=10 * rule.length,
+    )
 
 
 def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Generator) -> Components:
@@ -95,7 +53,7 @@ def _learn(
         return Components.empty(dim, points.device)
     center = points.mean(0)
     cells = pool_into_cells(points - center, rule.max_cells, rule.noise)
-    pieces = partition(cells.features[:, 1 : 1 + dim].contiguous(), cells.weight, rule.flatness(dim))
+    pieces = partition(cells.features[:, 1 : 1 + dim].contiguous(), cells.weight, flatness_rule(rule, dim))
     reg = rule.noise**2
     first = em.maximization(pool(cells.features, cells.weight, pieces.labels, pieces.n_pieces), reg)
     step = em.natural_step(cells.features, cells.weight, reg, em.SOFTMAX_DTYPES[rule.dtype])

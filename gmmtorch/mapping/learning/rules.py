@@ -1,0 +1,184 @@
+"""Learning rules: how scans become components of a map. Importing this file does not load torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from gmmtorch.errors import InvalidArgumentError, check_prior, check_resolution, check_whole
+
+if TYPE_CHECKING:
+    from gmmtorch.scan import Scan
+
+SOFTMAX_DTYPES = ("float32", "float64")
+"""Names of the types in which EM can compute exponentials."""
+
+
+@dataclass(frozen=True)
+class NoveltyRule:
+    """When a beam is novel, and when a component explains a point (thesis 4.1).
+
+    resolution: side (m) of the cells whose entropy is compared.
+    threshold: a beam is novel if it lowers the entropy of its cells by at least this many bits.
+    observed: a cell is observed if hits + misses reach this number of rays. A beam through an unobserved
+        cell is novel.
+    prior, cutoff: options of the evidence, see `occupancy_probability` and `point_evidence`.
+    explained: a component explains points within this squared Mahalanobis distance (d_ll of the thesis).
+        None: the 95 % quantile of χ² with D degrees of freedom.
+    distance: a component explains the free space of a beam only if one of its sensor origins is within
+        this distance (m) of the sensor (d_s of the thesis).
+    """
+
+    resolution: float = 0.1
+    threshold: float = 1.0
+    observed: float = 1.0
+    prior: float = 1.0
+    cutoff: float = 5.0
+    explained: float | None = None
+    distance: float = 0.5
+
+    def __post_init__(self) -> None:
+        check_resolution(self.resolution)
+        check_prior(self.prior)
+        for name in ("threshold", "observed", "distance"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")
+        for name in ("cutoff", "explained"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InvalidArgumentError(f"{name}={value} must be finite, above zero.")
+
+
+@dataclass(frozen=True)
+class WindowedRule:
+    """Learns a mixture from every window of scans and adds it to the map; nothing is merged.
+
+    noise: standard deviation of the range sensor (m). Its square is the smallest variance of a component;
+        a piece counts as flat if it is at most twice as thick.
+    length: largest standard deviation (m) along a component.
+    min_points: fewest points of a component. None: 6 in 2D, 20 in 3D.
+    n_components: largest number of components of a window. None: as many as the surfaces need.
+    max_origins: largest number of sensor origins of a component, sampled by their counts.
+    iterations: EM iterations. EM starts from the flat pieces and needs few.
+    max_cells: clouds with more points than this are first summed into cells.
+    window: number of neighbouring scans that are learned together.
+    dtype: type of the exponentials in EM, "float32" or "float64".
+    """
+
+    noise: float = 0.01
+    length: float = 0.3
+    min_points: float | None = None
+    n_components: int | None = None
+    max_origins: int = 8
+    iterations: int = 5
+    max_cells: int = 20_000
+    window: int = 20
+    dtype: str = "float32"
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
+        for name in ("max_origins", "iterations", "max_cells", "window"):
+            check_whole(name, getattr(self, name), 1)
+        if self.n_components is not None:
+            check_whole("n_components", self.n_components, 1)
+        if self.min_points is not None and not 1 <= self.min_points < math.inf:
+            raise InvalidArgumentError(f"min_points={self.min_points} must be at least 1, or null.")
+        if self.dtype not in SOFTMAX_DTYPES:
+            raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
+
+
+@dataclass(frozen=True)
+class IncrementalRule:
+    """Learns components from every window of scans, adds them, and merges the map under a budget.
+
+    Options that are None are derived from the first scans, see `fitted`.
+
+    noise: standard deviation of the range sensor (m). Its square is the smallest variance of a component;
+        a piece counts as flat if it is at most twice as thick.
+    length: largest standard deviation (m) along a component when it is learned; merging may exceed it.
+    cell: side (m) of the cells into which points are summed before EM.
+    window: number of neighbouring scans that are learned together.
+    window_components: largest number of components of a window.
+    iterations: EM iterations on the cells of a window.
+    n_components, max_bytes: budget of the whole map: components, bytes of its file, both, or none.
+    max_origins, mean_origins: largest and mean number of sensor origins of a component, see `limit_origins`.
+    max_cost: squared Hellinger distance up to which components are merged even if the budget is not used up.
+    novelty: learn from novel beams only, and count explained points to the components that explain them
+        (thesis 4.1). None: learn from all beams.
+    """
+
+    noise: float | None = None
+    length: float | None = None
+    cell: float | None = None
+    window: int | None = None
+    window_components: int = 500
+    iterations: int = 6
+    n_components: int | None = None
+    max_bytes: int | None = None
+    max_origins: int = 8
+    mean_origins: float | None = 2.0
+    max_cost: float | None = None
+    novelty: NoveltyRule | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "length", "cell"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InvalidArgumentError(f"{name}={value} must be above zero metres, or null.")
+        for name in ("window_components", "iterations", "max_origins"):
+            check_whole(name, getattr(self, name), 1)
+        for name in ("window", "n_components", "max_bytes"):
+            if getattr(self, name) is not None:
+                check_whole(name, getattr(self, name), 1)
+        if self.mean_origins is not None and not 1 <= self.mean_origins < math.inf:
+            raise InvalidArgumentError(f"mean_origins={self.mean_origins} must be at least 1, or null.")
+        if self.max_cost is not None and not 0 <= self.max_cost < 1:
+            raise InvalidArgumentError(
+                f"max_cost={self.max_cost} must be at least 0 (equal) and below 1 (no overlap)."
+            )
+
+    def fitted(self, scans: Sequence[Scan]) -> IncrementalRule:
+        """The rule with every None among noise, length, cell and window derived from scans.
+
+        Sensors differ in scale. Lengths are fixed fractions of the median range r of the scans, measured on
+        a depth camera, two lidars and a laser. A window holds as many scans as contain enough points to
+        learn surfaces from. Returns the rule itself if it is complete or no scan has a return.
+        """
+        import torch
+
+        ranges = [(scan.points - scan.origin).norm(dim=1) for scan in scans if len(scan.points)]
+        if not ranges or None not in (self.noise, self.length, self.cell, self.window):
+            return self
+        scale = _SCALES[scans[0].dim]
+        r = max(float(torch.cat(ranges).median()), _LEAST_RANGE)
+        points_per_scan = sum(map(len, ranges)) / len(ranges)
+        window = max(8, min(40, round(scale.points / points_per_scan)))
+        return replace(
+            self,
+            noise=_three_digits(r * scale.noise) if self.noise is None else self.noise,
+            length=_three_digits(r * scale.length) if self.length is None else self.length,
+            cell=_three_digits(r * scale.cell) if self.cell is None else self.cell,
+            window=window if self.window is None else self.window,
+        )
+
+
+class _Scale(NamedTuple):
+    """Noise, length and cell as fractions of the median range; points of a window."""
+
+    noise: float
+    length: float
+    cell: float
+    points: float
+
+
+_SCALES = {2: _Scale(1 / 175, 1 / 12, 1 / 175, 5e3), 3: _Scale(1 / 350, 1 / 4, 1 / 40, 2e5)}
+_LEAST_RANGE = 0.01  # metres
+
+
+def _three_digits(length: float) -> float:
+    """A length rounded to three digits, which take few bytes in a file."""
+    return float(f"{length:.3g}")
