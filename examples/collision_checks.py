@@ -1,0 +1,26 @@
+"""A planner checks a path against a map: distance to surfaces, collision probability, and its gradient.
+
+python examples/collision_checks.py
+"""
+
+import torch
+
+import gmmtorch as gt
+from gmmtorch.mapping.clearance import clearance, collision_probability
+
+RADIUS = 0.3  # metres, of the robot's body
+
+scans = gt.datasets.load("synthetic_building", stride=4)
+m = gt.GaussianMap()
+for scan in scans:
+    m.insert(scan)
+
+start, goal = scans[0].origin, scans[5].origin
+path = torch.lerp(start, goal, torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]).requires_grad_()
+
+gap = clearance(m, path)  # (50,), metres to the nearest surface
+risk = collision_probability(m, path.detach(), RADIUS)  # (50,)
+gap.min().backward()
+nearest = int(gap.argmin())
+print(f"smallest clearance {gap.min():.2f} m, largest collision probability {risk.max():.3f}")
+print(f"at point {nearest}, move along {path.grad[nearest].tolist()} to gain clearance")
