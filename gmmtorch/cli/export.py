@@ -126,7 +126,7 @@ def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_ev
     from gmmtorch.export import map_server
     from gmmtorch.export.octomap import write_octomap
     from gmmtorch.export.point_cloud import write_pcd, write_ply
-    from gmmtorch.occupancy.thresholds import Thresholds
+    from gmmtorch.occupancy.evidence import Thresholds
 
     output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
     if config.format == "map_server":
@@ -168,8 +168,7 @@ def _dense(
     import torch
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.occupancy.grid import VoxelGrid
-    from gmmtorch.occupancy.voxels.rasterize import rasterize
+    from gmmtorch.occupancy.grid import VoxelGrid, rasterize
 
     resolution = _resolution(config, source)
     low, high = _box(config, source)

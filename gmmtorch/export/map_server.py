@@ -18,8 +18,8 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.files import write_bytes
+from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT, VoxelGrid
-from gmmtorch.occupancy.thresholds import Thresholds
 
 _MAX_YAML_BYTES = 1 << 14
 _IMAGE_FORMATS = ("PPM", "PNG", "BMP")

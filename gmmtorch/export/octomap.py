@@ -10,8 +10,7 @@ import numpy as np
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, OutputError
 from gmmtorch.export.point_cloud import CellCloud
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.evidence import CellClass
-from gmmtorch.occupancy.thresholds import Thresholds
+from gmmtorch.occupancy.evidence import CellClass, Thresholds
 
 _REACH = 1 << 15  # cells to either side of the origin that OctoMap's 16-bit keys name
 _CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1: log-odds of ±13.8

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture, touching
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import check_number
-from gmmtorch.occupancy.forms.cone.box_mass import normal_mass
+from gmmtorch.occupancy.forms.flux.box_mass import normal_mass
 from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike
 

@@ -1,1 +1,57 @@
-"""Evidence of hits and misses, and the occupancy that follows from it (thesis chapter 3)."""
+"""Evidence of hits and misses, and the occupancy that follows from it (thesis chapter 3).
+
+Public names are imported when they are first used, so that `import gmmtorch.occupancy` stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gmmtorch.occupancy.cones import Cones as Cones
+    from gmmtorch.occupancy.evidence import CellClass as CellClass
+    from gmmtorch.occupancy.evidence import Evidence as Evidence
+    from gmmtorch.occupancy.evidence import Thresholds as Thresholds
+    from gmmtorch.occupancy.evidence import occupancy_probability as occupancy_probability
+    from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence as cone_evidence
+    from gmmtorch.occupancy.forms.flux.box_flux import box_flux as box_flux
+    from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence as flux_evidence
+    from gmmtorch.occupancy.forms.flux.regions import Boundary as Boundary
+    from gmmtorch.occupancy.forms.flux.regions import region_flux as region_flux
+    from gmmtorch.occupancy.forms.monte_carlo import RayBundle as RayBundle
+    from gmmtorch.occupancy.forms.monte_carlo import sample_rays as sample_rays
+    from gmmtorch.occupancy.forms.point import PointEvidence as PointEvidence
+    from gmmtorch.occupancy.forms.point import PointForm as PointForm
+    from gmmtorch.occupancy.forms.point import point_evidence as point_evidence
+    from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
+    from gmmtorch.occupancy.grid import rasterize as rasterize
+    from gmmtorch.occupancy.index.cone_index import ConeIndex as ConeIndex
+    from gmmtorch.occupancy.protocol import OccupancyMap as OccupancyMap
+    from gmmtorch.occupancy.ray_queries import ExpectedRange as ExpectedRange
+    from gmmtorch.occupancy.ray_queries import RayHits as RayHits
+    from gmmtorch.occupancy.ray_queries import expected_range as expected_range
+    from gmmtorch.occupancy.ray_queries import hit_probability as hit_probability
+
+_NAMES = {
+    "cones": ["Cones"],
+    "evidence": ["CellClass", "Evidence", "Thresholds", "occupancy_probability"],
+    "forms.cone.cone_evidence": ["cone_evidence"],
+    "forms.flux.box_flux": ["box_flux", "flux_evidence"],
+    "forms.flux.regions": ["Boundary", "region_flux"],
+    "forms.monte_carlo": ["RayBundle", "sample_rays"],
+    "forms.point": ["PointEvidence", "PointForm", "point_evidence"],
+    "grid": ["VoxelGrid", "rasterize"],
+    "index.cone_index": ["ConeIndex"],
+    "protocol": ["OccupancyMap"],
+    "ray_queries": ["ExpectedRange", "RayHits", "expected_range", "hit_probability"],
+}
+_HOMES = {name: f"gmmtorch.occupancy.{module}" for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted(_HOMES)  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'gmmtorch.occupancy' has no attribute {name!r}")

@@ -1,4 +1,9 @@
-"""Cones: components as seen from places, which is what every form of evidence is computed from."""
+"""Cones: components seen from sensor origins, and their geometry in the whitened frame.
+
+All forms of evidence are computed from cones. In the whitened frame of a cone its component is a unit ball
+around the origin. Functions on whitened vectors have coordinates first: (D, P) for P pairs of a cell or face
+and a cone, (E, D, P) for the E edges of each.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +16,14 @@ from torch import Tensor
 from gmmtorch.linalg import safe_cholesky
 
 CUTOFF = 5.0
-"""Standard deviations beyond which a component is taken to end: evidence outside is exactly zero."""
+"""Default cutoff in standard deviations: beyond it a component gives no evidence."""
 
 
 class Cones(NamedTuple):
-    """Components as seen from places: C rows, a component seen from two places takes two rows.
+    """C pairs of a component and a sensor origin that observed it.
 
-    means (C, D), covariances (C, D, D): the component; origins (C, D): the sensor position;
-    counts (C,): its points measured from there; max_range (C,) bool: points that met no surface.
+    means (C, D), covariances (C, D, D): the component; origins (C, D): the sensor origin; counts (C,): the
+    number of points measured from there; max_range (C,) bool: whether the points are ends of no-return beams.
     """
 
     means: Tensor
@@ -32,11 +37,18 @@ class Cones(NamedTuple):
         return self.means.shape[1]
 
 
+def cone_bounds(cones: Cones, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corner (C, D) of the box around each cone: its ellipsoid and its sensor origin."""
+    means, origins = cones.means.double(), cones.origins.double()
+    deviation = cutoff * cones.covariances.double().diagonal(dim1=-2, dim2=-1).sqrt()
+    return torch.minimum(origins, means - deviation), torch.maximum(origins, means + deviation)
+
+
 def whitening(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """W (C, D, D), float64, with W Σ Wᵀ = I, and log √det 2πΣ (C,).
 
-    Differences x − μ are whitened, never positions: in float32 the latter cancel (a component 5 mm
-    thick seen from 10 m away has whitened coordinates in the thousands).
+    Apply W to differences x − μ, not to positions. The whitened coordinates of a position can be large: in
+    the thousands for a component 5 mm thick at 10 m. Subtracting two of them loses digits.
     """
     factors = safe_cholesky(covariances.double())
     dim = covariances.shape[-1]
@@ -44,3 +56,80 @@ def whitening(covariances: Tensor) -> tuple[Tensor, Tensor]:
     inverse = torch.linalg.solve_triangular(factors, eye, upper=False)
     log_norm = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * dim * math.log(2 * math.pi)
     return inverse, log_norm
+
+
+class WhitenedCones(NamedTuple):
+    """The whitening of C cones, float64, coordinates first.
+
+    matrix (D, D, C): W; mean, origin (D, C): world frame; toward (D, C): W(μ − s); log_norm (C,): log √det
+    2πΣ.
+    """
+
+    matrix: Tensor
+    mean: Tensor
+    origin: Tensor
+    toward: Tensor
+    log_norm: Tensor
+
+    @classmethod
+    def of(cls, cones: Cones) -> WhitenedCones:
+        inverse, log_norm = whitening(cones.covariances)
+        mean, origin = cones.means.double().T, cones.origins.double().T
+        matrix = inverse.permute(1, 2, 0).contiguous()
+        return cls(matrix, mean, origin, (matrix * (mean - origin)).sum(1), log_norm)
+
+    def take(self, cone: Tensor) -> WhitenedCones:
+        """The cones with indices `cone` (P,)."""
+        return WhitenedCones(*(part.index_select(-1, cone) for part in self))
+
+    def apply(self, vector: Tensor) -> Tensor:
+        """W v: (D, P) → (D, P)."""
+        return (self.matrix * vector[None]).sum(1)
+
+
+# -- geometry in the whitened frame -----------------------------------------------------------------
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """a·b over coordinates: (…, D, P) → (…, P)."""
+    return (a * b).sum(-2)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """a × b: (…, 3, P) in 3D, (…, 1, P) in 2D. Its length is |b| times the part of a perpendicular to b."""
+    if a.shape[-2] == 2:
+        return (a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :])[..., None, :]
+    a, b = torch.broadcast_tensors(a, b)
+    return torch.linalg.cross(a, b, dim=-2)
+
+
+def length(a: Tensor) -> Tensor:
+    """|a| over coordinates: (…, D, P) → (…, P)."""
+    return dot(a, a).sqrt()  # much faster than torch.norm over a leading dimension
+
+
+def outside_cone(ray: Tensor, offset: Tensor, edges: Tensor, cutoff: float) -> Tensor:
+    """Whether each cell or face (P,) certainly lies outside its cone.
+
+    A place q is outside if its ray from the sensor origin s passes the mean μ at more than `cutoff`, or if q
+    lies more than `cutoff` behind the point of the ray nearest to μ. The test uses lower bounds of both over
+    centre + Σ f_i edge_i, |f_i| ≤ ½: it is never True for a cell that the cone meets, and can be False for
+    one that it does not meet.
+
+    Args:
+        ray, offset: W(q − s) and W(q − μ) of the centres, (D, P).
+        edges: whitened edges, (E, D, P).
+    """
+    reach = 0.5 * length(edges).sum(0)
+    mean = ray - offset
+    across = length(cross(offset, ray)) - 0.5 * length(cross(edges, mean[None])).sum(0)
+    behind = dot(offset, ray) - 0.5 * dot(edges, (offset + ray)[None]).abs().sum(0)
+    far = cutoff * (length(ray) + reach)
+    return (across > far) | (behind > far)
+
+
+def outside_ball(offset: Tensor, edges: Tensor, cutoff: float) -> Tensor:
+    """Whether each cell (P,) certainly lies beyond `cutoff` from the mean; arguments as in `outside_cone`."""
+    distance = length(offset)
+    along = dot(edges, offset[None] / distance.clamp_min(1e-30)).abs().sum(0)
+    return distance - 0.5 * along > cutoff

@@ -1,4 +1,4 @@
-"""Evidence: hits and misses of every cell of a grid, and the occupancy that follows from them."""
+"""Evidence: hits and misses of the cells of a grid, and the occupancy that follows from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS, traverse
 
 
 class CellClass(IntEnum):
-    """What a cell is called once the dead band is applied."""
+    """Classes of cells by their occupancy."""
 
     UNKNOWN = -1
     FREE = 0
@@ -24,9 +24,9 @@ class CellClass(IntEnum):
 
 
 def occupancy_probability(hits: Tensor, misses: Tensor, prior: float = 1.0) -> Tensor:
-    """θ = (H + N_p)/(H + M + 2N_p), thesis (3.9); ½ where there is no evidence at all.
+    """Occupancy θ = (H + N_p)/(H + M + 2N_p) of hits H and misses M, thesis (3.9); ½ without evidence.
 
-    Raises `InvalidArgumentError` when the prior count N_p is negative or not finite.
+    Raises `InvalidArgumentError` if the prior count N_p is negative or not finite.
     """
     check_prior(prior)
     total = hits + misses + 2 * prior
@@ -34,40 +34,63 @@ def occupancy_probability(hits: Tensor, misses: Tensor, prior: float = 1.0) -> T
 
 
 def bernoulli_variance(probability: Tensor) -> Tensor:
-    """θ(1 − θ): ¼ for an unknown cell, 0 for a certain one."""
+    """θ(1 − θ): ¼ for an unknown cell, 0 for a certain cell."""
     return probability * (1 - probability)
 
 
 def bernoulli_entropy(probability: Tensor) -> Tensor:
-    """−θ log₂ θ − (1−θ) log₂(1−θ) in bits: 1 for an unknown cell."""
+    """−θ log₂ θ − (1 − θ) log₂(1 − θ) in bits: 1 for an unknown cell, 0 for a certain cell."""
     return -(
         torch.xlogy(probability, probability) + torch.xlogy(1 - probability, 1 - probability)
     ) / math.log(2)
 
 
 def classify(probability: Tensor, variance_threshold: float) -> Tensor:
-    """Dead band of thesis (3.10): `CellClass` values (int8) of probabilities, any shape.
+    """`CellClass` values (int8) of probabilities, any shape, with the dead band of thesis (3.10).
 
-    With variance threshold v a cell is occupied above ½(1 + √(1−4v)), free below ½(1 − √(1−4v)),
-    else unknown. Raises `InvalidArgumentError` unless 0 < v ≤ ¼, the largest variance there is.
+    With the variance threshold v a cell is occupied above ½(1 + √(1 − 4v)), free below ½(1 − √(1 − 4v)), and
+    unknown between. Raises `InvalidArgumentError` unless 0 < v ≤ ¼, the largest possible variance.
     """
     if not 0 < variance_threshold <= 0.25:
         raise InvalidArgumentError(
             f"variance_threshold={variance_threshold} must lie in (0, 0.25]; "
-            "0.25 leaves no dead band, the thesis shows 0.06."
+            "0.25 means no dead band, the thesis uses 0.06."
         )
     half_width = 0.5 * math.sqrt(1 - 4 * variance_threshold)
+    return _labels(probability, 0.5 - half_width, 0.5 + half_width)
+
+
+def _labels(probability: Tensor, free: float, occupied: float) -> Tensor:
     label = torch.full_like(probability, CellClass.UNKNOWN, dtype=torch.int8)
-    label[probability > 0.5 + half_width] = int(CellClass.OCCUPIED)
-    label[probability < 0.5 - half_width] = int(CellClass.FREE)
+    label[probability > occupied] = int(CellClass.OCCUPIED)
+    label[probability < free] = int(CellClass.FREE)
     return label
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Expected number of rays that ended in each cell (`hits`) and passed through it (`misses`).
+class Thresholds:
+    """θ < `free` is free, θ > `occupied` is occupied, else unknown. The defaults are map_server's."""
 
-    Both have the grid's shape and are float64.
+    free: float = 0.196
+    occupied: float = 0.65
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.free <= self.occupied <= 1:  # NaN compares false
+            raise InvalidArgumentError(
+                f"free_thresh={self.free}, occupied_thresh={self.occupied} must be probabilities, "
+                "and the first must not exceed the second."
+            )
+
+    def classify(self, probability: Tensor) -> Tensor:
+        """`CellClass` values (int8) of probabilities, any shape."""
+        return _labels(probability, self.free, self.occupied)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Expected number of rays that end in each cell of a grid (`hits`) and that pass through it (`misses`).
+
+    Both have the shape of the grid, and are float64.
     """
 
     grid: VoxelGrid
@@ -80,23 +103,23 @@ class Evidence:
         return cls(grid, zeros, zeros.clone())
 
     def probability(self, prior: float = 1.0) -> Tensor:
-        """Occupancy θ of every cell, (3.9)."""
+        """Occupancy θ of each cell (3.9)."""
         return occupancy_probability(self.hits, self.misses, prior)
 
     def variance(self, prior: float = 1.0) -> Tensor:
-        """θ(1−θ) of every cell."""
+        """θ(1 − θ) of each cell."""
         return bernoulli_variance(self.probability(prior))
 
     def entropy(self, prior: float = 1.0) -> Tensor:
-        """Entropy of every cell in bits."""
+        """Entropy of each cell in bits."""
         return bernoulli_entropy(self.probability(prior))
 
     def classify(self, variance_threshold: float = 0.06, prior: float = 1.0) -> Tensor:
-        """Occupied, free or unknown by the dead band of (3.10), as int8 `CellClass` values."""
+        """`CellClass` values (int8) of all cells, with the dead band of (3.10)."""
         return classify(self.probability(prior), variance_threshold)
 
     def lookup(self, points: Tensor, prior: float = 1.0) -> Tensor:
-        """Occupancy (M,) of the cells that hold the world points (M, D); exactly ½ outside the grid."""
+        """Occupancy (M,) of the cells that contain points (M, D), world metres; ½ outside the grid."""
         cell, inside = self.grid.flat_index(points)
         theta = occupancy_probability(self.hits.flatten()[cell], self.misses.flatten()[cell], prior)
         return torch.where(inside, theta, torch.full_like(theta, 0.5))
@@ -110,14 +133,14 @@ class Evidence:
         chunk_visits: int = CHUNK_VISITS,
         compiled: bool = False,
     ) -> None:
-        """Count rays: a hit in the cell of each end, a miss in every cell passed on the way to it.
+        """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
         Args:
-            origins: (R, D) sensor positions, world metres.
-            ends: (R, D) where the rays end.
-            weights: (R,) how many rays each stands for; 1 if not given.
-            is_hit: (R,) False for rays that met no surface: misses only. All True if not given.
-            chunk_visits: voxel visits worked on at once; bounds the memory, not the result.
+            origins: (R, D) sensor origins, world metres.
+            ends: (R, D) ends of the rays, world metres.
+            weights: (R,) number of rays that each row counts for; 1 if not given.
+            is_hit: (R,) bool, False for no-return beams, which add only misses. All True if not given.
+            chunk_visits: voxel visits in one pass. It bounds the memory and does not change the result.
             compiled: see `traverse`.
         """
         starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)

@@ -1,9 +1,9 @@
-"""VoxelGrid: a regular grid of cubes (squares in 2D) with any origin, resolution and shape."""
+"""VoxelGrid: a regular grid of cubic cells (squares in 2D), and the rasterization of a map on it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,21 +13,23 @@ from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.errors import check_resolution as check_resolution
 
 BYTES_PER_CELL = 16
-"""Hits and misses of one cell, float64 each."""
+"""Bytes of the hits and misses of one cell, float64 each."""
 
 MEMORY_LIMIT = 4 << 30
-"""Bytes of evidence a grid may hold unless the caller says otherwise."""
+"""Default limit of the bytes of evidence of one grid."""
+
+_CELLS_PER_CALL = 1 << 16
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A grid of `shape` cells of side `resolution` (m) whose lowest corner is `origin` (m, world frame).
+    """A grid of `shape` cells of side `resolution` (m), with its lowest corner at `origin` (m, world frame).
 
     Cell (i, j[, k]) is the half-open cube origin + resolution·[i, i+1) × …; flat indices are row-major.
 
     Raises:
-        InvalidArgumentError: a resolution that is not above zero, a shape with no cells, or an
-            origin that is not finite or has another dimension than the shape.
+        InvalidArgumentError: a resolution that is not above zero, a shape without cells, or an origin that is
+            not finite or has another dimension than the shape.
     """
 
     origin: tuple[float, ...]
@@ -35,7 +37,7 @@ class VoxelGrid:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))  # a tensor will do
+        object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))  # also accepts a tensor
         if any(int(n) != n for n in self.shape):
             raise InvalidArgumentError(f"shape={self.shape} must be whole numbers of cells.")
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
@@ -65,10 +67,10 @@ class VoxelGrid:
         resolution: float,
         memory_limit: int = MEMORY_LIMIT,
     ) -> VoxelGrid:
-        """The smallest grid over the box [low, high] (m) whose planes are multiples of `resolution`.
+        """The smallest grid that contains the box [low, high] (m), with planes at multiples of `resolution`.
 
-        Raises `MemoryLimitError`, with the bytes it would take and the finest resolution that
-        fits, when its evidence would need more than `memory_limit` bytes.
+        Raises `MemoryLimitError` if its evidence would take more than `memory_limit` bytes; the message
+        names the bytes and a resolution that fits.
         """
         resolution = check_resolution(resolution)
         low, high = [float(x) for x in low], [float(x) for x in high]
@@ -90,12 +92,12 @@ class VoxelGrid:
         return cls(tuple(i * resolution for i in first), resolution, shape)
 
     def to_units(self, points: Tensor) -> Tensor:
-        """World points (M, D) in grid units, float64: cell (i, j, k) is [i, i+1) × …"""
+        """Points (M, D), world metres, in grid units, float64: cell (i, j, k) is [i, i+1) × …"""
         origin = torch.tensor(self.origin, dtype=torch.float64, device=points.device)
         return (points.double() - origin) / self.resolution
 
     def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat cell index (M,) of world points (M, D), and whether each lies inside (index 0 where not)."""
+        """Flat cell index (M,) of points (M, D), world metres, and whether each is inside; else index 0."""
         cell = self.to_units(points).floor()
         shape = torch.tensor(self.shape, dtype=torch.float64, device=points.device)
         inside = ((cell >= 0) & (cell < shape)).all(1)
@@ -106,7 +108,7 @@ class VoxelGrid:
         return flat, inside
 
     def centers(self, device: torch.device | str | None = None) -> Tensor:
-        """Cell centres (n_cells, D) in world metres, float64, row-major."""
+        """Centres of all cells (n_cells, D), world metres, float64, row-major."""
         axes = [
             o + (torch.arange(n, dtype=torch.float64, device=device) + 0.5) * self.resolution
             for o, n in zip(self.origin, self.shape, strict=True)
@@ -123,7 +125,32 @@ def _covering_cells(
 
 
 def _fitting_resolution(low: list[float], high: list[float], resolution: float, memory_limit: int) -> float:
-    """A coarser resolution, of three digits, at which the box's evidence fits the limit."""
+    """A coarser resolution, rounded to three digits, at which the evidence of the box fits the limit."""
     while math.prod(_covering_cells(low, high, resolution)[1]) * BYTES_PER_CELL > memory_limit:
         resolution = float(f"{resolution * 1.05:.3g}")
     return resolution
+
+
+def rasterize(
+    answer: Callable[[Tensor], Tensor],
+    grid: VoxelGrid,
+    on_event: Callable[[str, int, int | None], object] = lambda stage, done, total: None,
+) -> Tensor:
+    """Probability of each cell, float64, in the shape of the grid: `answer` at the centres of the cells.
+
+    Args:
+        answer: maps points (M, D), world metres, to probabilities (M,). It is called for some cells at a
+            time.
+        on_event: is called with ("cells", done, total) after each call.
+    """
+    found = torch.empty(grid.n_cells, dtype=torch.float64)
+    shape = torch.tensor(grid.shape)
+    origin = torch.tensor(grid.origin, dtype=torch.float64)
+    stride = torch.cat([shape.flip(0).cumprod(0).flip(0)[1:], torch.ones(1, dtype=torch.int64)])
+    on_event("cells", 0, grid.n_cells)
+    for first in range(0, grid.n_cells, _CELLS_PER_CALL):
+        flat = torch.arange(first, min(first + _CELLS_PER_CALL, grid.n_cells))
+        index = flat[:, None] // stride % shape
+        found[flat] = answer(origin + (index.double() + 0.5) * grid.resolution).detach().cpu().double()
+        on_event("cells", int(flat[-1]) + 1, grid.n_cells)
+    return found.view(grid.shape)

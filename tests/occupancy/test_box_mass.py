@@ -13,15 +13,14 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.box_mass import box_mass, normal_mass
-from gmmtorch.occupancy.index.culling import Whitened
+from gmmtorch.occupancy.cones import Cones, WhitenedCones
+from gmmtorch.occupancy.forms.flux.box_mass import box_mass, normal_mass
 
 
 def mass(mean, covariance, low, high, **options):
     """Mass (P,) of Gaussians in boxes, all (P, D)."""
     nowhere, ones = torch.zeros_like(mean), torch.ones(len(mean))
-    white = Whitened.of(Cones(mean, covariance, nowhere, ones, ones < 0))
+    white = WhitenedCones.of(Cones(mean, covariance, nowhere, ones, ones < 0))
     return box_mass(white, low.T, high.T, **options)
 
 

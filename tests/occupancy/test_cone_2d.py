@@ -13,8 +13,7 @@ from scipy import integrate
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.cone.cone_2d import share_beyond
-from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
+from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence, share_beyond_2d
 
 
 def one_cone(mean, covariance, origin=(0.0, 0.0), count=1.0, max_range=False) -> Cones:
@@ -33,7 +32,7 @@ def boxes(*corners: tuple[float, float, float, float]) -> tuple[torch.Tensor, to
 def share(p: float, corners: list[tuple[float, float]], inside: bool = False) -> float:
     cell = torch.tensor(corners, dtype=torch.float64)[..., None]
     mean = torch.tensor([[p], [0.0]], dtype=torch.float64)
-    return float(share_beyond(cell, mean, torch.tensor([inside]), 8.0))
+    return float(share_beyond_2d(cell, mean, torch.tensor([inside]), 8.0))
 
 
 def wedge_share(p: float, nearest: float, first: float, last: float) -> float:

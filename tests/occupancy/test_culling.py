@@ -10,16 +10,21 @@ from flux_cases import draw_ends, normal, one_each, only, random_covariances, un
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.forms.cone.mahalanobis import cross, outside_ball, outside_cone
+from gmmtorch.occupancy.cones import (
+    CUTOFF,
+    Cones,
+    WhitenedCones,
+    cone_bounds,
+    cross,
+    outside_ball,
+    outside_cone,
+)
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.index.culling import (
-    Whitened,
     ball_rows,
     candidate_pairs,
     cells_in_chunks,
     face_rows,
-    reach,
 )
 
 GRIDS = {2: VoxelGrid((-2.0, -1.8), 0.2, (20, 18)), 3: VoxelGrid((-2.0, -1.8, -2.1), 0.4, (10, 9, 11))}
@@ -36,7 +41,7 @@ def some_cones(dim: int, n: int, seed: int, inside: bool = False) -> Cones:
 def ends_within(cones: Cones, n: int) -> torch.Tensor:
     """Ends of rays, those beyond the cutoff left out."""
     ends = draw_ends(cones, n)
-    white = Whitened.of(cones)
+    white = WhitenedCones.of(cones)
     return ends[(white.apply((ends - cones.means).T).norm(dim=0) < CUTOFF)]
 
 
@@ -119,7 +124,7 @@ def test_chunks_hold_every_cell_once(size):
 
 def test_reach_is_the_box_of_ellipsoid_and_sensor():
     cones = some_cones(3, 5, 1)
-    low, high = reach(cones, 2.0)
+    low, high = cone_bounds(cones, 2.0)
     for i in range(5):
         surface = torch.nn.functional.normalize(
             draw_ends(

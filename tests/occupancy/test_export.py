@@ -23,11 +23,9 @@ from gmmtorch.errors import (
 from gmmtorch.export.map_server import highest_in_band, read_map_server, write_map_server
 from gmmtorch.export.octomap import write_octomap
 from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
-from gmmtorch.occupancy.evidence import CellClass
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.thresholds import Thresholds
+from gmmtorch.occupancy.evidence import CellClass, Thresholds
+from gmmtorch.occupancy.grid import VoxelGrid, rasterize
 from gmmtorch.occupancy.voxels.blocks import BlockEvidence
-from gmmtorch.occupancy.voxels.rasterize import rasterize
 
 pyoctomap = pytest.importorskip("pyoctomap")
 open3d = pytest.importorskip("open3d")

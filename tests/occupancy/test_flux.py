@@ -13,13 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.cones import Cones, cone_bounds
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE
 from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.index.culling import reach
 
 
 def cases(dim: int, n: int, seed: int, deviations=(1e-3, 2.0), distances=(0.1, 10.0), sizes=(1e-2, 1.0)):
@@ -147,7 +146,7 @@ def test_cells_outside_every_cone_have_no_evidence_at_all(dim):
     cones, grid = grid_case(dim)
     cones = only(cones, 0)
     evidence = flux_evidence(cones, grid)
-    low, high = reach(cones)
+    low, high = cone_bounds(cones)
     outside = ((grid.centers() + 0.1 < low) | (grid.centers() - 0.1 > high)).any(1)
     assert 0 < int(outside.sum()) < grid.n_cells
     assert evidence.probability().flatten()[outside].unique().tolist() == [0.5]

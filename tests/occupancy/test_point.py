@@ -15,7 +15,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, _shares, point_evidence
+from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, _pair_evidence, point_evidence
 
 
 def one_cone(mean, covariance, origin, count=100.0, max_range=False) -> Cones:
@@ -160,7 +160,7 @@ def every_pair(form: PointForm, points: Tensor) -> PointEvidence:
     """Every cone at every point, without any list or test of nearness."""
     columns = form._table.columns
     point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(columns.shape[1])).unbind(1)
-    shares = _shares(points.T[:, None], point, columns, cone, form.resolution, form.cutoff, False)
+    shares = _pair_evidence(points.T[:, None], point, columns, cone, form.resolution, form.cutoff, False)
     return PointEvidence(*(share.view(len(points), -1).sum(1) for share in shares))
 
 

@@ -11,8 +11,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.evidence import bernoulli_entropy, check_prior, occupancy_probability
-from gmmtorch.occupancy.thresholds import Thresholds
+from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
 from gmmtorch.occupancy.voxels.block_grid import BlockGrid
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, flat_index
 

@@ -11,7 +11,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.index.culling import reach
+from gmmtorch.occupancy.cones import cone_bounds
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
 
 _REACH = 3.0  # deviations around the means that count as near
@@ -66,7 +66,7 @@ class MixtureTiles:
             raise InvalidArgumentError(f"components have {components.dim} dimensions; tiles need 3.")
         low, high = [0.0] * 3, [0.0] * 3
         if len(components.seen_by):
-            lows, highs = reach(components.cones(), _REACH)
+            lows, highs = cone_bounds(components.cones(), _REACH)
             low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
             if not all(map(math.isfinite, (*low, *high))):
                 raise InvalidArgumentError(f"The components of key={key!r} hold NaN or infinite values.")

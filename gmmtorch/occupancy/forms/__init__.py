@@ -1,1 +1,1 @@
-"""The forms of evidence: point, flux, cone and Monte Carlo (thesis 3.2)."""
+"""The four forms of evidence: point, flux, cone and Monte Carlo (thesis 3.2)."""

@@ -1,4 +1,4 @@
-"""Evidence of Gaussian components by Monte Carlo ray casting (thesis 3.2.3)."""
+"""Monte Carlo form: rays sampled from Gaussian components, to be cast through a grid (thesis 3.2.3)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class RayBundle(NamedTuple):
 
 
 def allocate_samples(counts: Tensor, n_samples: int) -> Tensor:
-    """Samples per cone (C,), in proportion to its count, at least one where the count is above zero."""
+    """Number of samples (C,) of each cone: proportional to its count, at least 1 if the count is above 0."""
     share = counts.double() * (n_samples / counts.double().sum().clamp_min(1e-300))
     return torch.where(counts > 0, share.round().clamp_min(1), 0.0).long()
 
@@ -33,17 +33,18 @@ def allocate_samples(counts: Tensor, n_samples: int) -> Tensor:
 def sample_rays(
     cones: Cones, n_samples: int, generator: torch.Generator | None = None, sampling: Sampling = "sobol"
 ) -> RayBundle:
-    """Rays from the sensors to points drawn from the components.
+    """Rays from the sensor origins to points sampled from the components.
 
-    Each ray of a cone with count N and n samples carries the weight N/n, so that evidence means
-    the same whatever the sample count. `stratified` and `sobol` give every cone its share of the
-    samples; `plain` draws the cone of each sample at random; `sobol` takes scrambled Sobol points
-    through the normal quantile instead of independent normals.
+    A ray of a cone with count N and n samples has the weight N/n, so that the expected evidence does not
+    depend on the number of samples.
 
     Args:
-        cones: the components and whence they were seen.
-        n_samples: about how many rays to draw in all (rounded per cone, at least one each).
+        cones: the components and their sensor origins.
+        n_samples: approximate total number of rays; it is rounded for each cone, to at least one.
         generator: seeded source of randomness, on the CPU; seed 0 if not given.
+        sampling: `stratified` and `sobol` give each cone samples in proportion to its count, `plain` draws
+            the cone of each sample at random. `sobol` maps scrambled Sobol points through the normal
+            quantile function, the others draw independent normals.
 
     Raises:
         InvalidArgumentError: fewer than one sample, or an unknown kind of sampling.
@@ -77,5 +78,5 @@ def _standard_normals(n: int, dim: int, generator: torch.Generator | None, sampl
     seed = int(torch.randint(2**31 - 1, (), generator=generator))
     engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)
     uniform = engine.draw(n, dtype=torch.float64) if n else torch.empty(0, dim, dtype=torch.float64)
-    # The engine has 30 bits: move its points to the middle of their intervals, off 0 and 1.
+    # The engine has 30 bits: move its points to the middle of their intervals, so that none is 0 or 1.
     return torch.special.ndtri(uniform.clamp(0, 1 - 2.0**-30) + 2.0**-31)

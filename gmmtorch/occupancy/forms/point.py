@@ -1,10 +1,10 @@
-"""Evidence at single points, as of a cube around each: closed forms, no grid, no sampling."""
+"""Point form: evidence of the cube around a point in closed form, without a grid and without samples."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -13,22 +13,22 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import argsort, safe_cholesky
 from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.forms.radial import tail_moment
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.index.hulls import sum_of
+from gmmtorch.occupancy.index.point_blocks import PointBlocks
 from gmmtorch.occupancy.protocol import check_queries
 
 CHUNK_PAIRS = 1 << 16
-"""Pairs of point and cone worked on at once: bounds the memory, not the result."""
+"""Pairs of a point and a cone evaluated in one pass. It bounds the memory and does not change the result."""
 
-_SUBCELLS = 4  # along each axis of a bucket: points are sorted so finely that blocks are compact
-_PORTION = 1 << 20  # points sorted at once
-_FEW = 1 << 11  # points, for which an index is not worth building
+_CHUNK_POINTS = 1 << 20  # points sorted in one pass
+_FEW = 1 << 11  # for at most this many points an index does not pay
+_SQRT_HALF_PI = math.sqrt(math.pi / 2)
 
 
 class PointEvidence(NamedTuple):
-    """hits (M,), misses (M,): expected rays that end in, and that pass through, the cube at each point."""
+    """hits (M,), misses (M,): expected rays that end in the cube at each point, and that pass through it."""
 
     hits: Tensor
     misses: Tensor
@@ -43,39 +43,40 @@ def point_evidence(
     hit_length: float | None = None,
     compiled: bool = False,
 ) -> PointEvidence:
-    """Evidence of the cube of side `resolution` (m) centred at each point (M, D).
+    """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
 
-    For more than one question to the same cones keep a `PointForm`.
+    For several calls with the same cones use a `PointForm`.
     """
     form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=points.shape[0] > _FEW)
     return form(points, hit_length)
 
 
 class PointForm:
-    """The point form of evidence of fixed cones, for cubes of one side h; float64, in closed form.
+    """The point form of evidence of fixed cones, for cubes of one side h; float64, closed form.
 
-    Of a component N(μ, Σ) with count N, seen from s, at x with u = x − s:
+    A component N(μ, Σ) with count N, seen from s, gives to the cube at x, with u = x − s:
 
         hits = N h^D N(x | μ, Σ + h²/12 I)
         misses = N h^{D−1} (Σ_i |u_i|/|u|) |u| ∫_τ^∞ t^{D−1} N(s + tu | μ, Σ + κI) dt
 
-    h²/12 I is the spread of the cube, κ = (h²/12) |μ − s|²/|u|² the same as seen from the sensor: so a
-    cone narrower than the cube is averaged over the cube, not met or missed by its centre. The area
-    that the cube shows to the ray is h^{D−1} Σ|u_i|/|u|, the mean chord h |u|/Σ|u_i|, and τ lies half a
-    chord beyond x: what passes ends beyond the cube, and not in its second half.
+    h²/12 I is the covariance of the cube, and κ = (h²/12) |μ − s|²/|u|² is the same spread projected from the
+    sensor origin to the component. Both average a cone that is narrower than the cube over the cube. The
+    area of the cube perpendicular to the ray is h^{D−1} Σ|u_i|/|u|, and its mean chord is h |u|/Σ|u_i|. τ
+    lies half a chord beyond x: a ray that passes ends beyond the cube, not in its second half.
 
-    No cone gives more than its N rays: hits at most N, misses at most N − hits, and just that in a cube
-    that holds the sensor, where every ray begins. Both fade to zero over the last unit of squared
-    deviations before `cutoff`, so that evidence has no edge; beyond it they are exactly zero.
+    A cone gives at most N rays: hits ≤ N and misses ≤ N − hits. A cube that contains the sensor origin gets
+    exactly N − hits misses, because every ray starts there. Both fade to zero over the last unit of the
+    squared Mahalanobis distance before `cutoff`, and are exactly zero beyond it.
 
-    Gradients flow to the points, and to means, covariances, origins and counts that ask for them.
+    Gradients flow to the points, and to the means, covariances, origins and counts of the cones.
 
     Args:
-        cones: not to be changed afterwards.
+        cones: must not change afterwards.
         resolution: h (m).
-        cutoff: deviations beyond which a component is taken to end.
-        compiled: use torch.compile; needs a C++ compiler, and tens of seconds for its first use.
-        indexed: visit only the cones that can matter; else all of them, for a few questions.
+        cutoff: Mahalanobis distance beyond which a component gives no evidence.
+        compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
+        indexed: True evaluates only cones near a point, found by a `ConeIndex`; False evaluates all cones,
+            which is faster for a few points.
     """
 
     def __init__(
@@ -89,72 +90,72 @@ class PointForm:
     ) -> None:
         self.resolution = check_resolution(resolution)
         if not 0 < cutoff < math.inf:
-            raise InvalidArgumentError(f"cutoff={cutoff} must be a number of deviations above zero.")
+            raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
-        self._table = _Table.of(cones, self.resolution)
+        self._table = _ConeTable.of(cones, self.resolution)
         entries = None if indexed else 0
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
 
     def __call__(
         self, points: Tensor, hit_length: float | None = None, chunk_pairs: int = CHUNK_PAIRS
     ) -> PointEvidence:
-        """Hits and misses at points (M, D), world metres; zero at infinity.
+        """Hits and misses at points (M, D), world metres; zero at infinite points.
 
-        hit_length: ℓ (m), hits per area and ℓ instead of h: recalibrates what thin surfaces say.
+        hit_length: ℓ (m); hits are multiplied by ℓ/h. It recalibrates the evidence of thin surfaces.
         Raises `InvalidArgumentError` for another shape, NaN, or a length that is not above zero.
         """
         query = check_queries(points, self.dim)
         scale = 1.0 if hit_length is None else _check_length(hit_length) / self.resolution
         hits, misses = [], []
-        for part in query.split(_PORTION):
-            found = self._portion(part, chunk_pairs)
+        for part in query.split(_CHUNK_POINTS):
+            found = self._evaluate(part, chunk_pairs)
             hits.append(found.hits * scale)
             misses.append(found.misses)
         return PointEvidence(torch.cat(hits), torch.cat(misses))
 
-    def _portion(self, points: Tensor, chunk_pairs: int) -> PointEvidence:
+    def _evaluate(self, points: Tensor, chunk_pairs: int) -> PointEvidence:
         zeros = torch.zeros_like(points[:, 0])
         bucket = self.index.buckets(points)
         if not bool((bucket >= 0).any()):
             return PointEvidence(zeros, zeros.clone())
-        blocks = _Blocks.of(points, bucket, self.index)
+        blocks = PointBlocks.of(points, bucket, self.index)
         parts = [
-            self._blocks(blocks, part, chunk_pairs) for part in _portions(blocks, self.index, chunk_pairs)
+            self._of_blocks(blocks, part, chunk_pairs) for part in blocks.chunks(self.index, chunk_pairs)
         ]
         evidence = torch.cat(parts, 1).flatten(1)[:, blocks.slot]
         hits, misses = (zeros.index_copy(0, blocks.point, values) for values in evidence)
         return PointEvidence(hits, misses)
 
-    def _rows(self, blocks: _Blocks, part: slice) -> tuple[Tensor, Tensor]:
-        """Blocks (R,), counted in `part`, and the cones (R,) that can matter to them."""
-        place, cone = self.index.listed(blocks.bucket[part])
+    def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
+        """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""
+        block, cone = self.index.listed(blocks.bucket[part])
         centers, radius = blocks.centers[part], blocks.radius[part]
-        near = self.index.hulls.near(cone, centers[place], radius[place], self.compiled)
-        return place[near], cone[near]
+        near = self.index.hulls.near(cone, centers[block], radius[block], self.compiled)
+        return block[near], cone[near]
 
-    def _blocks(self, blocks: _Blocks, part: slice, chunk_pairs: int) -> Tensor:
+    def _of_blocks(self, blocks: PointBlocks, part: slice, chunk_pairs: int) -> Tensor:
         """Hits and misses (2, b, B) of the blocks in `part`."""
-        place, cone = self._rows(blocks, part)
+        block, cone = self._near_cones(blocks, part)
         points = blocks.points[..., part]
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
-        shares = _compiled_shares() if self.compiled else _shares
+        pair_evidence = _compiled_pair_evidence() if self.compiled else _pair_evidence
         settings = (self.resolution, self.cutoff, self._table.oblique)
         n_rows = max(1, chunk_pairs // points.shape[1])
-        for of, which in zip(place.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = shares(points, of, self._table.columns, which, *settings)
-            hits, misses = hits.index_add(0, of, hit.T), misses.index_add(0, of, miss.T)
+        for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
+            hit, miss = pair_evidence(points, rows, self._table.columns, cones, *settings)
+            hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
     def visited(self, points: Tensor, chunk_pairs: int = CHUNK_PAIRS) -> float:
-        """Cones whose evidence is computed for a point, on average over these points (M, D)."""
+        """Average number of cones evaluated for each of the points (M, D)."""
         query = check_queries(points, self.dim)
         bucket = self.index.buckets(query)
         if not bool((bucket >= 0).any()):
             return 0.0
-        blocks = _Blocks.of(query, bucket, self.index)
-        parts = _portions(blocks, self.index, chunk_pairs)
-        n_rows = sum(self._rows(blocks, part)[0].shape[0] for part in parts)
+        blocks = PointBlocks.of(query, bucket, self.index)
+        parts = blocks.chunks(self.index, chunk_pairs)
+        n_rows = sum(self._near_cones(blocks, part)[0].shape[0] for part in parts)
         return n_rows * blocks.points.shape[1] / query.shape[0]
 
 
@@ -166,22 +167,23 @@ def _check_length(length: float) -> float:
     return float(length)
 
 
-class _Table(NamedTuple):
-    """One column a cone of what `_shares` needs, in the axes V of its component; see there.
+class _ConeTable(NamedTuple):
+    """The quantities that `_pair_evidence` needs, one column for each cone, in the axes V of its component.
 
-    oblique: whether the columns end with the entries of VᵀΣV off the diagonal. They are zero, but
-    gradients of the covariance pass through them.
+    oblique: whether the columns end with the off-diagonal entries of VᵀΣV. These are zero, but gradients with
+    respect to the covariance pass through them.
     """
 
     columns: Tensor
     oblique: bool
 
     @staticmethod
-    def of(cones: Cones, resolution: float) -> _Table:
+    def of(cones: Cones, resolution: float) -> _ConeTable:
         dim = cones.dim
         covariances = cones.covariances.double()
-        safe_cholesky(covariances.detach())  # for its errors
-        # V is held fixed: it has no gradient where variances are equal, and to first order Σ needs none.
+        safe_cholesky(covariances.detach())  # raises if one is not positive definite
+        # V has no gradient where variances are equal. It is held constant, which is exact to first order in
+        # Σ.
         axes = torch.linalg.eigh(covariances.detach())[1]
         turned = axes.transpose(1, 2) @ covariances @ axes
         variances = turned.diagonal(dim1=1, dim2=2)
@@ -202,13 +204,19 @@ class _Table(NamedTuple):
         if oblique:
             above = torch.triu_indices(dim, dim, 1, device=covariances.device)
             columns.append(turned[:, above[0], above[1]])
-        return _Table(torch.cat(columns, 1).T.contiguous(), oblique)
+        return _ConeTable(torch.cat(columns, 1).T.contiguous(), oblique)
 
 
-def _shares(
-    points: Tensor, of: Tensor, table: Tensor, cone: Tensor, resolution: float, cutoff: float, oblique: bool
+def _pair_evidence(
+    points: Tensor,
+    block: Tensor,
+    table: Tensor,
+    cone: Tensor,
+    resolution: float,
+    cutoff: float,
+    oblique: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Hits and misses (B, R) at the points (D, B, b) of blocks `of` (R,), of cones (R,) of a table."""
+    """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of the table."""
     dim = points.shape[0]
     h = resolution
     columns = [column[cone] for column in table]
@@ -217,16 +225,16 @@ def _shares(
     widening, log_scale, counts, surface = columns[dim * dim + 4 * dim :][:4]
     tilts = columns[dim * dim + 4 * dim + 4 :] if oblique else []
 
-    x = [axis[:, of] for axis in points]
+    x = [axis[:, block] for axis in points]
     offset = [a - m for a, m in zip(x, mean, strict=True)]
     ray = [a - s for a, s in zip(x, origin, strict=True)]
     size = [r.abs() for r in ray]
-    begins = functools.reduce(torch.maximum, size) <= 0.5 * h  # the cube holds the sensor
+    at_sensor = functools.reduce(torch.maximum, size) <= 0.5 * h  # the cube contains the sensor origin
     y = [sum_of(axes[i][j] * offset[i] for i in range(dim)) for j in range(dim)]
-    # In a cube that holds the sensor all rays pass; the closed form is kept finite and not used.
-    z = [torch.where(begins, 1.0, a + b) for a, b in zip(y, seen, strict=True)]
-    squared_distance = torch.where(begins, 1.0, sum_of(r * r for r in ray))
-    breadth = torch.where(begins, 1.0, sum_of(size))
+    # There all rays pass. The closed form is not used; it is kept finite for the sake of gradients.
+    z = [torch.where(at_sensor, 1.0, a + b) for a, b in zip(y, seen, strict=True)]
+    squared_distance = torch.where(at_sensor, 1.0, sum_of(r * r for r in ray))
+    breadth = torch.where(at_sensor, 1.0, sum_of(size))
 
     sharp = [1 / (v + h * h / 12) for v in variances]
     squared = _product(y, y, sharp, tilts)
@@ -244,12 +252,12 @@ def _shares(
     peak = torch.exp(-0.5 * squared) * (determinant / (2 * math.pi * aa) ** dim).sqrt()
     flux = peak * tail_moment(leaving, length - along, dim) * breadth * h ** (dim - 1)
     inside = (cutoff**2 - squared - leaving.clamp_min(0) ** 2).clamp(0, 1)
-    miss = torch.minimum(torch.where(begins, 1.0, flux * inside), 1 - hit)
+    miss = torch.minimum(torch.where(at_sensor, 1.0, flux * inside), 1 - hit)
     return hit * surface, miss * counts
 
 
 def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: list[Tensor]) -> Tensor:
-    """vᵀ(VᵀΣV + κI)⁻¹w, to first order in the entries off the diagonal, which are zero."""
+    """vᵀ(VᵀΣV + κI)⁻¹w, to first order in the off-diagonal entries `tilts`, which are zero."""
     dim = len(v)
     product = sum_of(g * a * b for g, a, b in zip(sharp, v, w, strict=True))
     pairs = [(i, j) for i in range(dim) for j in range(i + 1, dim)] if tilts else []
@@ -259,62 +267,20 @@ def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: list[
 
 
 @functools.cache
-def _compiled_shares() -> Callable[..., tuple[Tensor, Tensor]]:
-    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(_shares, dynamic=True)
+def _compiled_pair_evidence() -> Callable[..., tuple[Tensor, Tensor]]:
+    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(_pair_evidence, dynamic=True)
     return compiled
 
 
-class _Blocks(NamedTuple):
-    """Points sorted by place, in blocks of B that share a bucket, filled up by repeating one.
+def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:
+    """∫_a^∞ (w + b)^{D−1} e^{−w²/2} dw, the radial integral of the rays that end beyond a point; any shape.
 
-    points (D, B, b); bucket (b,); centers (b, D) and radius (b,) of a ball around them; point (n,) and
-    slot (n,): which of the points given went into which of the b·B slots.
+    All lengths are in the deviations of one ray, measured from its point nearest to the mean: a (`along`)
+    is the position of the query, and −b (`depth`) that of the sensor origin. With Q = √(π/2) erfc(a/√2) and
+    g = e^{−a²/2} the integral is b Q + g in 2D and (b² + 1) Q + (2b + a) g in 3D.
     """
-
-    points: Tensor
-    bucket: Tensor
-    centers: Tensor
-    radius: Tensor
-    point: Tensor
-    slot: Tensor
-
-    @staticmethod
-    def of(points: Tensor, bucket: Tensor, index: ConeIndex) -> _Blocks:
-        """Those of the points (M, D) that have a bucket (M,) at all, −1 for those that have not."""
-        point = (bucket >= 0).nonzero().squeeze(1)
-        within = (points.detach()[point] - index.origin) / index.side % 1
-        fine = bucket[point]
-        for axis in range(index.dim):
-            fine = fine * _SUBCELLS + (within[:, axis] * _SUBCELLS).long()
-        point = point[argsort(fine)]
-        touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
-        size = (
-            16
-            if point.shape[0] > 24 * touched.shape[0]
-            else 4
-            if point.shape[0] > 4 * touched.shape[0]
-            else 1
-        )
-        n_blocks = (count + size - 1) // size
-        first, begin = torch.cumsum(count, 0) - count, (torch.cumsum(n_blocks, 0) - n_blocks) * size
-        number = torch.arange(point.shape[0], device=point.device)
-        slot = number + torch.repeat_interleave(begin - first, count)
-        # Slots left over repeat the last point before them.
-        filled = torch.zeros(int(n_blocks.sum()) * size, dtype=torch.int64, device=point.device)
-        filled[slot] = number
-        filled = filled.cummax(0).values
-        gathered = points[point][filled].view(-1, size, index.dim)
-        fixed = gathered.detach()
-        centers = 0.5 * (fixed.amin(1) + fixed.amax(1))
-        radius = (fixed - centers[:, None]).norm(dim=2).amax(1)
-        owner = torch.repeat_interleave(touched, n_blocks)
-        return _Blocks(gathered.permute(2, 1, 0).contiguous(), owner, centers, radius, point, slot)
-
-
-def _portions(blocks: _Blocks, index: ConeIndex, chunk_pairs: int) -> Iterator[slice]:
-    """Consecutive blocks whose lists together hold about `chunk_pairs` entries, or one block's."""
-    portion = torch.cumsum(index.list_lengths()[blocks.bucket], 0) // chunk_pairs
-    begin = 0
-    for count in torch.unique_consecutive(portion, return_counts=True)[1].tolist():
-        yield slice(begin, begin + count)
-        begin += count
+    tail = _SQRT_HALF_PI * torch.special.erfc(along * math.sqrt(0.5))
+    edge = torch.exp(-0.5 * along * along)
+    if dim == 2:
+        return depth * tail + edge
+    return (depth * depth + 1) * tail + (2 * depth + along) * edge

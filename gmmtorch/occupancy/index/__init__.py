@@ -1,1 +1,1 @@
-"""Cones of a map, and the spatial index that finds those near a point or cell."""
+"""Spatial index over cones: the cones that can give evidence to a point, cell or box."""

@@ -1,9 +1,8 @@
-"""ConeIndex: which cones can matter at a place, from lists kept for the buckets of a lattice.
+"""ConeIndex: lists of the cones that can give evidence in each bucket of a lattice.
 
-A cone's hull is what lies on its rays: the component's ellipsoid at `cutoff` deviations and all
-segments from it to the sensor. A cone is listed in every bucket that its hull comes near enough to
-matter for a cube of side `extent` around a place in the bucket. Lists are conservative: they may
-name a cone that turns out not to matter, and never miss one.
+A bucket lists every cone whose hull (see `Hulls`) meets a cube of side `extent` around any point of the
+bucket. Lists are conservative: they can contain a cone that gives no evidence, and never miss one that
+does.
 """
 
 from __future__ import annotations
@@ -21,27 +20,27 @@ from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.index.hulls import Hulls
 
-_ENTRIES_PER_CONE = {2: 64, 3: 512}  # bounds memory and the time to build, in proportion to the map
-_SPAN = 4  # buckets along an axis that a cone's search begins with, at most
-_KEY_BITS = {2: 31, 3: 21}  # of a packed bucket coordinate
+_ENTRIES_PER_CONE = {2: 64, 3: 512}  # limits memory and build time to a multiple of the number of cones
+_SPAN = 4  # the search for a cone's buckets starts with at most this many along an axis
+_KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _TESTS_AT_ONCE = 1 << 13
 
 
 class ConeIndex:
-    """Lists of cones by bucket: bucket b, with packed coordinate keys[b], lists the cones
-    `entries[starts[b] : starts[b + 1]]`, in rising order.
+    """Lists of cones, one for each bucket: bucket b, with packed coordinates keys[b], lists the cones
+    `entries[starts[b] : starts[b + 1]]` in ascending order.
 
-    Buckets that no cone comes near are not stored, so that memory is in proportion to the cones, and
-    an answer costs what its neighbourhood holds, however large the world is.
+    Empty buckets are not stored. So memory is proportional to the number of cones, and the cost of a query
+    depends on the cones near it, not on the size of the world.
 
     Args:
-        cones: fixed; gradients do not pass through an index.
-        extent: side (m) of the largest box that will be asked about.
-        cutoff: deviations beyond which a component is taken to end.
-        smoothed: lists are for the point form, whose cones are widened by the spread of the cube (see
-            `PointForm`); else for boxes that meet the cones themselves.
-        entries_per_cone: buckets are halved for as long as this many entries a cone suffice; 0: one
-            bucket with every cone.
+        cones: must not change afterwards; gradients do not pass through the index.
+        extent: side (m) of the largest box that is queried.
+        cutoff: Mahalanobis distance beyond which a component gives no evidence.
+        smoothed: True for the point form, which widens cones by the spread of the cube (see `PointForm`);
+            False for boxes that meet the cones themselves.
+        entries_per_cone: the buckets are halved while at most this many entries per cone suffice; 0 makes a
+            single bucket that lists all cones.
     """
 
     def __init__(
@@ -56,10 +55,10 @@ class ConeIndex:
         self.dim = cones.dim
         hulls = self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
         low, high = hulls.bounds()
-        some = len(cones.counts) > 0
-        self.origin = low.amin(0) if some else low.new_zeros(self.dim)
-        # Fine enough to follow the cones, yet coordinates fit their bits.
-        span = float((high.amax(0) - self.origin).amax()) * (1 + 1e-9) if some else 0.0
+        not_empty = len(cones.counts) > 0
+        self.origin = low.amin(0) if not_empty else low.new_zeros(self.dim)
+        # The finest buckets whose coordinates fit the bits of the key.
+        span = float((high.amax(0) - self.origin).amax()) * (1 + 1e-9) if not_empty else 0.0
         finest = max(self.extent, span / (1 << (_KEY_BITS[self.dim] - 1)))
         if entries_per_cone == 0:
             every = torch.arange(len(cones.counts), device=low.device)
@@ -88,7 +87,7 @@ class ConeIndex:
         return key
 
     def buckets(self, points: Tensor) -> Tensor:
-        """Bucket (M,) that holds each point (M, D); −1 where no cone matters."""
+        """Bucket (M,) that contains each point (M, D); −1 where no cone gives evidence."""
         if self.n_buckets == 0:
             return torch.full(points.shape[:1], -1, dtype=torch.int64, device=points.device)
         cell = ((points.detach().double() - self.origin) / self.side).floor()
@@ -98,11 +97,11 @@ class ConeIndex:
         return torch.where(inside & (self.keys[place] == key), place, -1)
 
     def list_lengths(self) -> Tensor:
-        """Cones (n_buckets,) that each bucket lists."""
+        """Number of cones (n_buckets,) in each list."""
         return self.starts[1:] - self.starts[:-1]
 
     def listed(self, buckets: Tensor) -> tuple[Tensor, Tensor]:
-        """Place in `buckets` (P,) and cone (P,) of every entry of the lists of buckets (B,), in order."""
+        """All entries of the lists of `buckets` (B,), in order: position in `buckets` (P,) and cone (P,)."""
         count = self.list_lengths()[buckets]
         place = torch.repeat_interleave(count)
         within = torch.arange(place.shape[0], device=place.device) - (torch.cumsum(count, 0) - count)[place]
@@ -111,10 +110,10 @@ class ConeIndex:
     def candidates(
         self, low: Tensor, high: Tensor, chunk_pairs: int = 1 << 20
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Pairs (box (P,), cone (P,)) such that no cone whose hull meets a box [low, high] (M, D) is missed.
+        """Chunks of pairs, box (P,) and cone (P,): all cones whose hull meets a box [low, high], (M, D) each.
 
-        Each pair comes once, boxes in rising order, all pairs of a box in the same portion. Portions
-        hold about `chunk_pairs`, or one box's.
+        Each pair occurs once, boxes ascend, and all pairs of a box are in the same chunk. A chunk has about
+        `chunk_pairs` pairs, or those of a single box.
 
         Raises `InvalidArgumentError` for boxes larger than `extent`.
         """
@@ -122,21 +121,21 @@ class ConeIndex:
         if low.numel() and float((high - low).amax()) > self.extent * (1 + 1e-9) + 1e-9:
             raise InvalidArgumentError(
                 f"A box of {float((high - low).amax()):.4g} m is larger than the index's "
-                f"extent={self.extent:.4g} m; make the index for the largest box."
+                f"extent={self.extent:.4g} m; make the index with the extent of the largest box."
             )
         bucket = self.buckets(0.5 * (low + high))
         box = (bucket >= 0).nonzero().squeeze(1)
         bucket = bucket[box]
-        portion = torch.cumsum(self.list_lengths()[bucket], 0) // chunk_pairs
-        sizes = torch.unique_consecutive(portion, return_counts=True)[1].tolist()
+        chunk = torch.cumsum(self.list_lengths()[bucket], 0) // chunk_pairs
+        sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
         for boxes, buckets in zip(box.split(sizes), bucket.split(sizes), strict=True):
             place, cone = self.listed(buckets)
             yield boxes[place], cone
 
 
 class _Lattice(NamedTuple):
-    """Boxes low (C, D), high (C, D) that the cones' hulls lie in, about `origin` (D,) in the world, and
-    the side of the finest buckets."""
+    """Boxes around the hulls of cones, low and high (C, D), relative to `origin` (D,) of the world frame;
+    and the side (m) of the finest buckets."""
 
     low: Tensor
     high: Tensor
@@ -144,7 +143,7 @@ class _Lattice(NamedTuple):
     finest: float
 
     def covering(self, cone: Tensor, side: float) -> tuple[Tensor, Tensor]:
-        """All pairs of these cones (C,) and a bucket (P, D) of their boxes."""
+        """All pairs of a cone (C,) and a bucket (P, D) of its box, for buckets of `side` (m)."""
         first, last = ((x[cone] / side).floor().long() for x in (self.low, self.high))
         size = last - first + 1
         count = size.prod(1)
@@ -158,9 +157,10 @@ class _Lattice(NamedTuple):
 
 
 def _search(hulls: Hulls, lattice: _Lattice, budget: int) -> tuple[Tensor, Tensor, float]:
-    """At most `budget` entries of the lists, where it can be: cone (P,), bucket (P, D); the buckets' side.
+    """Entries of the lists, cone (P,) and bucket (P, D), and the side (m) of the buckets.
 
-    From a few large buckets a cone, by halving those that it comes near.
+    The search starts with a few large buckets for each cone and halves those that its hull meets. It stops
+    before there are more than `budget` entries, if the largest buckets allow that.
     """
     extent = (lattice.high - lattice.low).amax(1)
     if extent.numel() == 0:
@@ -179,7 +179,7 @@ def _search(hulls: Hulls, lattice: _Lattice, budget: int) -> tuple[Tensor, Tenso
         )
         finer, fits = _near(hulls, lattice, pairs, side, budget if entries.cone.numel() else math.inf)
         if not fits:
-            # One size for all: cones that would have begun here or below are put into the larger buckets.
+            # All buckets have one size: cones whose search starts at this level or below use the larger one.
             pairs = _Entries(*lattice.covering((level <= now).nonzero().squeeze(1), 2 * side))
             rest, _ = _near(hulls, lattice, pairs, 2 * side, math.inf)
             return torch.cat([entries.cone, rest.cone]), torch.cat([entries.cell, rest.cell]), 2 * side
@@ -188,7 +188,7 @@ def _search(hulls: Hulls, lattice: _Lattice, budget: int) -> tuple[Tensor, Tenso
 
 
 class _Entries(NamedTuple):
-    """Pairs of cone (P,) and bucket (P, D)."""
+    """Pairs of a cone (P,) and a bucket (P, D)."""
 
     cone: Tensor
     cell: Tensor
@@ -197,7 +197,7 @@ class _Entries(NamedTuple):
 def _near(
     hulls: Hulls, lattice: _Lattice, pairs: _Entries, side: float, budget: float
 ) -> tuple[_Entries, bool]:
-    """Those of the pairs that are near each other, and whether they are all: not if above `budget`."""
+    """The pairs whose hull meets the bucket, and True; nothing and False if they exceed `budget`."""
     radius = 0.5 * side * hulls.dim**0.5
     found, n_found = [_Entries(pairs.cone[:0], pairs.cell[:0])], 0
     for cone, cell in zip(*(part.split(_TESTS_AT_ONCE) for part in pairs), strict=True):

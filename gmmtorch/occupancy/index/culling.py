@@ -1,6 +1,6 @@
-"""Culling: which cells and which faces of a grid a component's cone can reach at all.
+"""Culling: the cells and faces of a grid, and the boxes, that a cone can meet.
 
-Everything here errs on the safe side: what is left out has no evidence, what is kept may have none.
+All tests are conservative: a cell that is left out has no evidence; a cell that is kept can have none.
 """
 
 from __future__ import annotations
@@ -11,58 +11,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.occupancy.cones import CUTOFF, Cones, whitening
-from gmmtorch.occupancy.forms.cone.mahalanobis import outside_cone
+from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cone_bounds, outside_cone
 from gmmtorch.occupancy.grid import VoxelGrid
 
 Pairs = tuple[Tensor, Tensor]
-"""Indices of boxes and of cones, (P,) int64 each."""
-
-
-class Whitened(NamedTuple):
-    """What every pair with a cone needs of it, coordinates first, float64.
-
-    matrix (D, D, C): W; mean, origin (D, C): world; toward (D, C): W(μ − s); log_norm (C,): log √det 2πΣ.
-    """
-
-    matrix: Tensor
-    mean: Tensor
-    origin: Tensor
-    toward: Tensor
-    log_norm: Tensor
-
-    @classmethod
-    def of(cls, cones: Cones) -> Whitened:
-        inverse, log_norm = whitening(cones.covariances)
-        mean, origin = cones.means.double().T, cones.origins.double().T
-        matrix = inverse.permute(1, 2, 0).contiguous()
-        return cls(matrix, mean, origin, (matrix * (mean - origin)).sum(1), log_norm)
-
-    def take(self, cone: Tensor) -> Whitened:
-        return Whitened(*(part.index_select(-1, cone) for part in self))
-
-    def apply(self, vector: Tensor) -> Tensor:
-        """W v: (D, P) → (D, P)."""
-        return (self.matrix * vector[None]).sum(1)
-
-
-def reach(cones: Cones, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor]:
-    """Lowest and highest corners (C, D) of the box around each cone: its ellipsoid and its sensor."""
-    means, origins = cones.means.double(), cones.origins.double()
-    deviation = cutoff * cones.covariances.double().diagonal(dim1=-2, dim2=-1).sqrt()
-    return torch.minimum(origins, means - deviation), torch.maximum(origins, means + deviation)
+"""Indices of boxes and indices of cones, (P,) int64 each."""
 
 
 def candidate_pairs(
     cones: Cones, low: Tensor, high: Tensor, cutoff: float = CUTOFF, chunk_pairs: int = 1 << 18
 ) -> Iterator[Pairs]:
-    """Every box and cone that can meet, by trying all: boxes [low, high], (M, D) each."""
+    """All pairs of a box [low, high], (M, D) each, and a cone that can meet, by testing all pairs."""
     if not len(cones.counts) or not len(low):
         return
     cones = Cones(*(part.detach() for part in cones))
     low, high = low.detach().double(), high.detach().double()
-    below, above = reach(cones, cutoff)
-    white = Whitened.of(cones)
+    below, above = cone_bounds(cones, cutoff)
+    white = WhitenedCones.of(cones)
     for rows in torch.arange(len(low), device=low.device).split(max(1, chunk_pairs // len(cones.counts))):
         met = (low[rows, None] <= above).all(-1) & (high[rows, None] >= below).all(-1)
         box, cone = met.nonzero(as_tuple=True)
@@ -76,16 +41,17 @@ def candidate_pairs(
 
 
 def in_chunks(pairs: Iterable[Pairs], size: int) -> Iterator[Pairs]:
-    """The same pairs, at most `size` at once."""
+    """The same pairs in chunks of at most `size`."""
     for box, cone in pairs:
         yield from zip(box.split(size), cone.split(size), strict=True)
 
 
 class FaceRows(NamedTuple):
-    """Rectangles of faces, each on one plane of a grid, that a cone can cross outwards.
+    """R rectangles of faces, each in one plane of a grid, that the rays of a cone can cross.
 
-    cone (R,); plane (R,): index of the grid plane; forward (R,) bool: crossed in the direction of the
-    axis; first, number (R, D−1): lowest cell and how many there are along the other axes, in their order.
+    cone (R,): index of the cone. plane (R,): index of the grid plane. forward (R,) bool: whether rays cross
+    it in the positive direction of the axis. first, number (R, D−1): lowest cell and number of cells along
+    the other axes, in their order.
     """
 
     cone: Tensor
@@ -96,10 +62,11 @@ class FaceRows(NamedTuple):
 
 
 def face_rows(cones: Cones, grid: VoxelGrid, axis: int, cutoff: float = CUTOFF) -> FaceRows:
-    """Faces across `axis` that each cone can cross.
+    """Faces perpendicular to `axis` that the rays of each cone can cross.
 
-    On the plane at c the cone reaches s_b + (c − s_a) m along another axis b, m between the slopes of
-    the tangents from the sensor to the ellipse that is the component's shadow on the plane (a, b).
+    In the plane at c of axis a, the cone extends along another axis b over s_b + (c − s_a) m, where m lies
+    between the slopes of the two tangents from the sensor origin s to the projection of the component's
+    ellipsoid on the axes (a, b).
     """
     device = cones.means.device
     sensor = grid.to_units(cones.origins).detach()
@@ -108,7 +75,7 @@ def face_rows(cones: Cones, grid: VoxelGrid, axis: int, cutoff: float = CUTOFF) 
     spread = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     below, above = torch.minimum(sensor, mean - spread), torch.maximum(sensor, mean + spread)
     n = grid.shape[axis]
-    # Forward: planes 1 … n above the sensor, each closing the cell before it; backward: 0 … n − 1.
+    # Forward: planes 1 … n above the sensor origin, each the upper face of a cell; backward: 0 … n − 1.
     begin = torch.stack([sensor[:, axis].floor() + 1, below[:, axis].floor() + 1])
     stop = torch.stack([above[:, axis].ceil(), sensor[:, axis].ceil()])
     begin = torch.stack([begin[0].clamp(1, n + 1), begin[1].clamp(0, n)]).long()
@@ -134,10 +101,10 @@ def face_rows(cones: Cones, grid: VoxelGrid, axis: int, cutoff: float = CUTOFF) 
 
 
 def _tangent_slopes(toward: Tensor, scaled: Tensor, a: int, b: int) -> tuple[Tensor, Tensor]:
-    """Slopes db/da (C,) of the two tangents from the sensor to the ellipse of k²Σ, `scaled`.
+    """Slopes m = db/da (C,) of the two tangents from the sensor origin to the ellipse of k²Σ (`scaled`).
 
-    Infinite where the ellipse reaches beside or behind the sensor along axis a. They solve
-    (d_b − m d_a)² = k²(Σ_bb − 2mΣ_ab + m²Σ_aa).
+    They solve (d_b − m d_a)² = k²(Σ_bb − 2mΣ_ab + m²Σ_aa) and are infinite where the ellipse extends to the
+    sensor origin or behind it along axis a.
     """
     da, db = toward[:, a], toward[:, b]
     square = da * da - scaled[:, a, a]
@@ -154,7 +121,7 @@ def _tangent_slopes(toward: Tensor, scaled: Tensor, a: int, b: int) -> tuple[Ten
 
 
 class BallRows(NamedTuple):
-    """Boxes of cells around the ellipsoids of components: cone (R,); first, number (R, D)."""
+    """Boxes of cells around R ellipsoids: cone (R,); lowest cell `first` and `number` of cells, (R, D)."""
 
     cone: Tensor
     first: Tensor
@@ -162,7 +129,7 @@ class BallRows(NamedTuple):
 
 
 def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows:
-    """Cells in which points of each cone can lie; cones that met no surface have none."""
+    """Cells that the ellipsoid of each cone can meet; cones of no-return beams have none."""
     cone = (~cones.max_range).nonzero().squeeze(1)
     mean = grid.to_units(cones.means[cone].detach())
     variance = cones.covariances[cone].detach().double().diagonal(dim1=-2, dim2=-1)
@@ -174,7 +141,11 @@ def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows
 
 
 def cells_in_chunks(first: Tensor, count: Tensor, size: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Row (P,) and indices (K, P) of every cell of boxes of cells first, count (R, K), `size` at once."""
+    """Row (P,) and cell indices (K, P) of all cells of R boxes of cells, in chunks of `size`.
+
+    Args:
+        first, count: (R, K), lowest cell and number of cells of each box along each axis.
+    """
     per_row = count.prod(1)
     ends = torch.cumsum(per_row, 0)
     total = int(ends[-1]) if len(ends) else 0

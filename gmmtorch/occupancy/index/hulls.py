@@ -1,4 +1,4 @@
-"""Hulls: what lies on the rays of cones, and the test whether a place is near enough to matter."""
+"""Hulls of cones, and the test whether a cone can give evidence near a point."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from gmmtorch.occupancy.cones import Cones
 
 
 class Hulls:
-    """The hulls of cones in the axes of their components, and the test whether a ball comes near one.
+    """Hulls of C cones: all segments from the sensor origin to the component's ellipsoid at `cutoff`.
 
-    Near enough to matter for a cube of side `extent`; or, if `smoothed`, for the point form, which
-    widens the cone by the Gaussian of the cube's spread instead.
+    A cone can give evidence to a cube of side `extent` (m) if its hull meets the cube. With `smoothed`, as
+    in the point form, the cone is widened instead by a Gaussian with the variance of the cube.
     """
 
     def __init__(self, cones: Cones, extent: float, cutoff: float, smoothed: bool) -> None:
         dim = self.dim = cones.dim
         means, origins = cones.means.detach().double(), cones.origins.detach().double()
         variances, axes = torch.linalg.eigh(cones.covariances.detach().double())
-        squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, rising
+        squares = cutoff**2 * variances.clamp_min(0)  # (C, D) squared half axes, ascending
         distance = (means - origins).norm(dim=1, keepdim=True)
         far = distance + squares[:, -1:].sqrt()
         self.means, self.origins, self.distance = means, origins, distance[:, 0]
         self.half = (axes**2 @ squares[:, :, None]).squeeze(2).sqrt()
-        self.reach = 0.5 * extent * dim**0.5  # of the cube's corners
-        self.spread = cutoff * extent / 12**0.5 if smoothed else 0.0  # of its Gaussian, out to the cutoff
+        self.reach = 0.5 * extent * dim**0.5  # from the centre of the cube to its corners
+        self.spread = cutoff * extent / 12**0.5 if smoothed else 0.0  # cutoff radius of the cube's Gaussian
         self.table = torch.cat([axes.flatten(1), means, origins, squares, distance, far], 1).T.contiguous()
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Boxes (C, D), (C, D) outside which a cone cannot matter."""
-        # Of the spread as seen from the sensor, spread · distance / r at r, at most r itself.
+        """Boxes, lowest and highest corner (C, D), outside which a cone gives no evidence."""
+        # The spread as seen from the sensor origin at range r is spread · distance / r, and at most r.
         widest = max(self.reach, self.spread)
         pad = torch.maximum((widest * self.distance).sqrt(), torch.full_like(self.distance, widest))
         low = torch.minimum(self.means - self.half, self.origins) - pad[:, None]
@@ -41,7 +41,7 @@ class Hulls:
         return low, high
 
     def near(self, cone: Tensor, centers: Tensor, radius: Tensor | float, compiled: bool = False) -> Tensor:
-        """Whether (T,) a place in the ball around each center (T, D) can matter to its cone (T,)."""
+        """Whether (T,) cone (T,) can give evidence to a cube centred in the ball around `centers` (T, D)."""
         test = _compiled_near() if compiled else _near_cone
         return test(self.table, cone, centers, radius, self.reach, self.spread)
 
@@ -49,13 +49,13 @@ class Hulls:
 def _near_cone(
     table: Tensor, cone: Tensor, centers: Tensor, radius: Tensor | float, cube_reach: float, spread: float
 ) -> Tensor:
-    """`Hulls.near`, of cones that are columns of the table.
+    """`Hulls.near` for cones that are columns of the table.
 
-    If y, within R of the center x, is on the segment from the sensor s to p of the ellipsoid E,
-    then the ray from s through x passes beyond x within R |p − s|/|y − s| ≤ β of p, where
-    β = R·far/(|x − s| − R): from x on it meets the sum of E and a ball of radius β, which the
-    ellipsoid (1 + ε)E + (1 + 1/ε)β²I contains, whatever ε > 0 is. Two are tried, which are tight
-    along the two longest axes. If smoothed, E is itself widened first.
+    Let y, within R of the centre x, lie on the segment from the sensor origin s to a point p of the
+    ellipsoid E. Then the ray from s through x passes, beyond x, within R |p − s|/|y − s| ≤ β of p, with β =
+    R·far/(|x − s| − R). So from x on this ray meets the sum of E and a ball of radius β. The ellipsoid (1 +
+    ε)E + (1 + 1/ε)β²I contains that sum for every ε > 0. The test uses two values of ε, which are tight
+    along the two longest axes. In the smoothed case E is widened first.
     """
     dim = centers.shape[1]
     columns = [column[cone] for column in table]
@@ -70,7 +70,7 @@ def _near_cone(
     distance = sum_of(r * r for r in ray).sqrt()
     reach = radius if spread > 0 else radius + cube_reach
     clear = (distance - reach).clamp_min(1e-12)
-    widened = (spread * (whole / clear).clamp_min(1)) ** 2  # of rays, and of the component
+    widened = (spread * (whole / clear).clamp_min(1)) ** 2  # added variance, of the rays and of the component
     far = far + widened.sqrt()
     beta = far * reach / clear
     near = distance <= far + reach
@@ -81,9 +81,10 @@ def _near_cone(
         cc = sum_of(w * a * a for w, a in zip(weight, y, strict=True))
         bb = sum_of(w * a * b for w, a, b in zip(weight, y, z, strict=True))
         aa = sum_of(w * b * b for w, b in zip(weight, z, strict=True))
-        # Squared deviations of the inflated ellipsoid at x, or where the ray comes nearest beyond x.
+        # Squared Mahalanobis distance to the inflated ellipsoid, at x or at the nearest point of the ray
+        # beyond x.
         near = near & (cc - bb.clamp_max(0) ** 2 / aa.clamp_min(1e-300) < 1 + 1e-6)
-    # The cube holds the sensor; and where the bound has no sense, all are near.
+    # The bound does not hold where the cube contains the sensor origin: these cones count as near.
     return near | (distance <= (reach + cube_reach) * (1 + 1e-9))
 
 
@@ -94,5 +95,5 @@ def _compiled_near() -> Callable[..., Tensor]:
 
 
 def sum_of(terms: Iterable[Tensor]) -> Tensor:
-    """Their sum, without a zero to begin with."""
+    """Sum of tensors, in order; unlike `sum` it does not start with an integer 0."""
     return functools.reduce(torch.add, terms)

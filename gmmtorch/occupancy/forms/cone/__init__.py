@@ -1,1 +1,1 @@
-"""The thesis's cone approximation of hits and misses in a cell (thesis 3.2.2)."""
+"""Cone form: the closed-form approximations of hits and misses in a cell (thesis 3.2.2)."""

@@ -1,4 +1,4 @@
-"""Owen's T function, and with it the exact probability of polygons under a standard normal."""
+"""Owen's T function, and the exact probability of polygons under a standard normal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 _NODES = 10
-_FLAT = 40.0  # e^(−h²/2) is zero in float64 beyond
+_FLAT = 40.0  # e^(−h²/2) is zero in float64 for larger h
 
 
 @functools.cache
@@ -28,11 +28,12 @@ def _upper_tail(x: Tensor) -> Tensor:
 
 
 def owens_t(h: Tensor, a: Tensor) -> Tensor:
-    """T(h, a) = 1/2π ∫_0^a exp(−½h²(1 + x²))/(1 + x²) dx, to 1e-14 (Owen 1956); broadcasts.
+    """T(h, a) = 1/2π ∫_0^a exp(−½h²(1 + x²))/(1 + x²) dx, exact to 1e-14 (Owen 1956); h and a broadcast.
 
-    The probability of the wedge 0 < Y < aX beyond X = h. Even in h, odd in a; either may be infinite.
-    Gauss-Legendre on [0, |a|] for |a| ≤ 1, where the integrand is all but a polynomial unless it is
-    as good as zero; beyond, T(h, a) = ½Q(h) + ½Q(ah) − Q(h)Q(ah) − T(ah, 1/a), Q the upper tail.
+    It is the probability that X > h and 0 < Y < aX for independent standard normals. It is even in h and
+    odd in a; both can be infinite. For |a| ≤ 1 Gauss-Legendre quadrature on [0, |a|]: there the integrand
+    is close to a polynomial or to zero. For |a| > 1, T(h, a) = ½Q(h) + ½Q(ah) − Q(h)Q(ah) − T(ah, 1/a),
+    with the upper tail Q.
     """
     h, a = torch.broadcast_tensors(h, a)
     h, size = h.abs(), a.abs()
@@ -46,31 +47,33 @@ def owens_t(h: Tensor, a: Tensor) -> Tensor:
 
 
 def _shallow(h: Tensor, a: Tensor) -> Tensor:
-    """T(h, a) of |a| ≤ 1, h ≥ 0."""
+    """T(h, a) for |a| ≤ 1, h ≥ 0."""
     nodes, weights = _gauss_legendre(a.dtype, a.device)
     half = -0.5 * h.clamp_max(_FLAT) ** 2
     total = torch.zeros_like(a)
-    for node, weight in zip(nodes, weights, strict=True):  # a loop, lest memory grow n-fold
+    for node, weight in zip(
+        nodes, weights, strict=True
+    ):  # a loop: vectorised it would take n times the memory
         stretched = 1 + (node * a) ** 2
         total = total + weight * torch.exp(half * stretched) / stretched
     return total * a / (2 * math.pi)
 
 
 def polygon_probability(starts: Tensor, ends: Tensor) -> Tensor:
-    """P (P,) that a standard normal point lies in a polygon, exactly.
+    """Probability (P,) that a standard normal point lies in a polygon, exact.
 
-    In polar coordinates around the mean an edge at distance h that is seen under the angle φ adds
-    1/2π ∫ (1 − exp(−½h²/cos²φ)) dφ, the second part of which is the difference of two T. An edge
-    through the mean adds nothing.
+    In polar coordinates around the mean, an edge at distance h contributes 1/2π ∫ (1 − exp(−½h²/cos²φ)) dφ
+    over the angles φ that it covers. The second term is a difference of two values of T. An edge through
+    the mean contributes nothing.
 
     Args:
-        starts, ends: (E, 2, P) of the edges, counter-clockwise; edges of no length add nothing.
+        starts, ends: (E, 2, P) of the edges, counter-clockwise; edges of zero length contribute nothing.
     """
     step = ends - starts
     length = step.norm(dim=1)
     along = step / length.clamp_min(torch.finfo(step.dtype).tiny)[:, None]
     turned = starts[:, 0] * ends[:, 1] - starts[:, 1] * ends[:, 0]
-    seen = torch.atan2(turned, (starts * ends).sum(1))  # the angle the edge is seen under
+    seen = torch.atan2(turned, (starts * ends).sum(1))  # the angle that the edge covers
     distance = starts[:, 0] * along[:, 1] - starts[:, 1] * along[:, 0]
     reach = distance.abs()
     first, last = (starts * along).sum(1), (ends * along).sum(1)

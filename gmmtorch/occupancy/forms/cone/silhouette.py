@@ -1,4 +1,4 @@
-"""Silhouettes: the outline of a box as seen from a place, and its perspective image on a plane."""
+"""Silhouettes: the outline of a box seen from a point, and its perspective image on a plane."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_TOUCHING = 1e-6  # of a side: a place on a face sees it from this far off
-_GRAZING = 1e-9  # cosine of the directions that count as parallel to the plane
+_TOUCHING = 1e-6  # relative to a side: distance at which a viewpoint on a face is placed from it
+_GRAZING = 1e-9  # directions with a smaller cosine to the normal count as parallel to the plane
 
 
 class Edges(NamedTuple):
-    """Polygons: starts and ends (E, 2, P) of their edges, some of which may have no length."""
+    """P polygons: starts and ends (E, 2, P) of their edges; an edge can have zero length."""
 
     starts: Tensor
     ends: Tensor
 
 
 def outline(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Corners (6, 3, P) of each box's outline in cyclic order, and whether the place is in the box (P,).
+    """Corners (6, 3, P) of each box's outline in cyclic order, and whether the viewpoint is in the box (P,).
 
-    A box shows one, two or three faces, and an outline of four or six corners (the last is repeated).
+    One, two or three faces of a box are visible. The outline has four or six corners; the last one is
+    repeated.
 
     Args:
-        low, high: (3, P) of the boxes, from the place that they are seen from; on a face it is outside.
+        low, high: (3, P) corners of the boxes relative to the viewpoint. A viewpoint on a face is outside.
     """
     touching = _TOUCHING * (high - low)
     low = torch.where(low >= 0, torch.maximum(low, touching), low)
     high = torch.where(high <= 0, torch.minimum(high, -touching), high)
-    side = (low <= 0).long() + (high < 0).long()  # 0 before the box, 1 within its slab, 2 beyond
+    side = (low <= 0).long() + (high < 0).long()  # viewpoint below, within or above the box: 0, 1, 2
     code = 9 * side[0] + 3 * side[1] + side[2]
     vertex = _outlines(low.device)[code].T  # (6, P)
     corners = torch.stack(
@@ -41,10 +42,10 @@ def outline(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def image(corners: Tensor) -> Edges:
-    """Perspective image on the plane at depth 1 of convex outlines, clipped to what lies before the eye.
+    """Perspective image of convex outlines on the plane at depth 1, clipped to positive depth; n + 1 edges.
 
     Args:
-        corners: (n, 3, P) of the outlines as seen from the origin, the depth last; n + 1 edges result.
+        corners: (n, 3, P) of the outlines relative to the viewpoint; the last coordinate is the depth.
     """
     rays = corners / corners.norm(dim=1, keepdim=True).clamp_min(1e-300)
     following = rays.roll(-1, 0)
@@ -55,7 +56,7 @@ def image(corners: Tensor) -> Edges:
     starts = torch.where(seen[:, None], rays, crossing)
     ends = torch.where(next_seen[:, None], following, crossing)
     shown = (seen | next_seen)[:, None]
-    # What is cut off leaves a gap, out at the horizon, from where the outline leaves to where it returns.
+    # Clipping leaves a gap at the horizon: close it by an edge between the two clipped ends.
     leaving, returning = ((a & ~b)[:, None] for a, b in ((seen, next_seen), (next_seen, seen)))
     gap_start, gap_end = ((crossing * which).sum(0)[None] for which in (leaving, returning))
     cut = leaving.any(0)[None]
@@ -68,14 +69,16 @@ def image(corners: Tensor) -> Edges:
 
 
 def meets_disc(edges: Edges, radius: Tensor) -> Tensor:
-    """Polygons (P,) that come nearer to the origin than `radius` (P,)."""
+    """Whether each polygon (P,) meets the disc of `radius` (P,) around the origin."""
     starts, ends = edges
     step = ends - starts
     share = -(starts * step).sum(1) / (step * step).sum(1).clamp_min(1e-300)
     nearest = (starts + share.clamp(0, 1)[:, None] * step).norm(dim=1)
     drawn = (step != 0).any(1)
     turned = torch.atan2(starts[:, 0] * ends[:, 1] - starts[:, 1] * ends[:, 0], (starts * ends).sum(1))
-    around = torch.where(drawn, turned, 0.0).sum(0).abs() > 3  # 2π around the origin, else 0
+    around = (
+        torch.where(drawn, turned, 0.0).sum(0).abs() > 3
+    )  # the sum is 2π if the polygon surrounds the origin, else 0
     return around | (drawn & (nearest < radius)).any(0)
 
 
@@ -91,10 +94,10 @@ def facing(direction: Tensor) -> Tensor:
 
 @functools.cache
 def _outlines(device: torch.device) -> Tensor:
-    """Vertices (27, 6) around the faces that are seen from each of the 27 regions about a box.
+    """Vertices (27, 6) of the outline of a box seen from each of the 27 regions around it.
 
-    Bit b of a vertex says whether it is at the high end of axis b. They run counter-clockwise on a plane
-    behind the box whose axes are right-handed with the viewing direction.
+    Bit b of a vertex states whether it is at the high end of axis b. The vertices run counter-clockwise on
+    a plane behind the box whose axes are right-handed with the viewing direction.
     """
     table = torch.zeros(27, 6, dtype=torch.int64)
     for code, sides in enumerate(itertools.product(range(3), repeat=3)):
@@ -107,12 +110,13 @@ def _outlines(device: torch.device) -> Tensor:
             if side == 2:
                 around = [v + (1 << axis) for v in reversed(around)]
             edges |= set(itertools.pairwise([*around, around[0]]))
-        # An edge between two faces that are seen is in it once in either direction.
+        # The set contains an edge between two visible faces in both directions; the outline does not.
         table[code] = _chain({start: end for start, end in edges if (end, start) not in edges})
     return table.to(device)
 
 
 def _chain(following: dict[int, int]) -> Tensor:
+    """Vertices (6,) in cyclic order, given the successor of each; the last is repeated."""
     chain = [min(following, default=0)]
     while following and len(chain) < len(following):
         chain.append(following[chain[-1]])

@@ -1,1 +1,1 @@
-"""Exact hits and misses of a cell, polygon or mesh: the flux of rays through its faces."""
+"""Flux form: exact hits and misses of a cell, box, polygon or mesh, from the rays through its faces."""

@@ -1,10 +1,10 @@
-"""Integrals over flat patches whose integrand may be as thin as paper: panels that follow its scale.
+"""Adaptive quadrature on flat patches whose integrand can vary on a scale much smaller than the patch.
 
-A patch is affine: a segment in 2D; a parallelogram or a triangle in 3D. It is cut into panels until
-the integrand varies by a few standard deviations across each, whatever lies outside the component is
-dropped on the way, and what remains takes a Gauss-Legendre rule of just the order that it needs.
+A patch is affine: a segment in 2D, a parallelogram or a triangle in 3D. The integrator cuts it into panels
+until the integrand varies by at most a few standard deviations across each panel. It drops panels outside
+the component, and integrates the others by a Gauss-Legendre rule of the lowest sufficient order.
 
-Coordinates come first here, (D, P) for P patches: sums over D then run along contiguous memory.
+Coordinates come first, (D, P) for P patches, so that sums over D run along contiguous memory.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.cones import dot
 
 TOLERANCE = 1e-4
-"""Error that a rule may make on a panel, as a share of the integrand's peak there."""
+"""Default error of a rule on one panel, relative to the peak of the integrand there."""
 
 CHUNK_PANELS = 1 << 15
-"""Panels worked on at once: they stay in a core's cache, and the memory is bounded."""
+"""Panels integrated in one pass: they fit a core's cache, and the memory is bounded."""
 
 _ORDERS = (1, 2, 3, 4)
-# Of an n-point rule on a Gaussian, κ deviations wide: (n!)⁴/((2n+1)(2n)!³) max|He₂ₙ| κ²ⁿ.
+# Error bound of an n-point rule on a Gaussian κ deviations wide: (n!)⁴/((2n+1)(2n)!³) max|He₂ₙ| κ²ⁿ.
 _ERROR = tuple(math.factorial(n) ** 3 / ((2 * n + 1) * math.factorial(2 * n) ** 2 * 2**n) for n in _ORDERS)
-_MAX_SPLIT = 4  # parts at once: panels outside the component are dropped between two cuts
-_SMALLEST = 1e-15  # of a patch: what all but touches the sensor is cut down to rounding
+_MAX_SPLIT = 4  # parts per cut and axis: panels outside the component are dropped between two cuts
+_SMALLEST = (
+    1e-15  # smallest panel, relative to its patch: stops the cutting of patches close to the sensor origin
+)
 
 
 class Rule(NamedTuple):
@@ -51,10 +54,10 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Patches(ABC):
-    """An integrand on each of P affine patches f ↦ centre + Σ f_i edge_i, all in one tensor.
+    """An integrand on each of P affine patches f ↦ centre + Σ f_i edge_i, held in tensors with P last.
 
-    f runs over [−½, ½]^{D−1}, or over the triangle {f ≥ 0, Σf ≤ 1} where `triangular`. What lies
-    beyond `cutoff` deviations of the component is exactly zero.
+    f lies in [−½, ½]^{D−1}, or with `triangular` in the triangle {f ≥ 0, Σf ≤ 1}. The integrand is exactly
+    zero beyond `cutoff` standard deviations of the component.
     """
 
     cutoff: float
@@ -62,36 +65,36 @@ class Patches(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """How many."""
+        """Number of patches."""
 
     def take(self, index: Tensor) -> Self:
-        """The patches of an index (Q,): every tensor has them last."""
+        """The patches with indices (Q,)."""
         tensors = (f.name for f in fields(self) if isinstance(getattr(self, f.name), Tensor))
         return replace(self, **{name: getattr(self, name).index_select(-1, index) for name in tensors})
 
     @abstractmethod
     def cut(self, base: Tensor, scale: Tensor) -> Self:
-        """Of each patch the part f ↦ centre + Σ (base_i + scale_i f_i) edge_i; (D−1, P) each."""
+        """The part f ↦ centre + Σ (base_i + scale_i f_i) edge_i of each patch; base, scale (D−1, P)."""
 
     @abstractmethod
     def simple(self) -> Tensor:
-        """Patches (P,) on which a cheaper form of the integrand holds."""
+        """Patches (P,) on which a cheaper form of the integrand is valid."""
 
     @abstractmethod
     def variation(self, simple: Tensor) -> Tensor:
-        """By how many standard deviations the integrand changes along each edge: (D−1, P)."""
+        """Change of the integrand along each edge, in standard deviations: (D−1, P)."""
 
     @abstractmethod
     def outside(self) -> Tensor:
-        """Patches (P,) on which the integrand certainly is zero."""
+        """Patches (P,) on which the integrand is certainly zero."""
 
     @abstractmethod
     def sums(self, rule: Rule, simple: bool) -> Tensor:
-        """Integral over each patch (P,) by a rule; `simple` says that the cheaper form holds on all."""
+        """Integral over each patch (P,) by `rule`; `simple` states that the cheaper form is valid on all."""
 
 
 class _Panels(NamedTuple):
-    """Parts of patches: which patch (Q,), and which part of it (D−1, Q), as `Patches.cut` has it."""
+    """Parts of patches: index (Q,) of the patch; base and scale (D−1, Q) of the part, see `Patches.cut`."""
 
     patch: Tensor
     base: Tensor
@@ -106,25 +109,27 @@ class _Panels(NamedTuple):
 
 
 def check_tolerance(tolerance: float) -> float:
-    """The tolerance of a rule; raises `InvalidArgumentError` unless it lies in (0, 1)."""
+    """Return the tolerance of a rule; raise `InvalidArgumentError` unless it lies in (0, 1)."""
     if not 0 < float(tolerance) < 1:
-        raise InvalidArgumentError(f"tolerance={tolerance} must lie in (0, 1); {TOLERANCE} is exact enough.")
+        raise InvalidArgumentError(
+            f"tolerance={tolerance} must lie in (0, 1); {TOLERANCE} is exact enough for most uses."
+        )
     return float(tolerance)
 
 
 def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> Tensor:
-    """Integral over each patch (P,); `like` (D, P) gives dimension, dtype and device.
+    """Integral over each patch (P,); `like` (D, P) gives the dimension, dtype and device.
 
-    Differentiable: cuts and orders are chosen on values alone and do not depend on the parameters.
-    What is cut waits on a stack; about `CHUNK_PANELS` panels are worked on at once.
+    Differentiable: cuts and orders depend on detached values only. Panels to cut further are kept on a stack;
+    a pass works on about `CHUNK_PANELS` of them.
     """
     limits = tuple((tolerance / error) ** (0.5 / n) for n, error in zip(_ORDERS, _ERROR, strict=True))
     total = like.new_zeros(len(patches))
     index = torch.arange(len(patches), device=like.device)
     whole = like.new_zeros(like.shape[0] - 1, len(patches))
-    waiting = list(_Panels(index, whole, whole + 1).chunks()) if len(index) else []
-    while waiting:
-        panels = _next(waiting)
+    stack = list(_Panels(index, whole, whole + 1).chunks()) if len(index) else []
+    while stack:
+        panels = _next_panels(stack)
         geometry = patches.take(panels.patch).cut(panels.base, panels.scale)
         with torch.no_grad():
             inside = (~geometry.outside()).nonzero().squeeze(1)
@@ -135,27 +140,27 @@ def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> T
             fine = (variation <= limits[-1]).all(0) | (panels.scale.abs() < _SMALLEST).any(0)
         ready, coarse = fine.nonzero().squeeze(1), (~fine).nonzero().squeeze(1)
         if len(ready):
-            sums = _by_order(geometry, ready, variation[:, ready], simple, limits)
+            sums = _sums_by_order(geometry, ready, variation[:, ready], simple, limits)
             total = total.index_add(0, panels.patch[ready], sums)
         if len(coarse):
-            cut = _triangles_cut if patches.triangular else _boxes_cut
-            waiting.extend(cut(panels.take(coarse), variation[:, coarse] / limits[-1]).chunks())
+            cut = _cut_triangles if patches.triangular else _cut_boxes
+            stack.extend(cut(panels.take(coarse), variation[:, coarse] / limits[-1]).chunks())
     return total
 
 
-def _next(waiting: list[_Panels]) -> _Panels:
-    """The panels that came last, as many as are worked on at once: few ones are not worth a pass."""
-    parts, n = [waiting.pop()], 0
-    while waiting and (n := n + len(parts[-1].patch)) + len(waiting[-1].patch) <= 1.5 * CHUNK_PANELS:
-        parts.append(waiting.pop())
+def _next_panels(stack: list[_Panels]) -> _Panels:
+    """Pop and join the last entries of the stack, up to one pass: passes over few panels are inefficient."""
+    parts, n = [stack.pop()], 0
+    while stack and (n := n + len(parts[-1].patch)) + len(stack[-1].patch) <= 1.5 * CHUNK_PANELS:
+        parts.append(stack.pop())
     return _Panels(*(torch.cat(fields, -1) for fields in zip(*parts, strict=True)))
 
 
-def _by_order(
+def _sums_by_order(
     patches: Patches, index: Tensor, variation: Tensor, simple: Tensor, limits: tuple[float, ...]
 ) -> Tensor:
-    """Integrals (Q,) over the patches `index`, each by the cheapest rule that is good enough."""
-    order = torch.bucketize(variation, variation.new_tensor(limits[:-1]))  # (D−1, Q), into _ORDERS
+    """Integrals (Q,) over the patches `index`, each by the cheapest sufficient rule."""
+    order = torch.bucketize(variation, variation.new_tensor(limits[:-1]))  # (D−1, Q), indices into _ORDERS
     if patches.triangular:
         order = order.amax(0, keepdim=True).expand_as(order).clamp_min(1)
     dim, n = len(order), len(_ORDERS)
@@ -171,24 +176,24 @@ def _by_order(
 
 @functools.cache
 def _rule(orders: tuple[int, ...], triangular: bool, dtype: torch.dtype, device: torch.device) -> Rule:
-    """Gauss-Legendre of these orders along the edges."""
+    """Gauss-Legendre product rule with the given orders along the edges."""
     axes = [np.polynomial.legendre.leggauss(n) for n in orders]
     nodes = np.stack([g.ravel() for g in np.meshgrid(*(x / 2 for x, _ in axes), indexing="ij")], 1)
     weights = functools.reduce(np.multiply.outer, [w / 2 for _, w in axes]).ravel()
-    if triangular:  # the square folded onto the triangle: (x, y) ↦ (x(1 − y), y)
+    if triangular:  # maps the square to the triangle: (x, y) ↦ (x(1 − y), y)
         x, y = (nodes + 0.5).T
         nodes, weights = np.stack([x * (1 - y), y], 1), weights * (1 - y)
     return Rule(*(torch.as_tensor(part, dtype=dtype, device=device) for part in (nodes, weights)))
 
 
-def _boxes_cut(panels: _Panels, excess: Tensor) -> _Panels:
-    """Panels cut along each edge into as many parts, up to four, as its variation asks for."""
-    for axis in range(len(excess)):
-        parts = excess[axis].ceil().clamp(1, _MAX_SPLIT).long()
+def _cut_boxes(panels: _Panels, ratio: Tensor) -> _Panels:
+    """Cut panels along each edge into ⌈ratio⌉ parts, at most 4; ratio (D−1, Q): variation over its limit."""
+    for axis in range(len(ratio)):
+        parts = ratio[axis].ceil().clamp(1, _MAX_SPLIT).long()
         source = torch.repeat_interleave(parts)
         rank = torch.arange(len(source), device=source.device) - (torch.cumsum(parts, 0) - parts)[source]
-        panels, excess, parts = panels.take(source), excess[:, source], parts[source]
-        along = torch.arange(len(excess), device=source.device)[:, None] == axis
+        panels, ratio, parts = panels.take(source), ratio[:, source], parts[source]
+        along = torch.arange(len(ratio), device=source.device)[:, None] == axis
         shift = panels.scale * ((rank + 0.5) / parts - 0.5)
         panels = panels._replace(
             base=torch.where(along, panels.base + shift, panels.base),
@@ -197,9 +202,35 @@ def _boxes_cut(panels: _Panels, excess: Tensor) -> _Panels:
     return panels
 
 
-def _triangles_cut(panels: _Panels, excess: Tensor) -> _Panels:
-    """Triangles cut into four alike, the middle one upside down."""
+def _cut_triangles(panels: _Panels, ratio: Tensor) -> _Panels:
+    """Cut each triangle into four similar ones; the middle one has a negative scale."""
     half = panels.scale / 2
     corners = half.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
     base = torch.cat([panels.base + half * corner[:, None] for corner in corners], 1)
     return _Panels(panels.patch.repeat(4), base, torch.cat([half, half, half, -half], 1))
+
+
+# -- products of affine vectors at the nodes of a rule ------------------------------------------------
+
+
+def square_on(monomials: Tensor, start: Tensor, edges: Tensor) -> Tensor:
+    """|start + Σ f_i edge_i|² at the nodes f of a rule with these `monomials`: (n, P)."""
+    terms = [dot(start, start), *(2 * dot(start, edge) for edge in edges)]
+    for i, edge in enumerate(edges):
+        terms += [dot(edge, edge), *(2 * dot(edge, other) for other in edges[i + 1 :])]
+    return monomials @ torch.stack(terms)
+
+
+def product_on(monomials: Tensor, a: Tensor, b: Tensor, edges: Tensor) -> Tensor:
+    """(a + Σ f_i edge_i)·(b + Σ f_i edge_i) at the nodes: (n, P)."""
+    both = a + b
+    terms = [dot(a, b), *(dot(both, edge) for edge in edges)]
+    for i, edge in enumerate(edges):
+        terms += [dot(edge, edge), *(2 * dot(edge, other) for other in edges[i + 1 :])]
+    return monomials @ torch.stack(terms)
+
+
+def linear_on(monomials: Tensor, start: Tensor, edges: Tensor, vector: Tensor) -> Tensor:
+    """(start + Σ f_i edge_i)·vector at the nodes: (n, P)."""
+    terms = [dot(start, vector), *(dot(edge, vector) for edge in edges)]
+    return monomials[:, : len(terms)] @ torch.stack(terms)

@@ -1,26 +1,35 @@
-"""Face flux: the exact evidence of cells, from the rays that cross their faces.
+"""Flux form: the exact evidence of cells and boxes, from the rays that cross their faces.
 
-What leaves a convex cell through its faces ends beyond it: misses are the flux out, every face shared by
-two cells is visited once, and hits are the Gaussian's mass in the cell. Nothing is sampled.
+A ray that leaves a convex cell through one of its faces ends beyond it. So the misses of a cell are the
+flux out of its faces, and its hits are the mass of the Gaussian in it. No samples are drawn.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
 from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.cone.box_mass import box_mass
-from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
-from gmmtorch.occupancy.forms.flux.face_flux import FacePatches
+from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
+    TOLERANCE,
+    Patches,
+    Rule,
+    check_tolerance,
+    integrate,
+    linear_on,
+    product_on,
+    square_on,
+)
+from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.index.culling import (
     Pairs,
-    Whitened,
     ball_rows,
     candidate_pairs,
     cells_in_chunks,
@@ -29,7 +38,95 @@ from gmmtorch.occupancy.index.culling import (
 )
 
 CHUNK_FACES = 1 << 18
-"""Faces, or pairs of a box and a cone, prepared at once."""
+"""Faces, or pairs of a box and a cone, prepared in one pass."""
+
+_ROOT_TWO_PI = math.sqrt(2 * math.pi)
+_BEFORE = 6.0  # a face farther before the mean than this (Mahalanobis) has the whole component beyond it
+_NEARNESS = 2.5  # variation, in deviations, of a panel as wide as its distance from the sensor origin
+
+
+@dataclass(frozen=True, eq=False)
+class FacePatches(Patches):
+    """P faces, each with a cone. Whitened, coordinates first.
+
+    The integrand is the flux density of N(μ, Σ) seen from s: the rays per unit area that pass the place q and
+    end beyond it, (u·n) ∫_1^∞ t^{D−1} N(s + tu | μ, Σ) dt with u = q − s and face normal n.
+
+    ray, offset: W(q − s) and W(q − μ) of the centre q (first corner of a triangle), (D, P).
+    edges: whitened edges, (D−1, D, P).
+    strength: (u·n) dA / √det 2πΣ of the whole parallelogram, (P,); constant over the face.
+    """
+
+    ray: Tensor
+    offset: Tensor
+    edges: Tensor
+    strength: Tensor
+
+    def __len__(self) -> int:
+        return len(self.strength)
+
+    def cut(self, base: Tensor, scale: Tensor) -> FacePatches:
+        shift = (base[:, None] * self.edges).sum(0)
+        return replace(
+            self,
+            ray=self.ray + shift,
+            offset=self.offset + shift,
+            edges=scale[:, None] * self.edges,
+            strength=scale.abs().prod(0) * self.strength,
+        )
+
+    def _middle(self) -> tuple[Tensor, Tensor]:
+        shift = 0.5 * self.edges.sum(0) if self.triangular else 0.0
+        return self.ray + shift, self.offset + shift
+
+    def outside(self) -> Tensor:
+        return outside_cone(*self._middle(), self.edges, self.cutoff)
+
+    def simple(self) -> Tensor:
+        """Patches (P,) that have the whole component beyond them: no ray ends before them."""
+        ray, offset = self._middle()
+        distance = length(ray)
+        along, across = dot(offset, ray) / distance, length(cross(offset, ray)) / distance
+        reach = 0.5 * sum(length(edge) for edge in self.edges)
+        return along + reach * (1 + across / distance) < -_BEFORE
+
+    def variation(self, simple: Tensor) -> Tensor:
+        ray, _ = self._middle()
+        mean = self.ray - self.offset
+        square = dot(ray, ray)
+        rows = []
+        for edge in self.edges:
+            turned, stepped = cross(edge, mean), dot(edge, ray) * ~simple
+            near = dot(edge, edge) * _NEARNESS**2
+            rows.append(dot(turned, turned) + stepped * stepped + near)
+        return (torch.stack(rows) / square).sqrt()
+
+    def sums(self, rule: Rule, simple: bool) -> Tensor:
+        # With w = W(q − s), d = W(q − μ), a = d·w/|w| and b = |w| − a the integral is
+        # e^{−½|d − a w/|w||²} ∫_a^∞ (x + b)^{D−1} e^{−x²/2} dx / |w|^D, see `point.tail_moment`. The
+        # vectors are affine in f, so each of their products is a polynomial in f.
+        monomials, mean = rule.monomials(), self.ray - self.offset
+        # d × w = d₀ × w₀ + Σ f_i edge_i × m, since w − d = m is the same everywhere.
+        square = square_on(monomials, self.ray, self.edges).clamp_min(1e-30)
+        turned = square_on(monomials, cross(self.offset, self.ray), cross(self.edges, mean[None]))
+        across = (turned / square).clamp_min(0)  # a square's polynomial may round below zero
+        inverse = square.rsqrt()
+        if simple:
+            nearest = linear_on(monomials, self.ray, self.edges, mean) / square  # t₀
+            moment = nearest if len(self.ray) == 2 else nearest * nearest + 1 / square
+            density = _ROOT_TWO_PI * moment
+            seen = across < self.cutoff**2
+        else:
+            along = product_on(monomials, self.offset, self.ray, self.edges) * inverse
+            nearest = 1 - along * inverse
+            tail = 0.5 * _ROOT_TWO_PI * torch.special.erfc(along / math.sqrt(2))
+            edge = torch.exp(-0.5 * along * along)
+            density = nearest * tail + edge * inverse
+            if len(self.ray) == 3:
+                density = nearest * density + edge * inverse + tail / square
+            seen = (across < self.cutoff**2) & (along < self.cutoff)
+        density = torch.exp(-0.5 * across) * inverse * density.clamp_min(0)
+        return self.strength * (rule.weights @ torch.where(seen, density, 0.0))
 
 
 def flux_evidence(
@@ -40,18 +137,18 @@ def flux_evidence(
     tolerance: float = TOLERANCE,
     dtype: torch.dtype = torch.float64,
 ) -> Evidence:
-    """Hits and misses of every cell of a grid.
+    """Hits and misses of all cells of a grid.
 
-    Only faces inside a component's truncated cone are visited: cells outside get exactly 0. The cell
-    that holds a sensor is all source.
+    Each face between two cells is integrated once. Faces outside a cone are skipped, so cells outside get
+    exactly 0. All rays that leave the cell of a sensor origin count as its misses.
 
     Args:
-        cones: the components and whence they were seen.
+        cones: the components and their sensor origins.
         grid: the cells.
-        cutoff: deviations beyond which a component ends.
-        tolerance: of the quadrature, as a share of its peak on each piece of a face (see `panels`). At its
-            default evidence per ray is exact to 10⁻⁴, what the cutoff takes included.
-        dtype: of the integrands; geometry is whitened in float64 either way.
+        cutoff: Mahalanobis distance beyond which a component gives no evidence.
+        tolerance: of the quadrature, relative to the peak of the integrand on each panel. With the default,
+            evidence per ray is exact to 10⁻⁴; this includes the effect of the cutoff.
+        dtype: of the integrands; the whitening always uses float64.
 
     Raises:
         InvalidArgumentError: a grid of another dimension, or a tolerance outside (0, 1).
@@ -61,7 +158,7 @@ def flux_evidence(
         raise InvalidArgumentError(
             f"grid is {grid.dim}-dimensional, but the cones are {cones.dim}-dimensional."
         )
-    white = Whitened.of(cones)
+    white = WhitenedCones.of(cones)
     misses = white.log_norm.new_zeros(grid.n_cells)
     for axis in range(grid.dim):
         rows = face_rows(cones, grid, axis, cutoff)
@@ -90,11 +187,11 @@ def box_flux(
     tolerance: float = TOLERANCE,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[Tensor, Tensor]:
-    """hits (M,), misses (M,) of boxes [low, high] (m, world), (M, D) each, of any size and place.
+    """Hits (M,) and misses (M,) of boxes [low, high], (M, D) each, world metres, of any size and place.
 
     Args:
-        pairs: chunks of (box, cone) indices, (P,) each, no pair twice: those that can meet. Every box is
-            tried with every cone if not given.
+        pairs: chunks of (box, cone) indices, (P,) each, of all pairs that can meet, each pair once. All
+            boxes are tested with all cones if not given.
         cones, cutoff, tolerance, dtype: as in `flux_evidence`.
 
     Raises:
@@ -103,7 +200,7 @@ def box_flux(
     check_tolerance(tolerance)
     check_boxes(low, high, cones.dim)
     low, high = low.double(), high.double()
-    white = Whitened.of(cones)
+    white = WhitenedCones.of(cones)
     counts = cones.counts.double()
     hits, misses = (low.new_zeros(len(low)) for _ in range(2))
     if pairs is None:
@@ -122,7 +219,7 @@ def box_flux(
 
 
 def check_boxes(low: Tensor, high: Tensor, dim: int) -> None:
-    """Raises `InvalidArgumentError` unless these are corners (M, D) of boxes."""
+    """Raise `InvalidArgumentError` unless low and high are corners (M, D) of boxes."""
     if low.shape != high.shape or low.ndim != 2 or low.shape[1] != dim:
         raise InvalidArgumentError(
             f"low has shape {tuple(low.shape)}, high {tuple(high.shape)}; expected (M, {dim}) both."
@@ -137,7 +234,7 @@ def check_boxes(low: Tensor, high: Tensor, dim: int) -> None:
 
 
 def _grid_faces(
-    white: Whitened,
+    white: WhitenedCones,
     grid: VoxelGrid,
     axis: int,
     cone: Tensor,
@@ -147,16 +244,16 @@ def _grid_faces(
     cutoff: float,
     dtype: torch.dtype,
 ) -> FacePatches:
-    """Faces of a grid across `axis`."""
+    """Faces of a grid perpendicular to `axis`."""
     middle = cells.double() + 0.5
     position = [*middle[:axis], plane.double(), *middle[axis:]]
     center = torch.stack([o + i * grid.resolution for o, i in zip(grid.origin, position, strict=True)])
     side = center.new_full((len(center), 1), grid.resolution)
-    return face_patches(white.take(cone), center, side, axis, forward, cutoff, dtype)
+    return _face_patches(white.take(cone), center, side, axis, forward, cutoff, dtype)
 
 
-def face_patches(
-    white: Whitened,
+def _face_patches(
+    white: WhitenedCones,
     center: Tensor,
     side: Tensor,
     axis: int,
@@ -164,7 +261,7 @@ def face_patches(
     cutoff: float,
     dtype: torch.dtype,
 ) -> FacePatches:
-    """Faces across `axis` about centres (D, P) with sides (D, P), crossed forward or backward."""
+    """Faces perpendicular to `axis` with centres and sides (D, P), crossed along or against the axis."""
     others = [b for b in range(len(center)) if b != axis]
     ray = center - white.origin
     edges = torch.stack([white.matrix[:, b] * side[b] for b in others])
@@ -177,7 +274,7 @@ def face_patches(
 
 
 def _box_face_flux(
-    white: Whitened,
+    white: WhitenedCones,
     corners: tuple[Tensor, Tensor],
     axis: int,
     forward: bool,
@@ -185,7 +282,7 @@ def _box_face_flux(
     tolerance: float,
     dtype: torch.dtype,
 ) -> Tensor:
-    """Flux (P,) out of one face of each box; 0 where the sensor is on the outer side of it."""
+    """Flux (P,) out of one face of each box; 0 where the sensor origin is on the outer side of the face."""
     low, high = corners
     face = (high if forward else low)[axis]
     sign = 1 if forward else -1
@@ -193,7 +290,7 @@ def _box_face_flux(
     low, high, face = low[:, out], high[:, out], face[out]
     middle = 0.5 * (low + high)
     center = torch.cat([middle[:axis], face[None], middle[axis + 1 :]])
-    patches = face_patches(white.take(out), center, high - low, axis, forward, cutoff, dtype)
+    patches = _face_patches(white.take(out), center, high - low, axis, forward, cutoff, dtype)
     flux = integrate(patches, patches.ray, tolerance).double()
     return flux.new_zeros(corners[0].shape[1]).index_add(0, out, flux)
 

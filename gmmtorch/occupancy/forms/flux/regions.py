@@ -1,9 +1,9 @@
-"""Evidence of arbitrary regions: any simple polygon in 2D, any closed triangle mesh in 3D.
+"""Flux form for arbitrary regions: any simple polygon in 2D, any closed triangle mesh in 3D.
 
-The same two surface integrals as for cells, over the region's boundary. For a region that is not convex
-**misses are the expected number of times that rays leave it**: a ray that passes through twice counts
-twice, one that ends inside counts for the passes before that. Where the region is convex that is
-the expected number of rays that pass through it and end beyond.
+The two surface integrals are those of `box_flux`, over the boundary of the region. Misses are the expected
+number of times that rays leave the region: a ray that passes through twice counts twice, and a ray that
+ends inside counts its earlier passes. For a convex region this equals the expected number of rays that pass
+through and end beyond.
 """
 
 from __future__ import annotations
@@ -14,21 +14,20 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy.cones import CUTOFF, Cones
-from gmmtorch.occupancy.forms.cone.box_mass import MassPatches
-from gmmtorch.occupancy.forms.cone.mahalanobis import cross, dot
+from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
-from gmmtorch.occupancy.forms.flux.face_flux import FacePatches
-from gmmtorch.occupancy.index.culling import Whitened, candidate_pairs
+from gmmtorch.occupancy.forms.flux.box_flux import FacePatches
+from gmmtorch.occupancy.forms.flux.box_mass import MassPatches
+from gmmtorch.occupancy.index.culling import candidate_pairs
 
 _CHUNK_FACES = 1 << 16
 
 
 class Boundary(NamedTuple):
-    """The boundary of a region, outwards oriented.
+    """The boundary of a region as F faces: segments in 2D, triangles in 3D.
 
-    starts (F, D): first corner of each segment (2D) or triangle (3D), world metres.
-    edges (F, D−1, D): from it to the other corners. Segments run counter-clockwise about the region;
+    starts (F, D): first corner of each face, world metres.
+    edges (F, D−1, D): vectors from it to the other corners. Segments run counter-clockwise around the region;
     edge 0 × edge 1 of a triangle points outwards.
     """
 
@@ -37,20 +36,20 @@ class Boundary(NamedTuple):
 
     @classmethod
     def of_polygon(cls, vertices: Tensor) -> Boundary:
-        """The boundary of a simple polygon of vertices (V, 2), in order, either way round.
+        """Boundary of a simple polygon with vertices (V, 2) in order, clockwise or counter-clockwise.
 
-        Raises `InvalidArgumentError` for fewer than three vertices or ones that are not finite, and
+        Raises `InvalidArgumentError` for fewer than three vertices or vertices that are not finite, and
         `DataError` for a polygon that crosses or touches itself, or has no area.
         """
         vertices = vertices.double()
         _check_vertices(vertices, 2)
         edges = vertices.roll(-1, 0) - vertices
         if bool((edges == 0).all(1).any()):
-            raise DataError("The polygon repeats a vertex; drop what is degenerate.")
+            raise DataError("The polygon repeats a vertex; remove repeated vertices.")
         _check_simple(vertices.detach(), edges.detach())
         area = 0.5 * _cross_2d(vertices - vertices[0], edges).sum()
         if not bool(area != 0):
-            raise DataError("The polygon has no area; give one that goes round a region.")
+            raise DataError("The polygon has no area; give vertices that enclose a region.")
         if bool(area < 0):
             vertices = vertices.flip(0)
             edges = vertices.roll(-1, 0) - vertices
@@ -58,11 +57,11 @@ class Boundary(NamedTuple):
 
     @classmethod
     def of_mesh(cls, vertices: Tensor, triangles: Tensor) -> Boundary:
-        """The boundary of a closed mesh: vertices (V, 3), triangles (F, 3) of their indices, whose
-        corners run counter-clockwise as seen from outside.
+        """Boundary of a closed mesh with vertices (V, 3) and triangles (F, 3) of vertex indices.
 
-        Raises `InvalidArgumentError` for other shapes, vertices that are not finite and indices of no
-        vertex, and `DataError` for a mesh that is open, inconsistent or inverted.
+        The corners of a triangle run counter-clockwise as seen from outside. Raises `InvalidArgumentError`
+        for other shapes, vertices that are not finite and indices out of range, and `DataError` for a mesh
+        that is open, inconsistently oriented or inside out.
         """
         vertices = vertices.double()
         _check_vertices(vertices, 3)
@@ -73,7 +72,9 @@ class Boundary(NamedTuple):
             )
         triangles = triangles.long()
         if len(triangles) == 0 or int(triangles.min()) < 0 or int(triangles.max()) >= len(vertices):
-            raise InvalidArgumentError(f"triangles must index the {len(vertices)} vertices, from 0 on.")
+            raise InvalidArgumentError(
+                f"triangles must have entries from 0 to {len(vertices) - 1}: indices of the vertices."
+            )
         _check_closed(triangles, len(vertices))
         corners = vertices[triangles]
         edges = corners[:, 1:] - corners[:, :1]
@@ -94,16 +95,16 @@ def region_flux(
     tolerance: float = TOLERANCE,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[Tensor, Tensor]:
-    """hits and misses of one region, scalars: the rays that end in it, and how often rays leave it.
+    """Hits and misses of one region, scalars: expected rays that end in it, and times that rays leave it.
 
-    Arguments as in `flux.flux_evidence`. Differentiable in the boundary and the cones.
+    Arguments as in `flux_evidence`. Differentiable in the boundary and the cones.
     """
     check_tolerance(tolerance)
     if boundary.starts.shape[1] != cones.dim:
         raise InvalidArgumentError(
             f"boundary is {boundary.starts.shape[1]}-dimensional, but the cones are {cones.dim}-dimensional."
         )
-    counts, white = cones.counts.double(), Whitened.of(cones)
+    counts, white = cones.counts.double(), WhitenedCones.of(cones)
     corners = torch.cat([boundary.starts[:, None], boundary.starts[:, None] + boundary.edges], 1).detach()
     low, high = corners.flatten(0, 1).amin(0), corners.flatten(0, 1).amax(0)
     reached = [cone for _, cone in candidate_pairs(cones, low[None], high[None], cutoff)]
@@ -115,12 +116,12 @@ def region_flux(
             out, mass = _face_integrals(white, boundary, both[0], both[1], cutoff, tolerance, dtype)
             misses = misses.index_add(0, both[1], out)
             hits = hits.index_add(0, both[1], mass)
-    # The masses above faces add up to what is in the region, to rounding and quadrature.
+    # The signed masses above the faces sum to the mass in the region, which rounding can make negative.
     return (counts * ~cones.max_range) @ hits.clamp_min(0), counts @ misses
 
 
 def _face_integrals(
-    white: Whitened,
+    white: WhitenedCones,
     boundary: Boundary,
     face: Tensor,
     cone: Tensor,
@@ -128,7 +129,7 @@ def _face_integrals(
     tolerance: float,
     dtype: torch.dtype,
 ) -> tuple[Tensor, Tensor]:
-    """Flux out through each face (P,), and the signed mass above it."""
+    """Flux out of each face (P,), and the signed mass above it (P,)."""
     part = white.take(cone)
     start, edge = boundary.starts[face].T, boundary.edges[face].permute(1, 2, 0)
     triangular = len(edge) == 2
@@ -158,7 +159,9 @@ def _check_vertices(vertices: Tensor, dim: int) -> None:
             f"vertices has shape {tuple(vertices.shape)}; expected (V, {dim}), V at least {dim + 1}."
         )
     if not bool(torch.isfinite(vertices).all()):
-        raise InvalidArgumentError("vertices must be finite metres; drop what is not.")
+        raise InvalidArgumentError(
+            "vertices must be finite metres; remove vertices that are NaN or infinite."
+        )
 
 
 def _cross_2d(a: Tensor, b: Tensor) -> Tensor:
@@ -166,7 +169,7 @@ def _cross_2d(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _check_simple(vertices: Tensor, edges: Tensor) -> None:
-    """Raises `DataError` where two edges that are not neighbours meet, or neighbours fold back."""
+    """Raise `DataError` if two edges that are not neighbours meet, or if neighbours fold back."""
     n = len(vertices)
     following = edges.roll(-1, 0)
     folded = (_cross_2d(edges, following) == 0) & ((edges * following).sum(1) < 0)
@@ -191,10 +194,10 @@ def _check_simple(vertices: Tensor, edges: Tensor) -> None:
 
 
 def _check_closed(triangles: Tensor, n_vertices: int) -> None:
-    """Raises `DataError` unless every edge is run through as often one way as the other."""
+    """Raise `DataError` unless every edge belongs to two triangles that run it in opposite directions."""
     tail, head = triangles.flatten(), triangles.roll(-1, 1).flatten()
     if bool((tail == head).any()):
-        raise DataError("A triangle repeats a vertex; drop degenerate triangles.")
+        raise DataError("A triangle repeats a vertex; remove degenerate triangles.")
     forward, count = torch.unique(tail * n_vertices + head, return_counts=True)
     backward = torch.unique(head * n_vertices + tail)
     if bool((count > 1).any()):

@@ -1,7 +1,8 @@
-"""Mass of Gaussians in boxes: one edge in closed form, the other directions by panels.
+"""Mass of Gaussians in boxes: closed form along one edge, quadrature over the other directions.
 
-Along an edge a Gaussian's integral is a difference of two error functions; the edge that is longest
-against the component takes it, so that a sheet thinner than the box costs nothing.
+Along an edge the integral of a Gaussian is a difference of two error functions. The closed form is used along
+the edge that is longest relative to the component, so that a component much thinner than the box needs no
+panels across it.
 """
 
 from __future__ import annotations
@@ -12,17 +13,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gmmtorch.occupancy.cones import CUTOFF
-from gmmtorch.occupancy.forms.cone.mahalanobis import cross, dot, length, linear_on, outside_ball, square_on
-from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, Patches, Rule, integrate
-from gmmtorch.occupancy.index.culling import Whitened
+from gmmtorch.occupancy.cones import CUTOFF, WhitenedCones, cross, dot, length, outside_ball
+from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
+    TOLERANCE,
+    Patches,
+    Rule,
+    integrate,
+    linear_on,
+    square_on,
+)
 
-_BEYOND = 6.0  # deviations from where on an end of the closed edge no longer matters
-_SHORT = 0.1  # deviations below which the difference of error functions loses digits to its series
+_BEYOND = 6.0  # an end of the closed edge farther from the mean than this (Mahalanobis) does not matter
+_SHORT = 0.1  # spans below this (Mahalanobis) use a series: the difference of error functions loses digits
 
 
 def normal_mass(start: Tensor, span: Tensor) -> Tensor:
-    """P(start < Z < start + span) of a standard normal; to relative precision in the tails too.
+    """P(start < Z < start + span) for a standard normal Z, with full relative precision in the tails.
 
     An infinite span gives the upper tail.
     """
@@ -37,16 +43,16 @@ def normal_mass(start: Tensor, span: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class MassPatches(Patches):
-    """Cross-sections of boxes, or faces of a region seen along a direction; each with a component.
+    """P cross-sections of boxes, or faces of a region projected along a direction, each with a component.
 
     Whitened, coordinates first. The mass above a cross-section is
     ∫ (2π)^{−(D−1)/2} e^{−½ across²} P(along < Z < along + span) over its projection.
 
     offset: W(q − μ) of the centre q of the cross-section (first corner of a triangle), (D, P).
     edges: whitened edges of the cross-section, (D−1, D, P).
-    direction: unit vector of the closed direction, (D, P).
-    span: how far the box goes along it, in deviations, (P,); infinite for a face.
-    area: of the projection, (P,), with a sign for faces.
+    direction: unit vector of the direction with the closed form, (D, P).
+    span: whitened length of the box along it, (P,); infinite for a face.
+    area: whitened area of the projection, (P,); signed for faces.
     """
 
     offset: Tensor
@@ -79,7 +85,7 @@ class MassPatches(Patches):
         return (across > self.cutoff) | missed
 
     def simple(self) -> Tensor:
-        """Patches (P,) whose ends along the direction lie beyond the component."""
+        """Patches (P,) both ends of which, along the direction, lie beyond the component."""
         slope, along = (
             0.5 * dot(self.edges, self.direction[None]).abs().sum(0),
             dot(self._middle(), self.direction),
@@ -104,11 +110,11 @@ class MassPatches(Patches):
 
 
 def _cross_sections(offset: Tensor, edges: Tensor, volume: Tensor, cutoff: float) -> MassPatches:
-    """Boxes as cross-sections that are closed along their longest whitened edge.
+    """Cross-sections of boxes perpendicular to their longest whitened edge, which has the closed form.
 
     Args:
         offset: W(q − μ) of the centres, (D, P).
-        edges: whitened, (D, D, P).
+        edges: whitened edges, (D, D, P).
         volume: |det of the whitened edges| (P,).
     """
     dim = len(offset)
@@ -121,22 +127,22 @@ def _cross_sections(offset: Tensor, edges: Tensor, volume: Tensor, cutoff: float
 
 
 def box_mass(
-    white: Whitened,
+    white: WhitenedCones,
     low: Tensor,
     high: Tensor,
     cutoff: float = CUTOFF,
     tolerance: float = TOLERANCE,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Mass (P,) of P components, each in its own box [low, high], (D, P) each; never negative.
+    """Mass (P,) of P components, each in its own box [low, high], (D, P) each, world metres; never negative.
 
-    Exactly 0 beyond `cutoff` deviations. Differentiable; `tolerance` as in `panels`.
+    Exactly 0 beyond the cutoff. Differentiable; `tolerance` as in `integrate`.
     """
     side = high - low
     offset = white.apply(0.5 * (low + high) - white.mean)
     edges = white.matrix.transpose(0, 1) * side[:, None]
     kept = (~outside_ball(offset.detach(), edges.detach(), cutoff)).nonzero().squeeze(1)
-    # log_norm holds (2π)^{D/2}, which the mass of unit normals has already.
+    # log_norm contains (2π)^{D/2}; `MassPatches.sums` divides by it, so it is undone here.
     volume = side.prod(0) * torch.exp(-white.log_norm) * (2 * math.pi) ** (0.5 * len(low))
     offset, edges, volume = (part[..., kept].to(dtype) for part in (offset, edges, volume))
     patches = _cross_sections(offset, edges, volume, cutoff)
