@@ -48,7 +48,7 @@ _NAMES = {
 }
 _HOMES = {name: f"gmmtorch.occupancy.{module}" for module, names in _NAMES.items() for name in names}
 
-__all__ = sorted(_HOMES)  # noqa: PLE0605
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

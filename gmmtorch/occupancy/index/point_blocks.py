@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.linalg import argsort
 from gmmtorch.occupancy.index.cone_index import ConeIndex
-from gmmtorch.sorting import argsort
 
 _SUBCELLS = (
     4  # points are sorted into this many parts of a bucket along each axis, so that blocks are compact
