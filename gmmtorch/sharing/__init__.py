@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gmmtorch.sharing.journal import Journal as Journal
     from gmmtorch.sharing.replica.replica import Replica as Replica
+    from gmmtorch.sharing.store import Store as Store
 
-__all__ = ["Journal", "Replica"]
+__all__ = ["Journal", "Replica", "Store"]
 
-_HOMES = {"Journal": "gmmtorch.sharing.journal", "Replica": "gmmtorch.sharing.replica.replica"}
+_HOMES = {
+    "Journal": "gmmtorch.sharing.journal",
+    "Replica": "gmmtorch.sharing.replica.replica",
+    "Store": "gmmtorch.sharing.store",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -119,9 +119,17 @@ def _quantized(components: Components) -> bytes:
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
-    components = batches.decode(body)
-    _check_range(components.means, components.origins, components.ids)
-    return _message(components)
+    return _message(read_batch(body))
+
+
+def read_batch(data: bytes) -> Components:
+    """A codec batch of any size, with positions and ids that a message can have. Raises `DataError`."""
+    components = batches.decode(data)
+    try:
+        _check_range(components.means, components.origins, components.ids)
+    except InvalidArgumentError as error:
+        raise DataError(f"The batch is out of range: {error}") from error
+    return components
 
 
 def _float(components: Components) -> bytes:

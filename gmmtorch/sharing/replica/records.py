@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.codec.component_batch import encode, quantized
 from gmmtorch.mapping.components import Components
+from gmmtorch.sharing.messages.component_messages import read_batch
 from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
@@ -39,6 +40,8 @@ thousand totals of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
 """Of what is held, and of what supersessions that wait may add: more than a team leaves where datagrams are
 lost, and a bound on memory."""
+_BATCH = 2048
+"""Components of a stored batch."""
 _PIECE = 128
 """Components of a batch that is restored: dropping one costs as much as its batch is large."""
 
@@ -244,6 +247,23 @@ class Records:
         return digest.digest()
 
     # -- keeping ----------------------------------------------------------------------------------
+
+    def stored(self) -> tuple[list[bytes], list[bytes]]:
+        """Codec batches of all components that count, and the datagrams of the other records that count."""
+        keys = self.table.keys()
+        parts = [keys[begin : begin + _BATCH] for begin in range(0, len(keys), _BATCH)]
+        batches = [encode(self.table.taken(part)) for part in parts]
+        return batches, [self.datagrams[key] for key in sorted(self.others)]
+
+    def load_batch(self, data: bytes, own: int) -> None:
+        """Add the components of a batch of `stored`. The limit on components does not apply to those of robot
+        `own`. Raises as `add_components` does, and `DataError` for a damaged batch."""
+        components = read_batch(data)
+        is_own = components.ids[:, 0] == own
+        for rows in (is_own.nonzero().squeeze(1), (~is_own).nonzero().squeeze(1)):
+            for piece in rows.split(_PIECE):
+                part = components.selected(piece)
+                self.add_components(part, bounded=bool((part.ids[:, 0] != own).any()))
 
     def state(self) -> dict[str, Any]:
         keys = self.table.keys()

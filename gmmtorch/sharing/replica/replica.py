@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from gmmtorch.sharing.replica.record_keys import (
     drawn_incarnation,
     ids_of,
     keys_of,
+    robot_of,
 )
 from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records
 from gmmtorch.sharing.replica.rejections import RefusedError, merged
@@ -261,6 +263,29 @@ class Replica:
         return len(self._records.table)
 
     # -- keeping ----------------------------------------------------------------------------------
+
+    def stored(self) -> tuple[list[bytes], list[bytes]]:
+        """All that counts, for a `Store`: codec batches of components, and the datagrams of other records."""
+        return self._records.stored()
+
+    def load(self, batches: Iterable[bytes], datagrams: Iterable[bytes]) -> int:
+        """Add what `stored` returned in an earlier life, and datagrams that were sent or merged since.
+
+        Returns how many batches and datagrams were refused, as damaged or for want of room. Nothing becomes
+        due: teammates that lack something announce so. What is superseded counts as held again.
+        """
+        takes = [partial(self._records.load_batch, data, self.robot) for data in batches]
+        takes += [partial(self._load_datagram, data) for data in datagrams]
+        return sum(not merged(take, Counter(), Counter()) for take in takes)
+
+    def _load_datagram(self, datagram: bytes) -> None:
+        if datagram[:1] == _QUANTIZED:
+            self._records.load_batch(datagram[1:], self.robot)
+            return
+        message = decode(datagram)
+        if not isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+            raise DataError(f"{type(message).__name__} is no record.")
+        self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
 
     def state(self) -> dict[str, Any]:
         """Everything, for a file, and what `changes` has told of it. What was sent before it is saved
