@@ -49,9 +49,10 @@ from gmmtorch.evaluation.worker_pool import worker_pool
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
-from gmmtorch.mapping.learning.incremental import cell_rule
+from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_points
+from gmmtorch.mapping.learning.incremental import surface_fit
 from gmmtorch.mapping.learning.merging import compact
+from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.save import save_figure
 from gmmtorch.report.studies.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
@@ -151,7 +152,7 @@ MIXTURES = {  # how the same components are written, and for how many of them it
 def measure_mixtures(task: Task) -> Rows:
     """A row for each way to write the same components."""
     frames, asked = material(task.dataset, task.folder, task.n_frames)
-    rule = cell_rule(IncrementalRule().fitted([frame.scan for frame in frames]))
+    rule = surface_fit(IncrementalRule().fitted([frame.scan for frame in frames]), 3)
     rule = replace(
         rule,
         length=rule.length / FINER,
@@ -177,9 +178,9 @@ def measure_mixtures(task: Task) -> Rows:
     return rows
 
 
-def learn(scan: Scan, rule: CellRule, first: int) -> Components:
+def learn(scan: Scan, rule: SurfaceFit, first: int) -> Components:
     """The components of a frame, numbered in an order that takes few bytes."""
-    found = learn_cells([scan.points.clone()], scan.origin[None], rule)
+    found = fit_points([scan.points], scan.origin[None], rule, all_origins())
     found = found.rearranged(spatial_order(found))
     numbers = first + torch.arange(len(found))
     return replace(found, ids=torch.stack([torch.zeros_like(numbers), numbers], 1))

@@ -18,7 +18,7 @@ from gmmtorch.linalg import argsort, check_rigid
 from gmmtorch.mapping.codec import map_file as storage
 from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
 from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.learning.incremental import absorb, absorb_depth, depth_scan
+from gmmtorch.mapping.learning.incremental import absorb, depth_scan
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mapping.query import Answers
@@ -205,13 +205,9 @@ class GaussianMap(nn.Module):
         if self._pending:
             self._commit(self._with_pending())
         self.learning = self.learning.fitted([depth_scan(*frames[0], intrinsics, pixel_stride, max_range)])
-        self._commit(
-            self._numbered(
-                absorb_depth(
-                    self._committed(), frames, intrinsics, self.learning, pixel_stride, max_range, self._size
-                )
-            )
-        )
+        scans = (depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
+        learned = absorb(self._committed(), scans, self.learning, self._size, float(pixel_stride**2))
+        self._commit(self._numbered(learned))
 
     def _rule(self) -> Learning:
         """The rule, with what it takes from the first scans."""

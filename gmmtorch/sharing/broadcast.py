@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping.association import summed
 from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components, packed, unpacked
+from gmmtorch.mapping.learning.association import summed
 from gmmtorch.sharing.messages.envelope import check_codec, loaded, stored, within
 from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,

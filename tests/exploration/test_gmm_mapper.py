@@ -16,8 +16,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
-from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import common
 from gmmtorch.sharing.messages.message_registry import (

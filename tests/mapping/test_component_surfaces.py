@@ -11,8 +11,8 @@ from mapping.component_cases import counts_add_up, random_components
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.association import summed
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.association import summed
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, united
 

@@ -19,7 +19,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.incremental import absorb, absorb_depth
+from gmmtorch.mapping.learning.incremental import absorb, depth_scan
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.occupancy.evidence import occupancy_probability
@@ -198,6 +198,11 @@ def test_novel_points_that_are_explained_are_counted_not_learned():
 
 
 # -- depth images ---------------------------------------------------------------------------------
+
+
+def absorb_depth(components, frames, intrinsics, rule, pixel_stride=4, max_range=torch.inf):
+    scans = (depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
+    return absorb(components, scans, rule, weight=float(pixel_stride**2))
 
 
 def depth_frames(n: int = 3) -> list[tuple[Tensor, Tensor]]:

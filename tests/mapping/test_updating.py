@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from mapping.component_cases import counts_add_up, random_components
 from scipy.stats import chi2
 
-from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.association import count_explained
 
 
 def counts_by_a_loop(components, points, origin, distance, limit, max_range):
@@ -91,7 +91,7 @@ def test_many_points_are_counted_in_portions_alike(k, monkeypatch):
     components = random_components(k, 2, 1)
     points = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = count_explained(components, points, components.origins[0], 100.0)
-    monkeypatch.setattr("gmmtorch.mapping.association._PAIRS_AT_ONCE", 7 * k)
+    monkeypatch.setattr("gmmtorch.mapping.learning.association._PAIRS_AT_ONCE", 7 * k)
     parts = count_explained(components, points, components.origins[0], 100.0)
     assert torch.equal(whole.explained, parts.explained)
     torch.testing.assert_close(whole.components.support, parts.components.support)

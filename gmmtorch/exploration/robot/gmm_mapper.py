@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -20,14 +20,17 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
-from gmmtorch.mapping.association import count_explained, summed
 from gmmtorch.mapping.components import Components, packed, unpacked
-from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.learning.association import count_explained, summed
+from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
+from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
+from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, common, united
+from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.replica import Replica
@@ -74,14 +77,13 @@ class FrameRule:
         if not self.update_at > 1:
             raise InvalidArgumentError(f"update_at={self.update_at} must be above 1.")
 
-    def cells(self) -> CellRule:
-        """For the returns of a frame."""
-        return CellRule(self.noise, self.length, self.cell, self.components, self.iterations)
+    def surface_fit(self) -> SurfaceFit:
+        """How the returns of a frame become components."""
+        return cell_fit(self.noise, self.length, self.cell, self.components, self.iterations, 3)
 
-    def empty_cells(self) -> CellRule:
-        """For the ends of beams without one: finer, as they end at the edges of what is in sight."""
-        length = _EMPTY_LENGTH * self.length
-        return CellRule(self.noise, length, self.cell, self.components, self.iterations)
+    def empty_fit(self) -> SurfaceFit:
+        """The same for no-return beams: finer, because they end at the edges of the field of view."""
+        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
 
 
 class GmmMapper(Mapper):
@@ -131,11 +133,8 @@ class GmmMapper(Mapper):
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams."""
-        origin, rule = frame.origin[None], self._rule
-        surfaces = learn_cells([frame.ends[novel & frame.is_hit]], origin, rule.cells())
-        empty = learn_cells([frame.ends[novel & ~frame.is_hit]], origin, rule.empty_cells(), max_range=True)
-        parts = [surfaces, empty]
-        return Components.concatenate([part for part in parts if len(part)] or parts[:1])
+        scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
+        return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
 
     def _count(self, frame: DepthFrame, known: Tensor) -> None:
         """Count the beams (N,) that told nothing new, and what has grown enough as due to be told."""

@@ -1,9 +1,9 @@
-"""Maps that stay small as they grow: windows of scans learned, added, and merged under a budget."""
+"""Learning by an `IncrementalRule`: windows are learned, added to the map, and merged under a budget."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -11,64 +11,59 @@ from torch import Tensor
 from gmmtorch.datasets.depth_frames import back_project
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_rigid
-from gmmtorch.mapping.association import count_explained
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.cell_learning import CellRule, learn_cells
+from gmmtorch.mapping.learning.association import count_explained
+from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
+from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
-from gmmtorch.mapping.learning.viewpoints import limit_origins
-from gmmtorch.mapping.novelty import novel_beams
+from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins
+from gmmtorch.mixture.em.partition import FlatnessRule
 from gmmtorch.scan import Scan
 
 
-def cell_rule(rule: IncrementalRule) -> CellRule:
-    """What a window is learned by, of a rule that is `fitted`."""
-    if rule.noise is None or rule.length is None or rule.cell is None:
-        raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
-    return CellRule(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations)
-
-
 def absorb(
-    components: Components, scans: Sequence[Scan], rule: IncrementalRule, size: Size = estimated_bytes
-) -> Components:
-    """The components of a map with scans added, merged until they are within the budget.
-
-    Every `window` scans are learned together and added; `size` says what components take in bytes.
-    Components that are not as they were are not numbered (see `compaction.UNNUMBERED`). Nothing is drawn
-    at random: the same scans in the same order give the same map. Empty scans add nothing.
-    """
-    rule = rule.fitted(scans)
-    for begin in range(0, len(scans), rule.window or len(scans)):
-        components = _absorb_window(components, scans[begin:][: rule.window], rule, size)
-    return components
-
-
-def absorb_depth(
     components: Components,
-    frames: Sequence[tuple[Tensor, Tensor]],
-    intrinsics: Tensor,
+    scans: Iterable[Scan],
     rule: IncrementalRule,
-    pixel_stride: int = 4,
-    max_range: float = math.inf,
     size: Size = estimated_bytes,
+    weight: float = 1.0,
 ) -> Components:
-    """Depth images added to a map: `frames` of depth (H, W), metres, and pose (4, 4), world ← camera.
+    """The components of a map with scans added, merged until they meet the budget.
 
-    Every `pixel_stride`-th pixel of every `pixel_stride`-th row is taken, and stands for as many as that
-    leaves out. What is beyond `max_range` metres along the axis, zero or not finite, is left out.
+    Every `rule.window` scans are learned together; scans are taken from the iterable window by window.
+    Nothing is random: the same scans in the same order give the same map. Components that are new or
+    changed are not numbered (`UNNUMBERED`). Scans without beams add nothing.
+
+    Args:
+        components: of the map so far.
+        scans: of the dimension of the components.
+        rule: if it is not complete, it is fitted to all scans, which are then read at once.
+        size: number of bytes of given components, for `rule.max_bytes`.
+        weight: number of measured points for which each point of the scans stands.
+
+    Raises `InvalidArgumentError` for scans of another dimension.
     """
-    if frames:
-        rule = rule.fitted([depth_scan(*frames[0], intrinsics, pixel_stride, max_range)])
-    for begin in range(0, len(frames), rule.window or len(frames)):
-        scans = [
-            depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames[begin:][: rule.window]
-        ]
-        components = _absorb_window(components, scans, rule, size, float(pixel_stride**2))
+    if None in (rule.noise, rule.length, rule.cell, rule.window):
+        scans = list(scans)
+        rule = rule.fitted(scans)
+    left = iter(scans)
+    while window := list(islice(left, rule.window)):
+        components = _absorb_window(components, window, rule, size, weight)
     return components
 
 
-def depth_scan(depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: int, max_range: float) -> Scan:
-    """The scan of a depth image, of every so manieth pixel; see `absorb_depth`."""
+def depth_scan(
+    depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: int = 1, max_range: float = torch.inf
+) -> Scan:
+    """The scan of every `pixel_stride`-th pixel of every `pixel_stride`-th row of a depth image.
+
+    Args:
+        depth: (H, W), metres along the optical axis. Pixels at or beyond `max_range`, not above zero or
+            not finite are left out.
+        pose: (4, 4), world ← camera.
+        intrinsics: (3, 3).
+    """
     rotation, translation = check_rigid(pose, 3)
     taken = depth[::pixel_stride, ::pixel_stride]
     valid = torch.isfinite(taken) & (taken < max_range)
@@ -78,8 +73,29 @@ def depth_scan(depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: in
     return Scan(points @ rotation.T + translation, translation)
 
 
+def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
+    """How a window is learned in `dim` dimensions. Raises `InvalidArgumentError` if `rule` is not fitted."""
+    if rule.noise is None or rule.length is None or rule.cell is None:
+        raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
+    return cell_fit(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations, dim)
+
+
+def cell_fit(
+    noise: float, length: float, cell: float, max_components: int, iterations: int, dim: int
+) -> SurfaceFit:
+    """A fit on cells; the arguments are those of `IncrementalRule`, in metres."""
+    flatness = FlatnessRule(
+        thickness=2 * noise,
+        length=length,
+        min_weight=3 * (dim - 1),
+        max_components=max_components,
+        apart=10 * length,
+    )
+    return SurfaceFit(noise, cell, flatness, iterations)
+
+
 def _absorb_window(
-    components: Components, scans: Sequence[Scan], rule: IncrementalRule, size: Size, weight: float = 1.0
+    components: Components, scans: Sequence[Scan], rule: IncrementalRule, size: Size, weight: float
 ) -> Components:
     for scan in scans:
         if scan.dim != components.dim:
@@ -91,36 +107,29 @@ def _absorb_window(
         components, scans = _explain(components, scans, rule.novelty, weight)
     if not any(scan.n_beams for scan in scans):
         return components
-    origins = torch.stack([scan.origin.double() for scan in scans])
-    ends, by = [(scan.points, scan.no_return) for scan in scans], _rule_of(scans, rule)
-    returns = learn_cells([points for points, _ in ends], origins, by, weight=weight)
-    empty = learn_cells([points for _, points in ends], origins, by, max_range=True, weight=weight)
-    added = [part for part in (returns, empty) if len(part)]
-    return _within_budget(Components.concatenate([components, *added]), rule, size) if added else components
-
-
-def _rule_of(scans: Sequence[Scan], rule: IncrementalRule) -> CellRule:
-    """Scans of nothing but beams without return say as much of the scale by where those were cut off."""
     if rule.noise is None or rule.length is None or rule.cell is None:
+        # Scans without a return still show the scale of the sensor by the ends of their beams.
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
-    return cell_rule(rule)
+    learned = fit_window(scans, surface_fit(rule, components.dim), all_origins(weight))
+    return _within_budget(Components.concatenate([components, learned]), rule, size)
 
 
 def _explain(
     components: Components, scans: Sequence[Scan], rule: NoveltyRule, weight: float
 ) -> tuple[Components, list[Scan]]:
-    """The novel beams that no component explains, and the components with the counts of those explained."""
-    left = []
+    """The components with the counts of the points that they explain, and the novel beams of each scan
+    that no component explains."""
+    remaining = []
     for scan in scans:
-        fresh = scan.select(novel_beams(components, scan, rule))
+        novel = scan.select(novel_beams(components, scan, rule))
         keep = []
-        for points, max_range in ((fresh.points, False), (fresh.no_return, True)):
+        for points, max_range in ((novel.points, False), (novel.no_return, True)):
             components, explained = count_explained(
                 components, points, scan.origin, rule.distance, rule.explained, max_range, weight
             )
             keep.append(~explained)
-        left.append(fresh.select(torch.cat(keep)))
-    return components, left
+        remaining.append(novel.select(torch.cat(keep)))
+    return components, remaining
 
 
 def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import UNNUMBERED, Components
-from gmmtorch.mapping.learning.viewpoints import limit_origins, united_sightings
+from gmmtorch.mapping.learning.viewpoints import limit_origins, union_of_viewpoints
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.merge import simplify
 from gmmtorch.mixture.reduction.moments import merge_components
@@ -40,7 +40,7 @@ def merged(components: Components, labels: Tensor) -> Components:
     alone = members == 1
     ids = components.ids[first]
     ids[~alone, 1] = UNNUMBERED
-    by, whence, count = united_sightings(components, labels)
+    by, whence, count = union_of_viewpoints(components, labels)
     return replace(
         components,
         means=torch.where(alone[:, None], components.means[first], joined.means),

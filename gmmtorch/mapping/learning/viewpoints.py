@@ -1,9 +1,14 @@
-"""Whence components were seen: sightings united as components merge, and the few that are kept."""
+"""Viewpoints of components: their assignment when components are learned, their union and their reduction.
+
+A viewpoint is a sensor origin from which a component was observed, with the count of points observed from it.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,10 +17,70 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mapping.components import Components
 
 
-def united_sightings(components: Components, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """seen_by, seen_from, seen_count (E′,) of components merged by label (K,): each pair once, in order.
+class AssignedViewpoints(NamedTuple):
+    """kept (K,) bool: components that keep at least one viewpoint, K′ of them; their support (K′,); and
+    seen_by, seen_from, seen_count (E,) of their viewpoints, as in `Components`."""
 
-    Counts of the same origin add up.
+    kept: Tensor
+    support: Tensor
+    seen_by: Tensor
+    seen_from: Tensor
+    seen_count: Tensor
+
+
+AssignViewpoints = Callable[[Tensor, Tensor, int], AssignedViewpoints]
+"""From the points (K, S) of each component in each scan, the weights (K,) and the number of points.
+
+A component that is no point's most likely one has no points; it is dropped.
+"""
+
+
+def all_origins(weight: float = 1.0) -> AssignViewpoints:
+    """Keeps every origin. `weight`: number of measured points for which each point stands.
+
+    The support of the components that are kept adds up to weight · N.
+    """
+
+    def assign(counts: Tensor, weights: Tensor, n_points: int) -> AssignedViewpoints:
+        kept = counts.sum(1) > 0
+        counts, support = counts[kept], weights[kept]
+        support = support * (n_points * weight / support.sum())
+        counts *= (support / counts.sum(1))[:, None]
+        seen_by, seen_from = (counts > 0).nonzero(as_tuple=True)
+        return AssignedViewpoints(kept, support, seen_by, seen_from, counts[seen_by, seen_from])
+
+    return assign
+
+
+def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewpoints:
+    """Keeps at most `max_origins` origins of a component, drawn by their counts without replacement.
+
+    The origins that are kept share the component's support, weight · N. They are real sensor origins:
+    a centroid of several would lose the free space around the sensors.
+    """
+
+    def assign(counts: Tensor, weights: Tensor, n_points: int) -> AssignedViewpoints:
+        support = weights * n_points
+        n_kept = min(max_origins, counts.shape[1])
+        if n_kept < counts.shape[1]:
+            race = torch.empty(counts.shape, dtype=torch.float64).exponential_(generator=generator)
+            key = torch.where(counts > 0, race.to(counts.device) / counts.clamp_min(1), float("inf"))
+            drawn = key.topk(n_kept, dim=1, largest=False).indices
+            counts = torch.zeros_like(counts).scatter_(1, drawn, counts.gather(1, drawn))
+        share = counts * (support / counts.sum(1).clamp_min(1e-12))[:, None]
+        seen_by, seen_from = (share > 0).nonzero(as_tuple=True)
+        kept = torch.bincount(seen_by, minlength=len(support)) > 0
+        number = torch.cumsum(kept.long(), 0) - 1
+        seen_count = share[seen_by, seen_from]
+        return AssignedViewpoints(kept, support[kept], number[seen_by], seen_from, seen_count)
+
+    return assign
+
+
+def union_of_viewpoints(components: Components, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """seen_by, seen_from, seen_count (E′,) of components merged by label (K,); counts of an origin add up.
+
+    Each pair of component and origin occurs once, in rising order.
     """
     n_origins = max(1, components.origins.shape[0])
     keys, row = torch.unique(
@@ -26,22 +91,21 @@ def united_sightings(components: Components, labels: Tensor) -> tuple[Tensor, Te
 
 
 def limit_origins(components: Components, max_origins: int, mean_origins: float | None = None) -> Components:
-    """At most `max_origins` sightings of each component, and `mean_origins` on average; the counts of
-    what is left again add up to each component's support.
+    """Components with at most `max_origins` viewpoints each, and at most `mean_origins` on average.
 
-    Of each component the sighting of the largest count is kept, then again and again the one with the
-    largest √count times its distance from the nearest origin kept: neighbouring places tell the same of
-    space, and a place that saw little of a component would claim to have seen all of it. Where that
-    leaves too many, those further ones go, over all components, whose product was least: so large
-    surfaces keep many origins and small ones one. Origins are real ones: centroids lose the space
-    around the sensors.
+    The viewpoint with the largest count is kept first. Then, repeatedly, the viewpoint with the largest
+    √count · distance to the nearest kept origin: close origins observe the same free space, and an origin
+    with a small count would claim to have observed all of the component. If the average is still too large,
+    the viewpoints with the smallest such product are removed over all components, so large surfaces keep
+    many origins and small ones one. Kept counts are scaled to add up to each component's support; origins
+    without a viewpoint are dropped. Origins stay real positions: a centroid loses the space around sensors.
 
-    Origins that nothing was seen from are dropped. Raises `InvalidArgumentError` for less than one.
+    Raises `InvalidArgumentError` for limits below 1.
     """
     check_whole("max_origins", max_origins, 1)
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
-    kept = _most_worth(components, max_origins, mean_origins)
+    kept = _kept_viewpoints(components, max_origins, mean_origins)
     by, count = components.seen_by[kept], components.seen_count[kept]
     total = count.new_zeros(len(components)).index_add_(0, by, count)
     share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
@@ -55,8 +119,8 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     )
 
 
-def _most_worth(components: Components, max_origins: int, mean_origins: float | None) -> Tensor:
-    """Which sightings (E,) to keep."""
+def _kept_viewpoints(components: Components, max_origins: int, mean_origins: float | None) -> Tensor:
+    """Which viewpoints (E,) `limit_origins` keeps."""
     by, count = components.seen_by, components.seen_count
     n, rows = len(components), torch.arange(components.seen_by.shape[0], device=components.seen_by.device)
     limit = n * max_origins if mean_origins is None else int(n * mean_origins)
@@ -64,21 +128,21 @@ def _most_worth(components: Components, max_origins: int, mean_origins: float | 
     if n == 0 or (int(left.sum()) <= limit and int(torch.bincount(by[left]).max()) <= max_origins):
         return left
     worth, position = count.sqrt(), components.origins[components.seen_from]
-    apart = torch.ones_like(count)
-    rank = torch.full_like(count, -1.0)  # of what is chosen: how much it adds
+    nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
+    gain = torch.full_like(count, -1.0)  # √count · distance at which a viewpoint was chosen
     for step in range(max_origins):
-        adds = torch.where(left, worth * apart, -1.0)
-        most = adds.new_full((n,), -1.0).scatter_reduce_(0, by, adds, "amax")
-        best = left & (adds == most[by])
+        score = torch.where(left, worth * nearest, -1.0)
+        largest = score.new_full((n,), -1.0).scatter_reduce_(0, by, score, "amax")
+        best = left & (score == largest[by])
         first = rows.new_full((n,), len(rows)).scatter_reduce_(0, by[best], rows[best], "amin")
         chosen = first[first < len(rows)]
         if len(chosen) == 0:
             break
-        rank[chosen] = torch.inf if step == 0 else adds[chosen]
+        gain[chosen] = torch.inf if step == 0 else score[chosen]
         left = left.index_fill(0, chosen, False)
         place = position.new_full((n, components.dim), torch.inf).index_copy_(0, by[chosen], position[chosen])
         distance = (position - place[by]).norm(dim=1)
-        apart = distance if step == 0 else torch.minimum(apart, distance)
+        nearest = distance if step == 0 else torch.minimum(nearest, distance)
     kept = torch.zeros_like(left)
-    kept[rank.argsort(descending=True, stable=True)[:limit]] = True
-    return kept & (rank >= 0)
+    kept[gain.argsort(descending=True, stable=True)[:limit]] = True
+    return kept & (gain >= 0)
