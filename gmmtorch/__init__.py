@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gmmtorch import baselines as baselines
     from gmmtorch import datasets as datasets
     from gmmtorch import sharing as sharing
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
@@ -83,6 +84,7 @@ __all__ = [
     "VariationalGaussianMixture",
     "VoxelGrid",
     "WindowedRule",
+    "baselines",
     "datasets",
     "fit_depth_image",
     "merge",
@@ -95,7 +97,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
-    if name in ("datasets", "sharing"):
+    if name in ("baselines", "datasets", "sharing"):
         return importlib.import_module(f"gmmtorch.{name}")
     raise AttributeError(f"module 'gmmtorch' has no attribute {name!r}")
 

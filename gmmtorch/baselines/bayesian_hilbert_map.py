@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
-from gmmtorch.baselines.beam_samples import beam_samples
 from gmmtorch.baselines.hilbert_features import LatticeDesign, LatticeFeatures, check_lattice
 from gmmtorch.baselines.hilbert_map import check_between
-from gmmtorch.baselines.thinned_samples import check_length
+from gmmtorch.baselines.samples import beam_samples, check_length
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.scan import Scan

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.bgk_map import beta_mean, check_positive, sparse_kernel
 from gmmtorch.baselines.cell_table import CellTable
-from gmmtorch.baselines.thinned_samples import check_length, check_range, thinned_samples
+from gmmtorch.baselines.samples import check_length, check_range, thinned_samples
 from gmmtorch.errors import DataError, check_whole
 from gmmtorch.files import pack_tensors, read_tensors, require
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution

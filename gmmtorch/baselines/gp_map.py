@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.cell_table import CellTable
-from gmmtorch.baselines.thinned_samples import check_length, check_range, thinned_samples
+from gmmtorch.baselines.samples import check_length, check_range, thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import safe_cholesky

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.bgk_map import kernel_offsets, sparse_kernel
 from gmmtorch.baselines.cell_table import CellTable
-from gmmtorch.baselines.thinned_samples import centroids
+from gmmtorch.baselines.samples import centroids
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import require
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
-from gmmtorch.baselines.beam_samples import beam_samples
 from gmmtorch.baselines.hilbert_features import (
     Design,
     Features,
@@ -19,7 +18,7 @@ from gmmtorch.baselines.hilbert_features import (
     NystroemFeatures,
     check_lattice,
 )
-from gmmtorch.baselines.thinned_samples import check_length
+from gmmtorch.baselines.samples import beam_samples, check_length
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.scan import Scan

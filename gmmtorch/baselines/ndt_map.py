@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
 from gmmtorch.baselines.cell_table import CellTable
-from gmmtorch.baselines.thinned_samples import check_length, check_range
+from gmmtorch.baselines.samples import check_length, check_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric

@@ -6,32 +6,21 @@ import json
 import tempfile
 import zlib
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
-from gmmtorch.baselines.thinned_samples import check_range
+from gmmtorch.baselines.samples import check_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
+from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.scan import Scan
 
 _MARK = b"# gmmtorch.octomap_map 1 "
 _TREE_REACH = (1 << 15) - 2  # cells from the tree's middle, along each axis: its keys have 16 bits
-
-
-def _pyoctomap() -> ModuleType:
-    try:
-        import pyoctomap
-    except ImportError as error:
-        raise MissingDataError(
-            f"OctoMap needs the package pyoctomap ({error}); install it: pip install 'gmmtorch[baselines]'."
-        ) from error
-    module: ModuleType = pyoctomap
-    return module
 
 
 class OctoMapMap(BaselineMap):
@@ -86,7 +75,7 @@ class OctoMapMap(BaselineMap):
         return torch.device("cpu")
 
     def _start(self, dim: int, device: torch.device) -> None:
-        self._tree = _pyoctomap().OcTree(self.resolution)
+        self._tree = load_pyoctomap().OcTree(self.resolution)
         self._set_sensor_model()
 
     def _set_sensor_model(self) -> None:
@@ -235,4 +224,4 @@ def _read_tree(data: bytes) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "map.ot"
         file.write_bytes(data)
-        return _pyoctomap().OcTree(0.1).read(str(file))
+        return load_pyoctomap().OcTree(0.1).read(str(file))

@@ -181,19 +181,19 @@ def _flying(
 
 def _replay(config: DictConfig, memory: RobotMemory, transport: FramedTransport, stack: ExitStack) -> Node:
     """A robot that maps a recorded log, or its part of one."""
-    from gmmtorch.datasets.dataset_shard import Part, part_of
+    from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
     from gmmtorch.errors import check_whole
     from gmmtorch.exploration.mission.replay import ReplayNode
     from gmmtorch.sharing.replica.replica import Replica
 
     scans = common.open_dataset(config.log.dataset)
     indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
-    part = part_of(len(indices), config.id, config.team.size, config.log.part)
+    part = shard_indices(len(indices), config.id, config.team.size, config.log.part)
     replica = Replica(config.id)
     journal = memory.journal(replica, stack)
     return ReplayNode(
         replica,
-        Part(scans, [indices[row] for row in part]),
+        DatasetShard(scans, [indices[row] for row in part]),
         transport,
         maps.map_factory(_map_options(config)),
         journal=journal,

@@ -1,4 +1,4 @@
-"""Part: the scans of a log that one robot of a team has."""
+"""The share of a data set that one robot of a team reads."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from gmmtorch.scan import Scan
 SPLITS = ("interleaved", "consecutive")
 
 
-def part_of(n_scans: int, k: int, n: int, split: str = "interleaved") -> range:
-    """Which of so many scans are those of robot k of n: each n-th one, or the k-th of n stretches."""
+def shard_indices(n_scans: int, k: int, n: int, split: str = "interleaved") -> range:
+    """Indices of the scans of robot k of n.
+
+    "interleaved" takes every n-th scan from scan k on; "consecutive" takes the k-th of n equal intervals.
+    """
     check_whole("n_scans", n_scans, 0)
     if check_whole("k", k, 0) >= check_whole("n", n, 1):
         raise InvalidArgumentError(f"k={k} must be below n={n}: robots are counted from 0.")
@@ -23,11 +26,12 @@ def part_of(n_scans: int, k: int, n: int, split: str = "interleaved") -> range:
     return range(n_scans * k // n, n_scans * (k + 1) // n)
 
 
-class Part(Sequence[Scan]):
-    """Some scans of a data set, read when asked for.
+class DatasetShard(Sequence[Scan]):
+    """A selection of the scans of a data set, each read when it is accessed.
 
     Args:
-        indices: of the scans, in order, such as `part_of(len(scans), k, n)`.
+        scans: the data set.
+        indices: of the selected scans, in order, for example `shard_indices(len(scans), k, n)`.
     """
 
     def __init__(self, scans: Sequence[Scan], indices: Sequence[int]) -> None:
@@ -39,8 +43,8 @@ class Part(Sequence[Scan]):
     @overload
     def __getitem__(self, index: int) -> Scan: ...
     @overload
-    def __getitem__(self, index: slice) -> Part: ...
-    def __getitem__(self, index: int | slice) -> Scan | Part:
+    def __getitem__(self, index: slice) -> DatasetShard: ...
+    def __getitem__(self, index: int | slice) -> Scan | DatasetShard:
         if isinstance(index, slice):
-            return Part(self._scans, self._indices[index])
+            return DatasetShard(self._scans, self._indices[index])
         return self._scans[self._indices[index]]

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, existing
-from gmmtorch.datasets.point_files.clouds import open3d_for
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.optional_packages import load_open3d
 from gmmtorch.scan import Scan
 
 
@@ -66,7 +66,7 @@ def read_triangles(path: Path) -> Tensor:
 
     Raises `DataError` if it is unreadable, truncated, has no triangle, or a corner that is not finite.
     """
-    open3d = open3d_for(path)
+    open3d = load_open3d(f"{path} cannot be read")
     if path.suffix.lower() == ".obj" and b"\0" in path.read_bytes():
         raise DataError(f"{path} is no OBJ file: those are text.")  # which would crash its reader
     try:

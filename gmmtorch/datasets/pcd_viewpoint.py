@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key
-from gmmtorch.datasets.point_files.clouds import pcd_header, read_cloud
+from gmmtorch.datasets.point_files.cloud_files import pcd_header, read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 

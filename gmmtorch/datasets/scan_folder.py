@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key, rigid
-from gmmtorch.datasets.point_files.clouds import read_cloud
+from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, OutputError
+from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.export.point_cloud import CellCloud
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy.evidence import CellClass, Thresholds
+from gmmtorch.optional_packages import load_pyoctomap
 
 _REACH = 1 << 15  # cells to either side of the origin that OctoMap's 16-bit keys name
 _CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1: log-odds of ±13.8
@@ -29,7 +29,7 @@ def write_octomap(path: str | Path, cells: CellCloud, thresholds: Thresholds | N
     path = Path(path)
     if path.suffix not in (".bt", ".ot"):
         raise InvalidArgumentError(f"path={path} must end in .bt (two classes) or .ot (probabilities).")
-    pyoctomap = _pyoctomap()
+    pyoctomap = load_pyoctomap()
     centers = _lattice_centers(cells)
     theta = cells.probability.detach().cpu().double().clamp(_CERTAIN, 1 - _CERTAIN)
     tree = pyoctomap.OcTree(cells.resolution)
@@ -67,14 +67,3 @@ def _lattice_centers(cells: CellCloud) -> np.ndarray:
             "grid with VoxelGrid.covering."
         )
     return (index + 0.5) * cells.resolution
-
-
-def _pyoctomap() -> Any:
-    try:
-        import pyoctomap
-    except ImportError as error:
-        raise GmmTorchError(
-            f"OctoMap files are written with pyoctomap, which does not load ({error}); "
-            "pip install 'gmmtorch[baselines]'."
-        ) from error
-    return pyoctomap

@@ -22,8 +22,8 @@ from gmmtorch.baselines.bayesian_hilbert_map import (
     moments,
     variational_step,
 )
-from gmmtorch.baselines.beam_samples import beam_samples
 from gmmtorch.baselines.hilbert_features import LatticeDesign, LatticeFeatures
+from gmmtorch.baselines.samples import beam_samples
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.evaluation import metrics, queries, split

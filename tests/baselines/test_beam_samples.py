@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.baselines.beam_samples import beam_samples
+from gmmtorch.baselines.samples import beam_samples
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.scan import Scan
 

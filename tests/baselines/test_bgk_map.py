@@ -14,7 +14,7 @@ from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattic
 from gmmtorch import datasets
 from gmmtorch.baselines.bgk_map import BGKMap, kernel_offsets, sparse_kernel
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
-from gmmtorch.baselines.thinned_samples import centroids, thinned_samples
+from gmmtorch.baselines.samples import centroids, thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.files import pack_tensors, read_tensors

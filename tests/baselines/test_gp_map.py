@@ -21,7 +21,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gmmtorch.baselines.gp_map import GPMap, gp_regression
-from gmmtorch.baselines.thinned_samples import thinned_samples
+from gmmtorch.baselines.samples import thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan

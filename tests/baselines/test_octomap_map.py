@@ -12,7 +12,7 @@ from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattic
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")
@@ -144,5 +144,5 @@ def test_a_beam_that_leaves_the_octree_is_refused_and_changes_nothing():
 
 def test_without_the_package_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoctomap", None)
-    with pytest.raises(MissingDataError, match=r"pip install .*baselines"):
+    with pytest.raises(GmmTorchError, match=r"pip install .*baselines"):
         OctoMapMap(0.1).insert(wall_scan(3))

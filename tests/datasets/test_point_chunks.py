@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points, row_uniform
-from gmmtorch.datasets.point_files.point_survey import survey, united
+from gmmtorch.datasets.point_files.point_survey import merge_surveys, survey
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 
 N = 23
@@ -111,7 +111,7 @@ def test_every_format_gives_the_valid_points_in_their_order(tmp_path, name, chun
 @pytest.mark.parametrize("name", FILES)
 def test_parts_are_runs_of_rows_that_make_up_the_whole(tmp_path, name):
     source = open_points(written(tmp_path, name), chunk_points=4)
-    parts = [source.part(i, 3) for i in range(3)]
+    parts = [source.shard(i, 3) for i in range(3)]
     assert sum(part.n_rows for part in parts) == source.n_rows
     assert max(part.n_rows for part in parts) - min(part.n_rows for part in parts) <= 1
     for got, expected in zip(
@@ -194,7 +194,7 @@ def test_paths_that_cannot_be_are_refused(tmp_path):
     with pytest.raises(InvalidArgumentError, match=r"\.xyz"):
         open_points(tmp_path / "cloud.xyz")
     (tmp_path / "folder.npy").mkdir()
-    with pytest.raises(MissingDataError, match="is no file"):
+    with pytest.raises(MissingDataError, match="is not a file"):
         open_points(tmp_path / "folder.npy")
 
 
@@ -236,7 +236,7 @@ def test_a_survey_does_not_depend_on_chunks_or_parts(n, chunk_points, n_parts, w
     valid = points[np.isfinite(points).all(1)]
     source = in_memory(points, chunk_points=chunk_points)
     whole = survey(in_memory(points), wanted, seed)
-    parts = united([survey(source.part(i, n_parts), wanted, seed) for i in range(n_parts)], wanted)
+    parts = merge_surveys([survey(source.shard(i, n_parts), wanted, seed) for i in range(n_parts)], wanted)
     for found in (whole, parts):
         assert (found.n_points, found.n_dropped) == (len(valid), n - len(valid))
         np.testing.assert_allclose(found.total.numpy(), valid.sum(0), atol=1e-12)
@@ -282,8 +282,8 @@ def test_row_numbers_are_uniform_and_seeds_independent():
 
 def test_draws_of_disjoint_intervals_share_the_rows():
     source = in_memory(torch.randn(1000, 2), chunk_points=64)
-    rows = [together(source.drawn(low, high, 3))[1] for low, high in ((0, 0.1), (0.1, 1))]
+    rows = [together(source.random_subset(low, high, 3))[1] for low, high in ((0, 0.1), (0.1, 1))]
     assert sorted(np.concatenate(rows).tolist()) == list(range(1000))
     assert 60 < len(rows[0]) < 140
-    with pytest.raises(InvalidArgumentError, match="draw once"):
-        source.drawn(0, 0.5, 1).drawn(0, 0.5, 1)
+    with pytest.raises(InvalidArgumentError, match="already a random subset"):
+        source.random_subset(0, 0.5, 1).random_subset(0, 0.5, 1)

@@ -17,7 +17,7 @@ from PIL import Image
 from gmmtorch.datasets import Dataset, load
 from gmmtorch.datasets.carmen import beam_angles
 from gmmtorch.datasets.octomap_log import rotation
-from gmmtorch.datasets.point_files.clouds import read_cloud
+from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

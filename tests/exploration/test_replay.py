@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.dataset_shard import Part, part_of
+from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.exploration.mission.node import TwinError, check_number, run_paced
 from gmmtorch.exploration.mission.replay import ReplayNode
@@ -36,8 +36,8 @@ N_KILLS = 4
 """`python -m exploration.kill_replay` has more."""
 
 
-def part(k: int, n: int, n_scans: int = 24) -> Part:
-    return Part(log(n_scans), part_of(n_scans, k, n))
+def part(k: int, n: int, n_scans: int = 24) -> DatasetShard:
+    return DatasetShard(log(n_scans), shard_indices(n_scans, k, n))
 
 
 def robot(number: int, scans, transport, rule: str = "windowed", **options) -> ReplayNode:
@@ -419,7 +419,7 @@ def test_a_full_disk_is_said_once_and_all_is_kept_again_when_there_is_room(tmp_p
 
 
 def test_a_scan_that_cannot_be_read_is_left_out_and_said_once(caplog):
-    class Damaged(Part):
+    class Damaged(DatasetShard):
         def __getitem__(self, index):
             if index in (2, 5):
                 raise DataError(f"scan {index} is damaged")
@@ -504,7 +504,10 @@ def test_its_maps_are_files(tmp_path):
 def test_a_real_log(real_data, tmp_path):
     scans = load("carmen", real_data / "laser2d" / "intel.log.gz")
     network = Network(3, LinkConditions(loss=0.3))
-    rule, parts = IncrementalRule(window=5), [Part(scans, list(part_of(30, k, 3))) for k in range(3)]
+    rule, parts = (
+        IncrementalRule(window=5),
+        [DatasetShard(scans, list(shard_indices(30, k, 3))) for k in range(3)],
+    )
     nodes = [ReplayNode(Replica(k), parts[k], network, lambda: GaussianMap(rule)) for k in range(3)]
     run(*nodes, settle=15.0)
     assert len({node.replica.digest() for node in nodes}) == 1

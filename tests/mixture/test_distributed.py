@@ -85,7 +85,7 @@ with joined(timeout=3.0) as processes:
     try:
         fit_stream(
             GaussianMixture(6, dtype="float64", tol=0, max_iter=12, random_state=0),
-            open_points(cloud, chunk_points=200).part(processes.rank, processes.size),
+            open_points(cloud, chunk_points=200).shard(processes.rank, processes.size),
             sample_points=500,
             processes=processes,
             checkpoint=Checkpoint(Path(checkpoint), every=2),

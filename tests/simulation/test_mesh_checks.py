@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.simulation.worlds.mesh_checks import checked_triangles
+from gmmtorch.simulation.worlds.mesh_world import checked_triangles
 from gmmtorch.simulation.worlds.solids import box
 
 CUBE = box((0, 0, 0), (1, 1, 1))

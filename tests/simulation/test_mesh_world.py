@@ -83,7 +83,7 @@ def test_a_walk_that_has_seen_everything_spreads_its_stops():
 
 
 def test_a_world_without_room_is_refused():
-    with pytest.raises(InvalidArgumentError, match="no place where a sensor could be carried"):
+    with pytest.raises(InvalidArgumentError, match="no place where a sensor can be carried"):
         MeshWorld(box((0, 0, 0), (0.3, 0.3, 0.3))).tour(3)
     with pytest.raises(InvalidArgumentError, match="spacing=0"):
         MeshWorld(HALL).tour(3, spacing=0)

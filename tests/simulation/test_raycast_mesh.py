@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation.sensors import mesh_raycasting as raycast_mesh
-from gmmtorch.simulation.sensors import ray_bundles
+from gmmtorch.simulation.sensors import mesh_raycasting
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments, ray_triangles
 from gmmtorch.simulation.worlds.floor_plan import circle
 from gmmtorch.simulation.worlds.solids import ball, box, prism
@@ -55,9 +54,9 @@ def test_agrees_with_a_linear_solver(cast, dim, one_origin):
 def test_chunks_do_not_change_the_result(cast, dim, monkeypatch):
     primitives, directions = random((30, dim, dim), 0), random((200, dim), 1)
     whole = cast(torch.zeros(dim), directions, primitives)
-    monkeypatch.setattr(raycast_mesh, "_CHUNK_PAIRS", 64)
-    monkeypatch.setattr(ray_bundles, "_CHUNK_CONES", 64)
-    monkeypatch.setattr(ray_bundles, "_CHUNK_HITS", 16)
+    monkeypatch.setattr(mesh_raycasting, "_CHUNK_PAIRS", 64)
+    monkeypatch.setattr(mesh_raycasting, "_CHUNK_CONES", 64)
+    monkeypatch.setattr(mesh_raycasting, "_CHUNK_HITS", 16)
     torch.testing.assert_close(cast(torch.zeros(dim), directions, primitives), whole)
 
 

@@ -1,1 +1,1 @@
-"""Readers of point clouds in files (PLY, PCD, LAS, NPY, text), whole or in chunks."""
+"""Point cloud files (.npy, .las, .laz, .pcd, .ply): headers, and reading in chunks."""

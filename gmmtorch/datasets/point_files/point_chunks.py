@@ -1,7 +1,7 @@
-"""Clouds larger than memory: points that come in chunks, as often as they are asked for.
+"""Point clouds larger than memory, read in chunks, repeatedly.
 
-A source knows how many rows it has before it reads any, and every chunk says which rows it holds. So
-a share of the rows, or a random draw, is the same whatever the chunks and however many processes read.
+The number of rows is known before reading, and each chunk states its rows. A shard or a random subset of the
+rows therefore does not depend on the chunk size or on the number of processes that read.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from gmmtorch.datasets.point_files.point_rows import ArrayRows, Rows, open_rows
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 CHUNK_POINTS = 1 << 17
-"""Points read at once unless the caller says otherwise: some 20 MB with what EM makes of them."""
+"""Default number of points per chunk; EM needs about 20 MB for one chunk."""
 
 
 class Chunk(NamedTuple):
-    """points (n, D), finite, float64; rows (n,): which of the source they are; n_dropped: invalid rows."""
+    """points (n, D), finite, float64; rows (n,): their row numbers in the source; n_dropped: invalid rows."""
 
     points: Tensor
     rows: Tensor
     n_dropped: int
 
 
-class Draw(NamedTuple):
-    """The rows whose seeded random number in [0, 1) is at least `low` and below `high`."""
+class RowInterval(NamedTuple):
+    """A random subset of rows: those whose random number for `seed`, uniform in [0, 1), is in [low, high)."""
 
     low: float
     high: float
@@ -42,16 +42,16 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True)
 class PointChunks:
-    """Points of a file or an array in chunks; iterating again reads again.
+    """Points of a file or an array, in chunks. Each iteration reads the points again.
 
     Rows with NaN or infinite coordinates (beams without return) are dropped and counted.
 
     Args:
-        rows: where the points are; see `open_points` and `in_memory`.
-        chunk_points: rows read at once, which bounds the memory taken.
-        max_range: points at or beyond it (m), measured from the frame's origin, are dropped; None: none.
-        begin, end: the rows read; None: to the last.
-        draw: of these, the ones drawn; None: all.
+        rows: the source of the points; see `open_points` and `in_memory`.
+        chunk_points: rows per chunk, which limits the memory used.
+        max_range: points at this distance (m) from the frame's origin or beyond are dropped; None: no limit.
+        begin, end: first row, and the row after the last one; None: the end of the source.
+        subset: random subset of these rows; None: all.
     """
 
     rows: Rows
@@ -59,7 +59,7 @@ class PointChunks:
     max_range: float | None = None
     begin: int = 0
     end: int | None = None
-    draw: Draw | None = None
+    subset: RowInterval | None = None
 
     def __post_init__(self) -> None:
         check_whole("chunk_points", self.chunk_points, 1)
@@ -76,7 +76,7 @@ class PointChunks:
 
     @property
     def n_rows(self) -> int:
-        """Rows that are read, invalid ones included."""
+        """Number of rows read, including invalid ones."""
         return self._end - self.begin
 
     @property
@@ -92,10 +92,10 @@ class PointChunks:
     def _chunk(self, block: np.ndarray, first: int) -> Chunk:
         rows = torch.arange(first, first + block.shape[0])
         points = torch.from_numpy(np.require(block, requirements=["C", "W"]))
-        if self.draw is not None:
-            number = row_uniform(rows, self.draw.seed)
-            drawn = (number >= self.draw.low) & (number < self.draw.high)
-            points, rows = points[drawn], rows[drawn]
+        if self.subset is not None:
+            number = row_uniform(rows, self.subset.seed)
+            chosen = (number >= self.subset.low) & (number < self.subset.high)
+            points, rows = points[chosen], rows[chosen]
         valid = torch.isfinite(points).all(1)
         if self.max_range is not None:
             valid &= ~is_beyond(points.norm(dim=1), self.max_range)
@@ -103,16 +103,16 @@ class PointChunks:
             return Chunk(points, rows, 0)
         return Chunk(points[valid], rows[valid], int((~valid).sum()))
 
-    def part(self, index: int, n_parts: int) -> PointChunks:
-        """The `index`-th of `n_parts` runs of rows, equal to within one row."""
-        edges = [self.begin + self.n_rows * i // n_parts for i in (index, index + 1)]
+    def shard(self, index: int, n_shards: int) -> PointChunks:
+        """Shard `index` of `n_shards` contiguous shards whose sizes differ by at most one row."""
+        edges = [self.begin + self.n_rows * i // n_shards for i in (index, index + 1)]
         return dataclasses.replace(self, begin=edges[0], end=edges[1])
 
-    def drawn(self, low: float, high: float, seed: int) -> PointChunks:
-        """The rows whose seeded random number in [0, 1) lies in [low, high)."""
-        if self.draw is not None:
-            raise InvalidArgumentError("The rows are a draw already; draw once, from all of them.")
-        return dataclasses.replace(self, draw=Draw(low, high, seed))
+    def random_subset(self, low: float, high: float, seed: int) -> PointChunks:
+        """The rows whose random number for `seed`, uniform in [0, 1), is in [low, high)."""
+        if self.subset is not None:
+            raise InvalidArgumentError("These rows are already a random subset; take one subset of all rows.")
+        return dataclasses.replace(self, subset=RowInterval(low, high, seed))
 
 
 def open_points(
@@ -120,11 +120,11 @@ def open_points(
 ) -> PointChunks:
     """The points of a .npy, .las, .laz, .pcd or .ply file, in chunks.
 
-    .npy and binary PCD and PLY are mapped into memory; LAS, LAZ and ascii files are decoded anew each
-    time. Compressed PCD files, and PLY files with lists before or in their points, are held whole.
+    NPY and binary PCD and PLY files are mapped into memory. LAS, LAZ and ascii files are decoded in each
+    iteration. Compressed PCD files, and PLY files with lists in or before the points, are loaded as a whole.
 
-    Raises `MissingDataError` if it is not there, `InvalidArgumentError` for another kind of file, and
-    `DataError`, now or while reading, for a damaged one.
+    Raises `MissingDataError` if the file does not exist, `InvalidArgumentError` for another suffix, and
+    `DataError`, at once or while reading, for a damaged file.
     """
     return PointChunks(open_rows(path), chunk_points, max_range)
 
@@ -137,9 +137,9 @@ def in_memory(
 
 
 def row_uniform(rows: Tensor, seed: int) -> Tensor:
-    """A number in [0, 1) for each row (n,) and seed, float64: always the same, uniform, independent.
+    """A uniform random number in [0, 1) for each row (n,), float64; a function of the row and the seed only.
 
-    SplitMix64 (Steele, Lea & Flood, 2014) of the row as a counter, 53 bits of it.
+    53 bits of SplitMix64 (Steele, Lea & Flood, 2014) with the row number as counter.
     """
     base = mix_bits(np.array([seed], dtype=np.uint64))
     state = base + (rows.numpy().astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
@@ -147,7 +147,7 @@ def row_uniform(rows: Tensor, seed: int) -> Tensor:
 
 
 def mix_bits(state: np.ndarray) -> np.ndarray:
-    """SplitMix64's finalizer: 64-bit words (n,) with their bits mixed."""
+    """64-bit words (n,) after the finalizer of SplitMix64, which mixes their bits."""
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     mixed: np.ndarray = state ^ (state >> np.uint64(31))

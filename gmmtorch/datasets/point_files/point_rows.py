@@ -1,7 +1,7 @@
-"""Files of points, read block by block: .npy, .las, .laz, .pcd, .ply.
+"""Readers of point files, block by block: .npy, .las, .laz, .pcd, .ply.
 
-A reader checks the header when it is opened, and holds no more than one block of points at a time.
-What a header promises and the file does not hold is a `DataError` that names the file.
+A reader checks the header when it is opened, and keeps at most one block of points in memory. If the file
+contains less than its header announces, a `DataError` names the file.
 """
 
 from __future__ import annotations
@@ -15,20 +15,25 @@ from typing import Any, Protocol
 import numpy as np
 from torch import Tensor
 
-from gmmtorch.datasets.point_files.cloud_layout import AXES, Layout, pcd_layout, ply_layout
-from gmmtorch.datasets.point_files.clouds import read_cloud
+from gmmtorch.datasets.point_files.cloud_files import (
+    AXES,
+    Layout,
+    check_length,
+    read_cloud,
+    read_header,
+)
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 
 
 class Rows(Protocol):
-    """Rows of D numbers, in an order of their own, that can be read again and from anywhere."""
+    """Rows of D numbers in a fixed order, readable repeatedly and from any row."""
 
     name: str
     n_rows: int
     dim: int
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
-        """Rows begin, …, end − 1 in blocks (n ≤ size, D)."""
+        """Yields rows begin, …, end − 1 in blocks (n, D), n ≤ size."""
 
 
 class ArrayRows:
@@ -64,19 +69,19 @@ class NpyRows:
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
         for first in range(begin, end, size):
-            # Mapped anew: the pages of one map would stay resident as they are read.
+            # A new map for each block, because the pages of one map would stay in memory.
             yield self._map()[first : min(first + size, end)]
 
 
 class LasRows:
-    """The points of a LAS or LAZ file, in the file's own frame: scale and offset applied, in float64."""
+    """The points of a LAS or LAZ file, in the file's frame, float64, with scale and offset applied."""
 
     dim = 3
 
     def __init__(self, path: Path) -> None:
         try:
             import laspy
-            import lazrs  # noqa: F401  laspy finds it by itself
+            import lazrs  # noqa: F401  used by laspy
         except ImportError as error:
             raise GmmTorchError(
                 f"{path} cannot be read, because {error.name} is not installed: pip install gmmtorch[formats]"
@@ -102,7 +107,7 @@ class LasRows:
 
 @contextmanager
 def _las_errors(path: Path) -> Iterator[None]:
-    """Whatever laspy and lazrs raise on a damaged file becomes a `DataError`: they share no base class."""
+    """Turns every error of laspy and lazrs into a `DataError`; their errors share no base class."""
     try:
         yield
     except GmmTorchError:
@@ -119,9 +124,9 @@ class RecordRows:
 
     dim = 3
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    def __init__(self, path: Path, n_points: int, layout: Layout) -> None:
         self._path = path
-        self.name, self.n_rows = path.stem, layout.n_points
+        self.name, self.n_rows = path.stem, n_points
         self._skip = layout.skip
         self._record = np.dtype(
             {
@@ -131,12 +136,6 @@ class RecordRows:
                 "itemsize": layout.width,
             }
         )
-        held = path.stat().st_size - layout.skip
-        if held < layout.n_points * layout.width:
-            raise DataError(
-                f"{path} announces {layout.n_points} points, but ends after {held} of "
-                f"{layout.n_points * layout.width} bytes; it is truncated. Write or fetch it again."
-            )
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
         for first in range(begin, end, size):
@@ -147,20 +146,20 @@ class RecordRows:
 
 
 class TextRows:
-    """The points of an ascii PCD or PLY file: a line each. Lines before `begin` are read, too."""
+    """The points of an ascii PCD or PLY file, one per line; all lines before the first row are read too."""
 
     dim = 3
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    def __init__(self, path: Path, n_points: int, layout: Layout) -> None:
         self._path, self._layout = path, layout
-        self.name, self.n_rows = path.stem, layout.n_points
+        self.name, self.n_rows = path.stem, n_points
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
         if begin >= end:
             return
         with self._path.open(encoding="ascii", errors="replace") as file:
-            held = (line for line in itertools.islice(file, self._layout.skip, None) if line.strip())
-            lines = itertools.islice(held, begin, None)
+            data = (line for line in itertools.islice(file, self._layout.skip, None) if line.strip())
+            lines = itertools.islice(data, begin, None)
             for first in range(begin, end, size):
                 wanted = min(size, end - first)
                 taken = list(itertools.islice(lines, wanted))
@@ -169,7 +168,7 @@ class TextRows:
 
     def _numbers(self, lines: list[str], first: int) -> np.ndarray:
         try:
-            # All columns at first, so that a line cut short is seen, whichever column it lost.
+            # All columns are read, so that a truncated line is detected whichever column it lacks.
             table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
         except ValueError as error:
             raise DataError(f"{self._path}, from point {first} on: {error}; it is damaged.") from error
@@ -182,18 +181,18 @@ class TextRows:
 
 
 def open_rows(path: str | Path) -> Rows:
-    """The points of a .npy, .las, .laz, .pcd or .ply file.
+    """A reader of the points of a .npy, .las, .laz, .pcd or .ply file.
 
-    Raises `MissingDataError` if it is not there, `InvalidArgumentError` for another kind of file, and
-    `DataError` for a damaged one.
+    Raises `MissingDataError` if the file does not exist, `InvalidArgumentError` for another suffix, and
+    `DataError` for a damaged file.
     """
     path = Path(path).expanduser()
     readers: dict[str, Callable[[Path], Rows]] = {
         ".npy": NpyRows,
         ".las": LasRows,
         ".laz": LasRows,
-        ".pcd": lambda path: _cloud_rows(path, pcd_layout),
-        ".ply": lambda path: _cloud_rows(path, ply_layout),
+        ".pcd": _cloud_rows,
+        ".ply": _cloud_rows,
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
@@ -201,34 +200,33 @@ def open_rows(path: str | Path) -> Rows:
             f"points={path} has an unknown suffix {path.suffix!r}; known are {', '.join(readers)}."
         )
     if not path.is_file():
-        what = "is no file" if path.exists() else "does not exist"
+        what = "is not a file" if path.exists() else "does not exist"
         raise MissingDataError(f"points={path} {what}; give a file of points ({', '.join(readers)}).")
     return reader(path)
 
 
-def _cloud_rows(path: Path, layout_of: Callable[[Path], Layout | None]) -> Rows:
-    try:
-        layout = layout_of(path)
-    except (ValueError, KeyError, IndexError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error
-    if layout is None:
+def _cloud_rows(path: Path) -> Rows:
+    header = read_header(path)
+    if header.layout is None:
         return ArrayRows(read_cloud(path), path.stem)
-    return TextRows(path, layout) if layout.text else RecordRows(path, layout)
+    if header.is_text:
+        return TextRows(path, header.n_points, header.layout)
+    check_length(path, header)
+    return RecordRows(path, header.n_points, header.layout)
 
 
 def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:
     if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "fiu":
         raise DataError(
-            f"{name} holds {array.dtype} {array.shape}; expected real numbers of shape (N, D), a point a row."
+            f"{name} holds {array.dtype} {array.shape}; expected real numbers of shape (N, D), one point "
+            "per row."
         )
     return array.shape[0], array.shape[1]
 
 
-def _check_count(path: Path, first: int, held: int, wanted: int, announced: int) -> None:
-    if held < wanted:
+def _check_count(path: Path, first: int, found: int, wanted: int, announced: int) -> None:
+    if found < wanted:
         raise DataError(
-            f"{path} announces {announced} points, but ends after {first + held}; it is truncated. "
+            f"{path} announces {announced} points, but ends after {first + found}; it is truncated. "
             "Write or fetch it again."
         )

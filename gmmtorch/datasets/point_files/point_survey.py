@@ -1,4 +1,4 @@
-"""One pass over a source of points: what a fit must know before it begins."""
+"""Statistics of a point source from one pass, which a fit needs before it starts."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, mix_bits, row_uniform
 
-_CHECKSUM_BITS = 48  # so that sums of a few are whole numbers in float64, too
+_CHECKSUM_BITS = 48  # so that a sum of several checksums is exact in float64
 
 
 class Survey(NamedTuple):
-    """What one pass over a source finds.
+    """Statistics of a point source.
 
-    n_points, n_dropped: valid and invalid rows; total (D,): sum of the points; low, high (D,): bounds (m;
-    ±∞ if there is no point); checksum: of every coordinate and its row; sample (m, 2 + D): of at most
-    the wanted number of points drawn, random number, row and coordinates, in the order of the rows.
+    n_points, n_dropped: numbers of valid and invalid rows. total: (D,) sum of the points.
+    low, high: (D,) bounds (m); ±∞ without points. checksum: of all coordinates and their rows.
+    sample: (m, 2 + D) randomly drawn points in row order: random number, row, coordinates.
     """
 
     n_points: int
@@ -32,20 +32,20 @@ class Survey(NamedTuple):
 
     @property
     def center(self) -> Tensor:
-        """The mean of the points (D,)."""
+        """Mean (D,) of the points."""
         return self.total / self.n_points
 
     @property
     def points(self) -> Tensor:
-        """The points drawn (m, D)."""
+        """The sampled points (m, D)."""
         return self.sample[:, 2:]
 
 
 def survey(source: PointChunks, sample_points: int | None = None, seed: int = 0) -> Survey:
-    """Count, bounds, sum, checksum and a uniform draw of at most `sample_points` points (None: all).
+    """The survey of a source, with a uniform sample of at most `sample_points` points (None: all).
 
-    A point is drawn for its row's random number, the smallest of all: so the draw does not depend on the
-    chunks, nor on how the rows are shared among processes.
+    The sample consists of the points with the smallest random numbers of their rows. It does not depend on
+    the chunk size or on the distribution of rows over processes.
     """
     inf = torch.full((source.dim,), math.inf, dtype=torch.float64)
     found = Survey(0, 0, torch.zeros_like(inf), inf, -inf, 0, inf.new_empty(0, 2 + source.dim))
@@ -54,7 +54,7 @@ def survey(source: PointChunks, sample_points: int | None = None, seed: int = 0)
         number = row_uniform(rows, seed)
         kept.append(torch.cat([number[:, None], rows.double()[:, None], points], 1))
         if sample_points is not None:
-            kept = [smallest(torch.cat(kept), sample_points)]
+            kept = [_smallest(torch.cat(kept), sample_points)]
         found = Survey(
             found.n_points + points.shape[0],
             found.n_dropped + n_dropped,
@@ -67,22 +67,22 @@ def survey(source: PointChunks, sample_points: int | None = None, seed: int = 0)
     return found._replace(sample=torch.cat(kept))
 
 
-def united(surveys: list[Survey], sample_points: int | None) -> Survey:
-    """The survey of the rows of all of these, which are parts of one source in order."""
-    sample = torch.cat([part.sample for part in surveys])
+def merge_surveys(surveys: list[Survey], sample_points: int | None) -> Survey:
+    """The survey of a whole source from the surveys of its shards, in order."""
+    sample = torch.cat([shard.sample for shard in surveys])
     return Survey(
-        sum(part.n_points for part in surveys),
-        sum(part.n_dropped for part in surveys),
-        torch.stack([part.total for part in surveys]).sum(0),
-        torch.stack([part.low for part in surveys]).amin(0),
-        torch.stack([part.high for part in surveys]).amax(0),
-        sum(part.checksum for part in surveys) % (1 << _CHECKSUM_BITS),
-        sample if sample_points is None else smallest(sample, sample_points),
+        sum(shard.n_points for shard in surveys),
+        sum(shard.n_dropped for shard in surveys),
+        torch.stack([shard.total for shard in surveys]).sum(0),
+        torch.stack([shard.low for shard in surveys]).amin(0),
+        torch.stack([shard.high for shard in surveys]).amax(0),
+        sum(shard.checksum for shard in surveys) % (1 << _CHECKSUM_BITS),
+        sample if sample_points is None else _smallest(sample, sample_points),
     )
 
 
-def smallest(sample: Tensor, count: int) -> Tensor:
-    """The `count` rows of the smallest first column, in the order they had."""
+def _smallest(sample: Tensor, count: int) -> Tensor:
+    """The `count` rows with the smallest values in the first column, in their original order."""
     if sample.shape[0] <= count:
         return sample
     order = sample[:, 0].argsort(stable=True)[:count]

@@ -40,8 +40,8 @@ def split_source(source: PointChunks, test_share: float, seed: int, sample_point
     if not 0 <= test_share < 1:
         raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
     return Split(
-        source.drawn(test_share, 1.0, seed ^ _SPLIT_SALT),
-        source.drawn(0.0, test_share, seed ^ _SPLIT_SALT),
+        source.random_subset(test_share, 1.0, seed ^ _SPLIT_SALT),
+        source.random_subset(0.0, test_share, seed ^ _SPLIT_SALT),
         sample_points,
     )
 
@@ -69,7 +69,7 @@ def fit_streamed(
 
     Likelihoods are over all points; PSNR2 and components in use are of the points drawn.
     """
-    train, test = (part.part(processes.rank, processes.size) for part in (split.train, split.test))
+    train, test = (part.shard(processes.rank, processes.size) for part in (split.train, split.test))
     wanted = None if split.sample_points is None else max(split.sample_points, options.n_components or 1)
     on_event("reading points", 0, 2)
     found = survey_all(train, wanted, seed, processes)

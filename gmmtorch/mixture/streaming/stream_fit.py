@@ -19,7 +19,7 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks
-from gmmtorch.datasets.point_files.point_survey import Survey, survey, united
+from gmmtorch.datasets.point_files.point_survey import Survey, merge_surveys, survey
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
@@ -234,7 +234,7 @@ def survey_all(
         n_points, n_dropped, checksum = (int(value) for value in row[:3])
         total, low, high = row[3:].split(dim)
         parts.append(Survey(n_points, n_dropped, total, low, high, checksum, sample))
-    return united(parts, sample_points)
+    return merge_surveys(parts, sample_points)
 
 
 def draw_seed(generator: torch.Generator) -> int:

@@ -1,1 +1,1 @@
-"""Simulated range sensors: laser, lidar and depth camera, and the paths they move along."""
+"""Simulated range sensors (laser, lidar, depth camera) and the paths they follow."""

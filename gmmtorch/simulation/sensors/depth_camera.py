@@ -1,7 +1,7 @@
-"""DepthCamera: the forward-looking depth camera of a flying robot, and the frames that it takes.
+"""The forward-looking depth camera of a flying robot, and its frames.
 
-World frame: metres, z up. Camera frame: x forward along the heading, y left, z up, at the robot's centre;
-the camera turns with the robot's yaw alone.
+World frame: metres, z up. Camera frame: at the robot's centre, x forward along the heading, y left, z up.
+Only the robot's yaw rotates the camera.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 _CLOSEST_READING = 1e-3
 _TEAMMATE_MARGIN = 0.05
-"""Metres around a teammate in which nothing is believed: its outline is no sharper than that."""
+"""Beams that pass a teammate's body closer than this (m) are dropped, because its outline is not exact."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
-    """What one depth image says, world frame, metres.
+    """The beams of one depth image, world frame, metres.
 
-    origin: (3,) the camera's centre. ends: (N, 3) float64, where beams end. is_hit: (N,) bool, the beam
-    ended at a surface; else it met nothing up to its end. pixel: (N,) int64 rising, row-major index from
-    the top left of the image; beams that say nothing are absent.
+    origin: (3,) the camera's centre. ends: (N, 3) float64, the beam ends. is_hit: (N,) bool, whether the beam
+    ended at a surface; otherwise it had no return and is free up to its end. pixel: (N,) int64, ascending
+    row-major index from the top left of the image. Beams without a valid reading are absent.
     """
 
     origin: Tensor
@@ -38,22 +38,22 @@ class DepthFrame:
     pixel: Tensor
 
     def scan(self) -> Scan:
-        """The frame as a scan: surfaces, and ends of free beams."""
+        """The frame as a scan: hits, and ends of beams without return."""
         return Scan(self.ends[self.is_hit], self.origin, self.ends[~self.is_hit])
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A pinhole depth camera whose noise grows with the square of depth, as triangulation's does.
+    """A pinhole depth camera whose noise grows with the square of the depth, as in triangulation.
 
     Attributes:
         width, height: pixels, evenly spaced on the image plane.
-        horizontal_fov, vertical_fov: angles (rad) from edge to edge of the image, below π.
-        max_range: what lies at this distance (m) along a beam, or beyond, is not seen.
+        horizontal_fov, vertical_fov: angles (rad) between opposite edges of the image, below π.
+        max_range: surfaces at this distance (m) along a beam, or beyond, give no return.
         noise: a depth of z metres along the optical axis has standard deviation noise · z² metres.
-        dropout: share of the pixels that yield nothing.
+        dropout: share of the pixels without a reading.
 
-    Raises `InvalidArgumentError` for values without meaning, such as a camera with no field of view.
+    Raises `InvalidArgumentError` for a value out of its range.
     """
 
     width: int = 160
@@ -99,15 +99,16 @@ class DepthCamera:
         radius: float,
         generator: torch.Generator,
     ) -> DepthFrame:
-        """The frame taken at a pose.
+        """The frame at a pose.
 
-        A beam of range r and depth z is off by noise · z² · r/z. Readings of `max_range` or more become
-        beams that met nothing up to there. Dropped beams are absent, and so are those that reach a
-        teammate before anything else. The same number of random draws is spent whatever is seen.
+        A beam of range r and depth z has an error of standard deviation noise · z² · r/z. Readings of
+        `max_range` or more become beams without return that end there. Dropped beams are absent, and so are
+        beams that reach a teammate first. The number of random draws does not depend on the world.
 
         Args:
-            pose: (4,) x, y, z, yaw. others: (M, 3) centres of the teammates' bodies.
-            radius: of a teammate's body (m).
+            pose: (4,) x, y, z in metres, yaw in radians.
+            others: (M, 3) centres of the teammates' bodies, metres.
+            radius: radius of a teammate's body (m).
         """
         _check_finite("pose", pose, (4,))
         _check_finite("others", others, (len(others), 3))
@@ -126,9 +127,9 @@ class DepthCamera:
         return DepthFrame(origin, ends, is_hit[pixel], pixel)
 
     def image(self, frame: DepthFrame) -> Tensor:
-        """Depth (height, width), metres along the optical axis, of a frame that this camera took.
+        """Depth image (height, width) of a frame of this camera, metres along the optical axis.
 
-        Infinite where a beam met nothing, NaN where it says nothing.
+        Infinite for a beam without return, NaN for a pixel without a valid reading.
         """
         depth = torch.full((self.width * self.height,), math.nan, dtype=torch.float64)
         reading = (frame.ends - frame.origin).norm(dim=1) * self.directions[frame.pixel, 0]
@@ -136,23 +137,23 @@ class DepthCamera:
         return depth.view(self.height, self.width)
 
     def _turned(self, yaw: float) -> Tensor:
-        """The beams' directions (N, 3) in the world frame."""
+        """Directions of the beams (N, 3) in the world frame."""
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = torch.tensor([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
         return self.directions @ turn
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:
-    """Metres (N,) from the origin along directions (N, 3) to the first of spheres at (M, 3), or inf.
+    """Range (N,) in metres from the origin along directions (N, 3) to the nearest sphere.
 
-    Zero where the origin lies in one.
+    `centers` (M, 3) are the centres of the spheres. Infinite without a hit; zero inside a sphere.
     """
     along = directions @ centers.T
     distance = centers.square().sum(1)
     # |t u − c|² = ρ² has the roots t = u·c ± √((u·c)² − |c|² + ρ²).
     root = along.square() - distance + radius**2
-    meets = (root >= 0) & (along > 0)
-    entry = torch.where(meets, along - root.clamp_min(0).sqrt(), math.inf)
+    hits = (root >= 0) & (along > 0)
+    entry = torch.where(hits, along - root.clamp_min(0).sqrt(), math.inf)
     return torch.where(distance <= radius**2, 0.0, entry).amin(1)
 
 

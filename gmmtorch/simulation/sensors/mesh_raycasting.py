@@ -1,69 +1,90 @@
-"""How far a ray flies until it meets a line segment (2D) or a triangle (3D), in plain torch.
+"""Distance along rays to the nearest line segment (2D) or triangle (3D), in plain torch.
 
-Segments are few, so every ray is tested against each. Rays that start at one place, as those of a sensor
-do, are tested only against the triangles that reach into the cone of their bundle: a few in a hundred.
+Worlds have few segments, so each ray is tested against all of them. Rays that start at one point, as
+those of a sensor do, are grouped into bundles of similar direction. Each bundle is tested only against
+the triangles whose bounding cone overlaps the cone of the bundle: a few per cent of all triangles.
+
+Operations on bundles are kept small and gather with `index_select`. Above about 32 thousand elements
+(fewer with `x[index]`) torch splits an operation over threads. On a busy machine, waiting for the threads at
+each of many small operations takes longer than the work.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation.sensors.ray_bundles import apart, bundled, candidates
 
 _CHUNK_PAIRS = 1 << 15
-"""Pairs of ray and segment held at once."""
+"""Ray and segment pairs processed at a time."""
+
+_CHUNK_CONES = 1 << 15
+"""Bundle and triangle pairs processed at a time."""
+
+_CHUNK_HITS = 1 << 13
+"""Approximate number of ray and triangle pairs that `_candidates` yields at a time."""
+
+_CELLS = 8
+"""Bundles along each side of the cube onto which directions are projected: each is about 14° wide."""
 
 _SLACK = 64 * torch.finfo(torch.float64).eps
-"""How far beside an edge, relatively, a ray may pass and still count as a hit, so that no ray slips through
-where two primitives meet; rays closer than four times that to parallel do not meet a primitive."""
+"""Relative distance outside an edge at which a ray still counts as a hit, so that no ray passes between two
+adjacent primitives. A ray whose angle to a primitive is below four times this counts as parallel to it."""
 
 
 def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tensor:
-    """Distances (N,), float64, in lengths of the direction, to the nearest segment; inf where none is met.
+    """Distances (N,), float64, to the nearest segment, in multiples of the direction's length; inf if none.
 
-    Solves o + t d = a + s (b − a) for t > 0 and 0 ≤ s ≤ 1. Rays along a segment do not meet it.
+    Solves o + t d = a + s (b − a) for t > 0 and 0 ≤ s ≤ 1. A ray parallel to a segment does not hit it.
 
     Args:
-        origins: (N, 2), or (2,) for rays that all start at one place.
+        origins: (N, 2), or (2,) if all rays start at one point.
         directions: (N, 2).
-        segments: (S, 2, 2), the two ends of each.
+        segments: (S, 2, 2), the two end points of each segment.
     """
     origins, directions, segments = _checked(origins, directions, segments, (2, 2))
-    best = _nothing(directions)
+    best = torch.full_like(directions[:, 0], torch.inf)
+    if segments.shape[0] == 0:
+        return best
     a, edge = segments[:, 0], segments[:, 1] - segments[:, 0]
     flat = 4 * _SLACK * edge.norm(dim=1)
-    for rows in _chunks(directions.shape[0], segments.shape[0]):
+    step = max(1, _CHUNK_PAIRS // segments.shape[0])
+    for start in range(0, directions.shape[0], step):
+        rows = slice(start, start + step)
         d = directions[rows, None]
         to_start = a - origins[rows, None]
         turn = _cross_2d(d, edge)
         t = _cross_2d(to_start, edge) / turn
         s = _cross_2d(to_start, d) / turn
-        met = (t > 0) & (s >= -_SLACK) & (s <= 1 + _SLACK) & (turn.abs() > flat * d.norm(dim=2))
-        best[rows] = torch.where(met, t, torch.inf).amin(1)
+        hit = (t > 0) & (s >= -_SLACK) & (s <= 1 + _SLACK) & (turn.abs() > flat * d.norm(dim=2))
+        best[rows] = torch.where(hit, t, torch.inf).amin(1)
     return best
 
 
 def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Tensor:
-    """Distances (N,), float64, in lengths of the direction, to the nearest triangle; inf where none is met.
+    """Distances (N,), float64, to the nearest triangle, in multiples of the direction's length; inf if none.
 
-    A ray passes inside a triangle if it passes all three edges on the same side. The side of the edge
-    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p). Neighbours
-    share an edge with opposite sign, so no ray slips through between them.
-    Both faces count; rays in the plane of a triangle do not meet it.
+    A ray passes through a triangle if it passes all three edges on the same side. The side of the edge
+    p → q is the triple product d · ((p − o) × (q − o)) = d · (p × q) + (o × d) · (q − p). Adjacent
+    triangles share an edge with opposite sign, so no ray passes between them.
+    Both faces count. A ray in the plane of a triangle does not hit it.
 
     Args:
-        origins: (N, 3), or (3,) for rays that all start at one place.
+        origins: (N, 3), or (3,) if all rays start at one point.
         directions: (N, 3).
-        triangles: (T, 3, 3), the three corners of each.
+        triangles: (T, 3, 3), the three corners of each triangle.
     """
     one_origin = origins.ndim == 1
     origins, directions, triangles = _checked(origins, directions, triangles, (3, 3))
-    best = _nothing(directions)
+    best = torch.full_like(directions[:, 0], torch.inf)
     if triangles.shape[0] == 0 or directions.shape[0] == 0:
         return best
-    centre = origins[0]  # about which the products below cancel least
+    centre = origins[0]  # the products below lose the fewest digits about this point
     origins, triangles = origins - centre, triangles - centre
     rays = torch.cat([directions, torch.linalg.cross(origins, directions)], 1)
     ahead = triangles.roll(-1, dims=1)
@@ -71,11 +92,11 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
     normals = edges[:, :, :3].sum(1)
     offsets = (normals * triangles[:, 0]).sum(1)
     slack = _SLACK * rays.norm(dim=1).max() * edges.norm(dim=2).amax(1)
-    if one_origin:  # then all moments o × d are zero
+    if one_origin:  # all moments o × d are zero
         rays, edges = rays[:, :3], edges[..., :3]
-    lines, sides = rays.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row a coordinate
-    bundles = bundled(directions) if one_origin else apart(directions.shape[0])
-    for ray, triangle in candidates(bundles, triangles):
+    lines, sides = rays.T.contiguous(), edges.permute(1, 2, 0).contiguous()  # one row per coordinate
+    bundles = _direction_bundles(directions) if one_origin else _single_ray_bundles(directions.shape[0])
+    for ray, triangle in _candidates(bundles, triangles):
         line = [row.index_select(0, ray) for row in lines]
         side_a, side_b, side_c = (
             _dot(line, [row.index_select(0, triangle) for row in edge]) for edge in sides
@@ -88,13 +109,13 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
         if not one_origin:
             height = height - (normals[triangle] * origins[ray]).sum(1)
         t = height / steepness
-        met = ((lowest >= -bound) | (highest <= bound)) & (t > 0) & (steepness.abs() > 4 * bound)
-        best.scatter_reduce_(0, ray, torch.where(met, t, torch.inf), "amin")
+        hit = ((lowest >= -bound) | (highest <= bound)) & (t > 0) & (steepness.abs() > 4 * bound)
+        best.scatter_reduce_(0, ray, torch.where(hit, t, torch.inf), "amin")
     return best
 
 
 def _dot(u: list[Tensor], v: list[Tensor]) -> Tensor:
-    """Dot products (P,) of vectors given by coordinate."""
+    """Dot products (P,) of vectors given as one tensor (P,) per coordinate."""
     total = u[0] * v[0]
     for a, b in zip(u[1:], v[1:], strict=True):
         total = torch.addcmul(total, a, b)
@@ -105,19 +126,10 @@ def _cross_2d(u: Tensor, v: Tensor) -> Tensor:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def _nothing(directions: Tensor) -> Tensor:
-    return torch.full_like(directions[:, 0], torch.inf)
-
-
-def _chunks(n_rays: int, n_primitives: int) -> list[slice]:
-    size = max(1, _CHUNK_PAIRS // max(1, n_primitives))
-    return [slice(i, min(i + size, n_rays)) for i in range(0, n_rays, size) if n_primitives]
-
-
 def _checked(
     origins: Tensor, directions: Tensor, primitives: Tensor, shape: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Origins (N, D), directions (N, D) and primitives, all float64: the products below cancel."""
+    """Origins (N, D), directions (N, D) and primitives as float64, because the products above cancel."""
     dim = shape[1]
     if directions.ndim != 2 or directions.shape[1] != dim:
         raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, {dim}).")
@@ -131,3 +143,108 @@ def _checked(
             f"segments or triangles have shape {tuple(primitives.shape)}; expected (N, {shape[0]}, {dim})."
         )
     return origins.double().expand(directions.shape), directions.double(), primitives.double()
+
+
+# -- bundles of rays --------------------------------------------------------------------------------
+
+
+class _Cones(NamedTuple):
+    """Cones with their apex at the origin: unit axes (3, C), cosine and sine (C,) of the half-angles.
+
+    `is_open` (C,) marks sets of directions wider than a half-space. Such a set has no bounding cone and
+    counts as overlapping every cone.
+    """
+
+    axis: Tensor
+    cos: Tensor
+    sin: Tensor
+    is_open: Tensor
+
+
+class _Bundles(NamedTuple):
+    """Rays grouped into bundles.
+
+    rays: (N,) indices, sorted by bundle. Bundle g has `sizes[g]` of them, from position `starts[g]` on.
+    cones: one around each bundle; None if the rays start at different points.
+    """
+
+    rays: Tensor
+    starts: Tensor
+    sizes: Tensor
+    cones: _Cones | None
+
+
+def _direction_bundles(directions: Tensor) -> _Bundles:
+    """Groups rays from one origin (N, 3) by the cell of a cube's surface that each passes through."""
+    unit = normalize(directions, dim=1)
+    face = unit.abs().argmax(1)
+    cell = ((unit / unit.abs().amax(1, keepdim=True) + 1) * (_CELLS / 2)).floor().long()
+    cell = cell.nan_to_num().clamp(0, _CELLS)
+    key = ((cell[:, 0] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 2]) * 3 + face
+    _, bundle, sizes = torch.unique(key, return_inverse=True, return_counts=True)
+    axis = unit.new_zeros(sizes.shape[0], 3).index_add_(0, bundle, unit)
+    width = unit.new_zeros(sizes.shape[0]).scatter_reduce_(0, bundle, _angle(unit, axis[bundle]), "amax")
+    return _Bundles(bundle.argsort(stable=True), sizes.cumsum(0) - sizes, sizes, _cones(axis, width))
+
+
+def _single_ray_bundles(n: int) -> _Bundles:
+    """One bundle for each of `n` rays, without cones."""
+    rays = torch.arange(n)
+    return _Bundles(rays, rays, torch.ones_like(rays), None)
+
+
+def _candidates(bundles: _Bundles, triangles: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yields pairs of ray (P,) and triangle (P,) that may meet, in chunks.
+
+    `triangles` (T, 3, 3) are relative to the origin of the rays.
+    """
+    n_bundles, n_triangles = bundles.sizes.shape[0], triangles.shape[0]
+    step = max(1, _CHUNK_CONES // n_triangles)
+    middle = triangles.mean(1)
+    cones = _cones(middle, _angle(triangles, middle[:, None]).amax(1))
+    for first in range(0, n_bundles, step):
+        rows = slice(first, min(first + step, n_bundles))
+        if bundles.cones is None:
+            near = torch.ones(rows.stop - first, n_triangles, dtype=torch.bool)
+        else:
+            near = _overlap(bundles.cones, cones, rows)
+        bundle, triangle = near.nonzero(as_tuple=True)
+        bundle = bundle + first
+        ends = bundles.sizes[bundle].cumsum(0)
+        total = int(ends[-1]) if len(ends) else 0
+        cuts = torch.arange(_CHUNK_HITS, max(total, _CHUNK_HITS), _CHUNK_HITS)
+        for chunk in torch.arange(len(bundle)).tensor_split(torch.searchsorted(ends, cuts)):
+            if len(chunk):
+                yield _expanded(bundles, bundle[chunk], triangle[chunk])
+
+
+def _expanded(bundles: _Bundles, bundle: Tensor, triangle: Tensor) -> tuple[Tensor, Tensor]:
+    """Pairs of ray (P,) and triangle (P,): every ray of each bundle (Q,) with that bundle's triangle (Q,)."""
+    sizes = bundles.sizes.index_select(0, bundle)
+    ends = sizes.cumsum(0)
+    is_next = torch.zeros(int(ends[-1]), dtype=torch.long)
+    is_next[ends[:-1]] = 1  # no bundle is empty, so this counts up; repeat_interleave would start threads
+    pair = is_next.cumsum(0)
+    shift = bundles.starts.index_select(0, bundle) - (ends - sizes)
+    position = torch.arange(pair.shape[0]) + shift.index_select(0, pair)
+    return bundles.rays.index_select(0, position), triangle.index_select(0, pair)
+
+
+def _cones(axis: Tensor, width: Tensor) -> _Cones:
+    """Cones with axes (C, 3) of any length and half-angles (C,) in radians."""
+    is_open = ~(width < 0.49 * torch.pi)
+    return _Cones(normalize(axis, dim=1).T.contiguous(), width.cos(), width.sin(), is_open)
+
+
+def _overlap(bundles: _Cones, cones: _Cones, rows: slice) -> Tensor:
+    """Whether each bundle in `rows` overlaps each cone (C,): cos(angle of axes) ≥ cos(sum of half-angles)."""
+    margin = bundles.sin[rows, None] * cones.sin - bundles.cos[rows, None] * cones.cos
+    for own, other in zip(bundles.axis[:, rows], cones.axis, strict=True):
+        margin = torch.addcmul(margin, own[:, None], other)
+    return (margin > -1e-9) | cones.is_open | bundles.is_open[rows, None]
+
+
+def _angle(u: Tensor, v: Tensor) -> Tensor:
+    """Angles (…) between vectors (…, 3) in radians; a right angle if one of them is zero."""
+    scale = (u.norm(dim=-1) * v.norm(dim=-1)).clamp_min(1e-300)
+    return ((u * v).sum(-1) / scale).clamp(-1, 1).acos()

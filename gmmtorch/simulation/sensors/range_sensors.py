@@ -1,6 +1,6 @@
-"""Range sensors: where their beams point, and how their readings err.
+"""Range sensors: beam directions, noise and dropout.
 
-Sensor frame: x forward, y left, z up, for the camera too.
+Sensor frame: x forward, y left, z up, for cameras too.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ _CLOSEST_READING = 1e-3
 
 
 class World(Protocol):
-    """What a sensor needs to know of a world."""
+    """A world that sensors can observe."""
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
-        """Metres (N,) from the origin (D,) along unit directions (N, D) to the first surface, or inf."""
+        """Range (N,) in metres from the origin (D,) along unit directions (N, D); inf without a hit."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class RangeSensor:
-    """Beams and their errors.
+    """The beams of a sensor and their errors.
 
     Attributes:
         directions: (B, D) unit vectors in the sensor frame.
-        max_range: what lies at this distance (m) or beyond is not seen.
+        max_range: surfaces at this distance (m) or beyond give no return.
         range_noise: standard deviation (m) of a reading, along the beam.
-        dropout: share of the beams that yield no reading at all, which says nothing of free space.
+        dropout: share of the beams without any reading. A dropped beam shows neither a surface nor free
+            space.
     """
 
     directions: Tensor
@@ -58,7 +59,7 @@ def laser_2d(
     range_noise: float = 0.01,
     dropout: float = 0.0,
 ) -> RangeSensor:
-    """A planar laser: `n_beams` spread evenly over `field_of_view` radians, right to left."""
+    """A planar laser: `n_beams` beams spread evenly over `field_of_view` radians, from right to left."""
     _at_least_one(n_beams=n_beams)
     _angle(field_of_view=field_of_view, limit=2 * math.pi)
     angles = (torch.arange(n_beams, dtype=torch.float64) + 0.5) / n_beams * field_of_view - field_of_view / 2
@@ -73,7 +74,7 @@ def spinning_lidar(
     range_noise: float = 0.01,
     dropout: float = 0.0,
 ) -> RangeSensor:
-    """A lidar of `n_rings` × `n_azimuths` beams, ring by ring from the lowest of `elevations` (rad) up."""
+    """A lidar of `n_rings` × `n_azimuths` beams, ring by ring from the lower to the upper elevation (rad)."""
     _at_least_one(n_rings=n_rings, n_azimuths=n_azimuths)
     elevation = torch.linspace(*elevations, n_rings, dtype=torch.float64)[:, None]
     azimuth = torch.arange(n_azimuths, dtype=torch.float64) * (2 * math.pi / n_azimuths)
@@ -98,7 +99,7 @@ def depth_camera(
 ) -> RangeSensor:
     """A pinhole camera of `width` × `height` square pixels, row by row from the top left.
 
-    `field_of_view` is the angle (rad) from the left edge of the image to the right.
+    `field_of_view` is the horizontal angle (rad) between the left and right edges of the image.
     """
     _at_least_one(width=width, height=height)
     _angle(field_of_view=field_of_view, limit=math.radians(179))
@@ -107,8 +108,10 @@ def depth_camera(
 
 
 def pixel_rays(width: int, height: int, focal: tuple[float, float]) -> Tensor:
-    """Unit vectors (height · width, 3) through the centres of a pinhole camera's pixels, row by row from
-    the top left. `focal`: focal lengths in widths and in heights of a pixel."""
+    """Unit vectors (height · width, 3) through the pixel centres of a pinhole camera.
+
+    Pixels are in row-major order from the top left. `focal` is the focal length in pixel widths and heights.
+    """
     left = (width / 2 - 0.5 - torch.arange(width, dtype=torch.float64)) / focal[0]
     up = (height / 2 - 0.5 - torch.arange(height, dtype=torch.float64)) / focal[1]
     z, y = torch.meshgrid(up, left, indexing="ij")
@@ -118,10 +121,10 @@ def pixel_rays(width: int, height: int, focal: tuple[float, float]) -> Tensor:
 def sense(
     sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Beam ends (N, D) in the world frame, and which (N,) of them saw nothing within range.
+    """Beam ends (N, D) in the world frame, and whether each beam (N,) had no return.
 
-    The pose (D+1, D+1) is world ← sensor. A beam that saw nothing ends at the sensor's maximum range;
-    beams that dropped out are missing. The same number of random draws is spent whatever is seen.
+    The pose (D+1, D+1) is world ← sensor. A beam without return ends at the sensor's maximum range. Dropped
+    beams are absent. The number of random draws does not depend on the world.
     """
     origin, directions = pose[:-1, -1], sensor.directions @ pose[:-1, :-1].T
     n_beams = directions.shape[0]
@@ -135,7 +138,7 @@ def sense(
 
 
 def simulate_scan(sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator) -> Scan:
-    """The scan taken at a pose (D+1, D+1); beams that saw nothing are free up to the maximum range."""
+    """The scan at a pose (D+1, D+1), world ← sensor. Beams without return end at the maximum range."""
     ends, no_return = sense(sensor, pose, world, generator)
     return Scan(ends[~no_return], pose[:-1, -1], ends[no_return])
 

@@ -1,1 +1,1 @@
-"""Simulated places whose every surface is known: offices, halls, a warehouse, tunnels, any mesh."""
+"""Simulated worlds whose surfaces are known exactly: an office, a hall, a warehouse, tunnels, any mesh."""

@@ -1,9 +1,9 @@
-"""Floor plans: rooms, and footprints of furniture that leave a path free."""
+"""Floor plans: rooms, footprints of furniture, and placing furniture so that a path stays free."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 _ATTEMPTS = 40
 _GAP = 0.2
-"""Metres between two pieces of furniture, so that each can be told from the other."""
+"""Least distance between two pieces of furniture, metres."""
 
 
 class Room(NamedTuple):
-    """The inside of a room, wall to wall, metres."""
+    """The inside of a room, from wall to wall, metres."""
 
     x_min: float
     y_min: float
@@ -35,13 +35,13 @@ class Footprint:
     width: float
 
     def to_world(self, local: Tensor) -> Tensor:
-        """Points (N, 2) of the world from points in the frame of the footprint."""
+        """World points (N, 2) of points (N, 2) in the frame of the footprint."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         x = self.x + cos * local[:, 0] - sin * local[:, 1]
         return torch.stack([x, self.y + sin * local[:, 0] + cos * local[:, 1]], 1)
 
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
-        """Which points (N, 2) lie within the rectangle grown by `margin` metres: (N,) bool."""
+        """Whether each point (N, 2) lies in the rectangle grown by `margin` metres: (N,) bool."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
         along, across = (cos * dx + sin * dy).abs(), (cos * dy - sin * dx).abs()
@@ -58,21 +58,55 @@ class Footprint:
         return (corners * (1 - share) + corners.roll(-1, dims=0) * share).flatten(0, 1)
 
 
+class Piece(NamedTuple):
+    """A piece of furniture.
+
+    size: length and width (m). at_wall: whether it stands at a wall. build: returns its surfaces on a
+    footprint, as polygons (C, 2) in a plane world and triangles (T, 3, 3) in a 3D world.
+    """
+
+    size: tuple[float, float]
+    at_wall: bool
+    build: Callable[[Footprint], list[Tensor]]
+
+
+DrawPiece = Callable[[torch.Generator], Piece]
+
+
 def rectangle(length: float, width: float) -> Tensor:
-    """Corners (4, 2) of a rectangle about the origin, counter-clockwise."""
+    """Corners (4, 2) of a rectangle centred on the origin, counter-clockwise."""
     a, b = length / 2, width / 2
     return torch.tensor([[-a, -b], [a, -b], [a, b], [-a, b]], dtype=torch.float64)
 
 
 def circle(radius: float, n_sides: int) -> Tensor:
-    """Corners (n_sides, 2) of a regular polygon about the origin, counter-clockwise."""
+    """Corners (n_sides, 2) of a regular polygon centred on the origin, counter-clockwise."""
     angle = torch.arange(n_sides, dtype=torch.float64) * (2 * math.pi / n_sides)
     return radius * torch.stack([angle.cos(), angle.sin()], 1)
 
 
 def uniform(low: float, high: float, generator: torch.Generator) -> float:
-    """One number drawn evenly from [low, high)."""
+    """One number drawn uniformly from [low, high)."""
     return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+
+def furnish(
+    room: Room, path: Tensor, generator: torch.Generator, wanted: dict[DrawPiece, int]
+) -> list[Tensor]:
+    """Surfaces of furniture in a room that leaves the path (P, 2) free.
+
+    `wanted` gives the number of pieces of each kind. A piece for which no free place is found is left out.
+    """
+    taken: list[Footprint] = []
+    surfaces: list[Tensor] = []
+    for draw, count in wanted.items():
+        for _ in range(count):
+            piece = draw(generator)
+            footprint = place(room, piece.size, path, taken, generator, piece.at_wall)
+            if footprint is not None:
+                taken.append(footprint)
+                surfaces += piece.build(footprint)
+    return surfaces
 
 
 def place(
@@ -84,23 +118,23 @@ def place(
     at_wall: bool = False,
     clearance: float = 0.6,
 ) -> Footprint | None:
-    """A place in the room for something of `size` (length, width), or None if none was found.
+    """A free footprint of `size` (length, width) in the room, or None if none was found.
 
-    It stays `clearance` metres away from the path (P, 2) and does not touch what is `taken` already.
+    It stays `clearance` metres away from the path (P, 2) and does not touch the `taken` footprints.
     """
     draw = _at_wall if at_wall else _anywhere
     for _ in range(_ATTEMPTS):
-        spot = draw(room, *size, generator)
-        corners = spot.corners()
+        footprint = draw(room, *size, generator)
+        corners = footprint.corners()
         inside = (corners >= torch.tensor(room[:2])) & (corners <= torch.tensor(room[2:]))
-        if not bool(inside.all()) or bool(spot.contains(path, clearance).any()):
+        if not bool(inside.all()) or bool(footprint.contains(path, clearance).any()):
             continue
-        outline = spot.outline()
+        outline = footprint.outline()
         if not any(
-            bool(spot.contains(other.outline(), _GAP).any() or other.contains(outline, _GAP).any())
+            bool(footprint.contains(other.outline(), _GAP).any() or other.contains(outline, _GAP).any())
             for other in taken
         ):
-            return spot
+            return footprint
     return None
 
 
@@ -111,11 +145,11 @@ def _anywhere(room: Room, length: float, width: float, generator: torch.Generato
 
 
 def _at_wall(room: Room, length: float, width: float, generator: torch.Generator) -> Footprint:
-    gap = 0.02 + width / 2  # furniture stands a finger's breadth from the wall
+    offset = 0.02 + width / 2  # furniture stands 2 cm from the wall
     along_x = uniform(0, 1, generator) < 0.5
     near_side = uniform(0, 1, generator) < 0.5
     if along_x:
-        y = room.y_min + gap if near_side else room.y_max - gap
+        y = room.y_min + offset if near_side else room.y_max - offset
         return Footprint(uniform(room.x_min, room.x_max, generator), y, 0.0, length, width)
-    x = room.x_min + gap if near_side else room.x_max - gap
+    x = room.x_min + offset if near_side else room.x_max - offset
     return Footprint(x, uniform(room.y_min, room.y_max, generator), math.pi / 2, length, width)

@@ -1,34 +1,39 @@
-"""Furniture as triangle soups: each function draws one piece and says how to build it where it stands."""
+"""Furniture and pallet racks as triangles (T, 3, 3), metres, z up.
+
+Each of the functions from `table` to `globe` draws one piece at random. `racks` builds rows of pallet racks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.simulation.worlds.floor_plan import Footprint, circle, rectangle, uniform
-from gmmtorch.simulation.worlds.solids import ball, prism
+from gmmtorch.simulation.worlds.floor_plan import Footprint, Piece, circle, rectangle, uniform
+from gmmtorch.simulation.worlds.solids import UNIT_CUBE, ball, copies, prism
 
 CEILING = 4.0
 _BOARD = 0.03
 
+RACK_DEPTH = 1.1
+_UPRIGHT = 0.1
+_PALLET = 0.14
+_GAP = 0.2
+"""Least distance between goods and the deck above, metres."""
 
-class Piece(NamedTuple):
-    """Length and width (m), whether it stands at a wall, and its triangles (T, 3, 3) on a footprint."""
+_SLOTS = 2
 
-    size: tuple[float, float]
-    at_wall: bool
-    build: Callable[[Footprint], Tensor]
+
+# -- furniture of a hall ----------------------------------------------------------------------------
 
 
 def table(generator: torch.Generator) -> Piece:
     """A top on four legs."""
     height = uniform(0.7, 0.8, generator)
 
-    def build(spot: Footprint) -> Tensor:
-        return torch.cat([_slab(spot, height - 0.05, height), _legs(spot, height - 0.05, 0.08)])
+    def build(spot: Footprint) -> list[Tensor]:
+        return [_slab(spot, height - 0.05, height), *_legs(spot, height - 0.05, 0.08)]
 
     return Piece((uniform(1.4, 2.0, generator), uniform(0.8, 1.0, generator)), False, build)
 
@@ -37,23 +42,22 @@ def chair(generator: torch.Generator) -> Piece:
     """A seat on four legs, with a back."""
     height = uniform(0.42, 0.48, generator)
 
-    def build(spot: Footprint) -> Tensor:
+    def build(spot: Footprint) -> list[Tensor]:
         back = spot.to_world(rectangle(0.04, spot.width) + torch.tensor([spot.length / 2 - 0.02, 0.0]))
-        return torch.cat(
-            [_slab(spot, height - 0.04, height), _legs(spot, height - 0.04, 0.05), prism(back, height, 0.95)]
-        )
+        legs = _legs(spot, height - 0.04, 0.05)
+        return [_slab(spot, height - 0.04, height), *legs, prism(back, height, 0.95)]
 
     return Piece((0.45, 0.45), False, build)
 
 
 def shelf(generator: torch.Generator) -> Piece:
-    """Two cheeks, four boards, and boxes on the boards."""
+    """Two side panels, four boards, and boxes on the boards."""
     height = uniform(1.6, 2.2, generator)
     fill = [uniform(0.2, 0.6, generator) for _ in range(3)]
 
-    def build(spot: Footprint) -> Tensor:
+    def build(spot: Footprint) -> list[Tensor]:
         reach = spot.length / 2 - _BOARD / 2
-        cheeks = [
+        panels = [
             prism(spot.to_world(rectangle(_BOARD, spot.width) + torch.tensor([x, 0.0])), 0.0, height)
             for x in (-reach, reach)
         ]
@@ -65,18 +69,18 @@ def shelf(generator: torch.Generator) -> Piece:
             shift = torch.tensor([(0.5 - share) * (spot.length - length) / 2, 0.0])
             outline = spot.to_world(rectangle(length, 0.7 * spot.width) + shift)
             goods.append(prism(outline, level + _BOARD, level + _BOARD + 0.55 * height / 3))
-        return torch.cat([*cheeks, *boards, *goods])
+        return [*panels, *boards, *goods]
 
     return Piece((uniform(1.2, 2.2, generator), uniform(0.35, 0.5, generator)), True, build)
 
 
 def boxes(generator: torch.Generator) -> Piece:
-    """A box with a smaller one on top."""
+    """A box with a smaller box on top."""
     low, high = uniform(0.4, 0.7, generator), uniform(0.2, 0.5, generator)
 
-    def build(spot: Footprint) -> Tensor:
-        lid = spot.to_world(rectangle(0.6 * spot.length, 0.7 * spot.width))
-        return torch.cat([_slab(spot, 0.0, low), prism(lid, low, low + high)])
+    def build(spot: Footprint) -> list[Tensor]:
+        upper = spot.to_world(rectangle(0.6 * spot.length, 0.7 * spot.width))
+        return [_slab(spot, 0.0, low), prism(upper, low, low + high)]
 
     return Piece((uniform(0.5, 1.0, generator), uniform(0.4, 0.7, generator)), False, build)
 
@@ -84,21 +88,21 @@ def boxes(generator: torch.Generator) -> Piece:
 def pillar(generator: torch.Generator) -> Piece:
     """A round pillar from floor to ceiling."""
     diameter = uniform(0.4, 0.6, generator)
-    return Piece((diameter, diameter), False, lambda spot: _drum(spot, CEILING, 16))
+    return Piece((diameter, diameter), False, lambda spot: [_cylinder(spot, CEILING, 16)])
 
 
 def barrel(generator: torch.Generator) -> Piece:
-    """A drum."""
+    """An upright cylinder."""
     height = uniform(0.7, 1.0, generator)
-    return Piece((0.6, 0.6), False, lambda spot: _drum(spot, height, 12))
+    return Piece((0.6, 0.6), False, lambda spot: [_cylinder(spot, height, 12)])
 
 
 def globe(generator: torch.Generator) -> Piece:
     """A large ball on the floor."""
     diameter = uniform(0.7, 1.0, generator)
 
-    def build(spot: Footprint) -> Tensor:
-        return ball((spot.x, spot.y, diameter / 2), diameter / 2)
+    def build(spot: Footprint) -> list[Tensor]:
+        return [ball((spot.x, spot.y, diameter / 2), diameter / 2)]
 
     return Piece((diameter, diameter), False, build)
 
@@ -107,10 +111,126 @@ def _slab(spot: Footprint, bottom: float, top: float) -> Tensor:
     return prism(spot.corners(), bottom, top)
 
 
-def _drum(spot: Footprint, height: float, n_sides: int) -> Tensor:
+def _cylinder(spot: Footprint, height: float, n_sides: int) -> Tensor:
     return prism(spot.to_world(circle(spot.length / 2, n_sides)), 0.0, height)
 
 
-def _legs(spot: Footprint, height: float, width: float) -> Tensor:
+def _legs(spot: Footprint, height: float, width: float) -> list[Tensor]:
     feet = rectangle(spot.length - width, spot.width - width)
-    return torch.cat([prism(spot.to_world(rectangle(width, width) + foot), 0.0, height) for foot in feet])
+    return [prism(spot.to_world(rectangle(width, width) + foot), 0.0, height) for foot in feet]
+
+
+# -- pallet racks -----------------------------------------------------------------------------------
+
+
+class Bays(NamedTuple):
+    """Rack bays, each between two pairs of uprights.
+
+    place: (B, 2) centres, metres. width: metres. spacing: (B,) metres between levels.
+    levels: (B,) int64 number of levels. fill: (B,) share of the pallet places that are occupied.
+    """
+
+    place: Tensor
+    width: float
+    spacing: Tensor
+    levels: Tensor
+    fill: Tensor
+
+
+class _Cuboids(NamedTuple):
+    """Cuboids of bays: index of the bay (N,), centre relative to the bay (N, 3) and size (N, 3), metres.
+
+    The axes are along the row, across the row, and up.
+    """
+
+    bay: Tensor
+    offset: Tensor
+    size: Tensor
+
+
+def racks(bays: Bays, along_y: bool, floor: float, generator: torch.Generator) -> Tensor:
+    """Triangles (T, 3, 3) of bays in rows along x or y, on a floor at height `floor` (m).
+
+    Most levels have a deck; the others have beams only. The lowest pallets stand on the floor.
+    """
+    if len(bays.place) == 0:
+        return torch.zeros(0, 3, 3, dtype=torch.float64)
+    bay, offset, size = _joined(_frames(bays), _levels(bays, generator), _goods(bays, generator))
+    if along_y:
+        offset, size = offset[:, [1, 0, 2]], size[:, [1, 0, 2]]
+    base = torch.nn.functional.pad(bays.place, (0, 1), value=floor)
+    return copies(UNIT_CUBE, base[bay] + offset, size)
+
+
+def _frames(bays: Bays) -> _Cuboids:
+    """Four uprights per bay, and cross bars between the uprights on either side."""
+    height = bays.spacing * bays.levels + 0.2
+    reach = torch.tensor([bays.width - _UPRIGHT, RACK_DEPTH - _UPRIGHT], dtype=torch.float64) / 2
+    feet = torch.cartesian_prod(torch.tensor([-1.0, 1.0]), torch.tensor([-1.0, 1.0])).double() * reach
+    post, bay = _pairs(4, len(height))
+    tall = height[bay]
+    width = torch.full_like(tall, _UPRIGHT)
+    posts = _Cuboids(bay, torch.cat([feet[post], tall[:, None] / 2], 1), torch.stack([width, width, tall], 1))
+    bar, bay = _pairs(10, len(height))
+    above = 0.4 + 1.2 * (bar // 2)
+    along = (2.0 * (bar % 2) - 1) * reach[0]
+    bars = _Cuboids(
+        bay,
+        torch.stack([along, 0 * along, above.double()], 1),
+        torch.tensor([0.04, RACK_DEPTH - _UPRIGHT, 0.04], dtype=torch.float64).expand(len(bay), 3),
+    )
+    within = above < height[bay]
+    return _joined(posts, _Cuboids(*(field[within] for field in bars)))
+
+
+def _levels(bays: Bays, generator: torch.Generator) -> _Cuboids:
+    """Two beams per level, and on most levels a deck."""
+    level, bay = _pairs(int(bays.levels.max()), len(bays.levels))
+    level, bay = level[level < bays.levels[bay]], bay[level < bays.levels[bay]]
+    height = (level + 1) * bays.spacing[bay]
+    flat = torch.zeros_like(height)
+    edge = torch.full_like(height, (RACK_DEPTH - 0.05) / 2)
+    beam = torch.tensor([bays.width, 0.05, 0.12], dtype=torch.float64).expand(len(bay), 3)
+    decked = torch.rand(len(bay), generator=generator) < 0.85
+    deck = torch.tensor([bays.width, RACK_DEPTH - 0.1, 0.03], dtype=torch.float64).expand(len(bay), 3)
+    return _joined(
+        _Cuboids(bay, torch.stack([flat, edge, height - 0.06], 1), beam),
+        _Cuboids(bay, torch.stack([flat, -edge, height - 0.06], 1), beam),
+        _Cuboids(bay[decked], torch.stack([flat, flat, height - 0.015], 1)[decked], deck[decked]),
+    )
+
+
+def _goods(bays: Bays, generator: torch.Generator) -> _Cuboids:
+    """A pallet with a box at each occupied place: on the floor and on every level except the top one."""
+    place, bay = _pairs(_SLOTS * int(bays.levels.max()), len(bays.levels))
+    level, slot = place // _SLOTS, place % _SLOTS
+    draw = torch.rand(6, len(bay), generator=generator, dtype=torch.float64)
+    occupied = (level < bays.levels[bay]) & (draw[0] < bays.fill[bay])
+    level, slot, bay, draw = level[occupied], slot[occupied], bay[occupied], draw[:, occupied]
+    slot_width = (bays.width - 2 * _UPRIGHT) / _SLOTS
+    along = (slot - (_SLOTS - 1) / 2) * slot_width + 0.1 * (draw[1] - 0.5)
+    across = 0.1 * (draw[2] - 0.5)
+    base = level * bays.spacing[bay] + 0.01
+    load = torch.stack(
+        [
+            (0.55 + 0.35 * draw[3]) * slot_width,
+            0.6 + 0.35 * draw[4],
+            (0.25 + 0.75 * draw[5]) * (bays.spacing[bay] - _PALLET - _GAP - 0.12),
+        ],
+        1,
+    )
+    pallet = torch.tensor([0.85 * slot_width, 0.95, _PALLET], dtype=torch.float64).expand(len(bay), 3)
+    return _joined(
+        _Cuboids(bay, torch.stack([along, across, base + _PALLET / 2], 1), pallet),
+        _Cuboids(bay, torch.stack([along, across, base + _PALLET + load[:, 2] / 2], 1), load),
+    )
+
+
+def _pairs(n: int, n_bays: int) -> tuple[Tensor, Tensor]:
+    """All pairs of a number below `n` and a bay, each (n·B,)."""
+    both = torch.cartesian_prod(torch.arange(n), torch.arange(n_bays))
+    return both[:, 0], both[:, 1]
+
+
+def _joined(*cuboids: _Cuboids) -> _Cuboids:
+    return _Cuboids(*(torch.cat(column) for column in zip(*cuboids, strict=True)))

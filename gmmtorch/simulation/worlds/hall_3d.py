@@ -1,16 +1,17 @@
-"""A furnished hall, 14 × 10 × 4 m, as a triangle soup.
+"""A furnished hall, 14 × 10 × 4 m, as triangles.
 
-┌───────────────┬────────┐      a hall with pillars and a smaller room behind a partition with a
+┌───────────────┬────────┐
 │               │        └──────────────┐
 │     hall          room      corridor  │
 │               │        ┌──────────────┘
-└──── ═══ ── ═══┴─ ═══ ──┘      door; three windows to the south, through which nothing returns,
-                                and a corridor to the east, 14 m long
+└──── ═══ ── ═══┴─ ═══ ──┘
+
+A partition with a door separates the hall, which has pillars, from a smaller room. Beams through the three
+southern windows have no return. The corridor to the east is 14 m long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,10 +19,9 @@ from torch import Tensor
 
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.sensors.trajectories import smooth_path
-from gmmtorch.simulation.worlds.floor_plan import Footprint, Room, place
+from gmmtorch.simulation.worlds.floor_plan import DrawPiece, Room, furnish
 from gmmtorch.simulation.worlds.furniture import (
     CEILING,
-    Piece,
     barrel,
     boxes,
     chair,
@@ -37,12 +37,10 @@ _CORRIDOR_CEILING = 2.6
 _HALL = Room(0.1, 0.1, 8.9, 9.9)
 _ROOM = Room(9.1, 0.1, 13.9, 9.9)
 
-Draw = Callable[[torch.Generator], Piece]
-
 Opening = tuple[float, float, float, float]
-"""From, to (m along the wall), sill and head (m above the floor)."""
+"""Begin and end along the wall, and lower and upper edge above the floor, metres."""
 
-# (fixed coordinate, from, to, height, openings) of the walls' middle lines
+# Centre lines of the walls: (fixed coordinate, begin, end, height, openings).
 _WALLS_ALONG_X: tuple[tuple[float, float, float, float, tuple[Opening, ...]], ...] = (
     (0.0, 0.0, 14.0, CEILING, ((1.5, 4.0, 0.9, 2.6), (5.5, 8.0, 0.9, 2.6), (10.5, 12.5, 0.9, 2.6))),
     (10.0, 0.0, 14.0, CEILING, ()),
@@ -56,7 +54,7 @@ _WALLS_ALONG_Y: tuple[tuple[float, float, float, float, tuple[Opening, ...]], ..
     (28.0, 4.0, 6.0, _CORRIDOR_CEILING, ()),
 )
 
-# Three waypoints on a line at every door, so that the path passes it straight.
+# Three waypoints on a line at each door keep the path straight there.
 _TOUR = (
     *((1.6, 5.2), (1.6, 1.7), (5.0, 1.7), (7.2, 2.2), (7.2, 7.8), (4.6, 8.4), (4.2, 5.0), (7.6, 5.0)),
     *((9.0, 5.0), (10.4, 5.0), (11.0, 7.0), (11.5, 8.4), (12.6, 7.6), (12.6, 2.4), (11.5, 1.6)),
@@ -66,33 +64,33 @@ _TOUR = (
 
 @dataclass(frozen=True, eq=False)
 class World3D:
-    """A world of surfaces.
+    """A 3D world of triangles.
 
     Attributes:
-        triangles: (T, 3, 3) corners of the triangles that a sensor sees, metres.
-        path: (P, 2) a walk through it that stays clear of them.
+        triangles: (T, 3, 3) corners of the visible triangles, metres.
+        path: (P, 2) collision-free path through the world, metres.
     """
 
     triangles: Tensor
     path: Tensor
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
-        """Metres (N,) from the origin (3,) along unit directions (N, 3) to the first triangle, or inf."""
+        """Range (N,) in metres from the origin (3,) along unit directions (N, 3); inf without a hit."""
         return ray_triangles(origin, directions, self.triangles)
 
 
 def building_3d(generator: torch.Generator) -> World3D:
-    """The building, its walls always the same, its furniture drawn by the generator."""
+    """The hall with fixed walls and furniture drawn at random."""
     path = smooth_path(torch.tensor(_TOUR, dtype=torch.float64))
-    in_hall: dict[Draw, int] = {pillar: 3, table: 2, shelf: 4, chair: 3, boxes: 2, globe: 1, barrel: 1}
-    in_room: dict[Draw, int] = {table: 1, shelf: 2, chair: 1, boxes: 2, barrel: 1}
-    parts = [
+    in_hall: dict[DrawPiece, int] = {pillar: 3, table: 2, shelf: 4, chair: 3, boxes: 2, globe: 1, barrel: 1}
+    in_room: dict[DrawPiece, int] = {table: 1, shelf: 2, chair: 1, boxes: 2, barrel: 1}
+    surfaces = [
         *_floors_and_ceilings(),
         *_walls(),
-        *_furniture(_HALL, path, generator, in_hall),
-        *_furniture(_ROOM, path, generator, in_room),
+        *furnish(_HALL, path, generator, in_hall),
+        *furnish(_ROOM, path, generator, in_room),
     ]
-    return World3D(torch.cat(parts), path)
+    return World3D(torch.cat(surfaces), path)
 
 
 def _floors_and_ceilings() -> list[Tensor]:
@@ -107,41 +105,23 @@ def _floors_and_ceilings() -> list[Tensor]:
 
 def _walls() -> list[Tensor]:
     half = _THICKNESS / 2
-    parts = []
-    for along_y, walls in ((False, _WALLS_ALONG_X), (True, _WALLS_ALONG_Y)):
-        for across, start, stop, height, openings in walls:
-            for begin, end, bottom, top in _pieces(start - half, stop + half, height, openings):
+    walls = []
+    for along_y, centre_lines in ((False, _WALLS_ALONG_X), (True, _WALLS_ALONG_Y)):
+        for across, start, stop, height, openings in centre_lines:
+            for begin, end, bottom, top in _wall_segments(start - half, stop + half, height, openings):
                 low, high = (begin, across - half), (end, across + half)
                 if along_y:
                     low, high = low[::-1], high[::-1]
-                parts.append(box((*low, bottom), (*high, top)))
-    return parts
+                walls.append(box((*low, bottom), (*high, top)))
+    return walls
 
 
-def _pieces(start: float, stop: float, height: float, openings: tuple[Opening, ...]) -> list[Opening]:
-    """A wall cut into (from, to, bottom, top): between the openings, below their sills, above their heads."""
-    pieces = []
+def _wall_segments(start: float, stop: float, height: float, openings: tuple[Opening, ...]) -> list[Opening]:
+    """Rectangles (begin, end, bottom, top) of a wall: between, below and above its openings."""
+    segments = []
     begin = start
     for left, right, sill, head in openings:
-        pieces += [(begin, left, 0.0, height), (left, right, 0.0, sill), (left, right, head, height)]
+        segments += [(begin, left, 0.0, height), (left, right, 0.0, sill), (left, right, head, height)]
         begin = right
-    pieces.append((begin, stop, 0.0, height))
-    return [piece for piece in pieces if piece[3] > piece[2]]
-
-
-def _furniture(
-    room: Room,
-    path: Tensor,
-    generator: torch.Generator,
-    wanted: dict[Draw, int],
-) -> list[Tensor]:
-    taken: list[Footprint] = []
-    parts: list[Tensor] = []
-    for draw, count in wanted.items():
-        for _ in range(count):
-            piece = draw(generator)
-            spot = place(room, piece.size, path, taken, generator, piece.at_wall)
-            if spot is not None:
-                taken.append(spot)
-                parts.append(piece.build(spot))
-    return parts
+    segments.append((begin, stop, 0.0, height))
+    return [segment for segment in segments if segment[3] > segment[2]]

@@ -1,7 +1,8 @@
-"""A world of triangles from a file, and the places in it where a sensor can be carried."""
+"""Worlds of triangles: checks of a mesh, ray casting, and the places where a sensor can be carried."""
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -9,42 +10,84 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.optional_packages import load_open3d
+
+_log = logging.getLogger(__name__)
+
+_MIN_AREA = 1e-12
+"""Smallest ratio of a triangle's area to the square of its longest edge; below it the triangle is dropped."""
 
 _FLOORS = 8
-"""Floors above one another that are looked for, at most."""
+"""Largest number of floors, one above another, that are searched for."""
 
 _ENCLOSED = 0.75
-"""Share of the level directions in which something must be in sight: outside a tunnel nothing is."""
+"""Share of the horizontal directions in which a surface must be in sight of an indoor place."""
+
+
+def checked_triangles(triangles: Tensor, name: str = "mesh") -> Tensor:
+    """Triangles (T', 3, 3), float64, on the CPU, without those that have no area; logs their number.
+
+    Holes and inverted triangles are accepted: rays hit both faces, and the bounds of the world limit what is
+    visible through a hole. Raises `InvalidArgumentError` for another shape, and `DataError` for a corner
+    that is not finite or a mesh without any triangle that has an area.
+    """
+    if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
+        raise InvalidArgumentError(
+            f"{name}: triangles have shape {tuple(triangles.shape)}; expected (T, 3, 3)."
+        )
+    triangles = triangles.detach().cpu().double()
+    if len(triangles) == 0:
+        raise DataError(f"{name} has no triangles; give a mesh with faces.")
+    broken = ~torch.isfinite(triangles).flatten(1).all(1)
+    if bool(broken.any()):
+        raise DataError(
+            f"{name}: {int(broken.sum())} of {len(triangles)} triangles have a corner that is NaN or "
+            f"infinite, the first is number {int(broken.nonzero()[0])}; repair the mesh, or drop them."
+        )
+    solid = have_area(triangles)
+    n_flat = int((~solid).sum())
+    if n_flat == len(triangles):
+        raise DataError(
+            f"{name}: all {n_flat} triangles have no area; check that the coordinates are neither rounded "
+            "nor flat."
+        )
+    if n_flat:
+        _log.warning("%s: dropped %d of %d triangles that have no area", name, n_flat, len(triangles))
+    return triangles[solid]
+
+
+def have_area(triangles: Tensor) -> Tensor:
+    """Whether each triangle (T, 3, 3) has an area, so that it is not a line or a point: (T,) bool."""
+    edges = triangles.roll(-1, 1) - triangles
+    area = torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1) / 2
+    return area > _MIN_AREA * edges.square().sum(2).amax(1)
 
 
 class MeshWorld:
-    """Triangles (T, 3, 3), metres, z up. Rays are cast by Open3D (Embree), in float32 about the middle.
+    """A world of triangles (T, 3, 3), metres, z up.
 
-    Raises `GmmTorchError` where Open3D does not load.
+    Open3D (Embree) casts the rays, in float32 relative to the centre of the mesh. Raises `GmmTorchError` if
+    Open3D does not load.
     """
 
     def __init__(self, triangles: Tensor) -> None:
-        try:
-            import open3d
-        except (ImportError, OSError) as error:
-            raise GmmTorchError(
-                f"Rays cannot be cast in a mesh, because Open3D does not load: {error}. On Debian or Ubuntu "
-                "scripts/setup.sh installs the libraries it needs."
-            ) from error
+        open3d = load_open3d("Rays cannot be cast in a mesh")
         corners = triangles.detach().double().cpu().reshape(-1, 3)
         self.low, self.high = corners.amin(0), corners.amax(0)
         self._middle = (self.low + self.high) / 2
-        core: Any = open3d.core
-        self._tensor = core.Tensor
+        self._tensor = open3d.core.Tensor
         self._scene: Any = open3d.t.geometry.RaycastingScene()
         faces = np.arange(corners.shape[0], dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(self._tensor((corners - self._middle).float().numpy()), self._tensor(faces))
 
     def distances(self, origin: Tensor, directions: Tensor, threads: int = 0) -> Tensor:
-        """Metres (N,) from the origin (D,) or origins (N, D) along unit directions (N, D), or inf.
+        """Distances (N,) in metres to the first surface along unit directions (N, 3); inf if none is hit.
 
-        `threads`: how many cast rays; 0 for as many as there are cores.
+        Args:
+            origin: (3,), or (N, 3) for one origin per ray.
+            directions: (N, 3).
+            threads: number of threads; 0 uses all cores.
         """
         starts = (origin - self._middle).expand_as(directions)
         rays = torch.cat([starts, directions], 1).float().contiguous()
@@ -52,7 +95,10 @@ class MeshWorld:
         return torch.from_numpy(cast["t_hit"].numpy()).double()
 
     def clearance(self, points: Tensor, threads: int = 0) -> Tensor:
-        """Metres (N,) from each point (N, 3) to the nearest surface; `threads` as for `distances`."""
+        """Distance (N,) in metres from each point (N, 3) to the nearest surface.
+
+        `threads` is the number of threads; 0 uses all cores.
+        """
         moved = (points - self._middle).float().contiguous().numpy()
         found = self._scene.compute_distance(self._tensor(moved), nthreads=threads)
         return torch.from_numpy(found.numpy()).double()
@@ -60,10 +106,10 @@ class MeshWorld:
     def standing_places(
         self, height: float = 1.2, clearance: float = 0.4, spacing: float = 1.0, sight: float = 30.0
     ) -> Tensor:
-        """Places (P, 3) `height` metres above a floor, on a lattice of columns `spacing` metres apart.
+        """Indoor places (P, 3) at `height` metres above a floor, on a horizontal grid of `spacing` metres.
 
-        They keep `clearance` metres from every surface, and see something within `sight` metres in most
-        level directions: so they are inside.
+        Each place is at least `clearance` metres from every surface. In at least three quarters of the
+        horizontal directions a surface is within `sight` metres, so places outside the building are excluded.
         """
         for name, value in (("height", height), ("clearance", clearance), ("spacing", spacing)):
             if not (math.isfinite(value) and value > 0):
@@ -78,9 +124,9 @@ class MeshWorld:
         places = []
         for _ in range(_FLOORS):
             starts = torch.cat([columns, top], 1)
-            fall = self.distances(starts, down.expand_as(starts))
-            met = torch.isfinite(fall)
-            columns, floor = columns[met], (top[met, 0] - fall[met])[:, None]
+            drop = self.distances(starts, down.expand_as(starts))
+            hit = torch.isfinite(drop)
+            columns, floor = columns[hit], (top[hit, 0] - drop[hit])[:, None]
             if len(columns) == 0:
                 break
             places.append(torch.cat([columns, floor + height], 1))
@@ -89,9 +135,9 @@ class MeshWorld:
             return torch.empty(0, 3, dtype=torch.float64)
         found = torch.cat(places)
         found = found[self.clearance(found) >= min(clearance, height)]
-        return found[self._enclosed(found, sight)]
+        return found[self._is_enclosed(found, sight)]
 
-    def _enclosed(self, points: Tensor, sight: float) -> Tensor:
+    def _is_enclosed(self, points: Tensor, sight: float) -> Tensor:
         angle = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
         level = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
         starts = points.repeat_interleave(16, 0)
@@ -99,13 +145,12 @@ class MeshWorld:
         return seen.view(-1, 16).double().mean(1) >= _ENCLOSED
 
     def tour(self, n: int, stride: int = 2, spacing: float = 1.0, **options: float) -> Tensor:
-        """`n` places (n, 3) in the order of a walk through the largest connected part of the world.
+        """`n` places (n, 3) along a path through the largest connected part of the world.
 
-        Neighbouring standing places are connected where one sees the other. The walk goes from one end
-        to the place that is farthest from all it has been to, and on from there; it stops at every
-        `stride`-th place, sooner where everything has been seen before `n` stops. Raises
-        `InvalidArgumentError` where there is no place to stand. `options` are those of
-        `standing_places`.
+        Standing places within 1.5 `spacing` are connected if they see each other. The path starts at one end
+        of the part and always continues to the place that is farthest from all visited places. It stops at
+        every `stride`-th place, or more often if it covers the part before the n-th stop. `options` are
+        those of `standing_places`. Raises `InvalidArgumentError` if there is no standing place.
         """
         check_whole("n", n, 1)
         check_whole("stride", stride, 1)
@@ -113,15 +158,15 @@ class MeshWorld:
         if len(places) == 0:
             size = " × ".join(f"{x:.3g}" for x in (self.high - self.low).tolist())
             raise InvalidArgumentError(
-                f"The mesh of {size} m has no place where a sensor could be carried: a floor with walls "
-                "around it, and room to pass. Check that z is up and that lengths are metres."
+                f"The mesh of {size} m has no place where a sensor can be carried: a floor with walls "
+                "around it and enough room to pass. Check that z is up and that lengths are in metres."
             )
         walk = _walk(self._connections(places, 1.5 * spacing), 1 + stride * (n - 1), 3 * spacing)
         stops = np.linspace(0, min(len(walk) - 1, stride * (n - 1)), n).round().astype(np.int64)
         return places[torch.from_numpy(walk[stops])]
 
     def _connections(self, places: Tensor, reach: float) -> Any:
-        """Sparse matrix of the distances between places (P, 3) within `reach` that see each other."""
+        """Sparse matrix of distances between places (P, 3) that are within `reach` and see each other."""
         from scipy.sparse import coo_matrix
         from scipy.spatial import cKDTree
 
@@ -135,23 +180,26 @@ class MeshWorld:
 
 
 def _walk(graph: Any, n: int, reach: float) -> np.ndarray:
-    """Nodes (W,) of a walk in the largest connected part, W ≤ n, that ends when all are within `reach`."""
+    """Nodes (W,), W ≤ n, of a walk through the largest connected part of a graph.
+
+    It ends when every node of the part is within `reach` metres of a visited node.
+    """
     from scipy.sparse.csgraph import connected_components, dijkstra
 
     _, label = connected_components(graph, directed=False)
-    part = np.flatnonzero(label == np.bincount(label).argmax())
-    here = int(part[0])
-    here = int(part[dijkstra(graph, directed=False, indices=here)[part].argmax()])  # an end of it
+    largest = np.flatnonzero(label == np.bincount(label).argmax())
+    here = int(largest[0])
+    here = int(largest[dijkstra(graph, directed=False, indices=here)[largest].argmax()])  # one end
     walk = [here]
     while len(walk) < n:
-        unseen = dijkstra(graph, directed=False, indices=np.unique(walk), min_only=True)[part]
-        if unseen.max() <= reach:
+        distance = dijkstra(graph, directed=False, indices=np.unique(walk), min_only=True)[largest]
+        if distance.max() <= reach:
             break
-        target = int(part[unseen.argmax()])
+        target = int(largest[distance.argmax()])
         _, before = dijkstra(graph, directed=False, indices=here, return_predecessors=True)
-        way = [target]
-        while way[-1] != here:
-            way.append(int(before[way[-1]]))
-        walk += way[-2::-1]
+        path = [target]
+        while path[-1] != here:
+            path.append(int(before[path[-1]]))
+        walk += path[-2::-1]
         here = target
     return np.asarray(walk[:n], dtype=np.int64)

@@ -1,26 +1,35 @@
-"""One floor of an office building as a laser sees it, 30 × 20 m: line segments a hand above the floor.
+"""An office floor, 30 × 20 m, as line segments at the height of a planar laser.
 
 ┌──────┬──────┬───────────────┐
-│ room │ room │     hall      │   a corridor 30 m long, longer than most lasers see,
-├─ ────┴ ─────┴──  ────────  ─┤   a short one off it to the south, six rooms and a hall with
-│          corridor           │   pillars; walls are 20 cm thick
+│ room │ room │     hall      │
+├─ ────┴ ─────┴──  ────────  ─┤
+│          corridor           │
 ├─ ────┬ ─────┐  ┌──────┬─ ───┤
 │ room │ room │  │ room   room │
 └──────┴──────┴──┴──────┴─────┘
+
+The corridor is 30 m long, beyond the range of most lasers; a short corridor leads south. There are six rooms
+and a hall with pillars. Walls are 20 cm thick.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments
 from gmmtorch.simulation.sensors.trajectories import smooth_path
-from gmmtorch.simulation.worlds.floor_plan import Footprint, Room, circle, place, rectangle, uniform
+from gmmtorch.simulation.worlds.floor_plan import (
+    Footprint,
+    Piece,
+    Room,
+    circle,
+    furnish,
+    rectangle,
+    uniform,
+)
 
 _THICKNESS = 0.2
 _CORRIDOR = Room(0.1, 9.1, 29.9, 11.3)
@@ -34,7 +43,7 @@ _ROOMS = (
 )
 _HALL = Room(14.1, 11.5, 29.9, 19.9)
 
-# (fixed coordinate, from, to, doors as (from, to)) of the walls' middle lines
+# Centre lines of the walls: (fixed coordinate, begin, end, doors as (begin, end)), metres.
 _WALLS_ALONG_X: tuple[tuple[float, float, float, tuple[tuple[float, float], ...]], ...] = (
     (0.0, 0.0, 30.0, ()),
     (20.0, 0.0, 30.0, ()),
@@ -52,7 +61,7 @@ _WALLS_ALONG_Y: tuple[tuple[float, float, float, tuple[tuple[float, float], ...]
     (14.0, 11.4, 20.0, ()),
 )
 
-# Three waypoints on a line at every door, so that the path passes it straight.
+# Three waypoints on a line at each door keep the path straight there.
 _TOUR = (
     *((1.0, 10.2), (3.5, 10.2), (3.5, 9.0), (3.5, 7.8), (1.9, 7.0), (1.9, 1.9), (5.1, 1.9), (5.1, 7.0)),
     *((3.5, 7.8), (3.5, 9.0), (3.5, 10.2), (10.5, 10.2), (10.5, 9.0), (10.5, 7.8), (8.9, 7.0), (8.9, 1.9)),
@@ -69,29 +78,29 @@ _TOUR = (
 
 @dataclass(frozen=True, eq=False)
 class World2D:
-    """A plane world.
+    """A plane world of line segments.
 
     Attributes:
-        segments: (S, 2, 2) ends of the line segments that a laser sees, metres.
-        path: (P, 2) a walk through it that stays clear of them.
+        segments: (S, 2, 2) end points of the visible line segments, metres.
+        path: (P, 2) collision-free path through the world, metres.
     """
 
     segments: Tensor
     path: Tensor
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
-        """Metres (N,) from the origin (2,) along unit directions (N, 2) to the first segment, or inf."""
+        """Range (N,) in metres from the origin (2,) along unit directions (N, 2); inf without a hit."""
         return ray_segments(origin, directions, self.segments)
 
 
 def building_2d(generator: torch.Generator) -> World2D:
-    """The building, its walls and doors always the same, its furniture drawn by the generator."""
+    """The office with fixed walls and doors, and furniture drawn at random."""
     path = smooth_path(torch.tensor(_TOUR, dtype=torch.float64))
     polygons = [*_walls()]
     for room in _ROOMS:
-        polygons += _furniture(room, path, generator, {_shelf: 4, _table: 2, _desk: 2, _bin: 3})
-    polygons += _furniture(_HALL, path, generator, {_pillar: 6, _shelf: 4, _table: 4, _desk: 2, _bin: 4})
-    polygons += _furniture(_CORRIDOR, path, generator, {_cabinet: 5})
+        polygons += furnish(room, path, generator, {_shelf: 4, _table: 2, _desk: 2, _bin: 3})
+    polygons += furnish(_HALL, path, generator, {_pillar: 6, _shelf: 4, _table: 4, _desk: 2, _bin: 4})
+    polygons += furnish(_CORRIDOR, path, generator, {_cabinet: 5})
     return World2D(torch.cat([_sides(polygon) for polygon in polygons]), path)
 
 
@@ -111,30 +120,6 @@ def _walls() -> list[Tensor]:
                 centre = (across, middle) if along_y else (middle, across)
                 polygons.append(rectangle(*size) + torch.tensor(centre, dtype=torch.float64))
                 begin = door_stop
-    return polygons
-
-
-class Piece(NamedTuple):
-    """Length and width (m), whether it stands at a wall, and what is seen of it (polygons) on a footprint."""
-
-    size: tuple[float, float]
-    at_wall: bool
-    polygons: Callable[[Footprint], list[Tensor]]
-
-
-Draw = Callable[[torch.Generator], Piece]
-
-
-def _furniture(room: Room, path: Tensor, generator: torch.Generator, wanted: dict[Draw, int]) -> list[Tensor]:
-    taken: list[Footprint] = []
-    polygons: list[Tensor] = []
-    for draw, count in wanted.items():
-        for _ in range(count):
-            piece = draw(generator)
-            spot = place(room, piece.size, path, taken, generator, piece.at_wall)
-            if spot is not None:
-                taken.append(spot)
-                polygons += piece.polygons(spot)
     return polygons
 
 

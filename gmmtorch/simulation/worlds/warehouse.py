@@ -1,8 +1,8 @@
-"""A furnished warehouse of any size: racks with goods, aisles, a partition with doors, pipes and rails.
+"""A furnished warehouse of any size: racks with goods, aisles, partitions with doors, pipes and rails.
 
-The floor is divided into zones by partition walls. A zone holds rows of pallet racks along x or y with
-cross aisles between their blocks, or piles of crates on the floor with an office and a mezzanine. A corner
-of the first zone is left open: there goods are received, and robots start.
+Partition walls divide the floor into zones. A zone contains either rows of pallet racks along x or y with
+cross aisles between blocks of racks, or stacks of crates with an office and a mezzanine. One corner of the
+first zone is open: it is the receiving area, where robots start.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.simulation.worlds.floor_plan import Room, circle, uniform
-from gmmtorch.simulation.worlds.pallet_racks import RACK_DEPTH, Bays, racks
-from gmmtorch.simulation.worlds.solids import box, copies, prism
+from gmmtorch.simulation.worlds.furniture import RACK_DEPTH, Bays, racks
+from gmmtorch.simulation.worlds.solids import UNIT_CUBE, box, copies, prism
 
 _SHELL = 0.13
-"""Thickness (m) of floor, walls and ceiling, whose inside alone is drawn: no usual lattice has a plane
-there, so rays that end on them fall into one layer of cells."""
+"""Thickness of floor, outer walls and ceiling (m). Only their inner faces are drawn. The faces do not lie on
+the planes of usual grids, so all rays that end on a face fall into one layer of cells."""
 
-_LEAST = (15.0, 12.0, 4.0)
-_MOST = 2000.0
+_MIN_SIZE = (15.0, 12.0, 4.0)
+_MAX_SIZE = 2000.0
 _STAGING = 9.0
 _CROSS_AISLE = 3.4
 _AISLE = 2.5
-_CUBE = box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-_DRUM = prism(circle(0.5, 10), -0.5, 0.5)
-_PIPE = _DRUM[..., [2, 0, 1]]  # along x
+_UNIT_CYLINDER = prism(circle(0.5, 10), -0.5, 0.5)
+_UNIT_PIPE = _UNIT_CYLINDER[..., [2, 0, 1]]  # along x
 
 
 def warehouse(seed: int = 0, size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tensor:
-    """Triangles (T, 3, 3), float64, of a warehouse of `size` (m) whose lowest outer corner is the origin.
+    """Triangles (T, 3, 3), float64, of a warehouse in the box from the origin to `size` (m).
 
     The same seed and size give the same warehouse. Raises `InvalidArgumentError` for a size below
     15 × 12 × 4 m or above 2 km.
@@ -57,21 +56,22 @@ def warehouse(seed: int = 0, size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tenso
             parts += (
                 _stacks(zone, ceiling, generator) if stacked else _rack_zone(zone, ceiling, i + j, generator)
             )
-    # Walls and girders were drawn from end to end: they stop at the inside of the shell.
+    # Walls and girders are drawn over the full size; here they are cut at the inner faces.
     return torch.cat(parts).clamp(_size(*low), _size(*high))
 
 
 def warehouse_start(size: Sequence[float] = (50.0, 40.0, 8.0)) -> Tensor:
-    """A place (3,), metres, in the open corner of a warehouse of `size`, with room for robots around it."""
+    """Start position (3,), metres, in the open corner of a warehouse, with room for several robots."""
     _checked(size)
     return torch.tensor([4.6, 4.6, 1.3], dtype=torch.float64)
 
 
 def _checked(size: Sequence[float]) -> tuple[float, float, float]:
     values = tuple(float(x) for x in size)
-    if len(values) != 3 or not all(low <= x <= _MOST for low, x in zip(_LEAST, values, strict=True)):
+    if len(values) != 3 or not all(low <= x <= _MAX_SIZE for low, x in zip(_MIN_SIZE, values, strict=True)):
         raise InvalidArgumentError(
-            f"size={size} must be length, width and height of at least {_LEAST} and at most {_MOST:.0f} m."
+            f"size={size} must be length, width and height of at least {_MIN_SIZE} and at most "
+            f"{_MAX_SIZE:.0f} m."
         )
     return values
 
@@ -79,7 +79,7 @@ def _checked(size: Sequence[float]) -> tuple[float, float, float]:
 def _cuts(
     length: float, about: float, weights: tuple[float, float], generator: torch.Generator
 ) -> list[float]:
-    """Where zones begin and end along an axis, 0 and `length` among them: zones of `about` metres."""
+    """Borders of zones along an axis, from 0 to `length`; zones are about `about` metres long."""
     n = max(1, round(length / about))
     share = torch.tensor([weights[k % 2] * uniform(0.95, 1.05, generator) for k in range(n)])
     return [0.0, *(length * (share.cumsum(0) / share.sum())).tolist()[:-1], length]
@@ -94,23 +94,23 @@ def _chance(probability: float, n: int, generator: torch.Generator) -> Tensor:
 
 
 def _partitions(xs: list[float], ys: list[float], ceiling: float, generator: torch.Generator) -> Tensor:
-    """Walls between the zones, each with doors, some of them lower than the ceiling."""
+    """Walls with doors between the zones. Some are lower than the ceiling."""
     parts = [torch.zeros(0, 3, 3, dtype=torch.float64)]
     for cuts, others, swap in ((xs, ys, False), (ys, xs, True)):
         for at in cuts[1:-1]:
             for begin, end in itertools.pairwise(others):
                 top = ceiling if uniform(0, 1, generator) < 0.7 else min(ceiling, 4.0)
-                pieces = _wall(begin, end, top, generator)
-                center = torch.tensor([(at, (a + b) / 2, (c + d) / 2) for a, b, c, d in pieces]).double()
-                extent = torch.tensor([(0.15, b - a, d - c) for a, b, c, d in pieces]).double()
+                wall = _wall(begin, end, top, generator)
+                center = torch.tensor([(at, (a + b) / 2, (c + d) / 2) for a, b, c, d in wall]).double()
+                extent = torch.tensor([(0.15, b - a, d - c) for a, b, c, d in wall]).double()
                 if swap:
                     center, extent = center[:, [1, 0, 2]], extent[:, [1, 0, 2]]
-                parts.append(copies(_CUBE, center, extent))
+                parts.append(copies(UNIT_CUBE, center, extent))
     return torch.cat(parts)
 
 
 def _wall(begin: float, end: float, top: float, generator: torch.Generator) -> list[tuple[float, ...]]:
-    """(from, to, bottom, top) of the pieces of a wall: between its doors, and above them."""
+    """Rectangles (begin, end, bottom, top) of a wall: between its doors and above them."""
     n_doors = max(2, round((end - begin) / 14.0))
     span = (end - begin) / n_doors
     pieces, last = [], begin
@@ -124,7 +124,7 @@ def _wall(begin: float, end: float, top: float, generator: torch.Generator) -> l
 
 
 def _under_ceiling(length: float, width: float, ceiling: float, generator: torch.Generator) -> Tensor:
-    """Girders across, lamps below them, and pipes along."""
+    """Girders along y, lamps below them, and pipes along x."""
     girders = torch.arange(3.0, length - 1, 6.2, dtype=torch.float64)
     across = torch.full_like(girders, width / 2)
     pipes = torch.arange(2.5, width - 1, 7.7, dtype=torch.float64)
@@ -134,13 +134,12 @@ def _under_ceiling(length: float, width: float, ceiling: float, generator: torch
     lamp = torch.cat([lamps, torch.full_like(lamps[:, :1], ceiling - 0.75)], 1)
     pipe = torch.stack([torch.full_like(pipes, length / 2), pipes, ceiling - depth], 1)
     thick = _draw(0.06, 0.16, len(pipes), generator)
+    girder = torch.stack([girders, across, across * 0 + ceiling - 0.25], 1)
     return torch.cat(
         [
-            copies(
-                _CUBE, torch.stack([girders, across, across * 0 + ceiling - 0.25], 1), _size(0.2, width, 0.5)
-            ),
-            copies(_CUBE, lamp, _size(1.4, 0.18, 0.09)),
-            copies(_PIPE, pipe, torch.stack([thick * 0 + length, thick, thick], 1)),
+            copies(UNIT_CUBE, girder, _size(0.2, width, 0.5)),
+            copies(UNIT_CUBE, lamp, _size(1.4, 0.18, 0.09)),
+            copies(_UNIT_PIPE, pipe, torch.stack([thick * 0 + length, thick, thick], 1)),
         ]
     )
 
@@ -150,12 +149,12 @@ def _size(x: float, y: float, z: float) -> Tensor:
 
 
 def _on_floor(places: Tensor, size: Tensor, base: float | Tensor = _SHELL) -> Tensor:
-    """Centres (N, 3) of solids of size (N, 3) that stand on places (N, 2)."""
+    """Centres (N, 3) of solids of size (N, 3) that stand at positions (N, 2), at height `base` (m)."""
     return torch.cat([places, (base + size[:, 2] / 2)[:, None]], 1)
 
 
 def _staging(generator: torch.Generator) -> Tensor:
-    """Pallets along the walls of the open corner, a packing table, and a handrail with a gap."""
+    """Pallets along the walls of the open corner, drums, and a handrail with a gap."""
     along = torch.arange(2.0, _STAGING - 0.5, 1.6, dtype=torch.float64)
     places = torch.cat([torch.stack([along, 0 * along + 0.9], 1), torch.stack([0 * along + 0.9, along], 1)])
     places = places[_chance(0.7, len(places), generator)]
@@ -167,9 +166,9 @@ def _staging(generator: torch.Generator) -> Tensor:
     drums = torch.tensor([[8.3, 2.2], [8.6, 2.9], [7.8, 2.7]], dtype=torch.float64)
     drum = _size(0.6, 0.6, 0.9).expand(3, 3)
     parts = [
-        copies(_CUBE, _on_floor(places, pallet), pallet),
-        copies(_CUBE, _on_floor(places, load, _SHELL + 0.14), load, _draw(-0.2, 0.2, n, generator)),
-        copies(_DRUM, _on_floor(drums, drum), drum),
+        copies(UNIT_CUBE, _on_floor(places, pallet), pallet),
+        copies(UNIT_CUBE, _on_floor(places, load, _SHELL + 0.14), load, _draw(-0.2, 0.2, n, generator)),
+        copies(_UNIT_CYLINDER, _on_floor(drums, drum), drum),
         _handrail(torch.tensor([[_STAGING, 0.4], [_STAGING, 3.4]]).double()),
         _handrail(torch.tensor([[_STAGING, 6.2], [_STAGING, _STAGING]]).double()),
     ]
@@ -177,7 +176,7 @@ def _staging(generator: torch.Generator) -> Tensor:
 
 
 def _handrail(ends: Tensor, base: float = _SHELL) -> Tensor:
-    """Posts and two bars (T, 3, 3) between two places (2, 2)."""
+    """Posts and two bars (T, 3, 3) between two points (2, 2) on a floor at height `base` (m)."""
     run = ends[1] - ends[0]
     length, heading = float(run.norm()), torch.atan2(run[1], run[0])
     share = torch.linspace(0, 1, max(2, round(length / 1.5) + 1), dtype=torch.float64)
@@ -186,14 +185,14 @@ def _handrail(ends: Tensor, base: float = _SHELL) -> Tensor:
     bars = torch.cat([ends.mean(0).expand(2, 2), torch.tensor([[base + 0.55], [base + 1.1]]).double()], 1)
     return torch.cat(
         [
-            copies(_CUBE, _on_floor(posts, post, base), post),
-            copies(_CUBE, bars, _size(length, 0.045, 0.045), heading.expand(2)),
+            copies(UNIT_CUBE, _on_floor(posts, post, base), post),
+            copies(UNIT_CUBE, bars, _size(length, 0.045, 0.045), heading.expand(2)),
         ]
     )
 
 
 def _rack_zone(zone: Room, ceiling: float, turn: int, generator: torch.Generator) -> list[Tensor]:
-    """Double rows of racks along x, or in every other zone along y, and pillars between them."""
+    """Double rows of racks, along x in even zones and along y in odd ones, with pillars between them."""
     swap = turn % 2 == 1
     low, high = (zone.x_min, zone.y_min), (zone.x_max, zone.y_max)
     if swap:
@@ -220,7 +219,7 @@ def _rack_zone(zone: Room, ceiling: float, turn: int, generator: torch.Generator
     )
     width = block / n_bays
     place = torch.stack([flue[which, 0] + (k + 0.5) * width, flue[which, 1] + side[s]], 1)
-    kept = ~_chance(0.06, len(place), generator)  # a bay that was taken down
+    kept = ~_chance(0.06, len(place), generator)  # some bays are missing
     pillars = flue + torch.tensor([0.2, 0.0])
     if swap:
         place, pillars = place.flip(1), pillars.flip(1)
@@ -230,11 +229,11 @@ def _rack_zone(zone: Room, ceiling: float, turn: int, generator: torch.Generator
     which, place = which[kept], place[kept]
     bays = Bays(place, width, levels_apart[which], n_levels[which].long(), fill[which])
     pillar = _size(0.35, 0.35, ceiling - _SHELL).expand(len(pillars), 3)
-    return [racks(bays, swap, _SHELL, generator), copies(_CUBE, _on_floor(pillars, pillar), pillar)]
+    return [racks(bays, swap, _SHELL, generator), copies(UNIT_CUBE, _on_floor(pillars, pillar), pillar)]
 
 
 def _stacks(zone: Room, ceiling: float, generator: torch.Generator) -> list[Tensor]:
-    """Blocks of piled crates and drums with lanes between them, an office, and a mezzanine."""
+    """Stacks of crates and drums in blocks with lanes between them, an office, and a mezzanine."""
     corner = torch.tensor([zone.x_max - 3.0, zone.y_max - 3.2], dtype=torch.float64)
     deck = torch.tensor([zone.x_min + 5.2, zone.y_max - 4.6], dtype=torch.float64)
     pitch = torch.tensor([3 * 1.3 + _AISLE, 2 * 1.2 + _AISLE + 0.2], dtype=torch.float64)
@@ -260,26 +259,26 @@ def _stacks(zone: Room, ceiling: float, generator: torch.Generator) -> list[Tens
             on
         ]
         turned = _draw(-0.05, 0.05, n, generator)[on]
-        crates.append(copies(_CUBE, _on_floor(places[on], size, _SHELL + level * each[on]), size, turned))
+        crates.append(copies(UNIT_CUBE, _on_floor(places[on], size, _SHELL + level * each[on]), size, turned))
     drums = places[(high == 0) & _chance(0.6, n, generator)]
     drum = _size(0.6, 0.6, 0.9).expand(len(drums), 3)
     return [
         *crates,
-        copies(_DRUM, _on_floor(drums, drum), drum),
+        copies(_UNIT_CYLINDER, _on_floor(drums, drum), drum),
         _office(corner, generator),
         *_mezzanine(deck, ceiling),
     ]
 
 
 def _office(center: Tensor, generator: torch.Generator) -> Tensor:
-    """A room of 4.4 × 4.8 m with a door and a window, a desk and a cupboard, about a place (2,)."""
+    """A room of 4.4 × 4.8 m around a point (2,), with a door, a window, a desk and a cupboard."""
     rows = [
-        # x, y, z of the middle, and the size
+        # x, y, z of the centre, then the size
         (-2.2, -1.6, 1.4, 0.1, 1.6, 2.8),
         (-2.2, 1.3, 1.4, 0.1, 2.2, 2.8),
-        (-2.2, -0.3, 2.55, 0.1, 1.0, 0.5),  # over the door; the room behind it is dark to larger robots
+        (-2.2, -0.3, 2.55, 0.1, 1.0, 0.5),  # above the door
         (0.0, -2.4, 0.5, 4.4, 0.1, 1.0),
-        (0.0, -2.4, 2.4, 4.4, 0.1, 0.8),  # between them a window
+        (0.0, -2.4, 2.4, 4.4, 0.1, 0.8),  # with the row above: a window between them
         (-1.7, -2.4, 1.5, 1.0, 0.1, 1.0),
         (1.7, -2.4, 1.5, 1.0, 0.1, 1.0),
         (2.2, 0.0, 1.4, 0.1, 4.8, 2.8),
@@ -292,11 +291,11 @@ def _office(center: Tensor, generator: torch.Generator) -> Tensor:
     table = torch.tensor(rows, dtype=torch.float64)
     table[11, 0] += uniform(-0.4, 0.4, generator)
     base = torch.tensor([float(center[0]), float(center[1]), _SHELL], dtype=torch.float64)
-    return copies(_CUBE, table[:, :3] + base, table[:, 3:])
+    return copies(UNIT_CUBE, table[:, :3] + base, table[:, 3:])
 
 
 def _mezzanine(center: Tensor, ceiling: float) -> list[Tensor]:
-    """A platform of 7 × 5 m on posts with a handrail around it, where the ceiling is high enough."""
+    """A platform of 7 × 5 m on posts, with a handrail around it; nothing if the ceiling is too low."""
     height = 3.1
     if ceiling < height + 2.5:
         return []
@@ -307,4 +306,8 @@ def _mezzanine(center: Tensor, ceiling: float) -> list[Tensor]:
     post = _size(0.16, 0.16, height - _SHELL).expand(6, 3)
     slab = torch.tensor([[float(center[0]), float(center[1]), height + 0.1]], dtype=torch.float64)
     rails = [_handrail(torch.stack([corners[k], corners[k - 1]]), height + 0.2) for k in range(4)]
-    return [copies(_CUBE, _on_floor(inner, post), post), copies(_CUBE, slab, _size(7.0, 5.0, 0.2)), *rails]
+    return [
+        copies(UNIT_CUBE, _on_floor(inner, post), post),
+        copies(UNIT_CUBE, slab, _size(7.0, 5.0, 0.2)),
+        *rails,
+    ]

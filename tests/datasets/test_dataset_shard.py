@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets.dataset_shard import SPLITS, Part, part_of
+from gmmtorch.datasets.dataset_shard import SPLITS, DatasetShard, shard_indices
 from gmmtorch.errors import InvalidArgumentError
 
 
 @given(n_scans=st.integers(0, 200), n=st.integers(1, 20), split=st.sampled_from(SPLITS))
 def test_every_scan_is_one_robots_and_all_have_as_many(n_scans, n, split):
-    parts = [list(part_of(n_scans, k, n, split)) for k in range(n)]
+    parts = [list(shard_indices(n_scans, k, n, split)) for k in range(n)]
     assert sorted(itertools.chain(*parts)) == list(range(n_scans))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     for part in parts:
@@ -36,7 +36,7 @@ def test_every_scan_is_one_robots_and_all_have_as_many(n_scans, n, split):
 )
 def test_bad_parts(args, name):
     with pytest.raises(InvalidArgumentError, match=name):
-        part_of(*args)
+        shard_indices(*args)
 
 
 def test_a_part_reads_what_it_is_asked_for_and_no_more():
@@ -47,7 +47,7 @@ def test_a_part_reads_what_it_is_asked_for_and_no_more():
             read.append(index)
             return f"scan {index}"
 
-    part = Part(Scans(), part_of(10, 1, 3))
+    part = DatasetShard(Scans(), shard_indices(10, 1, 3))
     assert (len(part), part[1], part[-1]) == (3, "scan 4", "scan 7")
     assert list(part[1:]) == ["scan 4", "scan 7"]
     assert list(part) == ["scan 1", "scan 4", "scan 7"]

@@ -1,0 +1,213 @@
+"""PCD and PLY files: their headers, the position of the points in them, and reading them with Open3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError
+from gmmtorch.optional_packages import load_open3d
+
+AXES = ("x", "y", "z")
+_HEADER_BYTES = 1 << 16
+_PLY_CODES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+class Layout(NamedTuple):
+    """The position of the points in a PCD or PLY file of text lines or binary records.
+
+    skip: lines (text) or bytes (binary) before the first point. width: numbers per line, or bytes per record.
+    axes: of x, y and z, the column (text), or the dtype and byte offset (binary).
+    """
+
+    skip: int
+    width: int
+    axes: list[Any]
+
+
+class CloudHeader(NamedTuple):
+    """What the header of a PCD or PLY file announces.
+
+    n_points: number of points. is_text: text lines, or binary records. n_bytes: size of the header.
+    length: least number of words (text) or bytes (binary) after the header.
+    layout: None if the file can only be read as a whole.
+    """
+
+    n_points: int
+    is_text: bool
+    n_bytes: int
+    length: int
+    layout: Layout | None
+
+
+def read_cloud(path: Path) -> Tensor:
+    """Points (N, 3), float64, of a PCD or PLY file, including rows with NaN.
+
+    Raises `DataError` if the file is unreadable or shorter than its header announces.
+    """
+    open3d = load_open3d(f"{path} cannot be read")
+    header = read_header(path)
+    check_length(path, header)
+    try:
+        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+            cloud = open3d.t.io.read_point_cloud(path)
+            points = cloud.point.positions.numpy() if "positions" in cloud.point else np.empty((0, 3))
+    except (RuntimeError, KeyError) as error:
+        raise DataError(f"{path} cannot be read as a point cloud: {error}") from error
+    if points.shape[0] != header.n_points:
+        raise DataError(
+            f"{path} announces {header.n_points} points, but {points.shape[0]} could be read; the file is "
+            "truncated or not a point cloud. Write it again."
+        )
+    return torch.from_numpy(points.astype(np.float64))
+
+
+def read_header(path: Path) -> CloudHeader:
+    """The header of a PCD file (suffix .pcd) or a PLY file. Raises `DataError` if it is damaged."""
+    try:
+        return _pcd_cloud_header(path) if path.suffix.lower() == ".pcd" else _ply_cloud_header(path)
+    except (ValueError, KeyError, IndexError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error
+
+
+def check_length(path: Path, header: CloudHeader) -> None:
+    """Raises `DataError` if the file is shorter than its header announces.
+
+    Open3D does not check this: it fills the missing points with zeros.
+    """
+    if header.is_text:
+        with path.open("rb") as file:
+            file.seek(header.n_bytes)
+            found = len(file.read().split())
+    else:
+        found = path.stat().st_size - header.n_bytes
+    if found < header.length:
+        unit = "numbers" if header.is_text else "bytes"
+        raise DataError(
+            f"{path} announces {header.n_points} points, but ends after {found} of {header.length} "
+            f"{unit}; it is truncated. Write or fetch it again."
+        )
+
+
+def pcd_header(path: Path) -> dict[str, list[str]]:
+    """Header fields of a PCD file, such as {"VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"]}."""
+    fields: dict[str, list[str]] = {}
+    for line in _file_head(path).split(b"\n"):
+        words = line.decode("ascii", errors="replace").split()
+        if words and not words[0].startswith("#"):
+            fields[words[0]] = words[1:]
+            if words[0] == "DATA":
+                return fields
+    raise DataError(f"{path} has no PCD header (no DATA line); it is not a PCD file.")
+
+
+def _pcd_cloud_header(path: Path) -> CloudHeader:
+    header = pcd_header(path)
+    kind, fields = header["DATA"][0], header["FIELDS"]
+    if kind not in ("ascii", "binary", "binary_compressed"):
+        raise DataError(f"{path} has DATA {kind}; known are ascii, binary and binary_compressed.")
+    if not header.get("POINTS", [""])[0].isdecimal():
+        raise DataError(f"{path} does not state its number of points (POINTS); it is damaged.")
+    n_points, n_bytes = int(header["POINTS"][0]), _header_end(path, b"DATA")
+    if kind == "binary_compressed":  # the data begin with their own length, which Open3D checks
+        return CloudHeader(n_points, False, n_bytes, 0, None)
+    is_text = kind == "ascii"
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(fields))]
+    sizes = [int(size) for size in header["SIZE"]]
+    codes = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
+    widths = counts if is_text else [c * s for c, s in zip(counts, sizes, strict=True)]
+    axes = _axes(path, fields, widths, None if is_text else codes)
+    layout = Layout(_count_lines(path, n_bytes) if is_text else n_bytes, sum(widths), axes)
+    return CloudHeader(n_points, is_text, n_bytes, n_points * layout.width, layout)
+
+
+class _Property(NamedTuple):
+    """A property of a PLY element; `code` is the NumPy type of the value, or of a list's length."""
+
+    name: str
+    is_list: bool
+    code: str
+
+
+def _ply_cloud_header(path: Path) -> CloudHeader:
+    """The layout is None if points contain lists, or follow elements that do."""
+    lines = [line.decode("ascii", errors="replace").split() for line in _file_head(path).split(b"\n")]
+    if lines[0] != ["ply"]:
+        raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
+    form, element = "", ""
+    counts: dict[str, int] = {}
+    properties: dict[str, list[_Property]] = {}
+    for words in lines[: lines.index(["end_header"])]:
+        if words[:1] == ["format"]:
+            form = words[1]
+        elif words[:1] == ["element"]:
+            element = words[1]
+            counts[element], properties[element] = int(words[2]), []
+        elif words[:1] == ["property"]:
+            is_list = words[1] == "list"
+            code = _PLY_CODES[words[2] if is_list else words[1]]
+            properties[element].append(_Property(words[-1], is_list, code))
+    if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise DataError(f"{path} has format {form!r}; known are ascii, and binary of either byte order.")
+    if "vertex" not in counts:
+        raise DataError(f"{path} does not state its number of points (element vertex); it is damaged.")
+    is_text, n_bytes = form == "ascii", _header_end(path, b"end_header")
+    widths = {
+        name: [1 if is_text else np.dtype(p.code).itemsize for p in of] for name, of in properties.items()
+    }
+    length = sum(counts[name] * sum(widths[name]) for name in counts)
+    before = list(counts)[: list(counts).index("vertex")]
+    layout = None
+    if not any(p.is_list for name in [*before, "vertex"] for p in properties[name]):
+        order = ">" if form == "binary_big_endian" else "<"
+        codes = None if is_text else [order + p.code for p in properties["vertex"]]
+        axes = _axes(path, [p.name for p in properties["vertex"]], widths["vertex"], codes)
+        skip = (
+            _count_lines(path, n_bytes) + sum(counts[name] for name in before)
+            if is_text
+            else n_bytes + sum(counts[name] * sum(widths[name]) for name in before)
+        )
+        layout = Layout(skip, sum(widths["vertex"]), axes)
+    return CloudHeader(counts["vertex"], is_text, n_bytes, length, layout)
+
+
+def _axes(path: Path, fields: list[str], widths: list[int], codes: list[str] | None) -> list[Any]:
+    """The columns of x, y and z; with the `codes` of binary fields, their dtypes and byte offsets."""
+    missing = [axis for axis in AXES if axis not in fields]
+    if missing:
+        raise DataError(f"{path} has no field {missing[0]}, only {', '.join(fields)}; it holds no points.")
+    starts = [sum(widths[: fields.index(axis)]) for axis in AXES]
+    if codes is None:
+        return starts
+    return [(np.dtype(codes[fields.index(axis)]), start) for axis, start in zip(AXES, starts, strict=True)]
+
+
+def _file_head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_HEADER_BYTES)
+
+
+def _header_end(path: Path, last_line: bytes) -> int:
+    """Position of the first byte after the line that begins with `last_line`."""
+    head = _file_head(path)
+    return head.index(b"\n", head.index(b"\n" + last_line) + 1) + 1
+
+
+def _count_lines(path: Path, n_bytes: int) -> int:
+    """Number of lines in the first bytes of a file."""
+    return _file_head(path)[:n_bytes].count(b"\n")

@@ -1,0 +1,31 @@
+"""Loads third-party packages that may be missing, and explains how to install them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gmmtorch.errors import GmmTorchError
+
+
+def load_open3d(failure: str) -> Any:
+    """The module open3d. Raises `GmmTorchError`, which starts with `failure`, if it does not load."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise GmmTorchError(
+            f"{failure}, because Open3D does not load: {error}. On Debian or Ubuntu install libusb-1.0-0 "
+            "libgl1 libegl1 libx11-6 libudev1 libgomp1 (scripts/setup.sh does this)."
+        ) from error
+    return open3d
+
+
+def load_pyoctomap() -> Any:
+    """The module pyoctomap. Raises `GmmTorchError` if it does not load."""
+    try:
+        import pyoctomap
+    except ImportError as error:
+        raise GmmTorchError(
+            f"OctoMap needs the package pyoctomap, which does not load ({error}); install it: "
+            "pip install 'gmmtorch[baselines]'."
+        ) from error
+    return pyoctomap
