@@ -261,7 +261,7 @@ def _view(mission: Mission, probability: Any) -> TopView:
 
 def _team_view(mission: Mission) -> TopView:
     """The team's map from above, in the band of heights that the robots began in."""
-    from gmmtorch.occupancy.voxels.cell_evidence import Box
+    from gmmtorch.occupancy.voxels.boxes import Box
 
     box, (first, last) = mission.world.box, _layers(mission)
     low, high = box.low.clone(), box.high.clone()

@@ -14,14 +14,9 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.cell_evidence import (
-    Box,
-    CellEvidence,
-    common,
-    flat_index,
-    in_cells,
-    passage_of,
-)
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.ray_casting import rays_in_box
 
 Slices = tuple[slice, ...]
 
@@ -83,7 +78,7 @@ class SlidingVoxelMap:
         Returns the boxes, disjoint and now empty, of the cells that were not in the window before: all
         of it at first, and after a jump that leaves nothing of the old one.
         """
-        cell = in_cells(position, self.resolution, "position").floor().long().tolist()
+        cell = to_lattice(position, self.resolution, "position").floor().long().tolist()
         if self._low is None:
             half_step = self.step // 2
             self._place(
@@ -155,7 +150,7 @@ class SlidingVoxelMap:
         spare = torch.tensor(self.shape, device=size.device) - size
         if bool((spare < 0).any()):
             raise InvalidArgumentError(f"shape={tuple(shape)} is more than the window's {self.shape} cells.")
-        cell = in_cells(position, self.resolution, "position").floor().long() - self.low
+        cell = to_lattice(position, self.resolution, "position").floor().long() - self.low
         steps = (2 * cell - size + step) // (2 * step)  # rounded
         low = self.low + torch.minimum(steps.clamp_min(0), spare // step) * step
         return Box(low, low + size)
@@ -186,14 +181,14 @@ class SlidingVoxelMap:
         """
         if not 0 <= short < math.inf:
             raise InvalidArgumentError(f"short={short} must be finite metres, at least zero.")
-        stops = in_cells(ends, self.resolution, "ends")
-        starts = in_cells(origin, self.resolution, "origin").expand_as(stops)
+        stops = to_lattice(ends, self.resolution, "ends")
+        starts = to_lattice(origin, self.resolution, "origin").expand_as(stops)
         told = torch.zeros(len(stops), dtype=torch.float64, device=stops.device)
         way = stops - starts
         length = way.norm(dim=1, keepdim=True).clamp_min(torch.finfo(way.dtype).tiny)
         until = stops - way * (short / self.resolution / length).clamp_max(1) if short else None
-        box = self.box if within is None else common(self.box, within)
-        passage = None if box is None else passage_of(starts, stops, box, until)
+        box = self.box if within is None else intersection(self.box, within)
+        passage = None if box is None else rays_in_box(starts, stops, box, until)
         if passage is None:
             return told, torch.zeros_like(told, dtype=torch.bool)
         # No beam can tell more bits than it crosses cells: one sum holds the bits, and how many cells

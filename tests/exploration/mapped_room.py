@@ -14,7 +14,7 @@ from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.replica.replica import Replica

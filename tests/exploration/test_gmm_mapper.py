@@ -19,7 +19,7 @@ from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import common
+from gmmtorch.occupancy.voxels.boxes import intersection
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ComponentsMessage,
@@ -181,7 +181,7 @@ def test_a_window_that_wanders_is_filled_with_what_all_components_say() -> None:
 
 def assert_window_is_that_of_the_belief(one: GmmMapper) -> None:
     """In every cell of the window that the belief has, too."""
-    box = common(one.local.box, BOX)
+    box = intersection(one.local.box, BOX)
     assert box is not None
     inside = tuple(
         slice(low, high)

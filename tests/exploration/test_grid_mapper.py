@@ -15,7 +15,8 @@ from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_counts, encode_points
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
 from gmmtorch.sharing.replica.intervals import Intervals

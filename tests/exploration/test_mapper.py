@@ -9,7 +9,8 @@ from torch import Tensor
 from gmmtorch.exploration.robot.mapper import Memo, novel_beams
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)

@@ -21,7 +21,8 @@ from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.world import World
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.transport.link_conditions import Partition
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
 from gmmtorch.simulation.worlds.solids import box

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.world.observable import observable_cells, view_directions, viewpoints
-from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld

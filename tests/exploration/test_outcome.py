@@ -11,7 +11,8 @@ import torch
 
 from gmmtorch.exploration.mission.mission_results import row_of, with_times
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.transport.simulated_network import Reception
 
 VARIANT = {

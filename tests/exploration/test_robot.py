@@ -20,7 +20,8 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

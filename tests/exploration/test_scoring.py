@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement, overlap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 BOX = Box(torch.tensor([-3, 2, 0]), torch.tensor([9, 11, 7]))
 

@@ -16,7 +16,8 @@ from gmmtorch.exploration.planning.planners import Plan, Planner, PlanningTask
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, cast_evidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 
 RESOLUTION = 0.2
 PRIMITIVES = Primitives(Dynamics())

@@ -14,7 +14,9 @@ from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays import component_rays as module
 from gmmtorch.mapping.rays.component_rays import component_evidence, component_rays
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, cast_evidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 

@@ -14,7 +14,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import summed
 from gmmtorch.mapping.rays.component_rays import component_evidence
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, united
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
 
 RESOLUTION = 0.2
 
@@ -286,14 +287,16 @@ def test_disjoint_boxes_add_up(shell: float, thinned: bool) -> None:
         halves.append(component_evidence(components, RESOLUTION, Box(low, high), **options))
     expected = component_evidence(components, RESOLUTION, whole, **options)
     assert float(expected.hits.sum()) > 10
-    torch.testing.assert_close(dense(united(halves), whole), dense(expected, whole), rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(
+        dense(sum_evidence(halves), whole), dense(expected, whole), rtol=1e-5, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("thinned", [False, True])
 def test_company_changes_nothing(thinned: bool) -> None:
     components = random_components(20, 3, seed=6, empty=0.2)
     options = {"shell": 1.0, "hits_per_ray": 8, "thinned": thinned}
-    alone = united(
+    alone = sum_evidence(
         component_evidence(components.selected(torch.tensor([k])), RESOLUTION, AROUND, **options)
         for k in range(20)
     )

@@ -13,7 +13,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 
 RESOLUTION, SHAPE = 0.25, (24, 20, 12)
 

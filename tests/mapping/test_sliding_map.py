@@ -14,7 +14,9 @@ from occupancy.exact_dda import voxels_left
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, cast_evidence, united
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 
 SHAPE = (12, 16, 10)
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
@@ -178,7 +180,7 @@ def test_a_wandering_window_equals_one_made_from_scratch(seed, far):
         scratch = new_map()
         scratch.center_on(at(*(sliding.low + torch.tensor(SHAPE) // 2).tolist()))
         assert torch.equal(scratch.low, sliding.low)
-        scratch.add(united(cast_evidence(*ray, 0.25, EVERYTHING, weight) for ray, weight in rays))
+        scratch.add(sum_evidence(cast_evidence(*ray, 0.25, EVERYTHING, weight) for ray, weight in rays))
         for one, other in zip(sliding.evidence(), scratch.evidence(), strict=True):
             torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
 

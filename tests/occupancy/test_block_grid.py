@@ -7,7 +7,8 @@ import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.voxels.block_grid import BlockGrid
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 LOW, HIGH = [-21, 3, -5], [30, 47, 12]  # sides that are no multiples of a block's
 

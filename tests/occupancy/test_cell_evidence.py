@@ -8,17 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from occupancy.exact_dda import voxels_left
 
-import gmmtorch.occupancy.voxels.cell_evidence as module
+import gmmtorch.occupancy.voxels.ray_casting as module
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.voxels.cell_evidence import (
-    Box,
-    CellEvidence,
-    cast_evidence,
-    from_dense,
-    in_cells,
-    shares_near,
-    united,
-)
+from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
 
 Counts = dict[tuple[int, ...], tuple[float, float]]
 
@@ -105,7 +99,7 @@ def test_disjoint_boxes_add_up(seed, axis):
     first.high[axis] = second.low[axis] = seed - 2
     parts = [cast_evidence(starts, stops, is_hit, 1.0, part, weights) for part in (first, second)]
     expected = cast_evidence(starts, stops, is_hit, 1.0, whole, weights)
-    found = counts(united(parts))
+    found = counts(sum_evidence(parts))
     assert found.keys() == counts(expected).keys()
     for cell, both in counts(expected).items():
         assert found[cell] == pytest.approx(both, rel=1e-6)
@@ -185,13 +179,13 @@ def test_too_many_cells_are_refused():
     with pytest.raises(MemoryLimitError, match=r"resolution=0\.001 m"):
         cast_evidence(starts, stops, torch.tensor([True]), 0.001, box([0] * 3, [10_000] * 3))
     with pytest.raises(InvalidArgumentError, match="resolution=0"):
-        in_cells(starts, 0.0)
+        to_lattice(starts, 0.0)
 
 
 def test_dense_and_back():
     generator = torch.Generator().manual_seed(0)
     hits, misses = (torch.rand(2, 4, 5, 3, generator=generator) - 0.6).clamp_min(0)
-    evidence = from_dense(torch.tensor([-7, 2, 9]), hits, misses)
+    evidence = CellEvidence.from_dense(torch.tensor([-7, 2, 9]), hits, misses)
     expected = {
         (x - 7, y + 2, z + 9): (float(hits[x, y, z]), float(misses[x, y, z]))
         for x in range(4)
@@ -212,14 +206,14 @@ def test_united_adds_cell_by_cell():
         for cell, (h, m) in counts(part).items():
             both = expected.setdefault(cell, [0.0, 0.0])
             both[0], both[1] = both[0] + h, both[1] + m
-    assert counts(united(parts)) == {cell: tuple(both) for cell, both in expected.items()}
-    assert counts(united(reversed(parts))) == counts(united(parts))
-    assert len(united([]).cells) == 0
-    assert len(united([CellEvidence.empty(), CellEvidence.empty()]).cells) == 0
+    assert counts(sum_evidence(parts)) == {cell: tuple(both) for cell, both in expected.items()}
+    assert counts(sum_evidence(reversed(parts))) == counts(sum_evidence(parts))
+    assert len(sum_evidence([]).cells) == 0
+    assert len(sum_evidence([CellEvidence.empty(), CellEvidence.empty()]).cells) == 0
     one = torch.ones(1)
     ends = [CellEvidence(torch.full((1, 3), x), one, one) for x in (-(2**31), 2**31)]
-    with pytest.raises(InvalidArgumentError, match="cannot be united"):
-        united(ends)
+    with pytest.raises(InvalidArgumentError, match="cannot be summed"):
+        sum_evidence(ends)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -229,7 +223,7 @@ def test_no_hull_that_meets_the_box_is_missed(seed):
     middle = 8 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
     half = 2 * torch.rand(300, 3, generator=generator, dtype=torch.float64)
     within = box([0, -2, 1], [3, 1, 5])
-    first, last = shares_near(apex, middle - half, middle + half, within)
+    first, last = near_interval(apex, middle - half, middle + half, within)
     draws = 4000
     place = middle + half * (2 * torch.rand(draws, 300, 3, generator=generator, dtype=torch.float64) - 1)
     point = apex + torch.rand(draws, 300, 1, generator=generator, dtype=torch.float64) * (place - apex)
@@ -300,14 +294,14 @@ def test_rays_that_are_followed_nowhere_still_hit():
         (3, 3, 3): (1.0, 0.0)
     }
     nothing = (torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
-    assert (0, 0, 0) in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, struck=nothing))
-    assert (3, 3, 3) not in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, struck=nothing))
+    assert (0, 0, 0) in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, hit_places=nothing))
+    assert (3, 3, 3) not in counts(cast_evidence(start, stop, is_hit > 0, 1.0, LARGE, hit_places=nothing))
 
 
-@pytest.mark.parametrize("name", ["free_until", "struck"])
+@pytest.mark.parametrize("name", ["free_until", "hit_places"])
 def test_other_places_must_be_finite(name):
     starts, stops, is_hit = random_rays(3, 0)
     bad = stops * float("nan")
-    options = {"free_until": bad} if name == "free_until" else {"struck": (bad, torch.ones(3))}
+    options = {"free_until": bad} if name == "free_until" else {"hit_places": (bad, torch.ones(3))}
     with pytest.raises(InvalidArgumentError, match=name):
         cast_evidence(starts, stops, is_hit, 1.0, LARGE, **options)

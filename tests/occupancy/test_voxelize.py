@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.solids import ball, box

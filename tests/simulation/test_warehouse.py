@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.solids import box, copies

@@ -21,7 +21,8 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.collisions import collides, finely, meets_others
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
-from gmmtorch.occupancy.voxels.cell_evidence import cast_evidence, flat_index
+from gmmtorch.occupancy.voxels.boxes import flat_index
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.transport.simulated_network import Network
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 

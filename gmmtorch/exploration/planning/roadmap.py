@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 
 _BLOCK = 8  # nodes along each side of a block of storage
 _PASSABLE = 1

@@ -29,7 +29,8 @@ from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, common, united
+from gmmtorch.occupancy.voxels.boxes import Box, intersection
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.replica.intervals import Intervals
@@ -115,7 +116,7 @@ class GmmMapper(Mapper):
     # -- sensing ----------------------------------------------------------------------------------
 
     def center_on(self, position: Tensor) -> None:
-        uncovered = [common(box, self.belief.grid.box) for box in self.local.center_on(position)]
+        uncovered = [intersection(box, self.belief.grid.box) for box in self.local.center_on(position)]
         boxes = [box for box in uncovered if box is not None]
         regenerate(self.local, boxes, self.tiles, self._evidence)
 
@@ -258,7 +259,7 @@ class GmmMapper(Mapper):
                     empty, resolution, box, rays_per_cell=rays, cutoff=_EMPTY_CUTOFF, thinned=True
                 )
             )
-        return united(parts) if parts else CellEvidence.empty()
+        return sum_evidence(parts) if parts else CellEvidence.empty()
 
     # -- the whole --------------------------------------------------------------------------------
 

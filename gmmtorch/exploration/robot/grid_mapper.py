@@ -15,7 +15,8 @@ from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, cast_evidence
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.messages.envelope import loaded, stored, within
 from gmmtorch.sharing.messages.message_registry import Message, PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import MOST_PARTS

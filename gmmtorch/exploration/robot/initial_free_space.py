@@ -13,7 +13,7 @@ from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, fe
 from gmmtorch.exploration.planning.planner_interface import LEAST
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 _NEAR = 2.0

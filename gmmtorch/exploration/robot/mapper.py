@@ -16,7 +16,8 @@ from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.messages.message_registry import Message, decode
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_traversal import row_major_strides
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 

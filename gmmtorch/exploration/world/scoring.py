@@ -13,7 +13,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
 from gmmtorch.occupancy.voxels.block_grid import BlockGrid
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence, flat_index
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 
 @dataclass(frozen=True)

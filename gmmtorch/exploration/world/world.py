@@ -20,7 +20,7 @@ from gmmtorch.exploration.world.observable import observable_cells, view_directi
 from gmmtorch.exploration.world.starts import check_start, start_poses
 from gmmtorch.exploration.world.world_cache import kept_cells
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.cell_evidence import Box
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld, checked_triangles
 from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse, warehouse_start

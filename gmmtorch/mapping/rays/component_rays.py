@@ -15,14 +15,9 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_draws import normals
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.cell_evidence import (
-    Box,
-    CellEvidence,
-    cast_evidence,
-    in_cells,
-    shares_near,
-    united,
-)
+from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
 
 _EFFECTIVE_AREA = 4 * math.pi
 _THINNING = 4
@@ -104,7 +99,7 @@ def component_evidence(
         _evidence(components, seen[some], box, density, number[some], times[some], shell, thinned)
         for some in _portions(number * times)
     ]
-    return parts[0] if len(parts) == 1 else united(parts)
+    return parts[0] if len(parts) == 1 else sum_evidence(parts)
 
 
 def _portions(draws: Tensor) -> Iterator[slice]:
@@ -139,7 +134,7 @@ def _evidence(
         starts, stops, weights = _thinned(starts, stops, weights, sighting)
     passing = torch.zeros_like(weights, dtype=torch.bool)
     struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
-    return cast_evidence(starts, stops, passing, resolution, box, weights, struck=struck)
+    return cast_evidence(starts, stops, passing, resolution, box, weights, hit_places=struck)
 
 
 def _thinned(
@@ -198,8 +193,8 @@ def _counted(components: Components, resolution: float) -> Tensor:
     """The sightings (C,) of sound components that have a count."""
     if components.dim != 3:
         raise InvalidArgumentError(f"components have {components.dim} dimensions; their rays need 3.")
-    in_cells(components.means, resolution, "means")
-    in_cells(components.origins, resolution, "origins")
+    to_lattice(components.means, resolution, "means")
+    to_lattice(components.origins, resolution, "origins")
     return (components.seen_count > 0).nonzero().squeeze(1)
 
 
@@ -213,7 +208,7 @@ def _in_reach(
     origins = components.origins.double()[components.seen_from[seen]]
     scale = 1 / density.resolution
     # Half a cell more than the box covers the rounding of what is drawn.
-    first, last = shares_near(origins * scale, low[by] * scale, high[by] * scale, box)
+    first, last = near_interval(origins * scale, low[by] * scale, high[by] * scale, box)
     return (first <= last) & (last >= 1) if ends_only else first <= last
 
 

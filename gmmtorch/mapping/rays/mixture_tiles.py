@@ -12,7 +12,8 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cones import cone_bounds
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 _REACH = 3.0  # deviations around the means that count as near
 _MOST_TILES = 4096  # a batch that lies in more is looked at in every search

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.voxels.cell_evidence import Box, CellEvidence
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
 _BITS = 3
 _SIDE = 1 << _BITS

@@ -1,0 +1,67 @@
+"""Boxes of cells of the world's lattice: cell c is the cube [c, c + 1) times the resolution, world frame."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_resolution
+
+_FARTHEST = 2.0**32  # cells from the world's origin; sums of the ray traversal are exact within
+
+
+class Box(NamedTuple):
+    """Cells c with low ≤ c < high, along each axis; low and high are (3,) int64."""
+
+    low: Tensor
+    high: Tensor
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple((self.high - self.low).tolist())
+
+
+def intersection(one: Box, other: Box) -> Box | None:
+    """The cells that are in both boxes; None if there are none."""
+    found = Box(torch.maximum(one.low, other.low), torch.minimum(one.high, other.high))
+    return found if bool((found.low < found.high).all()) else None
+
+
+def difference(box: Box, other: Box) -> list[Box]:
+    """The cells of `box` that are not in `other`, as disjoint boxes."""
+    low, high, parts = box.low.tolist(), box.high.tolist(), []
+    for axis, (first, last) in enumerate(zip(other.low.tolist(), other.high.tolist(), strict=True)):
+        for begin, stop in ((low[axis], min(first, high[axis])), (max(last, low[axis]), high[axis])):
+            if begin < stop:
+                part = Box(box.low.new_tensor(low), box.low.new_tensor(high))
+                part.low[axis], part.high[axis] = begin, stop
+                parts.append(part)
+        low[axis], high[axis] = max(low[axis], first), min(high[axis], last)
+        if low[axis] >= high[axis]:
+            break
+    return parts
+
+
+def to_lattice(points: Tensor, resolution: float, name: str = "points") -> Tensor:
+    """Points (…, 3), world metres, in units of cells, float64.
+
+    Raises `InvalidArgumentError` if a point is not finite, or 2³² cells or more from the world's origin.
+    """
+    units = points.double() / check_resolution(resolution)
+    if units.numel() and not bool(units.abs().max() < _FARTHEST):  # not `>=`: NaN must fail, too
+        raise InvalidArgumentError(
+            f"{name} must be finite and less than 2**32 cells of resolution={resolution} m from the world's "
+            "origin; remove such points, or use coarser cells."
+        )
+    return units
+
+
+def flat_index(local: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Row-major index (C,) of cells (C, 3) in a block of `shape`, 0 outside, and whether each is inside."""
+    nx, ny, nz = shape
+    x, y, z = local.unbind(1)
+    # One comparison for each axis: reductions over a dimension of three are slow.
+    inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
+    return torch.where(inside, (x * ny + y) * nz + z, 0), inside
