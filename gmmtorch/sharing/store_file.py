@@ -127,7 +127,7 @@ def _opened(place: Path | None, path: Path, facts: Mapping[str, Any], max_bytes:
     except BaseException as error:
         if db is not None:
             db.close()  # else the file stays locked
-        if isinstance(error, GmmTorchError) or not isinstance(error, sqlite3.Error | OSError):
+        if isinstance(error, GmmTorchError) or not isinstance(error, sqlite3.Error | OSError | ValueError):
             raise
         raise explained(error, path) from error
     return db
