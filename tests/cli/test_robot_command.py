@@ -286,7 +286,7 @@ def test_what_it_said_before_it_was_started_again_is_no_other_robots(run, tmp_pa
         recorded._sealer.session = session  # as if what it said then were played back
         again = run(*LOG, "settle=7", kept, f"link.listen={here}", name="again")
     (row,) = succeeded(again).results()["rows"]
-    assert row["refused"]["namesake"] > 100
+    assert row["refused"]["duplicate_id"] > 100
     assert row["namesakes"] == {}
 
 
@@ -300,7 +300,7 @@ def test_another_key_is_counted_and_told_once(run, tmp_path):
     assert row["refused"].keys() == {"wrong_key"}
     assert row["refused"]["wrong_key"] > 10
     assert row["heard"] == 0
-    assert done.stdout.count("do not open") == 1
+    assert done.stdout.count("cannot be opened") == 1
     assert f"from 127.0.0.1:{other.address[1]}" in done.stdout
     assert "same team key" in done.stdout
     assert " refused" in done.stderr

@@ -28,8 +28,7 @@ from gmmtorch.files import write_json
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.transport.sockets import LOOPBACK, unicast_socket
-from gmmtorch.sharing.transport.udp import UdpTransport
+from gmmtorch.sharing.transport.udp import LOOPBACK, UdpTransport, unicast_socket
 
 N_SCANS = 31
 KILLS_OF_A_ROBOT = 5

@@ -167,7 +167,7 @@ def test_another_robot_of_its_number_is_named(world, monkeypatch):
         assert f"robot 0 (127.0.0.1:{other.address[1]}" in str(node.twin)
         assert "id=" in str(node.twin)
         assert "another robot 0 is there" in node.status()
-        assert node.row()["refused"].keys() == {"namesake"}
+        assert node.row()["refused"].keys() == {"duplicate_id"}
 
 
 def test_started_again_it_knows_what_it_knew(world, tmp_path):

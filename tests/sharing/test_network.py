@@ -361,7 +361,7 @@ def set_partitions(items: list[int]) -> Iterator[list[list[int]]]:
 
 def test_who_hears_whom_in_every_partition_of_four():
     ways = [groups for groups in set_partitions([0, 1, 2, 3]) if len(groups) > 1]
-    assert len(ways) == 14  # Bell's number of 4, less the one that cuts nobody off
+    assert len(ways) == 14  # Bell's number of 4, less the one that divides nothing
     for groups in ways:
         group_of = {robot: i for i, group in enumerate(groups) for robot in group}
         for named in (groups, groups[1:]):  # those not named are a group of their own
@@ -595,7 +595,7 @@ def test_partitions_that_cannot_be_are_named(bad):
 
 
 @pytest.mark.parametrize(
-    ("groups", "message"), [([[0, 2]], "names robot 2; there are 2"), ([[1, 0]], "cuts nobody off")]
+    ("groups", "message"), [([[0, 2]], "names robot 2; there are 2"), ([[1, 0]], "divides nothing")]
 )
 def test_partitions_of_another_team_are_named(groups, message):
     conditions = LinkConditions(partitions=[(0, 1, groups)])

@@ -259,7 +259,7 @@ def test_each_reason_is_told_apart(caplog):
         "wrong_key": [b"\xf1" + bytes(30), Sealer(3, other).seal(b"x"), Sealer(3).seal(b"x")],
         "echo": [sealer.seal(b"x"), sealer.seal(b"x")],
         "replayed": [frame, frame],
-        "namesake": [Sealer(1, KEY).seal(b"x")],
+        "duplicate_id": [Sealer(1, KEY).seal(b"x")],
     }.items():
         opener = Opener(KEY, own=sealer)
         for each in [Sealer(2, KEY).seal(b"x"), *([frame] if reason == "replayed" else [])]:
@@ -293,9 +293,9 @@ def test_two_robots_with_one_number_are_named_and_refused(caplog):
         heard += [opener.open(first.seal(b"1"), "10.0.0.5:1"), opener.open(second.seal(b"2"), "10.0.0.6:1")]
     assert heard[:2] == [(3, b"1"), (3, b"2")]
     assert heard[6:] == [None] * 14
-    assert set(opener.namesakes) == {3}
+    assert set(opener.duplicates) == {3}
     (message,) = caplog.messages
-    assert "number 3" in message
+    assert "the id 3" in message
     assert "10.0.0.5:1" in message
     assert "10.0.0.6:1" in message
 
@@ -314,8 +314,8 @@ def test_whoever_goes_on_with_this_robots_own_number_is_named(caplog):
     both = f"10.0.0.6:1 (session {other.session.hex()}) and this robot (session {own.session.hex()})"
     for n in range(1, 8):
         assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
-        assert refused(opener) == {"namesake": n}
-        assert opener.namesakes == ({} if n < 6 else {3: both})
+        assert refused(opener) == {"duplicate_id": n}
+        assert opener.duplicates == ({} if n < 6 else {3: both})
         assert len(caplog.messages) == (n >= 6)
         clock.now += 1.0
     assert both in caplog.text
@@ -334,8 +334,8 @@ def test_a_former_life_of_this_robot_is_refused_and_ends_nothing(caplog):
     n = 42 * len(played)
     assert opener.open(Sealer(4, KEY).seal(b"x")) == (4, b"x")
     assert opener.open(own.seal(b"mine")) is None
-    assert refused(opener) == {"namesake": n, "echo": 1}
-    assert (opener.namesakes, caplog.messages) == ({}, [])
+    assert refused(opener) == {"duplicate_id": n, "echo": 1}
+    assert (opener.duplicates, caplog.messages) == ({}, [])
 
 
 def test_sessions_of_former_starts_are_no_other_robot_however_they_come(caplog):
@@ -346,11 +346,11 @@ def test_sessions_of_former_starts_are_no_other_robot_however_they_come(caplog):
     for n in range(1, 60):
         clock.now += 1.0
         assert opener.open(before.seal(b"played back in its order"), "10.0.0.6:1") is None
-        assert (opener.namesakes, refused(opener)) == ({}, {"namesake": n})
+        assert (opener.duplicates, refused(opener)) == ({}, {"duplicate_id": n})
     for _ in range(8):
         clock.now += 1.0
         assert opener.open(other.seal(b"x"), "10.0.0.6:1") is None
-    assert list(opener.namesakes) == [3]
+    assert list(opener.duplicates) == [3]
     assert len(caplog.messages) == 1
 
 

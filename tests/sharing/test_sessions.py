@@ -12,9 +12,9 @@ from gmmtorch.sharing.transport.sessions import (
     RETURNS,
     SILENCE,
     WINDOW,
+    OwnIdWatch,
     ReplayWindow,
     Sessions,
-    TwinWatch,
 )
 
 A, B, C = b"A" * 8, b"B" * 8, b"C" * 8
@@ -66,14 +66,14 @@ def test_a_robot_that_restarts_is_believed_and_its_stragglers_too():
     assert sessions.refusal(3, B, 3) is None
     assert sessions.refusal(3, A, 4) == "replayed"
     assert all(sessions.refusal(3, C, i) is None for i in range(100))  # another restart
-    assert sessions.namesakes == {}
+    assert sessions.duplicates == {}
 
 
 def test_stragglers_of_a_former_start_are_no_second_robot():
     sessions = Sessions(Clock())
     assert sessions.refusal(3, A, 50) is None
     assert all(sessions.refusal(3, *spoken) is None for i in range(50) for spoken in ((B, i), (A, i)))
-    assert sessions.namesakes == {}
+    assert sessions.duplicates == {}
 
 
 def test_two_robots_with_one_number_are_refused_until_one_is_silent():
@@ -82,18 +82,18 @@ def test_two_robots_with_one_number_are_refused_until_one_is_silent():
     turns = [(A, 0, "a:1"), (B, 0, "b:2"), *((s, i, w) for i in (1, 2) for s, w in ((A, "a:1"), (B, "b:2")))]
     answers = [sessions.refusal(3, session, i, source) for session, i, source in turns]
     assert answers == [None] * (1 + RETURNS) + [
-        "namesake"
+        "duplicate_id"
     ]  # each that came back after the first two: RETURNS
-    assert sessions.namesakes == {3: "a:1 and b:2"}
+    assert sessions.duplicates == {3: "a:1 and b:2"}
     assert sessions.refusal(4, C, 0) is None  # others are not meant
     clock.now = SILENCE - 1
-    assert sessions.refusal(3, B, 3) == "namesake"
+    assert sessions.refusal(3, B, 3) == "duplicate_id"
     clock.now = SILENCE
     assert sessions.refusal(3, B, 4) is None
-    assert sessions.namesakes == {}
+    assert sessions.duplicates == {}
     for i in range(3, 8):  # A was only away
         last = [sessions.refusal(3, A, i), sessions.refusal(3, B, 2 + i)]
-    assert last == ["namesake"] * 2
+    assert last == ["duplicate_id"] * 2
 
 
 def test_memory_is_bounded_whoever_speaks():
@@ -105,7 +105,7 @@ def test_memory_is_bounded_whoever_speaks():
         sessions.refusal(7, A, 3 * i)
     assert len(sessions) == MAX_SESSIONS
     assert len(sessions._speakers) <= MAX_SESSIONS
-    assert set(sessions.namesakes) <= set(sessions._speakers)
+    assert set(sessions.duplicates) <= set(sessions._speakers)
 
 
 def test_what_has_long_been_silent_is_forgotten_first():
@@ -131,9 +131,9 @@ def test_what_has_long_been_silent_is_forgotten_first():
 def found(frames: list[tuple[float, bytes, int]]) -> list[bool]:
     """What a watch says of frames (when, session, number)."""
     clock = Clock()
-    watch, answers = TwinWatch(clock), []
+    watch, answers = OwnIdWatch(clock), []
     for clock.now, session, number in frames:
-        answers.append(watch.finds(session, number))
+        answers.append(watch.detects(session, number))
     return answers
 
 
@@ -170,7 +170,7 @@ def test_what_was_heard_long_ago_does_not_count():
 
 def test_the_memory_of_a_watch_is_bounded():
     clock = Clock()
-    watch = TwinWatch(clock)
+    watch = OwnIdWatch(clock)
     for k in range(3 * MAX_SESSIONS):
-        assert not watch.finds(k.to_bytes(8, "little"), k)
+        assert not watch.detects(k.to_bytes(8, "little"), k)
     assert len(watch) == MAX_SESSIONS

@@ -262,13 +262,13 @@ def test_two_robots_with_one_number_are_found_by_all(opening, caplog, monkeypatc
     for n in range(20):
         (first, second)[n % 2].send(3, [bytes([n])], 0.0, "maps")
         until(lambda n=n: a.received.datagrams == n + 1)
-    until(lambda: first.refused["namesake"] == second.refused["namesake"] == 10)
+    until(lambda: first.refused["duplicate_id"] == second.refused["duplicate_id"] == 10)
     assert len(a.deliver(0, 0.0)) < 8
-    assert a.refused["namesake"] > 12
-    assert set(a.namesakes) == set(first.namesakes) == set(second.namesakes) == {3}
+    assert a.refused["duplicate_id"] > 12
+    assert set(a.duplicates) == set(first.duplicates) == set(second.duplicates) == {3}
     for each in (first, second):
-        assert f"127.0.0.1:{each.address[1]}" in a.namesakes[3]
-    assert sum("number 3" in message for message in caplog.messages) == 3  # one of each
+        assert f"127.0.0.1:{each.address[1]}" in a.duplicates[3]
+    assert sum("the id 3" in message for message in caplog.messages) == 3  # one of each
 
 
 def test_what_was_recorded_of_a_robot_does_not_end_it_when_it_restarts(opening, raw):
@@ -281,8 +281,8 @@ def test_what_was_recorded_of_a_robot_does_not_end_it_when_it_restarts(opening, 
         raw.sendto(frame, again.address)
     a.send(0, [b"welcome"], 0.0, "maps")
     assert heard(again, 1) == [(0, b"welcome")]
-    assert {reason: n for reason, n in again.refused.items() if n} == {"namesake": 150}
-    assert again.namesakes == {}
+    assert {reason: n for reason, n in again.refused.items() if n} == {"duplicate_id": 150}
+    assert again.duplicates == {}
 
 
 def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):

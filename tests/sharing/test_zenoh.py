@@ -302,9 +302,9 @@ def test_two_robots_with_one_number_are_found(opening):
     where = endpoint()
     a = opening(0, listen=[where], key=KEY)
     twins = [opening(3, connect=[where], key=KEY) for _ in range(2)]
-    until(lambda: any(twin.send(3, [b"x"], 0.0, "maps") for twin in twins) or a.refused["namesake"] > 0)
-    assert set(a.namesakes) == {3}
-    assert all(twin.session.hex() in a.namesakes[3] for twin in twins)  # the keys are the same
+    until(lambda: any(twin.send(3, [b"x"], 0.0, "maps") for twin in twins) or a.refused["duplicate_id"] > 0)
+    assert set(a.duplicates) == {3}
+    assert all(twin.session.hex() in a.duplicates[3] for twin in twins)  # the keys are the same
 
 
 # -- who comes and goes ------------------------------------------------------------------------------------
@@ -469,7 +469,7 @@ def test_a_port_in_use_is_named_with_what_to_do(opening):
         ({"listen": ["pigeon/home"], "key": KEY}, "pigeon"),
         ({"connect": ["tcp/127.0.0.1:0"]}, "port 1"),
         ({"connect": [""]}, "connect=''"),
-        ({"listen": []}, "Nobody is reached"),
+        ({"listen": []}, "No robot is reached"),
         ({"max_waiting": 0}, "max_waiting=0"),
     ],
 )

@@ -1,1 +1,1 @@
-"""How datagrams travel: a simulated network, UDP and Zenoh, with encryption."""
+"""Transports of datagrams: a simulated network, UDP and Zenoh, with encryption."""

@@ -1,4 +1,5 @@
-"""What all transports of real networks have in common: frames, datagrams that wait, and the books."""
+"""FramedTransport: what UDP and Zenoh have in common: frames, a queue of received datagrams, and
+statistics."""
 
 from __future__ import annotations
 
@@ -16,16 +17,22 @@ from gmmtorch.sharing.transport.security import Opener, Sealer, TeamKey
 from gmmtorch.sharing.transport.simulated_network import Traffic
 
 MAX_WAITING = 4096
-"""Datagrams that wait to be delivered; of more, the oldest are dropped."""
+"""Datagrams in the queue; of more, the oldest are dropped."""
 _log = logging.getLogger(__name__)
 
 
 class FramedTransport(ABC):
-    """One robot's end of a network; see `Transport`. To be closed, or used as a context manager.
+    """One robot's end of a real network; see `Transport`. Close it, or use it as a context manager.
 
-    A subclass carries frames: `_carry` sends one, `_take` is given what comes in, by one thread of the
-    subclass, and `_shut` ends that thread. A network that is down is no error: `_fails` counts.
-    Times `now` are not used: what is there is delivered, whatever the clocks of the team say.
+    A subclass sends frames (`_carry`), passes received ones to `_take` from one thread, and ends that thread
+    (`_shut`). A network that is down is no error: `_count_failure` counts it. The times `now` are not used:
+    `deliver` returns what has arrived, whatever the clocks of the team show.
+
+    Attributes:
+        sent, received: frames that were given to the network and that came from it, refused ones included.
+        failures: number of network errors, by the name of the error.
+        n_dropped: datagrams that were dropped because the queue was full.
+        n_lost: datagrams that were dropped as `lose` demands.
     """
 
     def __init__(self, robot: int, key: TeamKey | None, max_waiting: int) -> None:
@@ -35,32 +42,27 @@ class FramedTransport(ABC):
         self._waiting: deque[tuple[int, bytes]] = deque()
         self._max_waiting = check_whole("max_waiting", max_waiting, 1)
         self.sent, self.received = Traffic(), Traffic()
-        """What has been given to the network and come from it: frames, refused ones too."""
         self.failures: dict[str, int] = {}
-        """How often the network failed, by the name of the error."""
-        self.n_dropped = 0
-        """Datagrams that were opened, waited, and had to give way to newer ones."""
-        self.n_lost = 0
-        """Datagrams that were thrown away, as `lose` asked for."""
-        self._loss, self._drawn = 0.0, random.Random(0)
+        self.n_dropped = self.n_lost = 0
+        self._loss, self._random = 0.0, random.Random(0)
         self._broadcast: dict[str, Traffic] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
 
     @abstractmethod
     def _carry(self, frame: bytes, kind: str) -> Traffic:
-        """Send a frame, without waiting; what has left, or nothing after `_fails`."""
+        """Send a frame without waiting; returns what was sent, nothing after an error."""
 
     @abstractmethod
     def _shut(self) -> None:
-        """Stop listening, and give back what is held. Called once."""
+        """Stop listening, and release resources. Called once."""
 
     # -- the transport -------------------------------------------------------------------------------------
 
     def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
-        """Broadcast datagrams of at most 1200 bytes; the only `sender` is this robot. See `Transport`.
+        """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`.
 
-        Does not wait: what the network does not take at once is lost.
+        Does not wait: datagrams that the network does not take at once are lost.
         """
         self._check("sender", sender)
         frames = [self._sealer.seal(datagram) for datagram in datagrams]
@@ -71,7 +73,8 @@ class FramedTransport(ABC):
             self._broadcast[kind] = _sum(self._broadcast.get(kind, Traffic()), said)
 
     def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
-        """(sender, datagram) in the order of arrival, at most `max_waiting`; see `Transport`. Never waits."""
+        """(sender, datagram) in the order of arrival, at most `max_waiting`; see `Transport`. Does not
+        wait."""
         self._check("robot", robot)
         with self._lock:
             delivered = list(self._waiting)
@@ -79,32 +82,32 @@ class FramedTransport(ABC):
         return delivered
 
     def lose(self, share: float, seed: int = 0) -> None:
-        """From now on throw away a share, [0, 1), of what comes: to try what a team makes of it."""
+        """From now on drop a share, in [0, 1), of the received datagrams, to simulate a bad network."""
         if not 0 <= share < 1:
             raise InvalidArgumentError(f"share={share} must be a share of the datagrams in [0, 1).")
-        self._loss, self._drawn = float(share), random.Random(seed)
+        self._loss, self._random = float(share), random.Random(seed)
 
     @property
     def session(self) -> bytes:
-        """The session of this start, drawn at random."""
+        """The session of this start, 8 random bytes."""
         return self._sealer.session
 
     def disown(self, former: Iterable[bytes]) -> None:
-        """Sessions of this robot's former starts: frames of them, late or played back, are no other robot's.
+        """Set the sessions of this robot's former starts. Their frames are no sign of a duplicate robot id.
 
-        Without them it is told by how they come: see `sessions.TwinWatch`.
+        Without them, `sessions.OwnIdWatch` decides by the frames' numbers and times.
         """
         self._opener.former = frozenset(former)
 
     @property
     def n_neighbours(self) -> int | None:
-        """To how many others it is connected now; None where there are no connections."""
+        """Connections to others now; None if the network has no connections."""
         return None
 
-    # -- the books -----------------------------------------------------------------------------------------
+    # -- statistics ----------------------------------------------------------------------------------------
 
     def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
-        """What this robot has broadcast, counted as `Network` does: each datagram once, without its frame."""
+        """What this robot has broadcast, as `Network` counts: each datagram once, without its frame."""
         if sender not in (None, self.robot):
             return Traffic()
         with self._lock:
@@ -112,13 +115,15 @@ class FramedTransport(ABC):
 
     @property
     def wire_bytes(self) -> int:
-        """Of all that was broadcast, each once, with the headers of its frame, of UDP and of IPv4."""
+        """Bytes of all broadcasts, each once, with the headers of frame, UDP and IPv4."""
         said = self.traffic()
         return said.wire_bytes + self.overhead * said.datagrams
 
     def books(self, robot: int) -> dict[str, Any]:
-        """What has passed, and what went wrong, for results; `robot`: this one. Its own frames, which
-        multicast brings back, are nothing wrong."""
+        """Traffic and errors, as fields of a results row. `robot` must be this one.
+
+        A robot's own frames that multicast brings back are not counted as refused.
+        """
         self._check_robot("robot", robot)
         said = self.traffic()
         with self._lock:
@@ -136,7 +141,7 @@ class FramedTransport(ABC):
             "refused": {reason: n for reason, n in self.refused.items() if n and reason != "echo"},
             "failures": dict(self.failures),
             "dropped": self.n_dropped,
-            "namesakes": {str(number): whence for number, whence in sorted(self.namesakes.items())},
+            "namesakes": {str(robot): sources for robot, sources in sorted(self.duplicates.items())},
         }
 
     @property
@@ -146,18 +151,20 @@ class FramedTransport(ABC):
 
     @property
     def refused(self) -> dict[str, int]:
-        """How many frames that came in were refused, by reason: `security.REFUSALS`."""
+        """Number of received frames that were refused, by reason: `security.REFUSALS`."""
         return dict(self._opener.refused)
 
     @property
-    def namesakes(self) -> dict[int, str]:
-        """Numbers that two robots have, and whence they were heard."""
-        return self._opener.namesakes
+    def duplicates(self) -> dict[int, str]:
+        """Robot ids that two robots use, with the addresses and sessions of both."""
+        return self._opener.duplicates
+
+    namesakes = duplicates
 
     # -- closing -------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Stop listening, and give back what is held. What waits is forgotten. May be called again."""
+        """Stop listening, and drop the queue. May be called again."""
         if not self._closing.is_set():
             self._closing.set()
             self._shut()
@@ -182,11 +189,11 @@ class FramedTransport(ABC):
             raise GmmTorchError(f"The transport of robot {self.robot} is closed; open another.")
 
     def _take(self, frame: bytes, source: str) -> None:
-        """Open what has come in, and let it wait; any bytes may be given. Not by two threads at once."""
+        """Open a received frame, whatever its bytes, and append its datagram to the queue. For one thread."""
         opened = self._opener.open(frame, source)
         with self._lock:
             self.received = _sum(self.received, Traffic(1, len(frame)))
-            if opened is not None and self._drawn.random() < self._loss:
+            if opened is not None and self._random.random() < self._loss:
                 self.n_lost += 1
             elif opened is not None:
                 if len(self._waiting) == self._max_waiting:
@@ -194,14 +201,12 @@ class FramedTransport(ABC):
                     self.n_dropped += 1
                 self._waiting.append(opened)
 
-    def _fails(self, name: str, what: str, whither: str) -> None:
-        """Count it, and say so the first time."""
+    def _count_failure(self, name: str, message: str, direction: str) -> None:
+        """Count a network error, and log the first one of each name."""
         with self._lock:
             self.failures[name] = n = self.failures.get(name, 0) + 1
         if n == 1:
-            _log.warning(
-                "Robot %d goes on without what did not get %s: %s (%s).", self.robot, whither, what, name
-            )
+            _log.warning("Robot %d lost a datagram %s: %s (%s).", self.robot, direction, message, name)
 
 
 def _sum(*traffic: Traffic) -> Traffic:

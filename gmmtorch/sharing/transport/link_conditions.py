@@ -1,4 +1,4 @@
-"""LinkConditions: what the links of a simulated network do to datagrams, and when they are cut."""
+"""LinkConditions: latency, loss, bandwidth and partitions of a simulated network's links."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gmmtorch.errors import InvalidArgumentError
 
 
 class Partition(NamedTuple):
-    """From `begin` until before `end` (s), robots of different groups do not hear each other.
+    """From `begin` until before `end` (s), robots of different groups do not receive each other's datagrams.
 
-    groups: numbers of robots. Those that no group names make up one more.
+    groups: robot numbers. Robots that no group contains form one more group.
     """
 
     begin: float
@@ -33,17 +33,16 @@ class Partition(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkConditions:
-    """Of all links of a network.
+    """Conditions of all links of a network.
 
-    latency: seconds from when a datagram has left its sender to when it arrives, at least. jitter: mean
-    (s) of what is added to that, drawn for each receiver and each copy from an exponential distribution.
-    bandwidth: bytes a second of each sender; None: no limit. loss: share of the datagrams that each
-    receiver misses, [0, 1). duplication: share of those not lost that come twice, [0, 1]. reach: metres
-    that two robots may be apart to hear each other; None: any. partitions: each a `Partition`, or a
-    mapping or triple of its fields; any number may be in force at once. names: what errors call fields,
-    where a user knows them by other names.
+    latency: seconds from the end of transmission to arrival, at least. jitter: mean (s) of an exponential
+    delay that is added for each receiver and each copy. bandwidth: bytes per second of each sender; None: no
+    limit. loss: share of the datagrams that each receiver loses, [0, 1). duplication: share of those not lost
+    that arrive twice, [0, 1]. reach: largest distance (m) between two robots that communicate; None: any.
+    partitions: each a `Partition`, or a mapping or triple of its fields; they may overlap in time. names:
+    field names to use in error messages, such as those of a command's options.
 
-    Raises `InvalidArgumentError` for values that cannot be.
+    Raises `InvalidArgumentError` for values out of range.
     """
 
     latency: float = 0.05
@@ -57,12 +56,12 @@ class LinkConditions:
 
     def __post_init__(self, names: Mapping[str, str] | None) -> None:
         names = names or {}
-        for field, (holds, demand) in _DEMANDS.items():
+        for field, (is_valid, requirement) in _REQUIREMENTS.items():
             value = getattr(self, field)
-            if value is None and field in _UNLIMITED:
+            if value is None and field in _OPTIONAL:
                 continue
-            if not (_is_number(value) and holds(value)):
-                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {demand}.")
+            if not (_is_number(value) and is_valid(value)):
+                raise InvalidArgumentError(f"{names.get(field, field)}={value!r} must be {requirement}.")
             object.__setattr__(self, field, float(value))
         name = names.get("partitions", "partitions")
         if not isinstance(self.partitions, Sequence):
@@ -71,7 +70,7 @@ class LinkConditions:
         object.__setattr__(self, "partitions", partitions)
 
     def check_team(self, n_robots: int, names: Mapping[str, str] | None = None) -> None:
-        """Raises `InvalidArgumentError` unless the partitions are of so many robots. names: as above."""
+        """Raise `InvalidArgumentError` unless the partitions fit a team of `n_robots`. names: as above."""
         name = (names or {}).get("partitions", "partitions")
         for i, partition in enumerate(self.partitions):
             named = [robot for group in partition.groups for robot in group]
@@ -83,25 +82,25 @@ class LinkConditions:
             if len(partition.groups) + (len(named) < n_robots) < 2:
                 raise InvalidArgumentError(
                     f"{name}[{i}].groups={partition.groups} puts all {n_robots} robots into one group, and "
-                    "so cuts nobody off; leave it out, or name two groups."
+                    "so divides nothing; leave it out, or give two groups."
                 )
 
     def cut(self, sender: int, receiver: int, begin: float, end: float) -> bool:
-        """Whether a datagram that is on the air from `begin` to `end` (s), both included, is cut off."""
+        """Whether a partition divides sender and receiver at any time from `begin` to `end` (s) inclusive."""
         return any(
             partition.begin <= end and begin < partition.end and partition.divides(sender, receiver)
             for partition in self.partitions
         )
 
     def draw_losses(self, n: int, generator: torch.Generator) -> list[bool]:
-        """Of so many receivers, who loses a datagram."""
+        """Which of n receivers lose a datagram."""
         if self.loss == 0:
             return [False] * n
         drawn = torch.rand(n, generator=generator, dtype=torch.float64) < self.loss
         return [bool(lost) for lost in drawn]
 
     def draw_delays(self, n: int, generator: torch.Generator) -> list[list[float]]:
-        """After what times (s) a datagram comes to each of so many receivers: one, or two."""
+        """For each of n receivers, the delays (s) of the one or two copies of a datagram."""
         if self.jitter == self.duplication == 0:
             return [[self.latency]] * n
         first, second, chance = torch.rand(3, n, generator=generator, dtype=torch.float64).tolist()
@@ -111,8 +110,8 @@ class LinkConditions:
         ]
 
 
-_UNLIMITED = ("bandwidth", "reach")  # if None
-_DEMANDS: dict[str, tuple[Callable[[float], bool], str]] = {
+_OPTIONAL = ("bandwidth", "reach")  # None: no limit
+_REQUIREMENTS: dict[str, tuple[Callable[[float], bool], str]] = {
     "latency": (lambda s: 0 <= s < math.inf, "a time of zero seconds or more, and finite"),
     "jitter": (lambda s: 0 <= s < math.inf, "a mean time of zero seconds or more, and finite"),
     "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes a second, and finite, or None"),
@@ -123,7 +122,7 @@ _DEMANDS: dict[str, tuple[Callable[[float], bool], str]] = {
 
 
 def _partition(name: str, value: Any) -> Partition:
-    """What somebody gave as a partition, checked."""
+    """The checked partition of a user's mapping or triple."""
     if isinstance(value, Mapping) and set(value) == set(Partition._fields):
         fields = [value[field] for field in Partition._fields]
     else:

@@ -1,7 +1,7 @@
-"""Datagrams that only a team can read and write: sealed with its key, and opened again.
+"""Encrypted frames: a team's datagrams, which only robots with the team's key can read and write.
 
-ChaCha20-Poly1305 (RFC 8439) of the package cryptography. What goes on the wire, byte by byte, and what it
-protects from: docs/network.md.
+Cipher: ChaCha20-Poly1305 (RFC 8439), from the package cryptography. docs/network.md describes the frame
+byte by byte, and what it protects from.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
-from gmmtorch.sharing.transport.sessions import Sessions, TwinWatch
+from gmmtorch.sharing.transport.sessions import OwnIdWatch, Sessions
 from gmmtorch.sharing.transport.team_key import TeamKey
 
 __all__ = ["REFUSALS", "Opener", "Sealer", "TeamKey"]
@@ -28,24 +28,24 @@ PLAIN_OVERHEAD = 15
 """Bytes that a frame without a key adds: first byte, sender (2), session (8), number (4)."""
 TAG_BYTES = 16
 SEALED_OVERHEAD = PLAIN_OVERHEAD + TAG_BYTES
-"""Bytes that a frame with a key adds. 1200 + 31 + 48 of IPv6 and UDP are 1279; any path takes 1280."""
-REFUSALS = ("oversized", "foreign", "version", "malformed", "wrong_key", "echo", "replayed", "namesake")
-"""Why a frame is refused, in the order in which it is asked."""
+"""Bytes that a frame with a key adds. 1200 + 31 + 48 (IPv6, UDP) = 1279; every path carries 1280."""
+REFUSALS = ("oversized", "foreign", "version", "malformed", "wrong_key", "echo", "replayed", "duplicate_id")
+"""Reasons for which a frame is refused, in the order of the checks."""
 _PLAIN, _SEALED = 14, 15  # high half of the first byte; the low half is the version
 _NUMBERS = 1 << 32
-_MAX_SAID = 16
-_NEWS = {
+_MAX_LOGGED = 16
+_WARNINGS = {
     "wrong_key": (
-        "Datagrams from {source} that say they are of robot {sender} do not open: they are sealed with "
-        "another key, or only one side has a key, or they were altered. Give all robots the same team key."
+        "Datagrams from {source} of robot {sender} cannot be opened: they are sealed with another key, or "
+        "only one side has a key, or they were altered. Give all robots the same team key."
     ),
     "version": (
         f"Frames from {{source}} are not of version {FRAME_VERSION}, which this gmmtorch reads. Update it "
         "on one of the robots."
     ),
-    "namesake": (
-        "Two robots have the number {sender}, heard from {pair}: what they say is refused. Give each robot "
-        "its own number."
+    "duplicate_id": (
+        "Two robots use the id {sender}, at {pair}: their datagrams are refused. Give each robot an id of "
+        "its own."
     ),
 }
 _log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class _Cipher:
             from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
         except ImportError as error:
             raise GmmTorchError(
-                f"Datagrams are sealed with the package cryptography, which does not load ({error}); "
+                f"A team key needs the package cryptography, which does not load ({error}); "
                 "pip install 'gmmtorch[network]'."
             ) from error
         self._aead, self._invalid = ChaCha20Poly1305(key._data), InvalidTag
@@ -69,7 +69,7 @@ class _Cipher:
         return self._aead.encrypt(_nonce(header), datagram, header)
 
     def decrypt(self, header: bytes, data: bytes) -> bytes | None:
-        """The datagram, or None where key, header or data are not those it was sealed with."""
+        """The datagram; None if key, header or data differ from those that it was sealed with."""
         try:
             return self._aead.decrypt(_nonce(header), data, header)
         except self._invalid:
@@ -77,16 +77,16 @@ class _Cipher:
 
 
 def _nonce(header: bytes) -> bytes:
-    """Session and number, 12 bytes: under one key no two datagrams have the same."""
+    """Session and number, 12 bytes: unique for each datagram under one key."""
     return header[3:]
 
 
 class Sealer:
-    """Frames one robot's datagrams: sealed with the team's key, or in the clear without one.
+    """Makes frames of one robot's datagrams: sealed with the team's key, or in the clear without one.
 
-    A frame carries its sender, a session and a number, which make its nonce. The session is 64 bits drawn at
-    random at each start; the number counts from zero. No nonce comes twice: after 2³² datagrams, and
-    in a process forked off, a new session is drawn. Threads may share a sealer.
+    A frame has its sender, a session and a number, which make its nonce. The session is 64 random bits,
+    drawn at each start; the number counts from zero. No nonce is used twice: after 2³² datagrams, and in a
+    forked process, a new session is drawn. Thread-safe.
     """
 
     def __init__(self, sender: int, key: TeamKey | None = None) -> None:
@@ -117,13 +117,17 @@ class Sealer:
         return header + (datagram if self._cipher is None else self._cipher.encrypt(header, datagram))
 
     def __reduce__(self) -> NoReturn:
-        raise InvalidArgumentError("A Sealer is not copied: two of one session would share nonces.")
+        raise InvalidArgumentError("A Sealer cannot be copied: two with one session would share nonces.")
 
 
 class Opener:
-    """Opens the frames that other robots have sealed; counts, and refuses, whatever else comes in.
+    """Opens the frames of other robots; refuses and counts everything else.
 
-    Not for several threads at once.
+    Not thread-safe.
+
+    Attributes:
+        former: sessions of former starts of this robot. Their frames are refused, but show no duplicate id.
+        refused: number of frames refused, by reason (`REFUSALS`).
     """
 
     def __init__(
@@ -133,42 +137,40 @@ class Opener:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Args:
-        key: what the others seal with, or None if they do not.
-        own: this robot's, so that what comes back to it, and others with its number, are known.
+        key: the team's key; None if frames are in the clear.
+        own: this robot's sealer, to recognize its own frames, and other robots with its id.
         clock: seconds that never go back.
         """
         self._cipher = None if key is None else _Cipher(key)
         self._own = own
         self._form = _PLAIN if key is None else _SEALED
         self._sessions = Sessions(clock)
-        self._twins = TwinWatch(clock)
-        self._said: set[tuple[str, int]] = set()
+        self._own_id = OwnIdWatch(clock)
+        self._logged: set[tuple[str, int]] = set()
         self.former: frozenset[bytes] = frozenset()
-        """Sessions of former starts of this robot: whoever speaks in them plays back what it said."""
         self.refused = dict.fromkeys(REFUSALS, 0)
-        """How many frames were refused, by reason."""
 
     @property
-    def namesakes(self) -> dict[int, str]:
-        """Numbers that two robots have, and the addresses and sessions they were heard from. This robot's own
+    def duplicates(self) -> dict[int, str]:
+        """Robot ids that two robots use, with the addresses and sessions of both. This robot's own id
         stays."""
-        return dict(self._sessions.namesakes)
+        return dict(self._sessions.duplicates)
 
     def open(self, frame: bytes, source: str = "") -> tuple[int, bytes] | None:
-        """(sender, datagram), or None for what is refused: any bytes may be given, none raise an error.
+        """(sender, datagram), or None if the frame is refused. Never raises, whatever the bytes.
 
-        `source`: the address it came from, for the log alone. The log tells the first of each kind.
+        source: the address that the frame came from, for the log. The first refusal of each kind is logged.
         """
         sender, datagram, reason = self._examined(frame, source)
         if reason is None:
             return sender, datagram
         self.refused[reason] += 1
-        self._say(reason, sender, source)
+        self._warn(reason, sender, source)
         return None
 
     def _examined(self, frame: bytes, source: str) -> tuple[int, bytes, str | None]:
-        """Sender, datagram, and why it is refused; sender −1 where nobody can tell."""
-        reason = _misfit(frame)
+        """Sender (−1 if unknown), datagram, and why it is refused."""
+        reason = _malformed(frame)
         if reason is not None:
             return -1, b"", reason
         header, data = frame[:PLAIN_OVERHEAD], frame[PLAIN_OVERHEAD:]
@@ -182,26 +184,26 @@ class Opener:
         if datagram is None:
             return sender, b"", "wrong_key"
         number = int.from_bytes(header[11:], "little")
-        whence = f"{source} (session {session.hex()})"  # which is in that robot's log, too
+        address = f"{source} (session {session.hex()})"  # the log of that robot shows its session, too
         if own is not None and sender == own.sender:
-            if session not in self.former and self._twins.finds(session, number):
-                self._sessions.namesakes[sender] = f"{whence} and this robot (session {own.session.hex()})"
-            return sender, datagram, "namesake"
-        return sender, datagram, self._sessions.refusal(sender, session, number, whence)
+            if session not in self.former and self._own_id.detects(session, number):
+                self._sessions.duplicates[sender] = f"{address} and this robot (session {own.session.hex()})"
+            return sender, datagram, "duplicate_id"
+        return sender, datagram, self._sessions.refusal(sender, session, number, address)
 
-    def _say(self, reason: str, sender: int, source: str) -> None:
-        """Log what somebody has to mend, once; and not much in all, whoever asks for it."""
-        if reason not in _NEWS or (reason, sender) in self._said or len(self._said) >= _MAX_SAID:
+    def _warn(self, reason: str, sender: int, source: str) -> None:
+        """Log a refusal that a user can mend: once for each reason and sender, `_MAX_LOGGED` in all."""
+        if reason not in _WARNINGS or (reason, sender) in self._logged or len(self._logged) >= _MAX_LOGGED:
             return
-        if reason == "namesake" and sender not in self._sessions.namesakes:
-            return  # of a former life of this robot, for all that is known yet
-        self._said.add((reason, sender))
-        pair = self._sessions.namesakes.get(sender, source)
-        _log.warning(_NEWS[reason].format(sender=sender, source=source or "somewhere", pair=pair))
+        if reason == "duplicate_id" and sender not in self._sessions.duplicates:
+            return  # it may come from a former start of this robot
+        self._logged.add((reason, sender))
+        pair = self._sessions.duplicates.get(sender, source)
+        _log.warning(_WARNINGS[reason].format(sender=sender, source=source or "somewhere", pair=pair))
 
 
-def _misfit(frame: bytes) -> str | None:
-    """Why bytes cannot be a frame of this version, by what they look like."""
+def _malformed(frame: bytes) -> str | None:
+    """Why bytes cannot be a frame of this version, by their form and length; None if they can."""
     if len(frame) > MAX_BYTES + SEALED_OVERHEAD:
         return "oversized"
     form, version = (frame[0] >> 4, frame[0] & 15) if frame else (0, 0)

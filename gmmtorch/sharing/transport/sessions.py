@@ -1,4 +1,4 @@
-"""Who is speaking: datagrams that come again are refused, and two robots with one number are told apart."""
+"""Detects replayed datagrams, and robots with a duplicate id, from sessions and datagram numbers."""
 
 from __future__ import annotations
 
@@ -8,31 +8,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 WINDOW = 1024
-"""How far behind the newest a datagram of a session may come and still be told from a replay."""
+"""Numbers below the highest one of a session for which replays are detected; lower numbers are refused."""
 MAX_SESSIONS = 1024
-"""That are remembered; of more, those longest silent are forgotten."""
+"""Sessions that are remembered. Of more, those that were silent longest are forgotten."""
 RETURNS = 4
-"""How often a session must come back after another of the same robot spoke, until they are two robots."""
+"""How often a session must continue after another one of the same robot id, until they are two robots."""
 SILENCE = 60.0
-"""Seconds for which one session has to speak alone until it is believed again."""
+"""Seconds for which only one session must send until its robot id counts as unique again."""
 FRESH_FRAMES, FRESH_SECONDS = 5, 5.0
-"""How many new frames of one session, over how long at least, show that a robot is there that sends them."""
+"""New frames of one session, and the time from first to last, that show a second robot with this id."""
 
 
 class ReplayWindow:
-    """Which of a session's last 1024 numbers have been seen: the anti-replay window of IPsec (RFC 4303, A2).
-
-    A number below the window is refused, as nobody remembers whether it has been seen.
-    """
+    """The numbers of a session that were received: the anti-replay window of IPsec (RFC 4303, appendix
+    A2)."""
 
     __slots__ = ("_seen", "highest")
 
     def __init__(self) -> None:
         self.highest = -1
-        self._seen = 0  # bit i: highest − i
+        self._seen = 0  # bit i: number highest − i was received
 
     def accept(self, number: int) -> bool:
-        """Whether a number ≥ 0 is new; from now on it is not."""
+        """Whether a number ≥ 0 is new; marks it as received."""
         ahead = number - self.highest
         if ahead > 0:
             kept = self._seen << ahead if ahead < WINDOW else 0
@@ -47,7 +45,7 @@ class ReplayWindow:
 
 @dataclass
 class _Speaker:
-    """Which session of a robot spoke last, and whence."""
+    """The session of a robot id that sent last, from which address, and since when."""
 
     session: bytes
     source: str
@@ -56,46 +54,47 @@ class _Speaker:
 
 
 class Sessions:
-    """The sessions that have been heard, one for each start of each robot.
+    """The sessions of other robots. Each start of a robot begins one.
 
-    A robot that restarts begins a new session, and its former one falls silent. Where sessions speak by
-    turns there are two robots with one number, and which of them is meant nobody can know: both are refused,
-    until one has spoken alone for a minute.
+    A robot that restarts begins a new session, and its former session ends. If two sessions of one id send
+    alternately, two robots use that id. Both are then refused until only one has sent for `SILENCE` seconds.
 
-    Memory: a few hundred bytes for each of at most 1024 sessions.
+    Memory: a few hundred bytes for each of at most `MAX_SESSIONS` sessions.
+
+    Attributes:
+        duplicates: robot ids that two robots use now, with the addresses of both.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock`: seconds that never go back, whatever the time of day does."""
+        """`clock`: seconds that never go back."""
         self._clock = clock
         self._windows: OrderedDict[tuple[int, bytes], ReplayWindow] = OrderedDict()
         self._speakers: dict[int, _Speaker] = {}
-        self.namesakes: dict[int, str] = {}
-        """Numbers that two robots have now, and whence they were heard."""
+        self.duplicates: dict[int, str] = {}
 
     def __len__(self) -> int:
         return len(self._windows)
 
     def refusal(self, sender: int, session: bytes, number: int, source: str = "") -> str | None:
-        """Why datagram `number` of a session is not to be believed: 'replayed', 'namesake', or None.
+        """Why an authentic datagram is refused: 'replayed', 'duplicate_id', or None if it is accepted.
 
-        To be asked only of datagrams that are authentic. `source`: whence it came, for people to read.
+        source: the sender's address, for messages.
         """
         known = self._windows.get((sender, session))
         window = known or ReplayWindow()
-        goes_on = number > window.highest  # a straggler of a session that has ended does not
+        continues = number > window.highest  # a late datagram of a former session does not
         if not window.accept(number):
             return "replayed"
         self._windows[sender, session] = window
         self._windows.move_to_end((sender, session))
         if len(self._windows) > MAX_SESSIONS:
             self._forget(*self._windows.popitem(last=False)[0])
-        if goes_on:
-            self._speaks(sender, session, source, returns=known is not None)
-        return "namesake" if sender in self.namesakes else None
+        if continues:
+            self._note_speaker(sender, session, source, returns=known is not None)
+        return "duplicate_id" if sender in self.duplicates else None
 
-    def _speaks(self, sender: int, session: bytes, source: str, returns: bool) -> None:
-        """A session goes on, or begins: two robots are found, or one of two has fallen silent."""
+    def _note_speaker(self, sender: int, session: bytes, source: str, returns: bool) -> None:
+        """Update which session of a robot id sends, and whether the id is duplicate."""
         now, speaker = self._clock(), self._speakers.get(sender)
         if speaker is None:
             self._speakers[sender] = _Speaker(session, source, now)
@@ -103,22 +102,22 @@ class Sessions:
         if session != speaker.session:
             speaker.returns += returns
             if speaker.returns >= RETURNS:
-                self.namesakes[sender] = f"{speaker.source} and {source}"
+                self.duplicates[sender] = f"{speaker.source} and {source}"
             speaker.session, speaker.source, speaker.since = session, source, now
-        elif sender in self.namesakes and now - speaker.since >= SILENCE:
+        elif sender in self.duplicates and now - speaker.since >= SILENCE:
             speaker.returns = 0
-            self.namesakes.pop(sender, None)
+            self.duplicates.pop(sender, None)
 
     def _forget(self, sender: int, session: bytes) -> None:
         speaker = self._speakers.get(sender)
         if speaker is not None and speaker.session == session:
             del self._speakers[sender]
-            self.namesakes.pop(sender, None)
+            self.duplicates.pop(sender, None)
 
 
 @dataclass
 class _Continuing:
-    """A session that goes on: its newest number, and the new ones since it was last silent for long."""
+    """A session that continues: its highest number, and the new frames since its last long silence."""
 
     since: float
     last: float
@@ -126,14 +125,15 @@ class _Continuing:
     n_fresh: int = 0
 
 
-class TwinWatch:
-    """Whether another robot speaks that has this robot's number.
+class OwnIdWatch:
+    """Detects whether another robot uses this robot's id.
 
-    A frame of that number that is not of this start of the robot may be of a former one: late on a slow way,
-    or recorded and played back. So it takes a session that goes on: `FRESH_FRAMES` frames, each newer than
-    all before, over `FRESH_SECONDS` or longer, without a silence of a minute.
+    A frame with this robot's id and another session may come from a former start of this robot: late, or
+    recorded and replayed. Another robot is reported only after `FRESH_FRAMES` frames of one session, each
+    with a higher number than all before, over at least `FRESH_SECONDS`, without a silence of `SILENCE`
+    seconds.
 
-    Memory: a few hundred bytes for each of at most 1024 sessions.
+    Memory: a few hundred bytes for each of at most `MAX_SESSIONS` sessions.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -143,11 +143,8 @@ class TwinWatch:
     def __len__(self) -> int:
         return len(self._sessions)
 
-    def finds(self, session: bytes, number: int) -> bool:
-        """Whether there is another, now that datagram `number` of a session of its has come.
-
-        To be asked only of datagrams that are authentic, and not of this start of the robot.
-        """
+    def detects(self, session: bytes, number: int) -> bool:
+        """Whether another robot uses the id, after an authentic datagram of another session arrived."""
         now = self._clock()
         heard = self._sessions.setdefault(session, _Continuing(now, now))
         self._sessions.move_to_end(session)

@@ -1,4 +1,4 @@
-"""Networks that carry datagrams between robots: what any transport offers, and a simulated one."""
+"""Transport, which carries datagrams between robots; and Network, a simulated one."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.transport.link_conditions import LinkConditions
 
 HEADER_BYTES = 28
-"""Of a datagram on the wire: 20 of IPv4, 8 of UDP."""
+"""Headers of a datagram on the wire: 20 of IPv4, 8 of UDP."""
 
-_OTHER_SEED = 0x5851F42D4C957F2D  # makes other numbers of the same seed
+_OTHER_SEED = 0x5851F42D4C957F2D  # a second, different stream of the same seed
 
 
 class Transport(Protocol):
     """What a mission needs of a network. Datagrams may be lost, but are never changed."""
 
     def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
-        """Broadcast datagrams at the time `now` (s); `kind` says what they are, for the books."""
+        """Broadcast datagrams at the time `now` (s); `kind` names their contents for the statistics."""
 
     def deliver(self, robot: int, now: float) -> list[tuple[int, bytes]]:
-        """(sender, datagram) of all that has come to a robot up to `now` and was not delivered before."""
+        """(sender, datagram) of all that arrived at a robot by `now` and was not delivered before."""
         ...
 
 
 class Traffic(NamedTuple):
-    """What has been sent, each broadcast counted once, however many hear it."""
+    """Datagrams and bytes that were sent. Each broadcast counts once, however many robots receive it."""
 
     datagrams: int = 0
     bytes: int = 0
@@ -44,10 +44,10 @@ class Traffic(NamedTuple):
 
 
 class Reception(NamedTuple):
-    """What became of the datagrams of others on their way to a receiver.
+    """What happened to the datagrams of other robots on the way to a receiver.
 
-    datagrams, bytes: delivered, copies among them. duplicated: second copies that the network made. lost,
-    cut_off (by a partition), out_of_reach: what will never come. With what is still on its way,
+    datagrams, bytes: delivered, copies included. duplicated: second copies that the network made. lost,
+    cut_off (by a partition), out_of_reach: never delivered. With those still in flight,
 
         sent by others + duplicated = datagrams + lost + cut_off + out_of_reach + in flight.
     """
@@ -61,7 +61,7 @@ class Reception(NamedTuple):
 
 
 class _Arrival(NamedTuple):
-    """A datagram on its way to one robot; sorted by time, then in the order of sending."""
+    """A datagram in flight to one robot; sorted by time, then by the order of sending."""
 
     time: float
     order: int
@@ -70,26 +70,24 @@ class _Arrival(NamedTuple):
 
 
 class Network:
-    """A simulated broadcast network of `n_robots`, whose links are all as `conditions` say.
+    """A simulated broadcast network of `n_robots`. All links have the same `conditions`.
 
-    A sender's datagrams leave one after another, each taking its bytes on the wire over `bandwidth`; what
-    is sent faster than that waits its turn, without limit. To each other robot a datagram then comes
-    `latency` and an exponential time of mean `jitter` after it has left, and, with probability
-    `duplication`, a second time, as late as chance makes it; or never, if that robot
+    A sender transmits its datagrams one after another, each for its bytes on the wire divided by `bandwidth`;
+    the queue is unlimited. A datagram arrives at each other robot after `latency` and an exponential delay of
+    mean `jitter`, and with probability `duplication` a second time with another delay. It never arrives if
 
-    1. is out of `reach` of the sender when `send` is called;
-    2. is cut off: a partition is in force between them at any time from when the datagram begins to leave
-       to when it would arrive, so what is in the air at the cut is lost. Of two copies the second may be
-       cut off alone; a datagram whose first copy is cut off has no second;
-    3. loses it, with probability `loss`.
+    1. the robot is out of `reach` of the sender when `send` is called;
+    2. a partition divides the two at any time from the begin of transmission to arrival. Of two copies the
+       second alone may be cut off; a datagram whose first copy is cut off has no second;
+    3. the robot loses it, with probability `loss`.
 
-    A sender's datagrams come in order without jitter, and with it overtake one another wherever the later
-    one is less late by more than lies between them. Draws of loss have a generator of their own, so the
-    same `seed` loses the same whatever else the conditions are. What is delivered is forgotten.
+    Without jitter, a sender's datagrams arrive in order. With jitter, they overtake one another if their
+    delays differ by more than the time between them. Losses have a random generator of their own: the same
+    `seed` loses the same datagrams whatever the other conditions are. Delivered datagrams are not stored.
     """
 
     def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:
-        """conditions: as they are by default, if None. seed: of all that is drawn."""
+        """conditions: None: the defaults. seed: of all random draws."""
         self.n_robots = check_whole("n_robots", n_robots, 1)
         self.conditions = LinkConditions() if conditions is None else conditions
         self.conditions.check_team(self.n_robots)
@@ -104,7 +102,7 @@ class Network:
         self._received: list[Counter[str]] = [Counter() for _ in range(self.n_robots)]
 
     def place(self, positions: torch.Tensor) -> None:
-        """Say where the robots are from now on, (n_robots, D), metres; `reach` needs it, nothing else."""
+        """Set the positions (n_robots, D), metres, of the robots. Only `reach` needs them."""
         if positions.ndim != 2 or len(positions) != self.n_robots or not positions.isfinite().all():
             raise InvalidArgumentError(
                 f"positions of shape {tuple(positions.shape)} must be finite metres, one row for each of "
@@ -122,11 +120,11 @@ class Network:
         others = [robot for robot in range(self.n_robots) if robot != sender]
         near = self._near(sender, others)
         for data in datagrams:
-            begin, left = self._transmission(sender, len(data), now)
+            begin, end = self._transmission(sender, len(data), now)
             lost = self.conditions.draw_losses(len(others), self._losses)
             delays = self.conditions.draw_delays(len(others), self._delays)
             for robot, is_near, is_lost, times in zip(others, near, lost, delays, strict=True):
-                copies = [_Arrival(left + time, self._n_sent, sender, data) for time in times]
+                copies = [_Arrival(end + time, self._n_sent, sender, data) for time in times]
                 self._carry(copies, robot, begin, is_near, is_lost)
             self._n_sent += 1
         before = self._traffic.get((sender, kind), Traffic())
@@ -145,7 +143,7 @@ class Network:
         return delivered
 
     def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
-        """What has been sent, of one sender or all, of one kind or all."""
+        """What was sent, by one sender or all, of one kind or all."""
         chosen = [
             traffic
             for (who, what), traffic in self._traffic.items()
@@ -154,11 +152,11 @@ class Network:
         return Traffic(sum(t.datagrams for t in chosen), sum(t.bytes for t in chosen))
 
     def reception(self, robot: int | None = None) -> Reception:
-        """Of what was sent to one robot, or to all: there each broadcast counts for every receiver."""
+        """Of the datagrams sent to one robot; or to all, where each broadcast counts for every receiver."""
         if robot is not None:
             self._check("robot", robot)
         chosen = self._received if robot is None else [self._received[robot]]
-        return Reception(*(sum(books[field] for books in chosen) for field in Reception._fields))
+        return Reception(*(sum(counts[field] for counts in chosen) for field in Reception._fields))
 
     @property
     def n_datagrams(self) -> int:
@@ -166,21 +164,21 @@ class Network:
 
     @property
     def n_bytes(self) -> int:
-        """Of all datagrams, without headers."""
+        """Bytes of all datagrams, without headers."""
         return self.traffic().bytes
 
     @property
     def n_wire_bytes(self) -> int:
-        """Of all datagrams, with the headers of UDP and IPv4."""
+        """Bytes of all datagrams, with the headers of UDP and IPv4."""
         return self.traffic().wire_bytes
 
     @property
     def bytes_by_kind(self) -> dict[str, int]:
-        """Bytes without headers, by the kind that the senders gave, sorted."""
+        """Bytes without headers, by the kinds that the senders gave, sorted."""
         return {kind: self.traffic(kind=kind).bytes for kind in sorted({k for _, k in self._traffic})}
 
     def books(self, robot: int) -> dict[str, Any]:
-        """What one robot has sent and received, for results; the names are those of a real transport's."""
+        """What one robot sent and received, as fields of a results row; see `FramedTransport.books`."""
         sent, got = self.traffic(robot), self.reception(robot)
         kinds = sorted(kind for who, kind in self._traffic if who == robot)
         return {
@@ -197,11 +195,11 @@ class Network:
 
     @property
     def n_in_flight(self) -> int:
-        """Datagrams on their way, one for each robot that will hear it."""
+        """Datagrams in flight, one for each robot that will receive it."""
         return sum(map(len, self._queues))
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs: what is on its way, the books, positions, and the generators."""
+        """All that `restore` needs: datagrams in flight, statistics, positions, and the generators."""
         arrivals = [(robot, arrival) for robot, queue in enumerate(self._queues) for arrival in sorted(queue)]
         datagrams = {arrival.order: arrival.datagram for _, arrival in arrivals}
         return {
@@ -218,7 +216,7 @@ class Network:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state` of a network with as many robots, and the same conditions."""
+        """Continue from a `state` of a network with as many robots, and the same conditions."""
         busy_until = state["busy_until"].tolist()
         if len(busy_until) != self.n_robots:
             raise InvalidArgumentError(
@@ -251,7 +249,7 @@ class Network:
         return [math.dist(positions[sender], positions[robot]) <= reach for robot in others]
 
     def _transmission(self, sender: int, n_bytes: int, now: float) -> tuple[float, float]:
-        """When a datagram begins to leave its sender, and has left."""
+        """Begin and end (s) of a datagram's transmission."""
         if self.conditions.bandwidth is None:
             return now, now
         begin = max(now, self._busy_until[sender])
@@ -261,24 +259,24 @@ class Network:
     def _carry(
         self, copies: list[_Arrival], receiver: int, begin: float, is_near: bool, is_lost: bool
     ) -> None:
-        """Queue what will come of the copies of a datagram that leaves at `begin`; book the rest."""
-        books, (first, *second) = self._received[receiver], copies
+        """Queue the copies that arrive of a datagram sent at `begin`; count the others."""
+        counts, (first, *second) = self._received[receiver], copies
 
-        def cut(copy: _Arrival) -> bool:
+        def is_cut(copy: _Arrival) -> bool:
             return self.conditions.cut(copy.sender, receiver, begin, copy.time)
 
         if not is_near:
-            books["out_of_reach"] += 1
-        elif cut(first):
-            books["cut_off"] += 1
+            counts["out_of_reach"] += 1
+        elif is_cut(first):
+            counts["cut_off"] += 1
         elif is_lost:
-            books["lost"] += 1
+            counts["lost"] += 1
         else:
             heapq.heappush(self._queues[receiver], first)
             for copy in second:
-                books["duplicated"] += 1
-                if cut(copy):
-                    books["cut_off"] += 1
+                counts["duplicated"] += 1
+                if is_cut(copy):
+                    counts["cut_off"] += 1
                 else:
                     heapq.heappush(self._queues[receiver], copy)
 

@@ -1,4 +1,4 @@
-"""The secret that a team shares."""
+"""TeamKey: the secret key of a team."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, O
 
 KEY_BYTES = 32
 KEY_VARIABLE = "GMMTORCH_TEAM_KEY"
-"""Environment variable that may hold the key."""
+"""Environment variable that may contain the key."""
 _HELP = f"A key is {KEY_BYTES} bytes as {2 * KEY_BYTES} hexadecimal digits: `openssl rand -hex 32`."
 
 
 class TeamKey:
-    """The secret that all robots of a team share. It shows itself to nobody: not in `repr`, nor in errors."""
+    """The secret that all robots of a team share. Neither `repr` nor any error shows it."""
 
     __slots__ = ("_data",)
 
     def __init__(self, data: bytes) -> None:
-        """`data`: 32 bytes, drawn at random."""
+        """`data`: 32 random bytes."""
         if not isinstance(data, bytes) or len(data) != KEY_BYTES:
             what = f"{len(data)} bytes" if isinstance(data, bytes) else f"of type {type(data).__name__}"
             raise InvalidArgumentError(f"The team key is {what}; it must be {KEY_BYTES} bytes.")
@@ -36,10 +36,10 @@ class TeamKey:
 
     @classmethod
     def from_file(cls, path: str | Path) -> TeamKey:
-        """The key in a file of 64 hexadecimal digits that its owner alone may read.
+        """The key in a file of 64 hexadecimal digits that only its owner may read.
 
-        Raises `MissingDataError` where there is none, `DataError` where it is something else, or others
-        than its owner may read or write it.
+        Raises `MissingDataError` if there is no file, and `DataError` if it contains something else, or if
+        other users may read or write it.
         """
         path = Path(path)
         try:
@@ -57,8 +57,8 @@ class TeamKey:
             raise DataError(f"The team key {path} cannot be read: {error.strerror}.") from None
         if os.name == "posix" and mode & 0o077:
             raise DataError(
-                f"The team key {path} has mode {mode:o}: others than its owner may read or write it. "
-                f"`chmod 600 {path}`; if others have been on this machine, make a new key."
+                f"The team key {path} has mode {mode:o}: other users than its owner may read or write it. "
+                f"`chmod 600 {path}`; if others have used this machine, make a new key."
             )
         return cls._from_hex(data, f"The team key {path}")
 
@@ -72,7 +72,7 @@ class TeamKey:
 
     @classmethod
     def _from_hex(cls, data: bytes, what: str) -> TeamKey:
-        """Errors say how long the data are, and nothing that is in them."""
+        """The key of hexadecimal digits. Errors show the length of the data, but no data."""
         digits = data.strip()
         if len(digits) != 2 * KEY_BYTES:
             raise DataError(f"{what} has {len(digits)} characters. {_HELP}")
@@ -82,7 +82,7 @@ class TeamKey:
             raise DataError(f"{what} has characters that are no hexadecimal digits. {_HELP}") from None
 
     def save(self, path: str | Path) -> Path:
-        """Write a file that `from_file` reads, for its owner alone; never over another."""
+        """Write a file that `from_file` reads. Raises `OutputError` if the file exists already."""
         path = Path(path)
         try:
             handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -105,4 +105,4 @@ class TeamKey:
         return "TeamKey(…)"
 
     def __reduce__(self) -> NoReturn:
-        raise InvalidArgumentError("A TeamKey is not pickled or copied: give other processes its file.")
+        raise InvalidArgumentError("A TeamKey cannot be pickled or copied: give other processes its file.")

@@ -1,4 +1,4 @@
-"""TokenBucket: no more than so many bytes a second, but for short bursts."""
+"""TokenBucket: limits the bytes that are sent per second."""
 
 from __future__ import annotations
 
@@ -7,24 +7,27 @@ from typing import Any
 
 from gmmtorch.errors import InvalidArgumentError
 
-_BURST = 1.0  # seconds of the rate, at least one datagram
-_LEAST = 1200.0
+_BURST = 1.0
+"""Seconds of the rate that may be sent in one burst."""
+_LEAST_BURST = 1200.0
+"""Bytes: one datagram."""
 
 
 class TokenBucket:
-    """In any span of t seconds no more is taken than `rate` · t and a burst: of one second, or one datagram.
+    """In any t seconds at most `rate` · t bytes are taken, and one burst: a second of the rate, or a
+    datagram.
 
-    Times may be of any clock. One that is set back brings nothing for that step, and goes on from there.
+    The times may come from any clock. If it is set back, that step adds nothing.
 
     Args:
-        rate: bytes a second.
+        rate: bytes per second.
     """
 
     def __init__(self, rate: float) -> None:
         if not 0 < rate < math.inf:
             raise InvalidArgumentError(f"budget={rate} must be above zero bytes a second, and finite.")
         self.rate = float(rate)
-        self._most = max(_BURST * self.rate, _LEAST)
+        self._most = max(_BURST * self.rate, _LEAST_BURST)
         self._tokens = self._most
         self._last: float | None = None
 
@@ -36,7 +39,7 @@ class TokenBucket:
         return max(0, int(self._tokens))
 
     def take(self, n_bytes: int) -> None:
-        """They were sent; more than was available is paid for later."""
+        """Subtract bytes that were sent. More than were available delay later ones."""
         self._tokens -= n_bytes
 
     def state(self) -> dict[str, Any]:

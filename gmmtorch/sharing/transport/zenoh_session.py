@@ -1,4 +1,4 @@
-"""Zenoh sessions: opened with a team's endpoints, with errors that say what to do."""
+"""Opens Zenoh sessions with a team's endpoints."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
 _IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
 _ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
 _LARGEST_MESSAGE = 1 << 16
-"""Bytes that Zenoh puts together from parts; unasked, it would take a gigabyte from whoever connects."""
+"""Bytes that Zenoh assembles from parts. Its default would accept a gigabyte from anybody who connects."""
 _KEY_REMEDY = "give one, or say insecure=True to let anybody read and write."
 _REMEDIES = {
     "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
-    "assign requested": "this machine has no such address, or not yet. `ip address` shows those it has; "
-    "0.0.0.0 is all of them, also those to come.",
+    "assign requested": "this machine has no such address, or not yet. `ip address` lists those it has; "
+    "0.0.0.0 is all of them, later ones included.",
     "denied": "ports below 1024 are for the system. Give one above.",
 }
 
 
 def load_zenoh() -> Any:
-    """The package; `GmmTorchError` where it is not installed."""
+    """The package zenoh; raises `GmmTorchError` if it is not installed."""
     try:
         import zenoh
     except ImportError as error:
         raise GmmTorchError(
-            f"Zenoh is spoken by the package eclipse-zenoh, which does not load ({error}); "
+            f"transport=zenoh needs the package eclipse-zenoh, which does not load ({error}); "
             "pip install 'gmmtorch[zenoh]'."
         ) from error
     return zenoh
@@ -46,17 +46,17 @@ def open_session(
     config: str | Path | None,
     is_local: bool,
 ) -> zenoh.Session:
-    """A session of Zenoh. Who is not reached now is tried again for as long as it is open.
+    """A session of Zenoh. While it is open, it keeps trying to connect to endpoints that are not reached.
 
     Args:
-        listen: endpoints, such as 'tcp/10.0.0.3:7447'; where there are none, those of `config`.
-        connect: endpoints of others, or of routers; likewise.
-        scouting: whether others are looked for by multicast; None: as `config` says, else not.
+        listen: endpoints, such as 'tcp/10.0.0.3:7447'; empty: those of `config`.
+        connect: endpoints of other robots, or of routers; empty: those of `config`.
+        scouting: whether to look for others by multicast; None: as `config` says, else not.
         config: a file of Zenoh's own settings (JSON5), or None.
-        is_local: whether it keeps to this machine: to endpoints on loopback, and to those that are given.
+        is_local: use only the given endpoints, which must be on loopback.
 
-    Raises `InvalidArgumentError` for endpoints that are none, or cannot be listened on, `MissingDataError`
-    and `DataError` for a file that is not there, or is no configuration.
+    Raises `InvalidArgumentError` for endpoints that are invalid or cannot be listened on, `MissingDataError`
+    if `config` does not exist, and `DataError` if it is no configuration.
     """
     if is_local and (scouting or config is not None):
         given = "scouting=True" if scouting else f"config={str(config)!r}"
@@ -65,13 +65,13 @@ def open_session(
         )
     if not (listen or connect or scouting or config is not None):
         raise InvalidArgumentError(
-            "Nobody is reached with listen=[], connect=[], scouting=None and config=None: give one of them."
+            "No robot is reached with listen=[], connect=[], scouting=None, config=None: give one of them."
         )
     settings = _settings(
         _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
     )
     if is_local:
-        settings["scouting/gossip/enabled"] = False  # neighbours may know of others elsewhere
+        settings["scouting/gossip/enabled"] = False  # neighbours may know robots on other machines
     zenoh = load_zenoh()
     whole = zenoh.Config() if config is None else _read(zenoh, Path(config))
     try:
@@ -83,20 +83,20 @@ def open_session(
         remedies = (remedy for sign, remedy in _REMEDIES.items() if sign in cause)
         raise InvalidArgumentError(
             f"listen={list(listen)}, connect={list(connect)}, config={str(config)!r} cannot be used by Zenoh "
-            f"({cause}): {next(remedies, 'give what it knows.')}"
+            f"({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
         ) from error
 
 
 def _settings(
     listen: list[str], connect: list[str], scouting: bool | None, config: str | Path | None
 ) -> dict[str, Any]:
-    """What is said to Zenoh, above what is in the file, by the names of its settings."""
+    """Settings of Zenoh, by name, that override those of the file."""
     settings: dict[str, Any] = {
         "connect/exit_on_failure": False,
         "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
-        "transport/shared_memory/enabled": False,  # too little to gain with datagrams, for one more way in
+        "transport/shared_memory/enabled": False,  # saves little with datagrams, and opens one more way in
     }
-    if listen or (config is None and not scouting):  # Zenoh itself would listen everywhere
+    if listen or (config is None and not scouting):  # else Zenoh listens everywhere
         settings["listen/endpoints"] = listen
     if connect:
         settings["connect/endpoints"] = connect
@@ -115,14 +115,14 @@ def _read(zenoh: Any, path: Path) -> zenoh.Config:
         raise DataError(f"config={str(path)!r} is no configuration of Zenoh: {_cause(error)}.") from error
     if mode == "client":
         raise DataError(
-            f"config={str(path)!r} has mode 'client', which gives up where the router is away at the start. "
-            "Say mode: 'router', which waits for it, and passes on what others say."
+            f"config={str(path)!r} has mode 'client', which gives up if the router is absent at the start. "
+            "Use mode: 'router', which waits for it, and relays other robots' datagrams."
         )
     return config
 
 
 def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: bool) -> list[str]:
-    """Endpoints, if they are some: Zenoh itself would try for ever to connect to what is none."""
+    """The endpoints, checked: Zenoh itself would try for ever to connect to an invalid one."""
     if isinstance(endpoints, str):
         raise InvalidArgumentError(f"{name}={endpoints!r} must be a list of endpoints: [{endpoints!r}].")
     for endpoint in endpoints:
@@ -136,7 +136,7 @@ def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: boo
 
 
 def _host(name: str, endpoint: str, least_port: int) -> str:
-    """Of an endpoint 'protocol/host:port?metadata#config'; '' where the protocol is not one of IP."""
+    """The host of an endpoint 'protocol/host:port?metadata#config'; '' if the protocol is not one of IP."""
     protocol, _, rest = endpoint.partition("/") if isinstance(endpoint, str) else ("", "", "")
     if protocol and rest and protocol not in _IP_PROTOCOLS:
         return ""
@@ -157,5 +157,5 @@ def _is_loopback(host: str) -> bool:
 
 
 def _cause(error: Exception) -> str:
-    """What Zenoh says, in a line, without the lines of its source that it names."""
+    """Zenoh's message in one line, without places in its source code."""
     return " ".join(re.sub(r" at /\S+", "", str(error)).split()).rstrip(" .")[:300]

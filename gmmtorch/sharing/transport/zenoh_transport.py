@@ -1,4 +1,4 @@
-"""Datagrams over Zenoh: among machines, across routers and networks; sealed, where the team has a key."""
+"""ZenohTransport: datagrams over Zenoh, across routers and networks; encrypted if the team has a key."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ from gmmtorch.sharing.transport.simulated_network import Traffic
 from gmmtorch.sharing.transport.zenoh_session import load_zenoh, open_session
 
 SOON_REPEATED = frozenset({"announcements", "plans"})
-"""Kinds of datagrams whose next one says it all again: not worth a repetition."""
+"""Kinds of datagrams that the next one replaces. A lost one need not be repeated."""
 _TEAM = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_QUEUED = 256  # samples between Zenoh's threads and ours; when it is full, Zenoh's links wait
+_QUEUED = 256  # samples between Zenoh's threads and this one; when it is full, Zenoh's links wait
 _LONGEST_SOURCE = 100
 
 
 class ZenohTransport(FramedTransport):
-    """One robot's end of a network of Zenoh; see `Transport`. To be closed, or used as a context manager.
+    """One robot's end of a Zenoh network; see `Transport`. Close it, or use it as a context manager.
 
-    Robot i publishes at the key 'gmmtorch/<team>/<i>' and subscribes to 'gmmtorch/<team>/*'. What is lost
-    on a link is Zenoh's affair: kinds in `SOON_REPEATED` are sent best-effort, all others reliably, from hop
-    to hop. Where a link is congested, Zenoh drops what it has no room for, of either. All have one priority:
-    those overtaken by a thousand others would be refused as replays.
+    Robot i publishes at the key 'gmmtorch/<team>/<i>' and subscribes to 'gmmtorch/<team>/*'. Kinds in
+    `SOON_REPEATED` are sent best-effort, all others reliably from hop to hop. On a congested link Zenoh drops
+    both. All have one priority: a datagram that a thousand others overtake is refused as replayed.
 
-    A network that is down is no error, and tried again. A thread takes in what comes, as in `UdpTransport`.
-    `sent` counts a frame once, however many hear it.
+    A network that is down is no error; Zenoh connects again. A thread reads frames, as in `UdpTransport`.
+    `sent` counts a frame once, however many robots receive it.
     """
 
     def __init__(
@@ -48,16 +47,16 @@ class ZenohTransport(FramedTransport):
         max_waiting: int = MAX_WAITING,
     ) -> None:
         """Args:
-        robot: this robot's number, 0 … 65535, which no other has.
-        team: its name in keys: 1 to 64 letters, digits, and _ . -.
+        robot: id of this robot, 0 … 65535; unique in the team.
+        team: name of the team in keys: 1 to 64 letters, digits, and _ . -.
         listen: endpoints where others may connect, such as 'tcp/0.0.0.0:7447'.
-        connect: endpoints of other robots, or of routers, which need not be there yet.
-        scouting: whether robots are looked for by multicast; None: as `config` says, else not.
-        config: a file of Zenoh's own settings (TLS, access control, …); what is given here goes above it.
+        connect: endpoints of other robots, or of routers; they may start later.
+        scouting: whether to look for robots by multicast; None: as `config` says, else not.
+        config: a file of Zenoh's own settings (TLS, access control, …); the arguments here override it.
         key: the team's. Without one all endpoints must be on loopback, unless `insecure`.
-        max_waiting: how many datagrams may wait to be delivered.
+        max_waiting: largest number of datagrams in the queue.
 
-        Raises as `open_session` does, and `GmmTorchError` where eclipse-zenoh is not installed.
+        Raises as `open_session` does, and `GmmTorchError` if eclipse-zenoh is not installed.
         """
         if not isinstance(team, str) or _TEAM.fullmatch(team) is None:
             raise InvalidArgumentError(f"team={team!r} must be 1 to 64 letters, digits, '_', '.' or '-'.")
@@ -72,11 +71,11 @@ class ZenohTransport(FramedTransport):
             raise
         self._thread = threading.Thread(target=self._listen, name=f"zenoh-{self.robot}", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # Python cannot end a thread that waits inside Zenoh
+        atexit.register(self.close)  # Python cannot end a thread that is blocked in Zenoh
 
     @property
     def n_neighbours(self) -> int:
-        """Robots and routers that it is connected to now; behind routers there may be more. 0 once closed."""
+        """Robots and routers that are connected now; routers may have more behind them. 0 after `close`."""
         if self._closing.is_set():
             return 0
         info = self._session.info
@@ -85,8 +84,8 @@ class ZenohTransport(FramedTransport):
     # -- inside --------------------------------------------------------------------------------------------
 
     def _declare(self, zenoh: Any, team: str) -> None:
-        """Where it publishes, and what it subscribes to."""
-        own, all_of_team = f"gmmtorch/{team}/{self.robot}", f"gmmtorch/{team}/*"
+        """Declare the publishers and the subscriber."""
+        own, team_keys = f"gmmtorch/{team}/{self.robot}", f"gmmtorch/{team}/*"
         try:
             self._best_effort, self._reliable = (
                 self._session.declare_publisher(
@@ -98,11 +97,11 @@ class ZenohTransport(FramedTransport):
                 for reliability in (zenoh.Reliability.BEST_EFFORT, zenoh.Reliability.RELIABLE)
             )
             self._subscriber = self._session.declare_subscriber(
-                all_of_team, zenoh.handlers.FifoChannel(_QUEUED), allowed_origin=zenoh.Locality.REMOTE
+                team_keys, zenoh.handlers.FifoChannel(_QUEUED), allowed_origin=zenoh.Locality.REMOTE
             )
         except zenoh.ZError as error:
             raise GmmTorchError(
-                f"Zenoh does not let robot {self.robot} publish at {own} and subscribe to {all_of_team}: "
+                f"Zenoh does not let robot {self.robot} publish at {own} and subscribe to {team_keys}: "
                 f"{error}. See what config allows."
             ) from error
 
@@ -111,7 +110,7 @@ class ZenohTransport(FramedTransport):
         try:
             publisher.put(frame)
         except self._error as error:
-            self._fails("ZError", str(error), "to Zenoh")
+            self._count_failure("ZError", str(error), "to Zenoh")
             return Traffic()
         return Traffic(1, len(frame))
 
@@ -121,6 +120,6 @@ class ZenohTransport(FramedTransport):
         self._thread.join()
 
     def _listen(self) -> None:
-        """Until the session is closed: take in what comes."""
+        """Read frames until the session is closed."""
         for sample in self._subscriber:
             self._take(sample.payload.to_bytes(), ascii(str(sample.key_expr))[:_LONGEST_SOURCE])
