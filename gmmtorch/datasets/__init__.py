@@ -1,6 +1,6 @@
-"""Scans from files in others' formats, and from simulated buildings.
+"""Data sets of scans: log files, scan folders, meshes, and simulated buildings.
 
-`load` opens a data set by name; its module is imported only then.
+`load` opens a data set by name and imports its module only then.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Dataset", "Ranges", "load"]
 
 
 class _Source(NamedTuple):
-    """Where a data set's class is, and what its readings mean unless the caller says otherwise."""
+    """The module and class of a data set, and the defaults of its `Ranges`."""
 
     module: str
     reader: str
@@ -48,24 +48,24 @@ def load(
     stride: int = 1,
     **options: Any,
 ) -> Dataset:
-    """The data set `name`: a sequence of `Scan`s, read when asked for.
+    """The data set `name`: a sequence of `Scan`s, each read when it is accessed.
 
     Args:
-        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, mesh, mesh_scans
-            (these need a `path`), synthetic_building or synthetic_building_2d (these need none).
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, mesh or mesh_scans, which need
+            a `path`; synthetic_building or synthetic_building_2d, which need none.
         path: the file or folder.
-        max_range: readings at or beyond it (m) are beams without return. None: 50 for CARMEN logs,
-            the sensor's own maximum for mesh_scans and the synthetic buildings, no limit (`math.inf`)
-            for the others.
-        no_return_range: how far (m) such a beam speaks of free space; 0 drops them. None: 8 for CARMEN
-            logs, mesh_scans and the synthetic buildings, 0 for the others.
+        max_range: a reading at this distance (m) or beyond is a beam without return. None: 50 for CARMEN
+            logs, the sensor's own maximum for mesh_scans and the synthetic buildings, no limit
+            (`math.inf`) for the others.
+        no_return_range: length (m) of free space along a beam without return; 0 drops such beams. None: 8
+            for CARMEN logs, mesh_scans and the synthetic buildings, 0 for the others.
         stride: every n-th scan is read.
-        options: what only this data set takes: `pixel_stride` for depth_frames; `n_points`, `noise` and
-            `seed` for mesh; `seed`, `n_scans` and `sensor` ("lidar" or "depth_camera", in 3D) for
+        options: specific to the data set: `pixel_stride` for depth_frames; `n_points`, `noise` and
+            `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or "depth_camera") for
             mesh_scans and the synthetic buildings.
 
-    Raises `InvalidArgumentError` for a name, option or value that is not known, `MissingDataError` for a
-    path that does not exist, and `DataError`, now or when a scan is read, for what cannot be read.
+    Raises `InvalidArgumentError` for an unknown name or option or an invalid value, `MissingDataError` for a
+    path that does not exist, and `DataError`, now or when a scan is read, for unreadable data.
     """
     if name not in _SOURCES:
         raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_SOURCES)}.")

@@ -1,9 +1,11 @@
-"""A dataset is a sequence of scans, read when asked for."""
+"""Data sets: sequences of scans, each read when it is accessed."""
 
 from __future__ import annotations
 
+import gzip
 import math
 import re
+import zlib
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,20 +19,20 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.scan import Scan
 
 _ROUNDING = 1e-6
-"""Share of a range that is lost when float32 coordinates are turned and measured again, amply."""
+"""Upper bound of the relative rounding error of a range recomputed from rotated float32 coordinates."""
 
 
 def is_beyond(distance: Tensor, max_range: float) -> Tensor:
-    """Which distances (m) are at or beyond `max_range`, to rounding."""
+    """Whether each distance (m) is at or beyond `max_range`, within rounding."""
     return distance >= max_range * (1 - _ROUNDING)
 
 
 @dataclass(frozen=True)
 class Ranges:
-    """What a reading means.
+    """How range readings are interpreted.
 
-    max_range: readings at or beyond it (m) are beams without return; None: none are.
-    no_return_range: how far (m) such a beam speaks of free space; 0: they are dropped.
+    max_range: a reading at this distance (m) or beyond is a beam without return; None: no limit.
+    no_return_range: length (m) of free space along a beam without return; 0: such beams are dropped.
     """
 
     max_range: float | None = None
@@ -48,11 +50,11 @@ class Ranges:
             )
 
     def scan(self, ends: Tensor, origin: Tensor, no_return: Tensor | None = None) -> Scan:
-        """A scan from beam ends (N, D) in the world frame.
+        """A scan from beam ends (N, D) and the sensor origin (D,), world frame, metres.
 
-        Ends at or beyond `max_range`, and those marked in `no_return` (N,), become beams without
-        return that free `no_return_range` metres, or their own length if that is shorter.
-        Ends that are not finite, or that lie on the sensor itself, are invalid and dropped.
+        Ends at or beyond `max_range`, and those marked in `no_return` (N,), become beams without return.
+        Their free part is `no_return_range` metres long, or as long as the beam if that is shorter. Ends
+        that are not finite or equal the sensor origin are invalid and dropped.
         """
         offset = ends - origin
         distance = offset.norm(dim=1)
@@ -60,17 +62,21 @@ class Ranges:
         empty = torch.zeros_like(valid) if no_return is None else no_return.clone()
         if self.max_range is not None:
             empty |= is_beyond(distance, self.max_range)
-        returned, empty = valid & ~empty, valid & empty
+        hit, empty = valid & ~empty, valid & empty
         if self.no_return_range == 0:
-            return Scan(ends[returned], origin)
-        reach = distance[empty].clamp_max(self.no_return_range)
+            return Scan(ends[hit], origin)
+        free_length = distance[empty].clamp_max(self.no_return_range)
         if self.max_range is not None:
-            reach = reach.clamp_max(self.max_range)
-        return Scan(ends[returned], origin, origin + offset[empty] * (reach / distance[empty])[:, None])
+            free_length = free_length.clamp_max(self.max_range)
+        return Scan(ends[hit], origin, origin + offset[empty] * (free_length / distance[empty])[:, None])
 
 
 class Dataset(Sequence[Scan]):
-    """Scans in the order they were taken. Subclasses say how many there are and how to read one."""
+    """Scans in the order of their recording. Subclasses implement `_count` and `_read`.
+
+    name: of the data set. ranges: how readings are interpreted. stride: every n-th scan of the source is
+        read.
+    """
 
     def __init__(self, name: str, ranges: Ranges, stride: int = 1) -> None:
         if stride < 1:
@@ -81,7 +87,7 @@ class Dataset(Sequence[Scan]):
 
     @abstractmethod
     def _count(self) -> int:
-        """How many scans the source holds."""
+        """Number of scans in the source."""
 
     @abstractmethod
     def _read(self, index: int) -> Scan:
@@ -100,7 +106,7 @@ class Dataset(Sequence[Scan]):
         return self._read(self._position(index))
 
     def _position(self, index: int) -> int:
-        """Where scan `index` of the data set, from the end if below zero, is in the source."""
+        """Position in the source of scan `index` of the data set; a negative index counts from the end."""
         position = index + len(self) if index < 0 else index
         if not 0 <= position < len(self):
             raise IndexError(f"scan {index} of {self.name}, which has {len(self)}")
@@ -110,27 +116,29 @@ class Dataset(Sequence[Scan]):
         return (self[i] for i in range(len(self)))
 
 
-def existing(path: str | Path, kind: str, looked_for: str, where_to_get: str) -> Path:
-    """The path, if it is there as a `kind` ("file" or "folder"); else an error that helps."""
+def require_path(path: str | Path, kind: str, content: str, source: str) -> Path:
+    """The path, with ~ expanded, if a `kind` ("file" or "folder") exists there.
+
+    Raises `InvalidArgumentError` for an empty path and `MissingDataError` for a missing one; the message
+    states the expected `content` and a `source` of such data.
+    """
     if path is None or str(path) == "":
-        raise InvalidArgumentError(
-            f"dataset.path is not set; give a {kind} with {looked_for}. {where_to_get}"
-        )
+        raise InvalidArgumentError(f"dataset.path is not set; give a {kind} with {content}. {source}")
     path = Path(path).expanduser()
     found = path.is_file() if kind == "file" else path.is_dir()
     if not found:
         what = "is not a " + kind if path.exists() else "does not exist"
-        raise MissingDataError(f"dataset.path={path} {what}; looked for {looked_for}. {where_to_get}")
+        raise MissingDataError(f"dataset.path={path} {what}; looked for {content}. {source}")
     return path
 
 
 def natural_key(path: Path) -> list[tuple[int, int | str]]:
-    """Sort key of file names that puts scan_2 before scan_10."""
+    """Sort key of file names that orders scan_2 before scan_10."""
     return [(0, int(w)) if w.isdecimal() else (1, w) for w in re.split(r"(\d+)", path.name)]
 
 
-def rigid(matrix: Tensor, where: str) -> Tensor:
-    """The pose (4, 4), after checking that it is a rigid motion; `where` names it in the error."""
+def check_pose(matrix: Tensor, where: str) -> Tensor:
+    """The pose (4, 4), world ← sensor. Raises `DataError`, which begins with `where`, unless it is rigid."""
     rotation = matrix[:3, :3]
     error = (rotation @ rotation.T - torch.eye(3, dtype=matrix.dtype)).abs().max()
     if not (
@@ -141,3 +149,14 @@ def rigid(matrix: Tensor, where: str) -> Tensor:
             "a rotation matrix and a translation in metres."
         )
     return matrix
+
+
+def gunzip(path: Path) -> bytes | None:
+    """The content of a gzip file; None if the file is not gzip. Raises `DataError` if it is damaged."""
+    with path.open("rb") as file:
+        if file.read(2) != b"\x1f\x8b":
+            return None
+    try:
+        return gzip.decompress(path.read_bytes())
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path} is not a complete gzip file ({error}); fetch it again.") from error

@@ -1,21 +1,20 @@
 """CARMEN logs of 2D lasers (the Radish collection and many others), gzip or plain text.
 
-Only lines `FLASER n r_1 … r_n x y theta …` are read: n ranges (m) and the laser's pose (m, rad),
-corrected by SLAM where the log is. Beam angles, 0 = forward: n = 180: −90° + i·1°; n = 360:
-−90° + i·0.5°; any other n: n beams spread evenly over [−90°, 90°].
+Only lines `FLASER n r_1 … r_n x y theta …` are read: n ranges (m) and the pose of the laser (m, rad), which
+is corrected by SLAM in corrected logs. Beam angles, 0 = forward: −90° + i·1° for n = 180, −90° + i·0.5° for
+n = 360, and n beams spread evenly over [−90°, 90°] for any other n.
 """
 
 from __future__ import annotations
 
-import gzip
+import io
 import math
-import zlib
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
@@ -23,7 +22,7 @@ _MAX_BEAMS = 100_000
 
 
 def beam_angles(n: int) -> Tensor:
-    """Angles (n,) of a front laser's beams in radians, 0 = forward, counter-clockwise."""
+    """Beam angles (n,) of a front laser in radians, 0 = forward, counter-clockwise."""
     if n in (180, 360):
         return (torch.arange(n, dtype=torch.float64) * (180 / n) - 90).deg2rad()
     return torch.linspace(-math.pi / 2, math.pi / 2, n, dtype=torch.float64)
@@ -32,13 +31,12 @@ def beam_angles(n: int) -> Tensor:
 class CarmenLog(Dataset):
     """Scans of a CARMEN log in the order of the file.
 
-    No return: readings at or beyond `max_range` (the laser's code for "nothing seen": 81.83, 81.91
-    or 50 m in the Radish logs), which free `no_return_range`. Invalid, dropped: readings of 0 or
-    less, NaN.
+    Readings at or beyond `max_range` have no return; the Radish logs use 81.83, 81.91 or 50 m as code for "no
+    return". Readings of zero or less, and NaN, are invalid and dropped.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
-        path = existing(
+        path = require_path(
             path,
             "file",
             "a CARMEN log (text or gzip) with FLASER lines",
@@ -55,7 +53,7 @@ class CarmenLog(Dataset):
         readings, (x, y, theta) = record[:-3], record[-3:]
         angles = beam_angles(readings.shape[0]) + theta
         origin = torch.stack([x, y])
-        valid = readings > 0  # NaN compares false
+        valid = readings > 0  # false for NaN
         if self.ranges.max_range is not None:
             readings = readings.clamp_max(self.ranges.max_range)  # some lasers report infinity
         ends = origin + readings[valid, None] * torch.stack([angles.cos(), angles.sin()], 1)[valid]
@@ -63,17 +61,13 @@ class CarmenLog(Dataset):
 
 
 def _read_records(path: Path) -> list[Tensor]:
-    """One tensor [r_1 … r_n, x, y, theta] per FLASER line."""
-    with path.open("rb") as probe:
-        compressed = probe.read(2) == b"\x1f\x8b"
+    """One tensor [r_1 … r_n, x, y, theta] for each FLASER line."""
+    data = gunzip(path)
     records = []
-    try:
-        with gzip.open(path, "rt", errors="replace") if compressed else path.open(errors="replace") as lines:
-            for number, line in enumerate(lines, 1):
-                if line.startswith("FLASER "):
-                    records.append(_parse(line.split(), f"{path}, line {number}"))
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise DataError(f"{path} is not a whole gzip file ({error}); fetch it again.") from error
+    with path.open("rb") if data is None else io.BytesIO(data) as file:
+        for number, line in enumerate(io.TextIOWrapper(file, errors="replace"), 1):
+            if line.startswith("FLASER "):
+                records.append(_parse(line.split(), f"{path}, line {number}"))
     if not records:
         raise DataError(f"{path} has no FLASER line, so it is not a CARMEN log of a front laser.")
     return records

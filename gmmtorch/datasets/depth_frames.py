@@ -1,7 +1,7 @@
 """Depth images with poses, in the layout of the 7-Scenes data set.
 
-`frame-*.depth.png`: 16 bit, millimetres along the optical axis; `frame-*.pose.txt`: 4×4
-camera-to-world, metres; `camera-intrinsics.txt`: 3×3 pinhole matrix in pixels.
+`frame-*.depth.png`: 16 bit, millimetres along the optical axis. `frame-*.pose.txt`: 4×4 matrix
+camera-to-world, metres. `camera-intrinsics.txt`: 3×3 pinhole matrix in pixels.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key, rigid
+from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.scan import Scan
 
@@ -20,16 +20,15 @@ _INVALID = (0, 65535)
 
 
 class DepthFrames(Dataset):
-    """Frames in the natural order of their names (frame-2 before frame-10).
+    """Depth images as scans, in the natural order of their names (frame-2 before frame-10).
 
-    No return: pixels at or beyond `max_range` metres of distance. Invalid, dropped: depth 0 and
-    65535, with which the camera says that it could not tell. `pixel_stride` keeps every n-th
-    pixel of every n-th row. `intrinsics` is the pinhole matrix (3, 3), pixels; `image` gives the depth
-    of a scan as it was read.
+    Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
+    and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `intrinsics` is the pinhole
+    matrix (3, 3) in pixels. `image` returns the full depth image of a scan.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, pixel_stride: int = 1) -> None:
-        path = existing(
+        path = require_path(
             path,
             "folder",
             "frame-*.depth.png, frame-*.pose.txt and camera-intrinsics.txt",
@@ -45,7 +44,7 @@ class DepthFrames(Dataset):
         poses = list(path.glob("frame-*.pose.txt"))
         if len(poses) != len(self._files):
             raise DataError(
-                f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; one each is needed."
+                f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; each image needs one."
             )
         self.intrinsics = _matrix(path / "camera-intrinsics.txt", 3)
 
@@ -58,9 +57,9 @@ class DepthFrames(Dataset):
         return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
-        """Depth (H, W) in metres, invalid pixels 0, and the pose (4, 4), world ← camera, of a scan.
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
 
-        The rotation, rounded in the file, is made orthonormal.
+        The rotation, which is rounded in the file, is made orthonormal.
         """
         position = self._position(index)
         pose = self._pose(position).clone()
@@ -71,13 +70,14 @@ class DepthFrames(Dataset):
     def _pose(self, index: int) -> Tensor:
         path = self._files[index]
         path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
-        return rigid(_matrix(path, 4), str(path))
+        return check_pose(_matrix(path, 4), str(path))
 
 
 def back_project(depth: Tensor, intrinsics: Tensor, pixel_stride: int = 1) -> Tensor:
-    """Camera-frame points (N, 3) of the valid pixels of a depth image (H, W) in metres, row by row.
+    """Camera-frame points (N, 3) of the valid pixels of a depth image (H, W), metres, row by row.
 
-    x = (u − c_x) d / f_x, y = (v − c_y) d / f_y, z = d; pixels of 0 or NaN depth are left out.
+    x = (u − c_x) d / f_x, y = (v − c_y) d / f_y, z = d. Pixels with depth 0 or NaN are omitted. Only every
+    `pixel_stride`-th pixel of every `pixel_stride`-th row is used.
     """
     depth = depth[::pixel_stride, ::pixel_stride]
     v, u = torch.meshgrid(
@@ -89,17 +89,17 @@ def back_project(depth: Tensor, intrinsics: Tensor, pixel_stride: int = 1) -> Te
 
 
 def _depth(path: Path) -> Tensor:
-    """Depth (H, W) in metres, float64; invalid pixels 0."""
+    """Depth (H, W) in metres, float64; 0 for invalid pixels."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             raw = np.asarray(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path} is not a whole PNG image: {error}") from error
+        raise DataError(f"{path} is not a complete PNG image: {error}") from error
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
         raise DataError(
-            f"{path} is {raw.dtype} of shape {raw.shape}; expected one channel of 16 bit, millimetres."
+            f"{path} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel, millimetres."
         )
     return torch.from_numpy(np.where(np.isin(raw, _INVALID), 0, raw) / 1000.0)
 

@@ -1,4 +1,4 @@
-"""Points sampled from the surface of a triangle mesh: a cloud that no sensor's view shaped."""
+"""Points sampled from the surface of a triangle mesh, independent of any sensor's view."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.optional_packages import load_open3d
 from gmmtorch.scan import Scan
 
 
 class MeshSamples(Dataset):
-    """One scan: `n_points` points uniform on the surface, each moved by isotropic Gaussian noise.
+    """One scan of `n_points` points, uniform on the surface, with isotropic Gaussian noise.
 
-    No sensor saw them; the middle of the bounding box stands for its position. No return: points at
-    or beyond `max_range` of that. None are invalid.
+    The sensor origin is the centre of the bounding box. Points at or beyond `max_range` from it have no
+    return.
 
     Args:
-        path: PLY, OBJ, STL or whatever else Open3D reads triangles from; metres.
-        n_points: how many.
+        path: PLY, OBJ, STL or another mesh format that Open3D reads; metres.
+        ranges: how readings are interpreted.
+        stride: see `Dataset`.
+        n_points: number of points.
         noise: standard deviation (m) along each axis.
-        seed: of the draw.
+        seed: of the random numbers.
     """
 
     def __init__(
@@ -36,11 +38,11 @@ class MeshSamples(Dataset):
         noise: float = 0.0,
         seed: int = 0,
     ) -> None:
-        self._path = existing(
+        self._path = require_path(
             path,
             "file",
             "a triangle mesh (PLY, OBJ, STL)",
-            "The Stanford 3D scanning repository has well-known ones.",
+            "The Stanford 3D scanning repository publishes well-known meshes.",
         )
         super().__init__(self._path.stem, ranges, stride)
         self.n_points = check_whole("n_points", n_points, 1)
@@ -62,13 +64,15 @@ class MeshSamples(Dataset):
 
 
 def read_triangles(path: Path) -> Tensor:
-    """Corners (T, 3, 3), float64, of the triangles of a mesh file.
+    """Triangles (T, 3, 3), float64, of a mesh file.
 
-    Raises `DataError` if it is unreadable, truncated, has no triangle, or a corner that is not finite.
+    Raises `DataError` if the file is unreadable or truncated, has no triangle, or has a corner that is not
+    finite.
     """
     open3d = load_open3d(f"{path} cannot be read")
     if path.suffix.lower() == ".obj" and b"\0" in path.read_bytes():
-        raise DataError(f"{path} is no OBJ file: those are text.")  # which would crash its reader
+        # Open3D's reader would crash.
+        raise DataError(f"{path} is not an OBJ file, because it is not text.")
     try:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
             mesh = open3d.t.io.read_triangle_mesh(path)
@@ -76,13 +80,13 @@ def read_triangles(path: Path) -> Tensor:
         raise DataError(f"{path} cannot be read as a mesh: {error}") from error
     if "positions" not in mesh.vertex or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         raise DataError(
-            f"{path} holds no triangles that can be read; it is truncated, a cloud, or no mesh at all. "
+            f"{path} contains no readable triangles; it is truncated, a point cloud, or not a mesh. "
             "Give a PLY, OBJ or STL file with faces."
         )
     corners = torch.from_numpy(mesh.vertex.positions.numpy()).double()
     indices = torch.from_numpy(mesh.triangle.indices.numpy()).long()
     if int(indices.min()) < 0 or int(indices.max()) >= len(corners):
-        raise DataError(f"{path}: a face names a corner that is not there; the file is damaged.")
+        raise DataError(f"{path}: a face refers to a missing corner; the file is damaged.")
     triangles = corners[indices]
     if not bool(torch.isfinite(triangles).all()):
         raise DataError(f"{path}: a corner is NaN or infinite; the file is damaged.")
@@ -90,9 +94,9 @@ def read_triangles(path: Path) -> Tensor:
 
 
 def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator) -> Tensor:
-    """Points (n_points, 3), uniform by area on triangles (T, 3, 3).
+    """Points (n_points, 3), uniformly distributed over the area of triangles (T, 3, 3).
 
-    With u, v uniform, a + (1 − v) √u (b − a) + v √u (c − a) is uniform on a triangle. Raises
+    For u and v uniform in [0, 1], a + (1 − v) √u (b − a) + v √u (c − a) is uniform on a triangle. Raises
     `DataError` if no triangle has an area.
     """
     a, b, c = triangles.unbind(1)

@@ -1,4 +1,4 @@
-"""Scans that a simulated sensor takes on a walk through a triangle mesh: a mine, a warehouse."""
+"""Scans of a simulated sensor on a path through a triangle mesh, such as a mine or a warehouse."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
 from gmmtorch.datasets.mesh_samples import read_triangles
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
@@ -21,16 +21,18 @@ _SEEDS_APART = 1_000_003
 
 
 class MeshScans(Dataset):
-    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64), 30 m, noise 1 cm.
+    """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
 
-    The sensor is carried through the largest part of the mesh that can be walked, 1.2 m above the
-    floor (see `MeshWorld.tour`); a camera looks where it goes. No return: beams that meet nothing
-    within the sensor's range, or within `max_range` if that is shorter. Scan i depends on the mesh, the
-    seed, the number of scans and i only.
+    The sensor moves through the largest connected part of the mesh, 1.2 m above the floor (see
+    `MeshWorld.tour`); a camera faces forward. Beams without a surface within the sensor's range, or within
+    `max_range` if that is shorter, have no return. Scan i depends only on the mesh, the seed, the number of
+    scans and i.
 
     Args:
-        path: PLY, OBJ, STL or whatever else Open3D reads triangles from; metres, z up.
-        n_scans: how many, about 2 m apart: what a mesh holds beyond them is not seen.
+        path: PLY, OBJ, STL or another mesh format that Open3D reads; metres, z up.
+        ranges: how readings are interpreted.
+        stride: every n-th scan is read.
+        n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
         sensor: "lidar" or "depth_camera".
         seed: of the sensor's noise.
     """
@@ -44,7 +46,9 @@ class MeshScans(Dataset):
         sensor: str = "lidar",
         seed: int = 0,
     ) -> None:
-        self._path = existing(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
+        self._path = require_path(
+            path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up."
+        )
         super().__init__(self._path.stem, ranges, stride)
         self.n_scans = check_whole("n_scans", n_scans, 1)
         self.seed = check_whole("seed", seed, 0)
@@ -58,12 +62,12 @@ class MeshScans(Dataset):
 
     @functools.cached_property
     def world(self) -> MeshWorld:
-        """The mesh, read when it is first needed."""
+        """The world of the mesh, which is read at the first access."""
         return MeshWorld(read_triangles(self._path))
 
     @functools.cached_property
     def poses(self) -> Tensor:
-        """(n_scans, 4, 4) world ← sensor, x ahead on the walk."""
+        """Sensor poses (n_scans, 4, 4), world ← sensor, x forward along the path."""
         places = self.world.tour(self.n_scans)
         ahead = places.roll(-1, 0) - places if len(places) > 1 else torch.zeros_like(places)
         if len(places) > 1:

@@ -1,48 +1,46 @@
-"""OctoMap's text logs, in which the Freiburg campus scans are published.
+"""Text logs of OctoMap, the format of the Freiburg campus scans.
 
-`NODE x y z roll pitch yaw` (metres, radians: R = Rz(yaw) Ry(pitch) Rx(roll), world ← sensor) opens
-a scan; the lines that follow, up to the next NODE, are its points in the sensor frame, three
-numbers each; blank lines and comments (#) are passed over.
+A line `NODE x y z roll pitch yaw` (metres, radians; R = Rz(yaw) Ry(pitch) Rx(roll), world ← sensor) starts
+a scan. The lines up to the next NODE are its points in the sensor frame, three numbers each. Blank lines and
+comments (#) are skipped.
 """
 
 from __future__ import annotations
 
-import gzip
 import io
-import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing
+from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
 
 class OctomapLog(Dataset):
-    """Scans in the order of the file, read when asked for: only their positions in it are kept.
+    """Scans of an OctoMap log in the order of the file. Only their positions in the file are kept in memory.
 
-    No return: points at or beyond `max_range`. Invalid, dropped: NaN and infinite points, and
-    points on the sensor itself. Gzip files are unpacked into memory, once.
+    Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
+    invalid and dropped. A gzip file is decompressed into memory once.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
-        self._path = existing(
+        self._path = require_path(
             path,
             "file",
             "an OctoMap scan log (NODE x y z roll pitch yaw, then points)",
             "The OctoMap 3D scan dataset of the University of Freiburg is published in this format.",
         )
         super().__init__(self._path.name.split(".")[0], ranges, stride)
-        self._unpacked = _unpack(self._path)
+        self._unzipped = gunzip(self._path)
         with self._open() as file:
             self._nodes = _node_positions(file)
         if not self._nodes:
             raise DataError(f"{self._path} has no NODE line, so it is not an OctoMap scan log.")
 
     def _open(self) -> io.BufferedIOBase:
-        return self._path.open("rb") if self._unpacked is None else io.BytesIO(self._unpacked)
+        return self._path.open("rb") if self._unzipped is None else io.BytesIO(self._unzipped)
 
     def _count(self) -> int:
         return len(self._nodes)
@@ -69,19 +67,8 @@ def rotation(roll: float, pitch: float, yaw: float) -> torch.Tensor:
     return torch.from_numpy(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix())
 
 
-def _unpack(path: Path) -> bytes | None:
-    """The text of a gzip file; None for a plain one."""
-    with path.open("rb") as file:
-        if file.peek(2)[:2] != b"\x1f\x8b":
-            return None
-        try:
-            return gzip.decompress(file.read())
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise DataError(f"{path} is not a whole gzip file ({error}); fetch it again.") from error
-
-
 def _node_positions(file: io.BufferedIOBase) -> list[int]:
-    """Where in the file the NODE lines begin, in bytes."""
+    """Byte positions of the NODE lines in the file."""
     positions, position = [], 0
     for line in file:
         if line.startswith(b"NODE"):

@@ -1,4 +1,4 @@
-"""A folder of PCD files whose points are already in the world frame, the origin in VIEWPOINT."""
+"""A folder of PCD files with points in the world frame and the sensor origin in VIEWPOINT."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key
+from gmmtorch.datasets.base import Dataset, Ranges, natural_key, require_path
 from gmmtorch.datasets.point_files.cloud_files import pcd_header, read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
@@ -15,12 +15,12 @@ from gmmtorch.scan import Scan
 class PcdViewpoint(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
-    No return: points at or beyond `max_range` from the viewpoint. Invalid, dropped: NaN and
-    infinite points, and points on the sensor itself. The orientation in VIEWPOINT is not used.
+    Points at or beyond `max_range` from the viewpoint have no return. NaN, infinite points and points at the
+    sensor origin are invalid and dropped. The orientation in VIEWPOINT is not used.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
-        path = existing(
+        path = require_path(
             path,
             "folder",
             "*.pcd in the world frame, the sensor position in VIEWPOINT",
@@ -29,7 +29,7 @@ class PcdViewpoint(Dataset):
         super().__init__(path.name, ranges, stride)
         self._files = sorted(path.glob("*.pcd"), key=natural_key)
         if not self._files:
-            raise DataError(f"{path} holds no .pcd file.")
+            raise DataError(f"{path} contains no .pcd file.")
 
     def _count(self) -> int:
         return len(self._files)
@@ -40,7 +40,7 @@ class PcdViewpoint(Dataset):
         try:
             origin = torch.tensor([float(w) for w in words[:3]], dtype=torch.float64)
         except ValueError as error:
-            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} is not numbers.") from error
+            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not consist of numbers.") from error
         if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
             raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not begin with a sensor position.")
         return self.ranges.scan(read_cloud(path), origin)

@@ -1,7 +1,7 @@
-"""A folder `scans/*.pcd` (or `*.ply`) in the sensor frame, and `poses.txt` with one KITTI row each.
+"""A folder with `scans/*.pcd` (or `*.ply`) in the sensor frame, and `poses.txt` with one KITTI row per scan.
 
-A KITTI row is 12 numbers, the upper 3×4 of world ← sensor, row by row; metres. The sensor's
-position is the translation.
+A KITTI row has 12 numbers: the upper 3×4 part of world ← sensor, row by row; metres. The translation is the
+sensor origin.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gmmtorch.datasets.base import Dataset, Ranges, existing, natural_key, rigid
+from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
 from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
@@ -20,12 +20,12 @@ from gmmtorch.scan import Scan
 class ScanFolder(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
-    No return: points at or beyond `max_range`. Invalid, dropped: NaN and infinite points, and
-    points on the sensor itself.
+    Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
+    invalid and dropped.
     """
 
     def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
-        path = existing(
+        path = require_path(
             path,
             "folder",
             "scans/*.pcd or scans/*.ply in the sensor frame, and poses.txt (12 numbers a row)",
@@ -35,12 +35,12 @@ class ScanFolder(Dataset):
         scans = path / "scans"
         self._files = sorted([*scans.glob("*.pcd"), *scans.glob("*.ply")], key=natural_key)
         if not self._files:
-            raise DataError(f"{scans} holds no .pcd and no .ply file; put one file per scan there.")
+            raise DataError(f"{scans} contains no .pcd and no .ply file; put one file per scan there.")
         self._poses = _read_poses(path / "poses.txt")
         if len(self._poses) != len(self._files):
             raise DataError(
                 f"{path}: poses.txt has {len(self._poses)} rows, but there are {len(self._files)} scans; "
-                "there must be one pose for each scan, in the order of the file names."
+                "write one pose for each scan, in the order of the file names."
             )
 
     def _count(self) -> int:
@@ -65,5 +65,5 @@ def _read_poses(path: Path) -> torch.Tensor:
     poses = torch.eye(4, dtype=torch.float64).repeat(rows.shape[0], 1, 1)
     poses[:, :3] = torch.from_numpy(rows.reshape(-1, 3, 4))
     for number, pose in enumerate(poses, 1):
-        rigid(pose, f"{path}, row {number}")
+        check_pose(pose, f"{path}, row {number}")
     return poses

@@ -1,6 +1,6 @@
-"""The embedded data sets: scans of simulated buildings, made when asked for; no file is needed.
+"""Data sets of simulated buildings, computed when they are accessed; no file is needed.
 
-Every scan depends on the seed and its own index only, in whatever order scans are read.
+A scan depends only on the seed and its index, not on the order of reading.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gmmtorch.simulation import (
 MAX_RANGE_2D = 12.0
 MAX_RANGE_3D = 10.0
 _SEEDS_APART = 1_000_003
-"""Distance between the generator seeds of two data sets, above any number of scans."""
+"""Difference between the generator seeds of consecutive data set seeds; larger than any number of scans."""
 
 _LIDAR_HEIGHT = 1.2
 _CAMERA_HEIGHT = 1.4
@@ -38,10 +38,10 @@ _CAMERA_SWING = math.radians(60)
 
 
 class _Simulated(Dataset):
-    """Scans taken along the path of a simulated world.
+    """Scans along the path of a simulated world.
 
-    No return: beams that meet nothing within the sensor's maximum range, or within `max_range` if that
-    is shorter; they free `no_return_range`. None are invalid.
+    Beams without a surface within the sensor's maximum range, or within `max_range` if that is shorter,
+    have no return. No beam is invalid.
     """
 
     world: World2D | World3D
@@ -58,7 +58,7 @@ class _Simulated(Dataset):
         self.n_scans = n_scans
 
     def _generator(self, number: int) -> torch.Generator:
-        """Random numbers for the world (0) or for scan `number` − 1."""
+        """Random number generator of the world (0) or of scan `number` − 1."""
         return torch.Generator().manual_seed(self.seed * _SEEDS_APART + number)
 
     def _count(self) -> int:
@@ -71,7 +71,7 @@ class _Simulated(Dataset):
 
 
 class SyntheticBuilding2D(_Simulated):
-    """A laser of 180 beams, 180° and 12 m carried through an office floor of 30 × 20 m; noise 1 cm."""
+    """A laser (180 beams over 180°, range 12 m, noise 1 cm) on a path through an office of 30 × 20 m."""
 
     def __init__(self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 120) -> None:
         super().__init__("synthetic_building_2d", ranges, stride, seed, n_scans)
@@ -81,7 +81,7 @@ class SyntheticBuilding2D(_Simulated):
 
 
 class SyntheticBuilding(_Simulated):
-    """A lidar (32 × 160 beams) or a depth camera (80 × 64 pixels) in a furnished hall; 10 m, noise 1 cm."""
+    """A lidar (32 × 160 beams) or depth camera (80 × 64 pixels) in a furnished hall; 10 m, noise 1 cm."""
 
     def __init__(
         self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 40, sensor: str = "lidar"

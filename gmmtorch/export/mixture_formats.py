@@ -1,4 +1,4 @@
-"""Mixtures in others' formats: GIRA's CSV, and plain arrays as NPZ."""
+"""Gaussian mixtures as GIRA's CSV files and as NPZ archives of plain arrays."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 
 MAX_BYTES = 1 << 30
-"""Of a file that is read, and of what a compressed one unpacks to."""
+"""Largest size of a file to read, compressed and decompressed."""
 
 
 class PlainMixture(NamedTuple):
-    """weights (K,) that add up to one, means (K, D), covariances (K, D, D): float64, metres.
+    """A mixture of K Gaussians in D dimensions as float64 tensors, metres.
 
-    support (K,): points that each component stands for; None if nobody says.
+    weights: (K,), sum 1. means: (K, D). covariances: (K, D, D).
+    support: (K,) number of points that each component represents; None if unknown.
     """
 
     weights: Tensor
@@ -34,16 +35,18 @@ class PlainMixture(NamedTuple):
 
     @classmethod
     def of_support(cls, means: Tensor, covariances: Tensor, support: Tensor) -> PlainMixture:
-        """The mixture of components with these supports, of which one at least is above zero."""
+        """The mixture of components with these supports, at least one of them above zero."""
         total = float(support.sum())
         if not total > 0:
-            raise InvalidArgumentError("support adds up to nothing; there is no mixture to write.")
+            raise InvalidArgumentError("support adds up to zero; there is no mixture to write.")
         return cls(support / total, means, covariances, support)
 
 
 def checked(mixture: PlainMixture) -> PlainMixture:
-    """The mixture in float64 on the CPU, its weights divided by their sum and its covariances made
-    exactly symmetric; raises `InvalidArgumentError` or `NumericalError` if it is none."""
+    """The mixture in float64 on the CPU, with normalized weights and exactly symmetric covariances.
+
+    Raises `InvalidArgumentError` or `NumericalError` if it is not a valid mixture.
+    """
     weights, means, covariances = (t.detach().cpu().double() for t in mixture[:3])
     support = None if mixture.support is None else mixture.support.detach().cpu().double()
     if means.ndim != 2 or 0 in means.shape:
@@ -61,7 +64,7 @@ def checked(mixture: PlainMixture) -> PlainMixture:
             raise InvalidArgumentError(f"{name} holds NaN or infinite values.")
     total = float(weights.sum())
     if bool((weights < 0).any()) or not 0 < total < math.inf:
-        raise InvalidArgumentError("weights must be at least zero, one of them above, and finite.")
+        raise InvalidArgumentError("weights must be finite and at least zero, and one of them above zero.")
     if support is not None and bool((support < 0).any()):
         raise InvalidArgumentError("support must not be negative.")
     covariances = (check_symmetric(covariances, "covariances") + covariances.mT) / 2
@@ -73,11 +76,10 @@ def checked(mixture: PlainMixture) -> PlainMixture:
 
 
 def write_gira_csv(path: str | Path, mixture: PlainMixture) -> Path:
-    """Write the mixture, atomically, as GIRA's `gmm_utils` does: a row for each component, no heading.
+    """Writes the mixture, atomically, in the format of GIRA's `gmm_utils`: one row per component, no header.
 
-    Columns: mean (D), covariance (D², column by column, which symmetry makes row by row), weight. The
-    number of points is not part of it. Written with 17 digits, as GIRA's own six make the covariances
-    of thin components indefinite.
+    Columns: mean (D), covariance (D²), weight. The file does not contain the number of points. Numbers
+        have 17 digits; with GIRA's six digits the covariances of thin components become indefinite.
     """
     sound = checked(mixture)
     rows = torch.cat([sound.means, sound.covariances.flatten(1), sound.weights[:, None]], 1)
@@ -87,17 +89,17 @@ def write_gira_csv(path: str | Path, mixture: PlainMixture) -> Path:
 
 
 def read_gira_csv(path: str | Path, n_points: float | None = None) -> PlainMixture:
-    """Read a mixture that GIRA, or `write_gira_csv`, wrote; D follows from the number of columns.
+    """Reads a mixture that GIRA or `write_gira_csv` wrote; D follows from the number of columns.
 
-    `n_points`: how many points it was learned from, which the file does not say; `support` is None
-    without. Weights are divided by their sum. Raises `MissingDataError` if it is not there, and
-    `DataError` if it is not such a file, or its covariances are not definite.
+    `n_points` is the number of points the mixture was learned from, which the file does not contain;
+    without it `support` is None. Weights are normalized. Raises `MissingDataError` if the file does not
+    exist, and `DataError` for another content or a covariance that is not positive definite.
     """
     path = _readable(path, "a GIRA mixture (CSV)")
     if n_points is not None and not 0 < n_points < math.inf:
         raise InvalidArgumentError(f"n_points={n_points} must be a number above zero, or None.")
     try:
-        # Opened here, as numpy would unpack what is called .gz; and an empty file is told of below.
+        # Opened here because numpy would decompress a .gz file. The check below reports an empty file.
         with path.open(encoding="ascii") as lines, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             rows = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None, dtype=np.float64)
@@ -120,7 +122,7 @@ def read_gira_csv(path: str | Path, n_points: float | None = None) -> PlainMixtu
 
 
 def write_npz(path: str | Path, mixture: PlainMixture) -> Path:
-    """Write the mixture, atomically, as NPZ: weights, means, covariances and, if known, support; float64."""
+    """Writes the mixture, atomically, as NPZ: weights, means, covariances and, if known, support; float64."""
     sound = checked(mixture)
     buffer = io.BytesIO()
     np.savez(buffer, **{k: v.numpy() for k, v in sound._asdict().items() if v is not None})
@@ -128,10 +130,10 @@ def write_npz(path: str | Path, mixture: PlainMixture) -> Path:
 
 
 def read_npz(path: str | Path) -> PlainMixture:
-    """Read a mixture from an NPZ file with arrays weights, means, covariances and, if there, support.
+    """Reads a mixture from an NPZ file with the arrays weights, means, covariances and, optionally, support.
 
-    Nothing is unpickled. Raises `MissingDataError` if it is not there, and `DataError` if it is no such
-    file, or unpacks to more than `MAX_BYTES`.
+    Pickled data are rejected. Raises `MissingDataError` if the file does not exist, and `DataError` for
+    another content or a decompressed size above `MAX_BYTES`.
     """
     path = _readable(path, "a mixture (NPZ)")
     names = ("weights", "means", "covariances")
@@ -139,21 +141,21 @@ def read_npz(path: str | Path) -> PlainMixture:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > MAX_BYTES:
-            raise DataError(f"{path} unpacks to {size:,} bytes, more than the {MAX_BYTES:,} that are read.")
+            raise DataError(f"{path} decompresses to {size:,} bytes, above the limit of {MAX_BYTES:,}.")
         with np.load(path, allow_pickle=False) as stored:
             missing = [name for name in names if name not in stored]
             if missing:
-                raise DataError(f"{path} lacks {', '.join(missing)}; it is no mixture.")
+                raise DataError(f"{path} lacks {', '.join(missing)}; it is not a mixture.")
             wanted = (*names, "support") if "support" in stored else names
             arrays = {name: torch.from_numpy(np.asarray(stored[name], dtype=np.float64)) for name in wanted}
     except GmmTorchError:
         raise
     except (OSError, ValueError, TypeError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path} is damaged, or no NPZ file of numbers: {error}") from error
+        raise DataError(f"{path} is damaged, or not an NPZ file of numbers: {error}") from error
     return _sound(path, PlainMixture(**arrays))
 
 
-# -- what both need -------------------------------------------------------------------------------
+# -- checks of a file -----------------------------------------------------------------------------
 
 
 def _readable(path: str | Path, what: str) -> Path:
@@ -161,9 +163,7 @@ def _readable(path: str | Path, what: str) -> Path:
     if not path.is_file():
         raise MissingDataError(f"{path} does not exist; expected {what}.")
     if path.stat().st_size > MAX_BYTES:
-        raise DataError(
-            f"{path} has {path.stat().st_size:,} bytes, more than the {MAX_BYTES:,} that are read."
-        )
+        raise DataError(f"{path} has {path.stat().st_size:,} bytes, above the limit of {MAX_BYTES:,}.")
     return path
 
 
@@ -171,4 +171,4 @@ def _sound(path: Path, mixture: PlainMixture) -> PlainMixture:
     try:
         return checked(mixture)
     except GmmTorchError as error:
-        raise DataError(f"{path} does not hold a mixture: {error}") from error
+        raise DataError(f"{path} does not contain a valid mixture: {error}") from error

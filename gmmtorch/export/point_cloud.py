@@ -1,4 +1,4 @@
-"""CellCloud: the cells something is known of, as points with probabilities; as PLY and PCD files."""
+"""Observed cells as points with occupancy probabilities, and their PLY and PCD files."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 
-_LEAST_STEPS = 16  # of float32 in a cell, for its centre to be worth writing
+_MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
 
 @dataclass(frozen=True, eq=False)
 class CellCloud:
-    """Centres (M, D) of cells of side `resolution`, world metres, and their occupancy (M,).
+    """Centres (M, D) of cells of side `resolution`, world metres, and their occupancy probability (M,).
 
-    Raises `InvalidArgumentError` for shapes that disagree, centres that are not finite, and values
-    that are no probabilities.
+    Raises `InvalidArgumentError` for shapes that do not match, centres that are not finite, and probabilities
+    outside [0, 1].
     """
 
     centers: Tensor
@@ -45,7 +45,7 @@ class CellCloud:
 
     @classmethod
     def of_grid(cls, grid: VoxelGrid, probability: Tensor) -> CellCloud:
-        """The cells of a grid whose probability, of the grid's shape, is not exactly ½."""
+        """The cells of a grid whose probability is not exactly ½. `probability` has the shape of the grid."""
         if tuple(probability.shape) != grid.shape:
             raise InvalidArgumentError(
                 f"probability has shape {tuple(probability.shape)}; the grid's is {grid.shape}."
@@ -77,18 +77,18 @@ class CellCloud:
         return self.centers.shape[0]
 
     def above(self, threshold: float) -> CellCloud:
-        """The cells more probably occupied than this."""
+        """The cells whose occupancy probability is above the threshold."""
         chosen = self.probability > threshold
         return CellCloud(self.centers[chosen], self.probability[chosen], self.resolution)
 
     def positions(self) -> np.ndarray:
-        """Centres as an array (M, 3) on the CPU; those of a 2D map have z = 0."""
+        """Centres as an array (M, 3) on the CPU; z = 0 for a 2D map."""
         array = self.centers.detach().cpu().double().numpy()
         return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
 
 
 def write_ply(path: str | Path, cells: CellCloud) -> Path:
-    """Write the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity (float), θ."""
+    """Writes the cells, atomically, as binary PLY: vertices x, y, z (double) and intensity = θ (float)."""
     kind = [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")]
     header = "\n".join(
         [
@@ -105,16 +105,17 @@ def write_ply(path: str | Path, cells: CellCloud) -> Path:
 
 
 def write_pcd(path: str | Path, cells: CellCloud) -> Path:
-    """Write the cells, atomically, as binary PCD: fields x, y, z and intensity, θ, all float32.
+    """Writes the cells, atomically, as binary PCD: fields x, y, z and intensity = θ, all float32.
 
-    PCL reads float32 alone: raises `InvalidArgumentError` where that cannot tell the cells apart.
+    PCL reads only float32. Raises `InvalidArgumentError` if float32 cannot represent the cell centres exactly
+    enough.
     """
     positions = cells.positions()
     far = float(np.abs(positions).max()) if len(cells) else 0.0
-    if np.spacing(np.float32(far)) * _LEAST_STEPS > cells.resolution:
+    if np.spacing(np.float32(far)) * _MIN_STEPS > cells.resolution:
         raise InvalidArgumentError(
-            f"cells of {cells.resolution} m lie {far:.6g} m from the origin, where the float32 of a PCD file "
-            "blurs them; write PLY, which has doubles, or move the map nearer to its origin."
+            f"cells of {cells.resolution} m lie {far:.6g} m from the origin, where the float32 numbers of a "
+            "PCD file are too coarse; write PLY, which has doubles, or move the map closer to its origin."
         )
     kind = [(name, "<f4") for name in ("x", "y", "z", "intensity")]
     header = "\n".join(
@@ -136,7 +137,7 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
 
 
 def _records(cells: CellCloud, kind: list[tuple[str, str]]) -> bytes:
-    """One packed record a cell: x, y, z, intensity."""
+    """One packed record per cell: x, y, z, intensity."""
     rows = np.empty(len(cells), dtype=kind)
     for axis, values in zip("xyz", cells.positions().T, strict=True):
         rows[axis] = values

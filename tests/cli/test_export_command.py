@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 from command_runs import CHECKOUT, COMMANDS, Finished, as_it_was, run_here, run_python, run_script
+from export.map_examples import read_map_image
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.cli import common, export, schema
 from gmmtorch.datasets import load
-from gmmtorch.export.map_server import read_map_server
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
@@ -77,7 +77,7 @@ def succeeded(done: Finished) -> Finished:
 
 def test_a_flat_map_becomes_an_image_of_its_own_answers(run, files, tmp_path):
     done = succeeded(run(f"path={files / 'map_2.safetensors'}", "output=floor.yaml", "resolution=0.2"))
-    found = read_map_server(tmp_path / "floor.yaml")
+    found = read_map_image(tmp_path / "floor.yaml")
     built = GaussianMap.load(files / "map_2.safetensors")
     theta = torch.as_tensor(built.occupancy(found.grid.centers(), 0.2)).view(found.grid.shape)
     assert float((found.probability - theta).abs().max()) <= 1 / 255
@@ -93,7 +93,7 @@ def test_a_flat_map_becomes_an_image_of_its_own_answers(run, files, tmp_path):
 def test_other_forms_of_evidence_fill_the_same_cells(run, files, tmp_path):
     source = f"path={files / 'map_2.safetensors'}"
     succeeded(run(source, "output=a.yaml", "method=monte_carlo", "resolution=0.2"))
-    found = read_map_server(tmp_path / "a.yaml")
+    found = read_map_image(tmp_path / "a.yaml")
     built = GaussianMap.load(files / "map_2.safetensors")
     theta = built.evidence(found.grid, "monte_carlo").probability()
     assert float((found.probability - theta).abs().max()) <= 1 / 255
@@ -102,7 +102,7 @@ def test_other_forms_of_evidence_fill_the_same_cells(run, files, tmp_path):
 @pytest.mark.parametrize("kind", ["grid", "log_odds"])
 def test_a_grid_becomes_an_image_of_its_own_cells(kind, run, files, tmp_path):
     succeeded(run(f"path={files / f'{kind}_2.safetensors'}", "output=floor.yaml"))
-    found = read_map_server(tmp_path / "floor.yaml")
+    found = read_map_image(tmp_path / "floor.yaml")
     grid = OccupancyGrid.load(files / f"{kind}_2.safetensors")
     theta = torch.as_tensor(grid.occupancy(found.grid.centers())).view(found.grid.shape)
     assert float((found.probability - theta).abs().max()) <= 1 / 255
@@ -113,7 +113,7 @@ def test_a_grid_becomes_an_image_of_its_own_cells(kind, run, files, tmp_path):
 def test_a_band_of_heights_becomes_an_image(run, files, tmp_path):
     options = ["output=band.yaml", "resolution=0.5", "z_min=0.3", "z_max=1.2"]
     succeeded(run(f"path={files / 'map_3.safetensors'}", *options))
-    found = read_map_server(tmp_path / "band.yaml")
+    found = read_map_image(tmp_path / "band.yaml")
     built = GaussianMap.load(files / "map_3.safetensors")
     columns = torch.cat(
         [
@@ -172,7 +172,7 @@ def test_bounds_cut_the_cells_out(run, files, tmp_path):
     succeeded(
         run(f"path={files / 'map_2.safetensors'}", "output=cut.yaml", "bounds=[1,2,4,3]", "resolution=0.1")
     )
-    assert read_map_server(tmp_path / "cut.yaml").grid.shape == (30, 10)
+    assert read_map_image(tmp_path / "cut.yaml").grid.shape == (30, 10)
 
 
 # -- components -----------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ def test_an_empty_map_needs_bounds(run, tmp_path):
     done = run("path=empty.safetensors", "output=a.yaml")
     assert "holds nothing; give bounds" in done.stderr
     succeeded(run("path=empty.safetensors", "output=a.yaml", "bounds=[0,0,1,1]"))
-    assert bool((read_map_server(tmp_path / "a.yaml").probability - 0.5).abs().max() <= 1 / 255)
+    assert bool((read_map_image(tmp_path / "a.yaml").probability - 0.5).abs().max() <= 1 / 255)
 
 
 # -- the command itself ---------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Parts of a log: every scan is one robot's, in order."""
+"""Dataset shards: each scan belongs to exactly one robot, in order."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gmmtorch.errors import InvalidArgumentError
 
 
 @given(n_scans=st.integers(0, 200), n=st.integers(1, 20), split=st.sampled_from(SPLITS))
-def test_every_scan_is_one_robots_and_all_have_as_many(n_scans, n, split):
-    parts = [list(shard_indices(n_scans, k, n, split)) for k in range(n)]
-    assert sorted(itertools.chain(*parts)) == list(range(n_scans))
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
-    for part in parts:
-        steps = {b - a for a, b in itertools.pairwise(part)}
+def test_shards_partition_the_scans_evenly(n_scans, n, split):
+    shards = [list(shard_indices(n_scans, k, n, split)) for k in range(n)]
+    assert sorted(itertools.chain(*shards)) == list(range(n_scans))
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+    for shard in shards:
+        steps = {b - a for a, b in itertools.pairwise(shard)}
         assert steps <= {n if split == "interleaved" else 1}
     if split == "consecutive":
-        assert list(itertools.chain(*parts)) == list(range(n_scans))
+        assert list(itertools.chain(*shards)) == list(range(n_scans))
 
 
 @pytest.mark.parametrize(
@@ -34,12 +34,12 @@ def test_every_scan_is_one_robots_and_all_have_as_many(n_scans, n, split):
         ((5, 0, 1, "x"), "split"),
     ],
 )
-def test_bad_parts(args, name):
+def test_shard_indices_rejects_invalid_arguments(args, name):
     with pytest.raises(InvalidArgumentError, match=name):
         shard_indices(*args)
 
 
-def test_a_part_reads_what_it_is_asked_for_and_no_more():
+def test_dataset_shard_reads_only_the_accessed_scans():
     read: list[int] = []
 
     class Scans:
@@ -47,10 +47,10 @@ def test_a_part_reads_what_it_is_asked_for_and_no_more():
             read.append(index)
             return f"scan {index}"
 
-    part = DatasetShard(Scans(), shard_indices(10, 1, 3))
-    assert (len(part), part[1], part[-1]) == (3, "scan 4", "scan 7")
-    assert list(part[1:]) == ["scan 4", "scan 7"]
-    assert list(part) == ["scan 1", "scan 4", "scan 7"]
+    shard = DatasetShard(Scans(), shard_indices(10, 1, 3))
+    assert (len(shard), shard[1], shard[-1]) == (3, "scan 4", "scan 7")
+    assert list(shard[1:]) == ["scan 4", "scan 7"]
+    assert list(shard) == ["scan 1", "scan 4", "scan 7"]
     assert read == [4, 7, 4, 7, 1, 4, 7]
     with pytest.raises(IndexError):
-        part[3]
+        shard[3]

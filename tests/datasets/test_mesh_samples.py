@@ -1,4 +1,4 @@
-"""Points on meshes: on the surface, uniform by area, and the errors of files that are none."""
+"""Points sampled from meshes: on the surface, uniform by area, and damaged files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gmmtorch.datasets import load
 from gmmtorch.datasets.mesh_samples import read_triangles, sample_surface
 from gmmtorch.errors import DataError, InvalidArgumentError
 
-# A tetrahedron whose faces are of different areas.
+# A tetrahedron with faces of different areas.
 CORNERS = [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 5.0)]
 FACES = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
 
@@ -48,30 +48,30 @@ def planes(triangles: Tensor) -> tuple[np.ndarray, np.ndarray]:
     return length / 2, cross / length[:, None]
 
 
-def test_every_face_gets_points_by_its_area(tetrahedron):
+def test_sample_surface_covers_faces_in_proportion_to_area(tetrahedron):
     triangles = read_triangles(tetrahedron)
     assert triangles.shape == (4, 3, 3)
     areas, normals = planes(triangles)
     points = sample_surface(triangles, 40_000, generator()).numpy()
     distance = np.abs(np.einsum("ntd,td->nt", points[:, None] - triangles[:, 0].numpy(), normals))
     assert distance.min(1).max() < 1e-12
-    assert (points @ [0.5, 1.0, 0.2] < 1 + 1e-12).all()  # within the tetrahedron's own corner of space
+    assert (points @ [0.5, 1.0, 0.2] < 1 + 1e-12).all()  # inside the tetrahedron
     assert points.min() >= 0
     shares = np.bincount(distance.argmin(1), minlength=4) / len(points)
     np.testing.assert_allclose(shares, areas / areas.sum(), atol=0.01)  # four standard errors
 
 
-def test_points_are_uniform_within_a_triangle():
+def test_sample_surface_is_uniform_within_a_triangle():
     triangle = torch.tensor([[[1.0, 1.0, 0.0], [5.0, 1.0, 0.0], [2.0, 4.0, 0.0]]], dtype=torch.float64)
     points = sample_surface(triangle, 50_000, generator()).numpy()
     corners = triangle[0].numpy()
     np.testing.assert_allclose(points.mean(0), corners.mean(0), atol=0.02)
-    # The second moment of a uniform triangle about its centre: Σ (corner − centre)(…)ᵀ / 12.
+    # Covariance of a uniform triangle: Σ (corner − centre)(corner − centre)ᵀ / 12.
     offset = corners - corners.mean(0)
     np.testing.assert_allclose(np.cov(points.T), offset.T @ offset / 12, atol=0.02)
 
 
-def test_faces_without_area_get_no_points():
+def test_sample_surface_skips_faces_without_area():
     flat = torch.tensor([[[7.0, 7.0, 7.0]] * 3, [[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]]]).double()
     points = sample_surface(torch.cat([flat, flat[:1]]), 1000, generator())
     assert float(points.max()) <= 1
@@ -79,7 +79,7 @@ def test_faces_without_area_get_no_points():
         sample_surface(flat[:1], 10, generator())
 
 
-def test_it_is_one_scan_from_the_middle(tetrahedron):
+def test_mesh_is_one_scan_from_the_centre_of_its_box(tetrahedron):
     dataset = load("mesh", tetrahedron, n_points=500)
     assert (dataset.name, len(dataset)) == ("tetrahedron", 1)
     scan = dataset[0]
@@ -88,20 +88,20 @@ def test_it_is_one_scan_from_the_middle(tetrahedron):
     assert scan.origin.tolist() == [1.0, 0.5, 2.5]
 
 
-def test_the_seed_decides(tetrahedron):
+def test_mesh_samples_depend_on_the_seed(tetrahedron):
     first, again, other = (load("mesh", tetrahedron, seed=seed)[0].points for seed in (3, 3, 4))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_noise_has_the_deviation_asked_for(tetrahedron):
+def test_mesh_noise_has_the_given_standard_deviation(tetrahedron):
     exact = load("mesh", tetrahedron, n_points=20_000)[0].points
     noisy = load("mesh", tetrahedron, n_points=20_000, noise=0.05)[0].points
     np.testing.assert_allclose(np.cov((noisy - exact).T), 0.0025 * np.eye(3), atol=1e-4)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl"])
-def test_other_formats_are_read(suffix, tetrahedron, tmp_path):
+def test_read_triangles_accepts_obj_and_stl(suffix, tetrahedron, tmp_path):
     import open3d
 
     mesh = open3d.io.read_triangle_mesh(str(tetrahedron))
@@ -116,14 +116,14 @@ def test_other_formats_are_read(suffix, tetrahedron, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no mesh at all", "no triangles that can be read"),
-        (ply(faces=[]), "no triangles that can be read"),
-        (ply()[:-12], "no triangles that can be read"),
+        ("not a mesh", "no readable triangles"),
+        (ply(faces=[]), "no readable triangles"),
+        (ply()[:-12], "no readable triangles"),
         (ply([*CORNERS[:3], (float("nan"), 0.0, 0.0)]), "NaN or infinite"),
         (ply([(1.0, 2.0, 3.0)] * 4), "no area"),
     ],
 )
-def test_a_file_that_is_no_mesh_is_named(text, message, tmp_path):
+def test_mesh_rejects_damaged_files(text, message, tmp_path):
     path = tmp_path / "broken.ply"
     path.write_text(text)
     with pytest.raises(DataError, match=message):
@@ -131,13 +131,13 @@ def test_a_file_that_is_no_mesh_is_named(text, message, tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [("n_points", 0), ("noise", -0.1), ("seed", -1)])
-def test_bad_options_are_named(option, value, tetrahedron):
+def test_mesh_rejects_invalid_options(option, value, tetrahedron):
     with pytest.raises(InvalidArgumentError, match=f"{option}={value}"):
         load("mesh", tetrahedron, **{option: value})
 
 
 @pytest.mark.real_data
-def test_the_bunny(real_data):
+def test_mesh_reads_the_stanford_bunny(real_data):
     dataset = load("mesh", real_data / "meshes" / "bunny.ply", n_points=5000)
     points = dataset[0].points
     size = points.amax(0) - points.amin(0)

@@ -1,4 +1,4 @@
-"""Scans on a walk through a mesh: on its surfaces, the same again, and the errors of bad input."""
+"""Scans on a path through a mesh: points on its surfaces, reproducibility, and invalid input."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def hall(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("sensor", ["lidar", "depth_camera"])
-def test_scans_end_on_the_walls_up_to_the_sensors_noise(hall, sensor):
+def test_mesh_scan_points_lie_on_the_surfaces_within_noise(hall, sensor):
     dataset = load("mesh_scans", hall, n_scans=4, sensor=sensor)
     assert len(dataset) == 4
     size = torch.tensor([20.0, 6.0, 3.0], dtype=torch.float64)
     for scan in dataset:
         points = scan.points.double()
         assert len(points) > 1000
-        beside = torch.minimum(points.abs(), (points - size).abs()).amin(1)
-        assert float(beside.max()) < 0.06  # noise of 1 cm along the beam
+        distance = torch.minimum(points.abs(), (points - size).abs()).amin(1)
+        assert float(distance.max()) < 0.06  # noise of 1 cm along the beam
         assert bool(((scan.origin > 0) & (scan.origin < size)).all())
 
 
-def test_a_scan_depends_on_seed_and_index_only(hall):
+def test_mesh_scan_depends_only_on_seed_and_index(hall):
     def scan(index: int, seed: int) -> Scan:
         return load("mesh_scans", hall, n_scans=4, seed=seed)[index]
 
@@ -45,7 +45,7 @@ def test_a_scan_depends_on_seed_and_index_only(hall):
     assert not torch.equal(scan(2, 4).points, scan(2, 3).points)
 
 
-def test_beams_without_return_free_no_return_range(hall):
+def test_mesh_scan_no_return_beams_have_no_return_range(hall):
     near = load("mesh_scans", hall, n_scans=2, max_range=2.0, no_return_range=1.5)[0]
     assert len(near.no_return) > 0
     assert float((near.points - near.origin).norm(dim=1).max()) < 2
@@ -55,7 +55,7 @@ def test_beams_without_return_free_no_return_range(hall):
     )
 
 
-def test_bad_input_is_named(hall, tmp_path):
+def test_mesh_scans_reject_invalid_input(hall, tmp_path):
     with pytest.raises(MissingDataError, match=r"nowhere\.ply"):
         load("mesh_scans", tmp_path / "nowhere.ply")
     with pytest.raises(InvalidArgumentError, match="sensor='radar'"):
@@ -69,7 +69,7 @@ def test_bad_input_is_named(hall, tmp_path):
 
 
 @pytest.mark.real_data
-def test_a_walk_through_a_mine_sees_tunnels(real_data):
+def test_mesh_scans_of_a_real_mine_cover_a_long_path(real_data):
     dataset = load("mesh_scans", real_data / "meshes" / "edgar_mine.ply", n_scans=50)
     scan = dataset[25]
     assert len(scan.points) > 2000

@@ -1,4 +1,4 @@
-"""Points in chunks: every format against what was written, bounded reads, and damaged files."""
+"""Point files in chunks: every format against the written points, bounded reads, and damaged files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ needs_laspy = pytest.mark.skipif(
 
 
 def pcd(points: np.ndarray, kind: str) -> bytes:
-    """Fields x, y, z in float32 with a label of one byte before and three of padding amid them."""
+    """float32 fields x, y, z after a label of one byte, with three bytes of padding between y and z."""
     header = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS label x y _ z\nSIZE 1 4 4 1 4\nTYPE U F F U F\nCOUNT 1 1 1 3 1\n"
         f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {kind}\n"
@@ -41,7 +41,7 @@ def pcd(points: np.ndarray, kind: str) -> bytes:
 
 
 def ply(points: np.ndarray, form: str) -> bytes:
-    """Doubles in the order z, x, y after a colour, behind an element of two whole numbers, before faces."""
+    """Doubles z, x, y after a colour; an element of two integers before the vertices and faces after them."""
     header = (
         f"ply\nformat {form} 1.0\ncomment made here\nelement camera 2\nproperty short id\n"
         f"element vertex {len(points)}\nproperty uchar red\nproperty double z\nproperty float64 x\n"
@@ -56,7 +56,7 @@ def ply(points: np.ndarray, form: str) -> bytes:
 
 
 def written(folder: Path, name: str) -> Path:
-    """POINTS in the format that the file's name says."""
+    """Writes POINTS in the format given by the file name."""
     path = folder / name
     form = path.stem
     if name.endswith(".npy"):
@@ -70,7 +70,7 @@ def written(folder: Path, name: str) -> Path:
 
         cloud = laspy.create(point_format=3, file_version="1.2")
         cloud.header.scales, cloud.header.offsets = [1e-9] * 3, [0.0] * 3
-        cloud.x, cloud.y, cloud.z = VALID.T  # whole numbers of nanometres: no NaN in LAS
+        cloud.x, cloud.y, cloud.z = VALID.T  # LAS stores integers (here nanometres), so no NaN
         cloud.write(path)
     return path
 
@@ -85,7 +85,7 @@ FILES = [
 ]
 
 
-def together(source: PointChunks) -> tuple[np.ndarray, np.ndarray, int]:
+def read_all(source: PointChunks) -> tuple[np.ndarray, np.ndarray, int]:
     chunks = list(source)
     points = torch.cat([chunk.points for chunk in chunks])
     assert points.dtype == torch.float64
@@ -96,10 +96,10 @@ def together(source: PointChunks) -> tuple[np.ndarray, np.ndarray, int]:
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("chunk_points", [1, 5, 1000])
-def test_every_format_gives_the_valid_points_in_their_order(tmp_path, name, chunk_points):
+def test_every_format_returns_the_valid_points_in_order(tmp_path, name, chunk_points):
     source = open_points(written(tmp_path, name), chunk_points=chunk_points)
-    for _ in range(2):  # a source can be read again
-        points, rows, n_dropped = together(source)
+    for _ in range(2):  # a source can be read repeatedly
+        points, rows, n_dropped = read_all(source)
         np.testing.assert_allclose(points, VALID, rtol=0, atol=1e-9 if name.startswith("a.") else 0)
         if not name.startswith("a."):
             assert n_dropped == 2
@@ -109,28 +109,28 @@ def test_every_format_gives_the_valid_points_in_their_order(tmp_path, name, chun
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_parts_are_runs_of_rows_that_make_up_the_whole(tmp_path, name):
+def test_shards_are_contiguous_and_cover_all_rows(tmp_path, name):
     source = open_points(written(tmp_path, name), chunk_points=4)
-    parts = [source.shard(i, 3) for i in range(3)]
-    assert sum(part.n_rows for part in parts) == source.n_rows
-    assert max(part.n_rows for part in parts) - min(part.n_rows for part in parts) <= 1
+    shards = [source.shard(i, 3) for i in range(3)]
+    assert sum(shard.n_rows for shard in shards) == source.n_rows
+    assert max(shard.n_rows for shard in shards) - min(shard.n_rows for shard in shards) <= 1
     for got, expected in zip(
-        zip(*[together(part)[:2] for part in parts], strict=True), together(source)[:2], strict=True
+        zip(*[read_all(shard)[:2] for shard in shards], strict=True), read_all(source)[:2], strict=True
     ):
         np.testing.assert_array_equal(np.concatenate(got), expected)
 
 
 @pytest.mark.parametrize("name", [*RECORDS, *TEXT, "c.npy", pytest.param("a.las", marks=needs_laspy)])
-def test_a_truncated_file_is_an_error_that_names_it(tmp_path, name):
+def test_open_points_rejects_a_truncated_file(tmp_path, name):
     path = written(tmp_path, name)
     data = path.read_bytes()
-    path.write_bytes(data[:-60])  # past the face, and into the last point
+    path.write_bytes(data[:-60])  # without the face and a part of the last point
     with pytest.raises(DataError, match=str(path)):
         list(open_points(path, chunk_points=6))
 
 
 @needs_laspy
-def test_truncated_laz_is_an_error_that_names_it(tmp_path):
+def test_open_points_rejects_a_truncated_laz_file(tmp_path):
     path = written(tmp_path, "a.laz")
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=str(path)):
@@ -139,7 +139,7 @@ def test_truncated_laz_is_an_error_that_names_it(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".npy", ".pcd", ".ply", pytest.param(".las", marks=needs_laspy)])
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n" + bytes(300), b"x y z\n1 2 3\n"])
-def test_another_file_of_that_name_is_an_error(tmp_path, suffix, data):
+def test_open_points_rejects_other_content(tmp_path, suffix, data):
     path = tmp_path / f"foreign{suffix}"
     path.write_bytes(data)
     with pytest.raises(DataError, match=str(path)):
@@ -147,17 +147,17 @@ def test_another_file_of_that_name_is_an_error(tmp_path, suffix, data):
 
 
 @given(position=st.integers(0, 250), byte=st.integers(0, 255), name=st.sampled_from([*RECORDS, *TEXT]))
-def test_a_damaged_header_is_read_or_refused_but_never_else(tmp_path, position, byte, name):
+def test_a_damaged_header_is_read_or_rejected_with_a_clear_error(tmp_path, position, byte, name):
     path = written(tmp_path, name)
     data = bytearray(path.read_bytes())
     data[position] = byte
     path.write_bytes(data)
-    said = str(path)
+    message = str(path)
     try:
-        together(open_points(path, chunk_points=50))
+        read_all(open_points(path, chunk_points=50))
     except GmmTorchError as error:
-        said = str(error)
-    assert str(path) in said
+        message = str(error)
+    assert str(path) in message
 
 
 @pytest.mark.parametrize(
@@ -165,30 +165,30 @@ def test_a_damaged_header_is_read_or_refused_but_never_else(tmp_path, position, 
     [np.zeros(3), np.zeros((2, 0)), np.zeros((2, 3), complex), np.zeros((2, 2, 2)), np.array([["a", "b"]])],
     ids=["one axis", "no column", "complex", "three axes", "text"],
 )
-def test_an_array_that_is_no_table_of_numbers_is_refused(tmp_path, array):
+def test_open_points_rejects_arrays_of_other_shapes_and_types(tmp_path, array):
     path = tmp_path / "odd.npy"
     np.save(path, array)
     with pytest.raises(DataError, match="odd"):
         open_points(path)
 
 
-def test_pickles_are_not_read(tmp_path):
+def test_open_points_rejects_pickled_arrays(tmp_path):
     path = tmp_path / "pickle.npy"
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(DataError, match="pickle"):
         open_points(path)
 
 
-def test_what_cannot_be_read_whole_in_records_is_read_by_open3d(tmp_path):
+def test_compressed_pcd_files_are_read_as_a_whole(tmp_path):
     open3d = pytest.importorskip("open3d")
     cloud = open3d.t.geometry.PointCloud(VALID)
     path = tmp_path / "compressed.pcd"
     open3d.t.io.write_point_cloud(str(path), cloud, write_ascii=False, compressed=True)
-    points, _, _ = together(open_points(path, chunk_points=5))
+    points, _, _ = read_all(open_points(path, chunk_points=5))
     np.testing.assert_array_equal(points, VALID)
 
 
-def test_paths_that_cannot_be_are_refused(tmp_path):
+def test_open_points_rejects_missing_files_and_unknown_suffixes(tmp_path):
     with pytest.raises(MissingDataError, match="does not exist"):
         open_points(tmp_path / "none.npy")
     with pytest.raises(InvalidArgumentError, match=r"\.xyz"):
@@ -199,12 +199,12 @@ def test_paths_that_cannot_be_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"chunk_points": 0}, {"max_range": 0.0}, {"max_range": float("nan")}])
-def test_options_that_cannot_be_are_refused(tmp_path, options):
+def test_open_points_rejects_invalid_options(tmp_path, options):
     with pytest.raises(InvalidArgumentError, match=next(iter(options))):
         open_points(written(tmp_path, "c.npy"), **options)
 
 
-def test_without_laspy_the_error_says_what_to_install(tmp_path, monkeypatch):
+def test_without_laspy_the_error_states_the_install_command(tmp_path, monkeypatch):
     path = tmp_path / "a.las"
     path.write_bytes(b"LASF")
     monkeypatch.setitem(sys.modules, "laspy", None)
@@ -220,36 +220,36 @@ def test_points_at_or_beyond_max_range_are_dropped_and_counted():
     assert chunk.n_dropped == 2
 
 
-# -- what one pass finds --------------------------------------------------------------------------
+# -- surveys --------------------------------------------------------------------------------------
 
 
 @given(
     n=st.integers(0, 60),
     chunk_points=st.integers(1, 70),
-    n_parts=st.integers(1, 5),
+    n_shards=st.integers(1, 5),
     wanted=st.one_of(st.none(), st.integers(1, 70)),
     seed=st.integers(0, 2**32),
 )
-def test_a_survey_does_not_depend_on_chunks_or_parts(n, chunk_points, n_parts, wanted, seed):
+def test_a_survey_does_not_depend_on_chunks_or_shards(n, chunk_points, n_shards, wanted, seed):
     points = np.random.default_rng(n).normal(size=(n, 2))
     points[::7] = np.nan
     valid = points[np.isfinite(points).all(1)]
     source = in_memory(points, chunk_points=chunk_points)
     whole = survey(in_memory(points), wanted, seed)
-    parts = merge_surveys([survey(source.shard(i, n_parts), wanted, seed) for i in range(n_parts)], wanted)
-    for found in (whole, parts):
+    merged = merge_surveys([survey(source.shard(i, n_shards), wanted, seed) for i in range(n_shards)], wanted)
+    for found in (whole, merged):
         assert (found.n_points, found.n_dropped) == (len(valid), n - len(valid))
         np.testing.assert_allclose(found.total.numpy(), valid.sum(0), atol=1e-12)
         if len(valid):
             assert found.low.tolist() == valid.min(0).tolist()
             assert found.high.tolist() == valid.max(0).tolist()
         assert found.points.shape[0] == (len(valid) if wanted is None else min(wanted, len(valid)))
-    assert torch.equal(whole.sample, parts.sample)
-    assert whole.checksum == parts.checksum
+    assert torch.equal(whole.sample, merged.sample)
+    assert whole.checksum == merged.checksum
     assert {tuple(row) for row in whole.points.tolist()} <= {tuple(row) for row in valid.tolist()}
 
 
-def test_any_change_to_the_points_changes_the_checksum():
+def test_the_checksum_depends_on_every_coordinate_and_row():
     points = torch.randn(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     before = survey(in_memory(points)).checksum
     swapped = points[torch.arange(50).roll(1)]
@@ -260,16 +260,16 @@ def test_any_change_to_the_points_changes_the_checksum():
         assert survey(in_memory(other)).checksum != before
 
 
-def test_every_point_is_drawn_equally_often():
+def test_the_sample_draws_every_point_equally_often():
     points = torch.arange(40.0)[:, None]
     counts = torch.zeros(40)
     for seed in range(600):
         counts[survey(in_memory(points), 10, seed).points[:, 0].long()] += 1
     assert counts.sum() == 6000
-    assert (counts - 150).abs().max() < 5 * (600 * 0.25 * 0.75) ** 0.5  # five deviations of a binomial
+    assert (counts - 150).abs().max() < 5 * (600 * 0.25 * 0.75) ** 0.5  # five standard deviations
 
 
-def test_row_numbers_are_uniform_and_seeds_independent():
+def test_row_uniform_is_uniform_and_independent_between_seeds():
     rows = torch.arange(100_000)
     first, second = row_uniform(rows, 0), row_uniform(rows, 1)
     assert float(first.min()) >= 0
@@ -280,9 +280,9 @@ def test_row_numbers_are_uniform_and_seeds_independent():
         assert abs(float(torch.corrcoef(torch.stack([first, other]))[0, 1])) < 0.02
 
 
-def test_draws_of_disjoint_intervals_share_the_rows():
+def test_random_subsets_of_disjoint_intervals_partition_the_rows():
     source = in_memory(torch.randn(1000, 2), chunk_points=64)
-    rows = [together(source.random_subset(low, high, 3))[1] for low, high in ((0, 0.1), (0.1, 1))]
+    rows = [read_all(source.random_subset(low, high, 3))[1] for low, high in ((0, 0.1), (0.1, 1))]
     assert sorted(np.concatenate(rows).tolist()) == list(range(1000))
     assert 60 < len(rows[0]) < 140
     with pytest.raises(InvalidArgumentError, match="already a random subset"):

@@ -1,4 +1,4 @@
-"""Ranges: which beam ends are surfaces, empty beams or invalid; and Dataset as a sequence."""
+"""Ranges: classification of beam ends into hits, no-return beams and invalid ones; Dataset as a sequence."""
 
 from __future__ import annotations
 
@@ -15,62 +15,62 @@ ORIGIN = torch.zeros(2, dtype=torch.float64)
 ENDS = torch.tensor([[1.0, 0.0], [0.0, 5.0], [-20.0, 0.0]], dtype=torch.float64)
 
 
-def test_without_limit_every_end_is_a_surface():
+def test_without_max_range_every_end_is_a_hit():
     scan = Ranges().scan(ENDS, ORIGIN)
     assert scan.points.tolist() == ENDS.tolist()
     assert scan.no_return.shape == (0, 2)
 
 
-def test_readings_at_or_beyond_the_limit_free_no_return_range():
+def test_ends_at_or_beyond_max_range_become_no_return_beams():
     scan = Ranges(5.0, 3.0).scan(ENDS, ORIGIN)
     assert scan.points.tolist() == [[1.0, 0.0]]
     assert scan.no_return.tolist() == [[0.0, 3.0], [-3.0, 0.0]]
 
 
-def test_no_return_range_zero_drops_empty_beams():
+def test_no_return_range_zero_drops_no_return_beams():
     scan = Ranges(5.0, 0.0).scan(ENDS, ORIGIN)
     assert scan.points.tolist() == [[1.0, 0.0]]
     assert scan.no_return.shape == (0, 2)
 
 
-def test_empty_beams_never_free_more_than_the_limit_or_their_own_length():
+def test_free_part_is_limited_by_max_range_and_the_beam():
     scan = Ranges(6.0, 50.0).scan(ENDS, ORIGIN, no_return=torch.tensor([False, True, False]))
     assert scan.no_return.tolist() == [[0.0, 5.0], [-6.0, 0.0]]
 
 
-def test_ends_not_finite_or_on_the_sensor_are_dropped():
+def test_ends_that_are_not_finite_or_at_the_origin_are_dropped():
     ends = torch.tensor([[math.nan, 0.0], [0.0, math.inf], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
     scan = Ranges(5.0, 3.0).scan(ends, ORIGIN)
     assert scan.points.tolist() == [[1.0, 1.0]]
     assert scan.no_return.shape == (0, 2)
 
 
-def test_rounding_does_not_turn_the_limit_into_a_surface():
-    angle = torch.linspace(0, 6, 1000)  # float32: lengths come out a little below 50 as often as above
+def test_ends_at_max_range_within_rounding_are_no_hits():
+    angle = torch.linspace(0, 6, 1000)  # float32: half of the lengths are rounded below 50
     ends = 50 * torch.stack([angle.cos(), angle.sin()], 1)
     assert Ranges(50.0, 8.0).scan(ends, torch.zeros(2)).points.shape == (0, 2)
 
 
-def test_the_callers_mask_is_left_alone():
+def test_the_no_return_mask_is_not_modified():
     mask = torch.zeros(3, dtype=torch.bool)
     Ranges(5.0, 3.0).scan(ENDS, ORIGIN, no_return=mask)
     assert not bool(mask.any())
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_refuses_a_limit_that_is_not_a_distance(value):
+def test_max_range_must_be_a_distance(value):
     with pytest.raises(InvalidArgumentError, match="max_range"):
         Ranges(value)
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
-def test_refuses_a_no_return_range_that_is_not_a_distance(value):
+def test_no_return_range_must_be_a_distance(value):
     with pytest.raises(InvalidArgumentError, match="no_return_range"):
         Ranges(None, value)
 
 
-class _Ten(Dataset):
-    """Ten scans, scan i with one point at (i, 0)."""
+class _TenScans(Dataset):
+    """Ten scans; scan i has one point at (i, 0)."""
 
     def _count(self) -> int:
         return 10
@@ -86,20 +86,20 @@ def _numbers(scans: list[Scan]) -> list[float]:
 @pytest.mark.parametrize(
     ("stride", "expected"), [(1, list(range(10))), (3, [0, 3, 6, 9]), (4, [0, 4, 8]), (20, [0])]
 )
-def test_stride_reads_every_nth(stride, expected):
-    dataset = _Ten("ten", Ranges(), stride)
+def test_dataset_stride_selects_every_nth_scan(stride, expected):
+    dataset = _TenScans("ten", Ranges(), stride)
     assert len(dataset) == len(expected)
     assert _numbers(list(dataset)) == expected
 
 
-def test_indexing_is_that_of_a_sequence():
-    dataset = _Ten("ten", Ranges(), 2)
+def test_dataset_supports_negative_indices_and_slices():
+    dataset = _TenScans("ten", Ranges(), 2)
     assert _numbers([dataset[-1]]) == [8]
     assert _numbers(dataset[1:3]) == [2, 4]
     with pytest.raises(IndexError, match="ten"):
         dataset[5]
 
 
-def test_refuses_a_stride_below_one():
+def test_dataset_rejects_a_stride_below_one():
     with pytest.raises(InvalidArgumentError, match="stride=0"):
-        _Ten("ten", Ranges(), 0)
+        _TenScans("ten", Ranges(), 0)

@@ -1,4 +1,4 @@
-"""Every reader on small files written here: values, order, what is invalid, and what a bad file is told."""
+"""Each reader on small files: values, order, invalid readings, and error messages for damaged files."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_carmen_beam_angles(n, first, last):
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_carmen_values(tmp_path, compressed):
+def test_carmen_beam_ends_follow_pose_and_ranges(tmp_path, compressed):
     text = "# a comment\nODOM 1 2 3\n" + flaser([1.0, 2.0, 3.0], (10.0, 20.0, math.pi / 2))
     path = tmp_path / "room.log"
     path.write_bytes(gzip.compress(text.encode()) if compressed else text.encode())
@@ -105,11 +105,11 @@ def test_carmen_values(tmp_path, compressed):
     assert dataset.name == "room"
     (scan,) = dataset
     assert scan.origin.tolist() == [10.0, 20.0]
-    expected = [[11.0, 20.0], [10.0, 22.0], [7.0, 20.0]]  # the robot looks up the page: right, ahead, left
+    expected = [[11.0, 20.0], [10.0, 22.0], [7.0, 20.0]]  # the robot faces +y: right, ahead, left
     torch.testing.assert_close(scan.points, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_carmen_no_return_and_invalid_readings(tmp_path):
+def test_carmen_separates_no_return_and_invalid_readings(tmp_path):
     path = tmp_path / "a.log"
     path.write_text(flaser([0.0, -1.0, 1.0, 81.83, 50.0, math.nan, math.inf]))
     scan = load("carmen", path)[0]
@@ -120,7 +120,7 @@ def test_carmen_no_return_and_invalid_readings(tmp_path):
     assert unlimited.points.norm(dim=1).tolist() == pytest.approx([1.0, 81.83, 50.0])
 
 
-def test_carmen_scan_of_empty_beams_only(tmp_path):
+def test_carmen_reads_a_scan_without_returns(tmp_path):
     path = tmp_path / "a.log"
     path.write_text(flaser([81.83] * 180))
     scan = load("carmen", path)[0]
@@ -136,7 +136,7 @@ def test_carmen_stride(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "complaint"),
+    ("content", "message"),
     [
         (b"hello\n", "no FLASER line"),
         (b"", "no FLASER line"),
@@ -148,14 +148,14 @@ def test_carmen_stride(tmp_path):
         (b"FLASER 999999999 1 2 3 4\n", "line 1.*announces 999999999 beams"),
         (b"FLASER -1 0 0 0\n", "line 1.*announces -1 beams"),
         (flaser([1.0], (math.nan, 0.0, 0.0)).encode(), "line 1.*pose.*not finite"),
-        (gzip.compress(flaser([1.0] * 50).encode() * 50)[:-20], "not a whole gzip file"),
-        (b"\x1f\x8b\x08garbage that is not gzip at all", "not a whole gzip file"),
+        (gzip.compress(flaser([1.0] * 50).encode() * 50)[:-20], "not a complete gzip file"),
+        (b"\x1f\x8b\x08garbage that is not gzip at all", "not a complete gzip file"),
     ],
 )
-def test_carmen_bad_files_are_named(tmp_path, content, complaint):
+def test_carmen_rejects_damaged_files(tmp_path, content, message):
     path = tmp_path / "bad.log"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=rf"bad\.log.*{complaint}"):
+    with pytest.raises(DataError, match=rf"bad\.log.*{message}"):
         load("carmen", path)
 
 
@@ -166,7 +166,7 @@ def test_carmen_bad_files_are_named(tmp_path, content, complaint):
 @pytest.mark.parametrize(
     "write", [pcd, lambda p: pcd(p, binary=False), ply], ids=["binary.pcd", "ascii.pcd", "ascii.ply"]
 )
-def test_scan_folder_values(tmp_path, write):
+def test_scan_folder_transforms_points_by_the_pose(tmp_path, write):
     suffix = "ply" if write is ply else "pcd"
     clouds = {f"{i:06d}.{suffix}": write([(1.0, 0.0, 0.0), (0.0, 2.0, float(i))]) for i in range(2)}
     poses = kitti(np.eye(3), [0.0, 0.0, 0.0]) + kitti(TURN_LEFT, [5.0, 0.0, 1.0])
@@ -177,7 +177,7 @@ def test_scan_folder_values(tmp_path, write):
 
 
 @needs_open3d
-def test_scan_folder_order_is_natural(tmp_path):
+def test_scan_folder_orders_file_names_naturally(tmp_path):
     clouds = {f"scan_{i}.pcd": pcd([(float(i), 1.0, 0.0)]) for i in (1, 2, 10)}
     poses = "".join(kitti(np.eye(3), [0.0, 0.0, float(i)]) for i in range(3))
     scans = load("scan_folder", scan_folder(tmp_path, clouds, poses))
@@ -185,7 +185,7 @@ def test_scan_folder_order_is_natural(tmp_path):
 
 
 @needs_open3d
-def test_scan_folder_no_return_and_invalid_points(tmp_path):
+def test_scan_folder_separates_no_return_and_invalid_points(tmp_path):
     points = [(1.0, 0.0, 0.0), NAN_POINT, (0.0, 0.0, 0.0), (math.inf, 0.0, 0.0), (0.0, 30.0, 0.0)]
     folder = scan_folder(tmp_path, {"0.pcd": pcd(points)}, kitti(np.eye(3), [0.0, 0.0, 0.0]))
     (scan,) = load("scan_folder", folder, max_range=20.0, no_return_range=5.0)
@@ -197,7 +197,7 @@ def test_scan_folder_no_return_and_invalid_points(tmp_path):
 
 @needs_open3d
 @pytest.mark.parametrize("points", [[], [NAN_POINT]])
-def test_scan_folder_scan_without_points(tmp_path, points):
+def test_scan_folder_reads_a_scan_without_points(tmp_path, points):
     folder = scan_folder(tmp_path, {"0.pcd": pcd(points)}, kitti(np.eye(3), [1.0, 2.0, 3.0]))
     (scan,) = load("scan_folder", folder)
     assert scan.n_beams == 0
@@ -208,7 +208,7 @@ IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
-    ("poses", "complaint"),
+    ("poses", "message"),
     [
         (IDENTITY * 2, r"2 rows, but there are 1 scans.*one pose for each"),
         ("", "0 rows"),
@@ -220,13 +220,13 @@ IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt")
-def test_scan_folder_bad_poses_are_named(tmp_path, poses, complaint):
-    with pytest.raises(DataError, match=rf"poses\.txt.*{complaint}"):
+def test_scan_folder_rejects_invalid_poses(tmp_path, poses, message):
+    with pytest.raises(DataError, match=rf"poses\.txt.*{message}"):
         load("scan_folder", scan_folder(tmp_path, {"0.pcd": pcd([])}, poses))
 
 
-def test_scan_folder_missing_parts_are_named(tmp_path):
-    with pytest.raises(DataError, match=r"scans.*holds no \.pcd"):
+def test_scan_folder_reports_missing_files(tmp_path):
+    with pytest.raises(DataError, match=r"scans.*contains no \.pcd"):
         load("scan_folder", tmp_path)
     scan_folder(tmp_path, {"0.pcd": pcd([])}, IDENTITY)
     (tmp_path / "poses.txt").unlink()
@@ -244,12 +244,12 @@ def test_scan_folder_missing_parts_are_named(tmp_path):
         ("0.pcd", b"\x89PNG\r\n\x1a\n" + bytes(200)),
         ("0.pcd", b""),
         ("0.ply", ply([(1.0, 2.0, 3.0)] * 100)[:-500]),
-        ("0.ply", b"this is no ply file"),
+        ("0.ply", b"this is not a ply file"),
         ("0.ply", b""),
     ],
     ids=["short", "short-ascii", "header-cut", "png", "empty", "short-ply", "text-ply", "empty-ply"],
 )
-def test_damaged_clouds_are_named(tmp_path, name, content):
+def test_read_cloud_rejects_damaged_files(tmp_path, name, content):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(DataError, match=name):
@@ -260,7 +260,7 @@ def test_damaged_clouds_are_named(tmp_path, name, content):
 
 
 @needs_open3d
-def test_pcd_viewpoint_values_order_and_limit(tmp_path):
+def test_pcd_viewpoint_reads_origins_order_and_no_return(tmp_path):
     for i in (10, 2, 1):
         content = pcd([(float(i), 0.0, 1.0), (float(i), 10.0, 1.0)], viewpoint=f"{i} 0 0 1 0 0 0")
         (tmp_path / f"scan_{i}.pcd").write_bytes(content)
@@ -272,21 +272,21 @@ def test_pcd_viewpoint_values_order_and_limit(tmp_path):
 
 
 @pytest.mark.parametrize("viewpoint", ["", "0 0", "a b c", "nan 0 0 1 0 0 0"])
-def test_pcd_viewpoint_without_a_position_is_named(tmp_path, viewpoint):
+def test_pcd_viewpoint_rejects_a_viewpoint_without_position(tmp_path, viewpoint):
     (tmp_path / "0.pcd").write_bytes(pcd([(1.0, 2.0, 3.0)], viewpoint))
     with pytest.raises(DataError, match=r"0\.pcd: VIEWPOINT"):
         load("pcd_viewpoint", tmp_path)[0]
 
 
-def test_pcd_viewpoint_empty_folder_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"holds no \.pcd file"):
+def test_pcd_viewpoint_rejects_an_empty_folder(tmp_path):
+    with pytest.raises(DataError, match=r"contains no \.pcd file"):
         load("pcd_viewpoint", tmp_path)
 
 
 # Depth frames
 
 
-def test_depth_frames_values(tmp_path):
+def test_depth_frames_back_project_and_transform_pixels(tmp_path):
     depth = np.array([[1000, 0, 65535], [0, 2000, 0], [0, 0, 4000]], dtype=np.uint16)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
@@ -299,7 +299,7 @@ def test_depth_frames_values(tmp_path):
     torch.testing.assert_close(second.points, moved)
 
 
-def test_depth_frames_limit_and_pixel_stride(tmp_path):
+def test_depth_frames_apply_max_range_and_pixel_stride(tmp_path):
     folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
     assert load("depth_frames", folder, pixel_stride=2)[0].points.shape == (6, 3)
     scan = load("depth_frames", folder, max_range=3.0, no_return_range=2.0)[0]
@@ -309,12 +309,12 @@ def test_depth_frames_limit_and_pixel_stride(tmp_path):
         load("depth_frames", folder, pixel_stride=0)
 
 
-def test_depth_frame_without_valid_pixels(tmp_path):
+def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):
     folder = depth_folder(tmp_path, [(np.zeros((4, 6), dtype=np.uint16), np.eye(4))])
     assert load("depth_frames", folder)[0].n_beams == 0
 
 
-def _cut_png(folder: Path) -> None:
+def _truncated_png(folder: Path) -> None:
     path = folder / "frame-000000.depth.png"
     path.write_bytes(path.read_bytes()[:-40])
 
@@ -323,7 +323,7 @@ def _text_png(folder: Path) -> None:
     (folder / "frame-000000.depth.png").write_text("not an image")
 
 
-def _colour_png(folder: Path) -> None:
+def _color_png(folder: Path) -> None:
     Image.fromarray(np.zeros((4, 6, 3), dtype=np.uint8)).save(folder / "frame-000000.depth.png")
 
 
@@ -336,26 +336,26 @@ def _pose(value: np.ndarray | str) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "complaint"),
+    ("damage", "message"),
     [
-        (_cut_png, r"000000\.depth\.png is not a whole PNG"),
-        (_text_png, r"000000\.depth\.png is not a whole PNG"),
-        (_colour_png, r"000000\.depth\.png is uint8.*expected one channel of 16 bit"),
+        (_truncated_png, r"000000\.depth\.png is not a complete PNG"),
+        (_text_png, r"000000\.depth\.png is not a complete PNG"),
+        (_color_png, r"000000\.depth\.png is uint8.*expected one 16-bit channel"),
         (_pose(np.full((4, 4), math.nan)), r"000000\.pose\.txt.*finite 4×4"),
         (_pose(np.eye(3)), r"000000\.pose\.txt.*finite 4×4"),
         (_pose(3 * np.eye(4)), r"000000\.pose\.txt is not a rigid pose"),
         (_pose("lost"), r"000000\.pose\.txt is not a matrix of numbers"),
     ],
 )
-def test_depth_frames_bad_files_are_named(tmp_path, spoil, complaint):
+def test_depth_frames_reject_damaged_files(tmp_path, damage, message):
     noise = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
     dataset = load("depth_frames", depth_folder(tmp_path, [(noise, np.eye(4))]))
-    spoil(tmp_path)
-    with pytest.raises(DataError, match=complaint):
+    damage(tmp_path)
+    with pytest.raises(DataError, match=message):
         dataset[0]
 
 
-def test_depth_frames_missing_parts_are_named(tmp_path):
+def test_depth_frames_report_missing_files(tmp_path):
     with pytest.raises(DataError, match="holds no frame-"):
         load("depth_frames", tmp_path)
     depth_folder(tmp_path, [(np.ones((2, 2), dtype=np.uint16), np.eye(4))] * 2)
@@ -392,7 +392,7 @@ def octomap(path: Path, text: str, compressed: bool = False) -> Dataset:
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_octomap_values(tmp_path, compressed, newline):
+def test_octomap_log_transforms_points_by_the_pose(tmp_path, compressed, newline):
     first, second, third = octomap(tmp_path / "campus.graph", OCTOMAP.replace("\n", newline), compressed)
     assert first.origin.tolist() == [1.0, 2.0, 3.0]
     assert first.points.tolist() == [[2.0, 2.0, 3.0], [1.0, 3.0, 3.0]]
@@ -401,7 +401,7 @@ def test_octomap_values(tmp_path, compressed, newline):
     assert third.n_beams == 0
 
 
-def test_octomap_rotation_is_yaw_pitch_roll():
+def test_octomap_log_rotation_is_yaw_pitch_roll():
     roll, pitch, yaw = 0.1, -0.2, 0.3
 
     def about(axis: int, angle: float) -> torch.Tensor:
@@ -415,7 +415,7 @@ def test_octomap_rotation_is_yaw_pitch_roll():
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         ("NODE 0 0 0\n1 2 3\n", "NODE line: expected 6 numbers"),
         ("NODE\n1 2 3\n", "NODE line: expected 6 numbers"),
@@ -425,16 +425,16 @@ def test_octomap_rotation_is_yaw_pitch_roll():
         ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers a line"),
     ],
 )
-def test_octomap_bad_scans_are_named(tmp_path, text, complaint):
+def test_octomap_log_rejects_damaged_scans(tmp_path, text, message):
     dataset = octomap(tmp_path / "bad.graph", text)
-    with pytest.raises(DataError, match=rf"bad\.graph.*{complaint}"):
+    with pytest.raises(DataError, match=rf"bad\.graph.*{message}"):
         dataset[0]
 
 
-def test_octomap_foreign_and_cut_files_are_named(tmp_path):
+def test_octomap_log_rejects_other_and_truncated_files(tmp_path):
     with pytest.raises(DataError, match="no NODE line"):
         octomap(tmp_path / "a.graph", "hello\n")
     path = tmp_path / "b.graph"
     path.write_bytes(gzip.compress(OCTOMAP.encode() * 20)[:-15])
-    with pytest.raises(DataError, match=r"b\.graph is not a whole gzip file"):
+    with pytest.raises(DataError, match=r"b\.graph is not a complete gzip file"):
         load("octomap_log", path)

@@ -1,4 +1,4 @@
-"""The readers on real logs, as far as $GMMTORCH_DATA holds them."""
+"""The readers on real logs from $GMMTORCH_DATA."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def real(name: str, relative: str, **options) -> Dataset:
         pytest.skip("GMMTORCH_DATA is not set")
     path = Path(root) / relative
     if not path.exists():
-        pytest.skip(f"{path} is not there")
+        pytest.skip(f"{path} does not exist")
     if name in ("scan_folder", "pcd_viewpoint"):
         pytest.importorskip("open3d", exc_type=ImportError)
     return load(name, path, **options)
@@ -35,7 +35,7 @@ def span(scans: list, share: float = 1.0) -> list[float]:
 
 
 def disagreement(scans: list) -> float:
-    """Median distance (m) from every 5th scan's points to the other scans: large if poses are misread."""
+    """Median distance (m) from every 5th scan's points to the other scans; large if poses are wrong."""
     tested = torch.cat([scan.points for scan in scans[::5]])[::20]
     rest = torch.cat([scan.points for i, scan in enumerate(scans) if i % 5])
     return float(np.median(cKDTree(rest.numpy()).query(tested.numpy())[0]))
@@ -49,7 +49,7 @@ def disagreement(scans: list) -> float:
         ("freiburg-101", 292, 360, None),
     ],
 )
-def test_carmen_logs(log, n_scans, n_beams, size):
+def test_carmen_reads_consistent_scans_from_real_logs(log, n_scans, n_beams, size):
     scans = list(real("carmen", f"laser2d/{log}.log.gz"))
     assert len(scans) == n_scans
     assert all(scan.n_beams <= n_beams for scan in scans)
@@ -65,7 +65,7 @@ def test_carmen_logs(log, n_scans, n_beams, size):
 @pytest.mark.parametrize(
     ("folder", "n_scans", "n_points"), [("hall", 45, 1.14e6), ("courtyard", 157, 0.80e6)]
 )
-def test_scan_folders(folder, n_scans, n_points):
+def test_scan_folder_reads_consistent_scans_from_real_data(folder, n_scans, n_points):
     scans = list(real("scan_folder", folder))
     assert len(scans) == n_scans
     assert sum(scan.n_beams for scan in scans) == pytest.approx(n_points, rel=0.01)
@@ -75,7 +75,7 @@ def test_scan_folders(folder, n_scans, n_points):
         assert span(scans, 0.99) == pytest.approx([29, 35, 11], abs=0.5)
 
 
-def test_depth_frames():
+def test_depth_frames_reads_real_images():
     dataset = real("depth_frames", "kinect", pixel_stride=4)
     assert len(dataset) == 140
     scan = dataset[70]
@@ -84,7 +84,7 @@ def test_depth_frames():
 
 
 @pytest.mark.parametrize("folder", ["sim_structured", "sim_unstructured"])
-def test_pcd_viewpoint(folder):
+def test_pcd_viewpoint_reads_real_scans(folder):
     dataset = real("pcd_viewpoint", f"la3dm/{folder}", max_range=8.0, no_return_range=8.0)
     assert len(dataset) == 12
     for scan in dataset:

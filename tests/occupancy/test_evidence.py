@@ -18,6 +18,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import (
     CellClass,
     Evidence,
+    Thresholds,
     bernoulli_entropy,
     bernoulli_variance,
     classify,
@@ -198,3 +199,14 @@ def test_a_look_up_reads_the_cell_and_a_half_outside():
     nan, inf = float("nan"), float("inf")
     far = torch.tensor([[100.0, 0.0], [-1.01, 1.0], [nan, 1.0], [inf, 1.0]], dtype=torch.float64)
     assert evidence.lookup(far).tolist() == [0.5] * 4
+
+
+def test_thresholds_classify_free_unknown_and_occupied():
+    theta = torch.tensor([0.0, 0.196, 0.5, 0.65, 0.651, 1.0], dtype=torch.float64)
+    assert Thresholds().classify(theta).tolist() == [0, -1, -1, -1, 1, 1]
+
+
+@pytest.mark.parametrize(("free", "occupied"), [(0.7, 0.6), (-0.1, 0.5), (0.1, 1.1), (math.nan, 0.5)])
+def test_thresholds_reject_invalid_values(free, occupied):
+    with pytest.raises(InvalidArgumentError, match="free_thresh="):
+        Thresholds(free, occupied)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
+from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid, rasterize
 
 GRIDS = [VoxelGrid((-1.0, 2.0), 0.25, (4, 6)), VoxelGrid((0.1, -7.3, 500_000.0), 0.1, (3, 4, 5))]
 
@@ -121,3 +121,13 @@ def test_a_shape_or_origin_that_makes_no_grid_is_refused(origin, shape):
 def test_a_box_that_is_none_is_refused(low, high):
     with pytest.raises(InvalidArgumentError, match=r"low|high"):
         VoxelGrid.covering(low, high, 0.1)
+
+
+@pytest.mark.parametrize("shape", [(500, 300), (70, 40, 50)])
+def test_rasterize_evaluates_each_cell_centre_and_reports_progress(shape):
+    grid = VoxelGrid((0.3,) * len(shape), 0.1, shape)
+    progress: list[int] = []
+    found = rasterize(lambda x: (x * 0.1).sum(1), grid, lambda stage, done, total: progress.append(done))
+    torch.testing.assert_close(found.flatten(), (grid.centers() * 0.1).sum(1), rtol=0, atol=0)
+    assert progress == sorted(progress)
+    assert progress[-1] == grid.n_cells

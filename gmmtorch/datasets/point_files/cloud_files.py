@@ -79,7 +79,7 @@ def read_header(path: Path) -> CloudHeader:
     """The header of a PCD file (suffix .pcd) or a PLY file. Raises `DataError` if it is damaged."""
     try:
         return _pcd_cloud_header(path) if path.suffix.lower() == ".pcd" else _ply_cloud_header(path)
-    except (ValueError, KeyError, IndexError) as error:
+    except (ValueError, KeyError, IndexError, TypeError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path} has a damaged header ({error!r}); write it again.") from error

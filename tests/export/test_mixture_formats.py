@@ -1,4 +1,4 @@
-"""Mixtures in others' formats: what is written comes back, and what is broken is refused."""
+"""GIRA's CSV files and NPZ archives of mixtures: round trips and damaged files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, NumericalError
-from gmmtorch.export import mixture_formats as interchange
+from gmmtorch.export import mixture_formats
 from gmmtorch.export.mixture_formats import PlainMixture, read_gira_csv, read_npz, write_gira_csv, write_npz
 
 
-def mixture(k: int = 4, dim: int = 3, seed: int = 0, thin: float = 1e-3, offset: float = 0.0) -> PlainMixture:
-    """Components `thin` metres thick, in any direction."""
+def random_mixture(
+    k: int = 4, dim: int = 3, seed: int = 0, thin: float = 1e-3, offset: float = 0.0
+) -> PlainMixture:
+    """Components with a thickness of `thin` metres in a random direction."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -39,8 +41,8 @@ def assert_same(found: PlainMixture, expected: PlainMixture) -> None:
 
 
 @given(st.integers(1, 6), st.integers(1, 4), st.integers(0, 99), st.sampled_from([1e-6, 1e-3, 10.0]))
-def test_csv_round_trip_loses_nothing(tmp_path, k, dim, seed, thin):
-    given_mixture = mixture(k, dim, seed, thin, offset=5e5)
+def test_gira_csv_round_trip_is_exact(tmp_path, k, dim, seed, thin):
+    given_mixture = random_mixture(k, dim, seed, thin, offset=5e5)
     path = write_gira_csv(tmp_path / "gira.csv", given_mixture)
     found = read_gira_csv(path)
     assert_same(found, given_mixture)
@@ -50,16 +52,16 @@ def test_csv_round_trip_loses_nothing(tmp_path, k, dim, seed, thin):
 
 
 @given(st.integers(1, 6), st.integers(1, 4), st.integers(0, 99))
-def test_npz_round_trip_loses_nothing(tmp_path, k, dim, seed):
-    given_mixture = mixture(k, dim, seed)
+def test_npz_round_trip_is_exact(tmp_path, k, dim, seed):
+    given_mixture = random_mixture(k, dim, seed)
     found = read_npz(write_npz(tmp_path / "m.npz", given_mixture))
     assert_same(found, given_mixture)
     assert torch.equal(found.support, given_mixture.support)
 
 
-def test_csv_rows_are_mean_covariance_weight_as_gira_reads_them(tmp_path):
-    """Its loader splits lines at commas, and takes 3, 9 and 1 columns."""
-    given_mixture = mixture()
+def test_gira_csv_rows_are_mean_covariance_weight(tmp_path):
+    """GIRA's loader splits lines at commas and takes 3, 9 and 1 columns."""
+    given_mixture = random_mixture()
     lines = write_gira_csv(tmp_path / "gira.csv", given_mixture).read_text().splitlines()
     values = np.array([[float(cell) for cell in line.split(",")] for line in lines])
     assert values.shape == (4, 13)
@@ -68,9 +70,9 @@ def test_csv_rows_are_mean_covariance_weight_as_gira_reads_them(tmp_path):
     np.testing.assert_array_equal(values[:, 12], given_mixture.weights)
 
 
-def test_what_gira_writes_is_read(tmp_path):
-    """Eigen's six digits, a comma and a space, no end of line after the last row."""
-    path = tmp_path / "theirs.csv"
+def test_gira_csv_reader_accepts_files_of_gira(tmp_path):
+    """Eigen writes six digits, a comma and a space, and no line end after the last row."""
+    path = tmp_path / "gira.csv"
     path.write_text(
         "1, 2, 3, 0.04, 0, 0, 0, 0.09, 0, 0, 0, 0.01, 0.25\n-1, 0, 1e1, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0.75"
     )
@@ -80,8 +82,8 @@ def test_what_gira_writes_is_read(tmp_path):
     assert found.weights.tolist() == [0.25, 0.75]
 
 
-def test_an_npz_opens_without_pickle_and_without_gmmtorch(tmp_path):
-    given_mixture = mixture()
+def test_npz_opens_with_numpy_without_pickle(tmp_path):
+    given_mixture = random_mixture()
     with np.load(write_npz(tmp_path / "m.npz", given_mixture), allow_pickle=False) as stored:
         assert sorted(stored) == ["covariances", "means", "support", "weights"]
         assert {stored[name].dtype for name in stored} == {np.dtype("float64")}
@@ -89,33 +91,33 @@ def test_an_npz_opens_without_pickle_and_without_gmmtorch(tmp_path):
         assert "support" not in stored
 
 
-def test_weights_that_are_counts_are_normalised(tmp_path):
-    given_mixture = mixture()
+def test_npz_weights_are_normalized(tmp_path):
+    given_mixture = random_mixture()
     path = write_npz(tmp_path / "m.npz", given_mixture._replace(weights=given_mixture.weights * 1000))
     torch.testing.assert_close(read_npz(path).weights, given_mixture.weights)
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "message"),
     [
         ("", "has 0 rows"),
         ("\n\n", "has 0 rows"),
         ("1,2,3,4\n", "1 rows of 4 numbers"),
         ("mean,cov,weight\n1,1,1\n", "comma-separated numbers"),
         ("1,1,1\n1,1\n", "comma-separated numbers"),
-        ("1,nan,1\n", "not hold a mixture"),
+        ("1,nan,1\n", "not contain a valid mixture"),
         ("inf,1,1\n", "means holds NaN or infinite"),
-        ("1,1,-1\n", "weights must be at least zero"),
-        ("1,1,0\n", "weights must be at least zero"),
+        ("1,1,-1\n", "weights must be finite and at least zero"),
+        ("1,1,0\n", "weights must be finite and at least zero"),
         ("1,-1,1\n", "not positive definite"),
         ("0,0,1,0.5,0.4,1,1\n", "not symmetric"),
         ("é,1,1\n", "comma-separated numbers"),
     ],
 )
-def test_broken_csv_is_refused(content, says, tmp_path):
+def test_gira_csv_reader_rejects_damaged_files(content, message, tmp_path):
     path = tmp_path / "broken.csv"
     path.write_text(content, encoding="utf-8")
-    with pytest.raises(DataError, match=says) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         read_gira_csv(path)
     assert "broken.csv" in str(caught.value)
 
@@ -125,8 +127,8 @@ def npz_of(path: Path, **arrays: np.ndarray) -> Path:
     return path
 
 
-def test_broken_npz_is_refused(tmp_path):
-    sound = {k: v.numpy() for k, v in mixture()._asdict().items()}
+def test_npz_reader_rejects_damaged_files(tmp_path):
+    sound = {k: v.numpy() for k, v in random_mixture()._asdict().items()}
     path = tmp_path / "broken.npz"
     with pytest.raises(DataError, match="lacks covariances"):
         read_npz(npz_of(path, weights=sound["weights"], means=sound["means"]))
@@ -134,7 +136,7 @@ def test_broken_npz_is_refused(tmp_path):
         read_npz(npz_of(path, **{**sound, "covariances": sound["covariances"][:, :2, :2]}))
     with pytest.raises(DataError, match="support must not be negative"):
         read_npz(npz_of(path, **{**sound, "support": -sound["support"]}))
-    with pytest.raises(DataError, match="damaged, or no NPZ"):
+    with pytest.raises(DataError, match="damaged, or not an NPZ"):
         read_npz(npz_of(path, **{**sound, "weights": np.array(list("abcd"))}))
     whole = npz_of(path, **sound).read_bytes()
     for cut in (0, 10, len(whole) // 2, len(whole) - 5):
@@ -143,7 +145,7 @@ def test_broken_npz_is_refused(tmp_path):
             read_npz(path)
 
 
-def test_nothing_is_unpickled(tmp_path):
+def test_npz_reader_rejects_pickled_objects(tmp_path):
     class Bomb:
         def __reduce__(self) -> tuple:
             return (Path(tmp_path / "boom").touch, ())
@@ -152,26 +154,26 @@ def test_nothing_is_unpickled(tmp_path):
     np.savez(
         path, weights=np.array([Bomb()], dtype=object), means=np.ones((1, 2)), covariances=np.eye(2)[None]
     )
-    pickle.dumps(Bomb())  # it can be pickled, so it was
-    with pytest.raises(DataError, match="damaged, or no NPZ"):
+    pickle.dumps(Bomb())  # the object can be pickled, so the file contains it
+    with pytest.raises(DataError, match="damaged, or not an NPZ"):
         read_npz(path)
     assert not (tmp_path / "boom").exists()
 
 
-def test_a_small_file_that_unpacks_to_a_huge_one_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(interchange, "MAX_BYTES", 10_000)
+def test_readers_limit_the_compressed_and_decompressed_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(mixture_formats, "MAX_BYTES", 10_000)
     path = tmp_path / "bomb.npz"
     np.savez_compressed(path, weights=np.zeros(100_000))
     assert path.stat().st_size < 10_000
-    with pytest.raises(DataError, match="unpacks to 800,"):
+    with pytest.raises(DataError, match="decompresses to 800,"):
         read_npz(path)
     large = tmp_path / "large.csv"
     large.write_text("1,1,1\n" * 2000)
-    with pytest.raises(DataError, match="more than the 10,000 that are read"):
+    with pytest.raises(DataError, match="above the limit of 10,000"):
         read_gira_csv(large)
 
 
-def test_an_array_that_lies_about_its_size_is_refused(tmp_path):
+def test_npz_reader_rejects_an_array_header_with_a_wrong_size(tmp_path):
     header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + "\n"
     lying = io.BytesIO()
     with zipfile.ZipFile(lying, "w") as archive:
@@ -185,14 +187,14 @@ def test_an_array_that_lies_about_its_size_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("read", [read_gira_csv, read_npz])
-def test_a_missing_file_is_named(read, tmp_path):
+def test_readers_report_a_missing_file(read, tmp_path):
     with pytest.raises(MissingDataError, match="nowhere does not exist; expected"):
         read(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("write", [write_gira_csv, write_npz])
-def test_nothing_that_is_no_mixture_is_written(write, tmp_path):
-    sound = mixture()
+def test_writers_reject_invalid_mixtures(write, tmp_path):
+    sound = random_mixture()
     path = tmp_path / "out"
     with pytest.raises(InvalidArgumentError, match="weights has shape"):
         write(path, sound._replace(weights=sound.weights[:2]))
@@ -203,14 +205,14 @@ def test_nothing_that_is_no_mixture_is_written(write, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_supports_that_add_up_to_nothing_are_no_mixture():
-    sound = mixture()
-    with pytest.raises(InvalidArgumentError, match="adds up to nothing"):
+def test_of_support_rejects_a_total_of_zero():
+    sound = random_mixture()
+    with pytest.raises(InvalidArgumentError, match="adds up to zero"):
         PlainMixture.of_support(sound.means, sound.covariances, torch.zeros(4))
 
 
 @pytest.mark.parametrize("n_points", [0, -1, float("inf"), float("nan")])
-def test_a_number_of_points_is_checked(n_points, tmp_path):
-    path = write_gira_csv(tmp_path / "gira.csv", mixture())
+def test_gira_csv_reader_rejects_an_invalid_number_of_points(n_points, tmp_path):
+    path = write_gira_csv(tmp_path / "gira.csv", random_mixture())
     with pytest.raises(InvalidArgumentError, match="n_points="):
         read_gira_csv(path, n_points)
