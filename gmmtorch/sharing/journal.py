@@ -25,7 +25,7 @@ from gmmtorch.sharing.journal_format import framed, log_header, pack_snapshot
 from gmmtorch.sharing.journal_restore import MOST_LOG_BYTES, MOST_SNAPSHOT_BYTES, restore
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_names import RECORDS, names_in
+from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
 from gmmtorch.sharing.replica.replica import Replica
 
 SYNCS = ("snapshot", "always")
@@ -166,7 +166,7 @@ class Journal:
         given = [datagrams] if isinstance(datagrams, bytes) else datagrams
         kept, frames = self._kept, []
         for datagram in given:
-            if _is_record(datagram) and not kept.covers(names := names_in(datagram)):
+            if _is_record(datagram) and not kept.covers(names := keys_in(datagram)):
                 kept |= names
                 frames.append(framed(datagram))
         if frames:

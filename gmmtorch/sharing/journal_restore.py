@@ -9,7 +9,7 @@ from pathlib import Path
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.sharing.journal_files import LOG, SNAPSHOT, numbers, place, read
 from gmmtorch.sharing.journal_format import Log, is_sound, read_log, unpack_snapshot
-from gmmtorch.sharing.replica.record_keys import keys_of_life
+from gmmtorch.sharing.replica.record_keys import keys_of_author
 from gmmtorch.sharing.replica.replica import Replica
 
 MOST_LOG_BYTES = 64 << 20
@@ -58,7 +58,7 @@ def restore(folder: Path, replica: Replica) -> Restored:
             f"{folder} holds nothing of a journal that can be read: {damage[0]} Move the folder away and "
             "start anew: teammates have what was sent."
         )
-    if replica.held & keys_of_life(replica.robot, replica.incarnation):
+    if replica.held & keys_of_author(replica.robot, replica.incarnation):
         raise _lived_before(replica, folder)
     for line in damage:
         _log.warning("%s", line)

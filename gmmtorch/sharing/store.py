@@ -14,8 +14,8 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import keys_of_life
-from gmmtorch.sharing.replica.record_names import RECORDS, names_in
+from gmmtorch.sharing.replica.record_keys import keys_of_author
+from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store_file import explained, open_file, transaction
 
@@ -128,7 +128,7 @@ class Store:
         batches = [row for (row,) in self._rows("SELECT data FROM batch ORDER BY number")]
         datagrams = [row for (row,) in self._rows("SELECT datagram FROM record ORDER BY number")]
         n_refused = replica.load(batches, datagrams)
-        if replica.held & keys_of_life(replica.robot, replica.incarnation):
+        if replica.held & keys_of_author(replica.robot, replica.incarnation):
             raise InvalidArgumentError(
                 f"incarnation={replica.incarnation} of robot {replica.robot} has records in {self.path} "
                 f"already. Make Replica({replica.robot}) without incarnation: it draws a new one."
@@ -154,7 +154,7 @@ class Store:
         rows, kept = [], self._kept
         for datagram in datagrams:
             _check_datagram(datagram)
-            if datagram[0] & 15 in RECORDS and not kept.covers(names := names_in(datagram)):
+            if datagram[0] & 15 in RECORDS and not kept.covers(names := keys_in(datagram)):
                 kept |= names
                 rows.append((datagram,))
         if not rows or not self.is_writable:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed, split
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
     read_intervals,
     read_keys,
@@ -77,7 +77,7 @@ def encode_views_held(
         return writer
 
     if detail is None:
-        return [sealed(Kind.VIEWS_HELD, head().to_bytes())]
+        return [make_datagram(Kind.VIEWS_HELD, head().to_bytes())]
     _check_detail(detail)
     cuts = np.union1d(detail.known.edges[::2], detail.alive)
 
@@ -92,7 +92,7 @@ def encode_views_held(
         write_intervals(writer, detail.known & Intervals.span(begin, end), begin)
         write_keys(writer, detail.alive[seen])
         writer.fixed(detail.checks[seen], _CHECK_BITS)
-        return sealed(Kind.VIEWS_HELD, writer.to_bytes())
+        return make_datagram(Kind.VIEWS_HELD, writer.to_bytes())
 
     return split(len(cuts), part, "view", max_bytes) if len(cuts) else [part(0, 0)]
 

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
-from gmmtorch.sharing.replica.intervals import Intervals, excess
+from gmmtorch.sharing.replica.intervals import Intervals, evict
 from gmmtorch.sharing.replica.record_keys import keys_of_robot, robot_of
 
 MOST_PEERS = 64
@@ -93,7 +93,7 @@ class Peers:
             peer.asked, peer.waited = self._round, peer.waited + 1 if peer.lacks else 0
         still = gap & peer.lacks
         peer.lacks = (peer.lacks - scope) | gap
-        for robot in excess({robot: peer.lacks for robot, peer in self._peers.items()}, MOST_LACKED):
+        for robot in evict({robot: peer.lacks for robot, peer in self._peers.items()}, MOST_LACKED):
             self._peers[robot].lacks = Intervals.empty()
         others = [robot for robot in self._present() if robot != sender]
         due = Intervals.empty()

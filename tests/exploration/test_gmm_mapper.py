@@ -23,8 +23,8 @@ from gmmtorch.occupancy.voxels.boxes import intersection
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ComponentsMessage,
+    CountersMessage,
     CountsMessage,
-    TotalsMessage,
     decode,
     encode_components,
     encode_counts,
@@ -138,7 +138,7 @@ def test_a_replica_holds_what_it_says(flight: tuple) -> None:
     model = Model()
     for datagram in said:
         model.receive(datagram)
-    assert any(isinstance(record, TotalsMessage) for record in model.records.values())
+    assert any(isinstance(record, CountersMessage) for record in model.records.values())
     held, expected = rows(one.components().checked()), model.components()
     assert held.keys() == expected.keys()
     for key, (mean, covariance, support, flag, _) in held.items():

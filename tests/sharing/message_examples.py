@@ -28,9 +28,9 @@ from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
     RecordMessage,
     SupersessionMessage,
+    counters_message,
     encode_record,
     pose_of,
-    totals_message,
 )
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, first_key
@@ -81,7 +81,7 @@ def records() -> list[RecordMessage]:
     """One of every kind that is no component."""
     return [
         SupersessionMessage(first_key(2, 5), span(2, 0, 3) | span(2, 7, 8), span(2, 30, 32)),
-        totals_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
+        counters_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
         CorrectionMessage(first_key(2, 9), 3, 1, span(2, 4, 6), pose_of(torch.eye(4))),
     ]
 

@@ -6,8 +6,8 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,
     CorrectionMessage,
+    CountersMessage,
     SupersessionMessage,
-    TotalsMessage,
     decode,
 )
 
@@ -41,7 +41,7 @@ class Model:
         message = decode(datagram)
         if isinstance(message, ComponentsMessage):
             self.records.update(rows(message.components))
-        elif isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+        elif isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
             self.records[message.key] = message
 
     def dead(self) -> set[int]:
@@ -67,8 +67,8 @@ class Model:
     def support(self, key: int) -> float:
         largest: dict[int, float] = {}
         for record in self.counting().values():
-            if isinstance(record, TotalsMessage):
-                for component, total in zip(record.components.tolist(), record.totals.tolist(), strict=True):
+            if isinstance(record, CountersMessage):
+                for component, total in zip(record.components.tolist(), record.points.tolist(), strict=True):
                     if component == key:
                         life = record.key >> 28
                         largest[life] = max(largest.get(life, 0.0), total)

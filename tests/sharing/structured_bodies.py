@@ -354,7 +354,7 @@ _BODIES: dict[Kind, Callable[[Random], bytes]] = {
     Kind.PLAN: _plan,
     Kind.ANNOUNCEMENT: _announcement,
     Kind.SUPERSESSION: _supersession,
-    Kind.TOTALS: _totals,
+    Kind.COUNTERS: _totals,
     Kind.CORRECTION: _correction,
     Kind.VIEWS_HELD: _views_held,
 }

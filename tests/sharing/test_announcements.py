@@ -20,16 +20,16 @@ from gmmtorch.sharing.messages.fields import write_intervals, write_keys
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
+    CountersMessage,
     SupersessionMessage,
-    TotalsMessage,
+    counters_message,
     encode_record,
     pose_of,
-    totals_message,
 )
 from gmmtorch.sharing.replica.anti_entropy import MOST_PEERS, Backlog
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of
-from gmmtorch.sharing.replica.record_names import names_in
+from gmmtorch.sharing.replica.record_names import keys_in
 from gmmtorch.sharing.replica.replica import Replica
 
 robots = st.integers(0, 1023)
@@ -99,13 +99,13 @@ def test_supersessions(robot, number, old, new):
 @settings(max_examples=60, deadline=None)
 @given(key=keys, totals=st.dictionaries(keys, st.floats(0, 2.0**40), max_size=30))
 def test_totals(key, totals):
-    message = decode(encode_record(totals_message(key, totals)))
-    assert isinstance(message, TotalsMessage)
+    message = decode(encode_record(counters_message(key, totals)))
+    assert isinstance(message, CountersMessage)
     assert message.key == key
     assert message.components.tolist() == sorted(totals)
-    for name, total in zip(message.components.tolist(), message.totals.tolist(), strict=True):
+    for name, total in zip(message.components.tolist(), message.points.tolist(), strict=True):
         assert total == pytest.approx(totals[name], rel=COUNT_ERROR + 1e-9, abs=2.0**-10)
-    assert encode_record(message) == encode_record(totals_message(key, totals))
+    assert encode_record(message) == encode_record(counters_message(key, totals))
 
 
 @settings(max_examples=40, deadline=None)
@@ -155,7 +155,7 @@ def examples() -> list[bytes]:
     return [
         *encode_announcements(1, 2, held),
         encode_record(SupersessionMessage(first_key(2, 5), within(2, 0, 1, 2, 7), within(2, 30, 31))),
-        encode_record(totals_message(first_key(1, 9), {1: 5.0, first_key(4) + 3: 800.0})),
+        encode_record(counters_message(first_key(1, 9), {1: 5.0, first_key(4) + 3: 800.0})),
         encode_record(CorrectionMessage(first_key(2, 9), 3, 1, within(2, 4, 5), pose)),
     ]
 
@@ -215,7 +215,7 @@ def test_announcements_of_nonsense_are_refused(numbers):
         decode(sealed(b"\x1a" + writer.to_bytes()))
 
 
-def written(record: SupersessionMessage | TotalsMessage | CorrectionMessage) -> bytes:
+def written(record: SupersessionMessage | CountersMessage | CorrectionMessage) -> bytes:
     """Its datagram, whatever it says."""
     writer, base = BitWriter(), first_key(record.key >> 52)
     writer.number(record.key)
@@ -223,7 +223,7 @@ def written(record: SupersessionMessage | TotalsMessage | CorrectionMessage) -> 
         write_intervals(writer, record.old, base)
         write_intervals(writer, record.new, base)
         return sealed(b"\x1b" + writer.to_bytes())
-    if isinstance(record, TotalsMessage):
+    if isinstance(record, CountersMessage):
         write_keys(writer, record.components)
         writer.column(record.steps)
         return sealed(b"\x1c" + writer.to_bytes())
@@ -250,8 +250,8 @@ def test_records_of_nonsense_are_neither_read_nor_written():
         CorrectionMessage(key, 1 << 60, 1, within(2, 1), pose),
         CorrectionMessage(key, 0, -1, within(2, 1), pose),
         SupersessionMessage(-1, within(0, 1), Intervals.empty()),
-        *(TotalsMessage(key, np.array([3]), np.array([step])) for step in (-42, 161)),
-        TotalsMessage(key, np.array([END]), np.array([0])),
+        *(CountersMessage(key, np.array([3]), np.array([step])) for step in (-42, 161)),
+        CountersMessage(key, np.array([END]), np.array([0])),
     ):
         with pytest.raises(DataError):
             decode(written(record))
@@ -260,8 +260,8 @@ def test_records_of_nonsense_are_neither_read_nor_written():
     for record in (
         SupersessionMessage(END, within(0, 1), Intervals.empty()),
         CorrectionMessage(key, 0, 1, within(2, 1), pose[:5]),
-        TotalsMessage(key, np.array([3, 3]), np.array([0, 0])),
-        TotalsMessage(key, np.array([3, 4]), np.array([0])),
+        CountersMessage(key, np.array([3, 3]), np.array([0, 0])),
+        CountersMessage(key, np.array([3, 4]), np.array([0])),
     ):
         with pytest.raises(InvalidArgumentError):
             encode_record(record)
@@ -354,7 +354,7 @@ def test_nothing_is_due_for_ever():
     dead = Intervals.of(keys_of(ids))
     assert due() & dead
     for _ in range(5):  # the last time nothing is on its way any more
-        assert not any(names_in(datagram) & dead for datagram in one.datagrams())
+        assert not any(keys_in(datagram) & dead for datagram in one.datagrams())
         assert not due()
     for datagram in other.announcements():
         one.receive(datagram)

@@ -22,9 +22,9 @@ from gmmtorch.sharing.messages.message_registry import (
 )
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
+    CountersMessage,
     RecordMessage,
     SupersessionMessage,
-    TotalsMessage,
     encode_record,
 )
 from gmmtorch.sharing.replica import anti_entropy, records
@@ -164,11 +164,11 @@ def test_totals_without_end(monkeypatch):
     most = 1 << 17
     monkeypatch.setattr(records, "MOST_ENTRIES", most)
 
-    def totals() -> Iterator[TotalsMessage]:
+    def totals() -> Iterator[CountersMessage]:
         steps = np.zeros(7000, np.int64)
         for number in range(40):
             keys = first_key(STRANGER) + 7000 * number + np.arange(7000)
-            yield TotalsMessage(first_key(number % 5) + number, keys, steps)
+            yield CountersMessage(first_key(number % 5) + number, keys, steps)
 
     replica = Replica(50, most_components=10)
     tracemalloc.start()
@@ -191,9 +191,9 @@ def test_totals_without_end(monkeypatch):
 def test_records_without_end(monkeypatch):
     monkeypatch.setattr(records, "MOST_OTHERS", 200)
 
-    def small() -> Iterator[TotalsMessage]:
+    def small() -> Iterator[CountersMessage]:
         for number in range(250):
-            yield TotalsMessage(first_key(number % 20) + number, np.array([number]), np.array([7]))
+            yield CountersMessage(first_key(number % 20) + number, np.array([number]), np.array([7]))
 
     replica = Replica(50, most_components=10)
     assert told(replica, small()) == 200

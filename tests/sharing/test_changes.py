@@ -16,7 +16,7 @@ from sharing.schedules import act, components
 from gmmtorch.errors import DataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.message_registry import decode
-from gmmtorch.sharing.messages.record_messages import SupersessionMessage, TotalsMessage, encode_record
+from gmmtorch.sharing.messages.record_messages import CountersMessage, SupersessionMessage, encode_record
 from gmmtorch.sharing.replica import authorship, changes
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.replica import Replica
@@ -237,7 +237,7 @@ def test_totals_that_fall_start_it_over():
         one.receive(datagram)
     follower.follow(one)
     first = 5 << 52 | 2 << 28
-    less = TotalsMessage(first + 1, np.array([key[1]], np.int64), np.array([8], np.int64))
+    less = CountersMessage(first + 1, np.array([key[1]], np.int64), np.array([8], np.int64))
     assert one.receive(encode_record(less))
     old, new = (
         Intervals.span(first, first + 1),

@@ -26,18 +26,18 @@ from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages import message_registry as messages
 from gmmtorch.sharing.messages.announcements import encode_announcements
-from gmmtorch.sharing.messages.component_messages import LARGEST_BATCH
+from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT
 from gmmtorch.sharing.messages.envelope import FARTHEST, Kind
 from gmmtorch.sharing.messages.message_registry import (
     AnnouncementMessage,
     ComponentsMessage,
     CorrectionMessage,
+    CountersMessage,
     CountsMessage,
     Message,
     PlanMessage,
     PointsMessage,
     SupersessionMessage,
-    TotalsMessage,
     ViewsHeldMessage,
     ViewsMessage,
     decode,
@@ -60,7 +60,7 @@ def sound() -> list[bytes]:
 
 def test_every_kind_says_what_it_is(sound):
     kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
-    kinds += [AnnouncementMessage, SupersessionMessage, TotalsMessage, CorrectionMessage, ViewsHeldMessage]
+    kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage, ViewsHeldMessage]
     assert [type(decode(datagram)) for datagram in sound] == kinds
     assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 15)]
 
@@ -99,8 +99,8 @@ def assert_sound(message: Message) -> None:
     if isinstance(message, ComponentsMessage):
         c = message.components.checked()
         assert not torch.linalg.cholesky_ex(c.covariances).info.any()
-        assert 1 <= len(c) <= LARGEST_BATCH
-        assert len(c.seen_by) <= LARGEST_BATCH
+        assert 1 <= len(c) <= MOST_COMPONENTS_SENT
+        assert len(c.seen_by) <= MOST_COMPONENTS_SENT
         assert float(c.covariances.abs().max()) <= LARGEST_VARIANCE
         assert float(c.support.max()) <= MOST_POINTS
         assert 0 <= int(c.ids.min()) <= int(c.ids.max()) < 1 << 60

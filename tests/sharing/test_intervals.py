@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.replica.intervals import Intervals, excess
+from gmmtorch.sharing.replica.intervals import Intervals, evict
 
 numbers = st.sets(st.integers(0, 40))
 
@@ -60,7 +60,7 @@ def test_the_union_of_many_is_that_of_one_after_another(sets):
 @given(sets=st.dictionaries(st.integers(0, 9), numbers), most=st.integers(0, 30))
 def test_who_has_most_is_forgotten_first_and_no_more_than_need_be(sets, most):
     intervals = {name: of(values) for name, values in sets.items()}
-    gone = excess(intervals, most)
+    gone = evict(intervals, most)
     sizes = {name: len(one) for name, one in intervals.items()}
     left = [sizes[name] for name in sizes.keys() - set(gone)]
     assert sum(left) <= most

@@ -26,7 +26,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.component_messages import LARGEST_BATCH, fitted
+from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT, fitted
 from gmmtorch.sharing.messages.envelope import FARTHEST, VERSION, Kind
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
@@ -202,13 +202,13 @@ def test_components_that_take_no_bits_are_in_datagrams_of_bounded_work(max_sight
     for datagrams in (encode_components(many), [datagram for datagram, _ in fitted(quantize(many))]):
         found = [decode(datagram).components for datagram in datagrams]
         assert torch.equal(Components.concatenate(found).ids, many.ids)
-        assert max(len(part.seen_by) for part in found) <= LARGEST_BATCH
-        assert max(len(part) for part in found) > LARGEST_BATCH / max_sightings / 4
+        assert max(len(part.seen_by) for part in found) <= MOST_COMPONENTS_SENT
+        assert max(len(part) for part in found) > MOST_COMPONENTS_SENT / max_sightings / 4
 
 
 @codecs
 def test_a_component_seen_from_more_places_than_a_datagram_has_is_named(codec):
-    n = LARGEST_BATCH + 1
+    n = MOST_COMPONENTS_SENT + 1
     one = random_components(3, k=1, n_origins=n, max_sightings=1)
     many = replace(
         one,
@@ -217,9 +217,9 @@ def test_a_component_seen_from_more_places_than_a_datagram_has_is_named(codec):
         seen_from=torch.arange(n),
         seen_count=one.support.expand(n) / n,
     )
-    with pytest.raises(InvalidArgumentError, match=f"seen from {n} places"):
+    with pytest.raises(InvalidArgumentError, match=f"has {n} viewpoints"):
         encode_components(many, codec)
-    with pytest.raises(InvalidArgumentError, match=f"seen from {n} places"):
+    with pytest.raises(InvalidArgumentError, match=f"has {n} viewpoints"):
         list(fitted(quantize(many)))
 
 

@@ -1,4 +1,4 @@
-"""names_in: what a datagram holds, without what it says of it, against the decoder."""
+"""keys_in: what a datagram holds, without what it says of it, against the decoder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.errors import DataError
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import keys_of
-from gmmtorch.sharing.replica.record_names import RECORDS, names_in
+from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
 from gmmtorch.sharing.replica.replica import Replica
 
 
@@ -38,7 +38,7 @@ def test_names_are_those_that_the_decoder_finds():
             datagrams += encode_components(made)
     assert {datagram[0] & 15 for datagram in datagrams} == RECORDS
     for datagram in datagrams:
-        assert names_in(datagram) == decoded_names(datagram)
+        assert keys_in(datagram) == decoded_names(datagram)
 
 
 def test_what_is_no_record_is_refused():
@@ -47,4 +47,4 @@ def test_what_is_no_record_is_refused():
     assert len(others) >= 8
     for datagram in [b"", b"\x11", components[:9], b"\x1b" + components[1:], *others]:
         with pytest.raises(DataError):
-            names_in(datagram)
+            keys_in(datagram)

@@ -19,7 +19,7 @@ import gmmtorch as gt
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode, encode_components, encode_counts
-from gmmtorch.sharing.replica.records import MOST_SIGHTINGS
+from gmmtorch.sharing.replica.records import MOST_VIEWPOINTS
 from gmmtorch.sharing.replica.replica import Replica
 
 N_SCHEDULES = int(os.environ.get("GMMTORCH_SCHEDULES", "8"))
@@ -462,7 +462,7 @@ def test_other_dimensions_kinds_and_crowds_of_sightings_are_refused():
         seen_count=torch.ones(60, dtype=torch.float64),
         support=torch.tensor([60.0], dtype=torch.float64),
     )
-    assert MOST_SIGHTINGS < 60
+    assert MOST_VIEWPOINTS < 60
     for datagram in [*encode_components(flat), *encode_components(crowd)]:
         assert not one.receive(datagram)
     assert one.refused == {"unfit": 2}
@@ -477,13 +477,13 @@ def test_other_dimensions_kinds_and_crowds_of_sightings_are_refused():
 
 def test_a_component_of_the_most_sightings_can_be_passed_on():
     made = random_components(
-        3, k=1, n_origins=MOST_SIGHTINGS, max_sightings=1, extent=1e6, deviations=(1e-6, 1e5)
+        3, k=1, n_origins=MOST_VIEWPOINTS, max_sightings=1, extent=1e6, deviations=(1e-6, 1e5)
     )
     made = replace(
         made,
-        seen_by=torch.zeros(MOST_SIGHTINGS, dtype=torch.int64),
-        seen_from=torch.arange(MOST_SIGHTINGS),
-        seen_count=torch.logspace(0, 3, MOST_SIGHTINGS, dtype=torch.float64),
+        seen_by=torch.zeros(MOST_VIEWPOINTS, dtype=torch.int64),
+        seen_from=torch.arange(MOST_VIEWPOINTS),
+        seen_count=torch.logspace(0, 3, MOST_VIEWPOINTS, dtype=torch.float64),
     )
     one = Replica(1023, incarnation=(1 << 24) - 1)
     one.add(made)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.sharing.messages.count_messages import counts_of
-from gmmtorch.sharing.messages.record_messages import TotalsMessage
+from gmmtorch.sharing.messages.record_messages import CountersMessage
 from gmmtorch.sharing.replica.counters import Totals
 from gmmtorch.sharing.replica.record_keys import first_key
 
@@ -20,7 +20,7 @@ def test_sums_are_those_of_what_is_here(acts, choice):
     totals, here = Totals(), {}
     for number, (robot, row, drops) in enumerate(acts):
         names = np.array(list(row), np.int64)
-        record = TotalsMessage(
+        record = CountersMessage(
             first_key(robot, 3) + number, names, np.array([row[name] for name in names.tolist()], np.int64)
         )
         totals.add(record)

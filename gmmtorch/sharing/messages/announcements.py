@@ -1,4 +1,4 @@
-"""What a replica holds, announced in datagrams. See docs/messages.md."""
+"""Announcements of the records that a replica holds, as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed, split
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import read_intervals, read_number, write_intervals, write_number
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, LARGEST_INCARNATION, LARGEST_ROBOT
@@ -14,7 +14,8 @@ from gmmtorch.sharing.replica.record_keys import END, LARGEST_INCARNATION, LARGE
 
 @dataclass(frozen=True, eq=False)
 class AnnouncementMessage:
-    """Of the keys from `begin` to `end` − 1, `sender`, in its life `incarnation`, holds just these."""
+    """Of the keys from `begin` to `end` − 1, incarnation `incarnation` of robot `sender` holds exactly
+    `held`."""
 
     sender: int
     incarnation: int
@@ -30,14 +31,14 @@ class AnnouncementMessage:
 def encode_announcements(
     sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
 ) -> list[bytes]:
-    """Datagrams that say what is held, and by it what is not: one at least.
+    """Datagrams of all keys that are held, at least one.
 
-    Each says so of a part of all keys of its own, so that any of them may get lost. Raises
-    `InvalidArgumentError` for what is out of range.
+    Each speaks of another range of keys, so that any of them may get lost. Raises `InvalidArgumentError` for
+    values out of range.
     """
-    _check_speaker(sender, incarnation)
+    _check_sender(sender, incarnation)
     if not Intervals.span(0, END).covers(held):
-        raise InvalidArgumentError(f"held={held!r} goes beyond the keys that robots give.")
+        raise InvalidArgumentError(f"held={held!r} goes beyond the largest key, {END - 1}.")
     n = len(held)
 
     def part(begin: int, end: int) -> bytes:
@@ -49,7 +50,7 @@ def encode_announcements(
         writer.number(first)
         writer.number(last - first)
         write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
-        return sealed(Kind.ANNOUNCEMENT, writer.to_bytes())
+        return make_datagram(Kind.ANNOUNCEMENT, writer.to_bytes())
 
     return split(n, part, "interval", max_bytes) if n else [part(0, 0)]
 
@@ -57,7 +58,7 @@ def encode_announcements(
 def read_announcement(body: bytes) -> AnnouncementMessage:
     reader = BitReader(body)
     sender, incarnation = read_number(reader), read_number(reader)
-    _check_speaker(sender, incarnation)
+    _check_sender(sender, incarnation)
     begin = reader.number()
     end = begin + reader.number() + 1
     if not 0 <= begin < end <= END:
@@ -67,9 +68,9 @@ def read_announcement(body: bytes) -> AnnouncementMessage:
     return AnnouncementMessage(sender, incarnation, begin, end, held)
 
 
-def _check_speaker(sender: int, incarnation: int) -> None:
+def _check_sender(sender: int, incarnation: int) -> None:
     if sender > LARGEST_ROBOT or incarnation > LARGEST_INCARNATION:
         raise InvalidArgumentError(
-            f"sender={sender} in its life incarnation={incarnation}: robots go to {LARGEST_ROBOT}, lives to "
-            f"{LARGEST_INCARNATION}."
+            f"sender={sender}, incarnation={incarnation}: robots go up to {LARGEST_ROBOT}, incarnations "
+            f"up to {LARGEST_INCARNATION}."
         )

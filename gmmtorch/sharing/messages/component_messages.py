@@ -18,23 +18,23 @@ from gmmtorch.mapping.codec.quantization import MOST_POINTS, ORIGIN_STEP, Quanti
 from gmmtorch.mapping.codec.thesis_message import FARTHEST as THESIS_FARTHEST
 from gmmtorch.mapping.codec.thesis_message import decode_thesis, encode_thesis
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, check_codec, sealed, split
+from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, check_codec, make_datagram, split
 from gmmtorch.sharing.messages.fields import LARGEST_NUMBER, check_places
 
-LARGEST_BATCH = 1024
-"""Components, and sightings of them, in a datagram: for each a receiver may have to cast hundreds of rays. Of
-a map there are some 170."""
+MOST_COMPONENTS_SENT = 1024
+"""Components, and viewpoints of them, in a datagram, as a receiver may cast hundreds of rays for each. A
+map's datagrams have about 170."""
 
-_SIZES = struct.Struct("<BIII")  # dimensions, components, origins, sightings
-_TRIED = 128
+_SIZES = struct.Struct("<BIII")  # dimensions, components, origins, viewpoints
+_FIRST_GUESS = 128
 """Components that are likely to fit into a datagram."""
 _FILL = 0.95
-"""Of a datagram, as components are not all of the same size."""
+"""Share of a datagram to fill, as components differ in size."""
 
 
 @dataclass(frozen=True, eq=False)
 class ComponentsMessage:
-    """Components as whoever sent them holds them."""
+    """Components, as the sender's decoder returns them."""
 
     components: Components
 
@@ -42,46 +42,47 @@ class ComponentsMessage:
 def encode_components(
     components: Components, codec: str = "quantized", max_bytes: int = MAX_BYTES
 ) -> list[bytes]:
-    """Datagrams of components in order, each with the sensor positions that it needs; none of none.
+    """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
     Args:
-        codec: "quantized": 8 to 10 bytes a component, and `mapping.codec.quantized` says what comes out.
-            "float": float64, as they are. "thesis": 57 bytes for each component and sensor position.
-        max_bytes: of each datagram.
+        codec: "quantized": 8 to 10 bytes a component, rounded as `mapping.codec.quantized` does.
+            "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
+        max_bytes: largest size of a datagram.
 
-    Raises `InvalidArgumentError` for what the codec cannot store, or lies farther out than
-    `envelope.FARTHEST`, and for a component of so many sensor positions that it does not fit into a datagram.
+    Raises `InvalidArgumentError` for values that the codec cannot store, for positions beyond
+    `envelope.FARTHEST`, and for a component with so many sensor origins that it does not fit into a datagram.
     """
-    sightings = torch.bincount(components.seen_by, minlength=len(components)).cpu()
-    _check_sightings(sightings)
-    so_far = torch.cat([sightings.new_zeros(1), sightings.cumsum(0)]).tolist()
+    viewpoints = torch.bincount(components.seen_by, minlength=len(components)).cpu()
+    _check_viewpoints(viewpoints)
+    so_far = torch.cat([viewpoints.new_zeros(1), viewpoints.cumsum(0)]).tolist()
     write = {"quantized": _quantized, "float": _float, "thesis": _thesis}[check_codec(codec)]
 
     def part(begin: int, end: int) -> bytes:
         return write(_part(components, begin, end))
 
-    def may_go(begin: int, end: int) -> bool:
-        return max(end - begin, so_far[end] - so_far[begin]) <= LARGEST_BATCH
+    def is_allowed(begin: int, end: int) -> bool:
+        return max(end - begin, so_far[end] - so_far[begin]) <= MOST_COMPONENTS_SENT
 
-    return split(len(components), part, "component", max_bytes, may_go)
+    return split(len(components), part, "component", max_bytes, is_allowed)
 
 
 def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[bytes, Quantized]]:
-    """Quantised components in order, as datagrams of as many as fit, and what each of these holds.
+    """Datagrams of quantised components in order, each with as many as fit; and the components of each.
 
-    As many are tried as the datagram before lets expect to fit, rather than halves of all.
+    The number of components is estimated from the size of the datagram before, which takes fewer attempts
+    than halving all of them.
     """
-    _check_sightings(values.sightings)
+    _check_viewpoints(values.sightings)
     _check_quantized(values)
     so_far = values.sightings.cumsum(0)
-    begin, n = 0, _TRIED
+    begin, n = 0, _FIRST_GUESS
     while begin < len(values):
-        told = int(so_far[begin - 1]) if begin else 0
-        n_seen = int(torch.searchsorted(so_far, told + LARGEST_BATCH, right=True)) - begin
-        n = min(n, LARGEST_BATCH, n_seen)
+        before = int(so_far[begin - 1]) if begin else 0
+        n_allowed = int(torch.searchsorted(so_far, before + MOST_COMPONENTS_SENT, right=True)) - begin
+        n = min(n, MOST_COMPONENTS_SENT, n_allowed)
         whole = begin == 0 and n >= len(values)
         part = values if whole else values.arranged(torch.arange(begin, min(begin + n, len(values))))
-        datagram = sealed(Kind.COMPONENTS, batches.encode_quantized(part))
+        datagram = make_datagram(Kind.COMPONENTS, batches.encode_quantized(part))
         room = int(_FILL * len(part) * max_bytes / len(datagram))
         if len(datagram) <= max_bytes:
             yield datagram, part
@@ -91,12 +92,12 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
         else:
             raise InvalidArgumentError(
                 f"A single component takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
-                "Let it have fewer sensor positions."
+                "Give it fewer sensor origins."
             )
 
 
 def _part(components: Components, begin: int, end: int) -> Components:
-    """Components begin … end − 1, sightings in their order, and the origins that they use."""
+    """Components begin … end − 1, with viewpoints in their order, and the origins that they use."""
     c = components
     kept = ((c.seen_by >= begin) & (c.seen_by < end)).nonzero().squeeze(1)
     kept = kept[torch.argsort(c.seen_by[kept], stable=True)]
@@ -115,7 +116,7 @@ def _part(components: Components, begin: int, end: int) -> Components:
 def _quantized(components: Components) -> bytes:
     values = quantize(components)
     _check_quantized(values)
-    return sealed(Kind.COMPONENTS, batches.encode_quantized(values))
+    return make_datagram(Kind.COMPONENTS, batches.encode_quantized(values))
 
 
 def read_quantized(body: bytes) -> ComponentsMessage:
@@ -123,7 +124,7 @@ def read_quantized(body: bytes) -> ComponentsMessage:
 
 
 def read_batch(data: bytes) -> Components:
-    """A codec batch of any size, with positions and ids that a message can have. Raises `DataError`."""
+    """The components of a codec batch of any size. Raises `DataError` if they are damaged or out of range."""
     components = batches.decode(data)
     try:
         _check_range(components.means, components.origins, components.ids)
@@ -146,7 +147,7 @@ def _float(components: Components) -> bytes:
         _doubles(c.seen_count),
     ]
     sizes = (c.dim, len(c), len(c.origins), len(c.seen_by))  # indices beyond 16 bits do not fit anyway
-    return sealed(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + b"".join(f.tobytes() for f in fields))
+    return make_datagram(Kind.FLOAT_COMPONENTS, _SIZES.pack(*sizes) + b"".join(f.tobytes() for f in fields))
 
 
 def read_float(body: bytes) -> ComponentsMessage:
@@ -156,7 +157,7 @@ def read_float(body: bytes) -> ComponentsMessage:
     if dim not in (2, 3):
         raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
     if max(k, s, e) > len(body) or not k:
-        raise DataError(f"{k} components, {s} positions and {e} sightings are announced: it is damaged.")
+        raise DataError(f"{k} components, {s} origins and {e} viewpoints do not fit: it is damaged.")
     layout = np.dtype(
         [
             ("means", "<f8", (k, dim)),
@@ -171,7 +172,7 @@ def read_float(body: bytes) -> ComponentsMessage:
         ]
     )
     if len(body) != _SIZES.size + layout.itemsize:
-        raise DataError(f"{len(body)} bytes are not those of {k} components, {s} positions, {e} sightings.")
+        raise DataError(f"{len(body)} bytes do not match {k} components, {s} origins, {e} viewpoints.")
     row = np.frombuffer(body, layout, offset=_SIZES.size)[0]
     if (row["max_range"] > 1).any() or (row["ids"] < 0).any():
         raise DataError("A max_range flag or an id is out of range: it is damaged.")
@@ -186,7 +187,7 @@ def read_float(body: bytes) -> ComponentsMessage:
 def _thesis(components: Components) -> bytes:
     if components.dim != 3:
         raise InvalidArgumentError(
-            f"The thesis's messages are of 3D components, not {components.dim}D; use codec=quantized."
+            f"codec=thesis stores 3D components, not {components.dim}D; use codec=quantized."
         )
     c = components
     count = c.seen_count.float().double()
@@ -199,7 +200,7 @@ def _thesis(components: Components) -> bytes:
         seen_count=count,
     )
     _checked(sent, THESIS_FARTHEST)
-    return sealed(Kind.THESIS_COMPONENTS, encode_thesis(components))
+    return make_datagram(Kind.THESIS_COMPONENTS, encode_thesis(components))
 
 
 def read_thesis(body: bytes) -> ComponentsMessage:
@@ -207,26 +208,26 @@ def read_thesis(body: bytes) -> ComponentsMessage:
 
 
 def _message(components: Components) -> ComponentsMessage:
-    """Of components in range, if they are as many as a datagram may have."""
+    """The message of components; raises `DataError` if there are none, or more than a datagram may have."""
     k, e = len(components), len(components.seen_by)
-    if k == 0 or max(k, e) > LARGEST_BATCH:
+    if k == 0 or max(k, e) > MOST_COMPONENTS_SENT:
         raise DataError(
-            f"{k} components and {e} sightings; a datagram has a component, and {LARGEST_BATCH} of either "
-            "at most: it is damaged."
+            f"{k} components and {e} viewpoints; a datagram has from 1 to {MOST_COMPONENTS_SENT} of each: "
+            "it is damaged."
         )
     return ComponentsMessage(components)
 
 
-# Who writes asks the same as who reads, so that nobody says what nobody takes.
+# Encoders apply the decoder's checks, so that an encoded message is always accepted.
 
 
-def _check_sightings(sightings: Tensor) -> None:
-    """Raises `InvalidArgumentError` where one of components (K,) was seen from too many places."""
-    most = int(sightings.max()) if len(sightings) else 0
-    if most > LARGEST_BATCH:
+def _check_viewpoints(viewpoints: Tensor) -> None:
+    """Raise `InvalidArgumentError` if one of the components (K,) has too many viewpoints."""
+    most = int(viewpoints.max()) if len(viewpoints) else 0
+    if most > MOST_COMPONENTS_SENT:
         raise InvalidArgumentError(
-            f"A single component was seen from {most} places; a datagram may have {LARGEST_BATCH}. Let it "
-            "have fewer sensor positions: mapping.sightings.limit_origins."
+            f"A single component has {most} viewpoints; a datagram may have {MOST_COMPONENTS_SENT}. Keep "
+            "fewer of its origins: mapping.learning.viewpoints.limit_origins."
         )
 
 
@@ -246,7 +247,8 @@ def _check_range(means: Tensor, origins: Tensor, ids: Tensor, farthest: float = 
 
 
 def _checked(components: Components, farthest: float = FARTHEST) -> Components:
-    """Itself, if it is as the lattice of `quantized` would have it: definite, and nothing absurd."""
+    """The components, if they are in range and their covariances positive definite, as codec=quantized
+    demands."""
     c = components.checked()
     _check_range(c.means, c.origins, c.ids, farthest)
     for name, value, limit in (
@@ -255,8 +257,10 @@ def _checked(components: Components, farthest: float = FARTHEST) -> Components:
         ("seen_count", c.seen_count, MOST_POINTS),
     ):
         if value.numel() and float(value.max()) > limit:
-            raise InvalidArgumentError(f"{name} reach {float(value.max()):g}; {limit:g} is the most. Metres?")
-    _check_definite(unpack_symmetric(pack_symmetric(c.covariances), c.dim))  # its lower half is not sent
+            raise InvalidArgumentError(
+                f"{name} go up to {float(value.max()):g}; {limit:g} is the most. Are they in metres?"
+            )
+    _check_definite(unpack_symmetric(pack_symmetric(c.covariances), c.dim))  # only the upper half is sent
     return c
 
 
@@ -265,8 +269,8 @@ def _check_definite(covariances: Tensor) -> None:
     if bool((info != 0).any()):
         first = int((info != 0).nonzero()[0])
         raise InvalidArgumentError(
-            f"covariances[{first}] is not positive definite in the numbers of this codec; use "
-            "codec=quantized, which keeps it so, or give it a larger least variance."
+            f"covariances[{first}] is not positive definite after rounding by this codec; use "
+            "codec=quantized, which keeps it positive definite, or a larger least variance."
         )
 
 

@@ -1,4 +1,4 @@
-"""Counts of points that components gained, as datagrams. See docs/messages.md."""
+"""Points that components gained, as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, power
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_COUNT, MOST_POINTS, NO_COUNT
 from gmmtorch.mapping.codec.thesis_message import decode_thesis_updates, encode_thesis_updates
-from gmmtorch.sharing.messages.envelope import Kind, check_codec, sealed, split
+from gmmtorch.sharing.messages.envelope import Kind, check_codec, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
     LARGEST_NUMBER,
     check_ids,
@@ -30,7 +30,7 @@ _COUNT = np.dtype([("robot", "<i8"), ("number", "<i8"), ("count", "<f8")])
 
 @dataclass(frozen=True, eq=False)
 class CountsMessage:
-    """Points that `sender` has found to belong to components since it last said so, by (robot, sequence)."""
+    """Points that `sender` assigned to components since its last message, by (robot, sequence)."""
 
     sender: int
     counts: dict[tuple[int, int], float]
@@ -39,11 +39,11 @@ class CountsMessage:
 def encode_counts(
     sender: int, counts: Mapping[tuple[int, int], float], codec: str = "quantized"
 ) -> list[bytes]:
-    """Datagrams of counts ≥ 0 that components (robot, sequence) gained; none of none.
+    """Datagrams of counts ≥ 0 that components (robot, sequence) gained; empty without counts.
 
     Args:
-        codec: "quantized": 1 to 3 bytes a count, to 9 %, as in `mapping.quantization`. "float": 24
-            bytes. "thesis": 8 bytes, id and float32.
+        codec: "quantized": 1 to 3 bytes a count, rounded by up to 9 %, as `mapping.codec.quantization` does.
+            "float": 24 bytes. "thesis": 8 bytes, id and float32.
     """
     ids = torch.tensor(list(counts), dtype=torch.int64).reshape(-1, 2)
     values = torch.tensor(list(counts.values()), dtype=torch.float64)
@@ -66,7 +66,7 @@ def _quantized_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
     write_number(writer, "sender", sender)
     write_ids(writer, ids.numpy())
     writer.column(count_steps(counts))
-    return sealed(Kind.COUNTS, writer.to_bytes())
+    return make_datagram(Kind.COUNTS, writer.to_bytes())
 
 
 def read_quantized_counts(body: bytes) -> CountsMessage:
@@ -78,18 +78,18 @@ def read_quantized_counts(body: bytes) -> CountsMessage:
 
 
 def count_steps(counts: Tensor) -> Ints:
-    """log2 of the counts in steps, as `mapping.quantization` has the support of components."""
+    """log2 of the counts in steps, as `mapping.codec.quantization` rounds the support of components."""
     least = 2.0 ** (LEAST_COUNT / PER_OCTAVE)
     steps = (torch.log2(counts.clamp_min(least)) * PER_OCTAVE).round().long()
     return torch.where(counts < least / 2, NO_COUNT, steps).numpy()
 
 
 def counts_of(steps: Ints) -> np.ndarray:
-    """The counts that steps stand for. Raises `DataError` for what `count_steps` does not give."""
+    """The inverse of `count_steps`. Raises `DataError` for steps out of range."""
     if len(steps) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
         raise DataError(f"Counts reach from {steps.min()} to {steps.max()} steps: it is damaged.")
-    told = power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy()
-    return np.where(steps == NO_COUNT, 0.0, told)
+    counts = power(torch.from_numpy(np.maximum(steps, LEAST_COUNT))).numpy()
+    return np.where(steps == NO_COUNT, 0.0, counts)
 
 
 def _float_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
@@ -97,7 +97,7 @@ def _float_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
     write_number(writer, "sender", sender)
     rows = np.empty(len(ids), _COUNT)
     rows["robot"], rows["number"], rows["count"] = ids[:, 0], ids[:, 1], counts
-    return sealed(Kind.FLOAT_COUNTS, writer.to_bytes() + rows.tobytes())
+    return make_datagram(Kind.FLOAT_COUNTS, writer.to_bytes() + rows.tobytes())
 
 
 def read_float_counts(body: bytes) -> CountsMessage:
@@ -111,7 +111,7 @@ def read_float_counts(body: bytes) -> CountsMessage:
 def _thesis_counts(sender: int, ids: Tensor, counts: Tensor) -> bytes:
     writer = BitWriter()
     write_number(writer, "sender", sender)
-    return sealed(Kind.THESIS_COUNTS, writer.to_bytes() + encode_thesis_updates(ids, counts))
+    return make_datagram(Kind.THESIS_COUNTS, writer.to_bytes() + encode_thesis_updates(ids, counts))
 
 
 def read_thesis_counts(body: bytes) -> CountsMessage:
@@ -121,7 +121,7 @@ def read_thesis_counts(body: bytes) -> CountsMessage:
 
 
 def _sender_of(body: bytes) -> tuple[int, bytes]:
-    """The number that a body of whole bytes begins with, and the rest."""
+    """The sender at the begin of a body, and the remaining bytes."""
     reader = BitReader(body)
     sender = read_number(reader)
     return sender, body[len(body) - reader.left // 8 :]
@@ -134,5 +134,5 @@ def _counts(sender: int, ids: Ints, values: np.ndarray) -> CountsMessage:
     if len(counts) != len(ids) or not all(0 <= count <= MOST_POINTS for count in counts.values()):
         raise DataError(f"An id comes twice, or a count is not from 0 to {MOST_POINTS:g}: it is damaged.")
     if not len(ids) or not 0 <= int(ids.min()) <= int(ids.max()) <= LARGEST_NUMBER:
-        raise DataError(f"There is no id, or one is not from 0 to {LARGEST_NUMBER}: it is damaged.")
+        raise DataError(f"No ids, or ids outside 0 to {LARGEST_NUMBER}: it is damaged.")
     return CountsMessage(sender, counts)

@@ -1,4 +1,4 @@
-"""What every datagram has: a first byte that says what it is, 1200 bytes at most, and a checksum."""
+"""The format that all datagrams share: a first byte with version and kind, at most 1200 bytes, a checksum."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 
 VERSION = 1
 MAX_BYTES = 1200
-"""Longest datagram: with its headers it fits the smallest path of IPv6, so it is never fragmented."""
+"""Longest datagram. With its headers it fits the smallest path of IPv6, so it is never fragmented."""
 FARTHEST = 2.0**24
-"""Metres from the world's origin on each axis, of whatever is told: 16 777 km, so that UTM's coordinates fit,
-and earth-centred ones. Even moved by a correction it is within 2³² cells of 2 cm, where rays can be cast."""
+"""Largest coordinate (m) of a position in a message: 16 777 km, so that UTM and earth-centred coordinates
+fit. Moved by a correction, positions stay within 2³² cells of 2 cm, where rays can be cast."""
 CODECS = ("quantized", "float", "thesis")
-"""How components and counts are written."""
+"""Encodings of components and counts."""
 _KIND_BITS = 4
 _CHECKSUM_BYTES = 4
 
 
 class Kind(IntEnum):
-    """What a datagram is: the low half of its first byte; the high half is the version."""
+    """The low half of a datagram's first byte; the high half is the version. 14 is reserved."""
 
     COMPONENTS = 1
     FLOAT_COMPONENTS = 2
@@ -38,25 +38,25 @@ class Kind(IntEnum):
     PLAN = 9
     ANNOUNCEMENT = 10
     SUPERSESSION = 11
-    TOTALS = 12
+    COUNTERS = 12
     CORRECTION = 13
     VIEWS_HELD = 14
 
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})
-"""Whose body ends with its own checksum, and gets no second one."""
+"""Kinds whose body ends with a checksum of its own, and gets no second one."""
 
 
-def sealed(kind: Kind, body: bytes) -> bytes:
-    """The datagram of a body: first byte, body, CRC-32 of both (4 bytes, little-endian)."""
+def make_datagram(kind: Kind, body: bytes) -> bytes:
+    """First byte, body, CRC-32 of both (4 bytes, little-endian)."""
     data = bytes([VERSION << _KIND_BITS | kind]) + body
     if kind in OWN_CHECKSUM:
         return data
     return data + zlib.crc32(data).to_bytes(_CHECKSUM_BYTES, "little")
 
 
-def opened(datagram: bytes) -> tuple[Kind, bytes]:
-    """Kind and body of a datagram; `DataError` for what is too long, foreign or damaged."""
+def parse_datagram(datagram: bytes) -> tuple[Kind, bytes]:
+    """Kind and body of a datagram. Raises `DataError` if it is too long, foreign or damaged."""
     if len(datagram) > MAX_BYTES:
         raise DataError(f"The datagram has {len(datagram)} bytes; {MAX_BYTES} are the most: it is foreign.")
     if not datagram:
@@ -64,11 +64,11 @@ def opened(datagram: bytes) -> tuple[Kind, bytes]:
     version, number = datagram[0] >> _KIND_BITS, datagram[0] & ((1 << _KIND_BITS) - 1)
     if version != VERSION:
         raise DataError(
-            f"The datagram is version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
-            "damaged, or gmmtorch is to be updated on one of the robots."
+            f"The datagram is of version {version}; this gmmtorch reads version {VERSION}. It is foreign or "
+            "damaged, or gmmtorch must be updated on one of the robots."
         )
     if number not in {int(kind) for kind in Kind}:
-        raise DataError(f"The datagram is of kind {number}, which is none: it is foreign or damaged.")
+        raise DataError(f"The datagram has the unknown kind {number}: it is foreign or damaged.")
     kind = Kind(number)
     if kind in OWN_CHECKSUM:
         return kind, datagram[1:]
@@ -83,23 +83,24 @@ def split(
     encode: Callable[[int, int], bytes],
     what: str,
     max_bytes: int = MAX_BYTES,
-    may_go: Callable[[int, int], bool] = lambda begin, end: True,
+    is_allowed: Callable[[int, int], bool] = lambda begin, end: True,
 ) -> list[bytes]:
-    """Datagrams of n things, halved until each fits; encode(begin, end) writes those from begin to end − 1,
-    and `may_go` says whether a datagram may have them, however few bytes they take.
+    """Datagrams of n items, which are halved until each part fits.
 
-    Raises `InvalidArgumentError` where a single one does not fit.
+    encode(begin, end) makes the datagram of items begin … end − 1; is_allowed(begin, end) tells whether
+    these may be in one datagram, however few bytes they take. Raises `InvalidArgumentError` if a single
+    item does not fit.
     """
 
     def parts(begin: int, end: int) -> list[bytes]:
-        if end - begin == 1 or may_go(begin, end):
+        if end - begin == 1 or is_allowed(begin, end):
             datagram = encode(begin, end)
             if len(datagram) <= max_bytes:
                 return [datagram]
             if end - begin == 1:
                 raise InvalidArgumentError(
                     f"A single {what} takes {len(datagram)} bytes; a datagram has room for {max_bytes}. "
-                    "Let it have fewer sensor positions."
+                    "Give it fewer sensor origins."
                 )
         middle = (begin + end) // 2
         return parts(begin, middle) + parts(middle, end)
@@ -108,23 +109,23 @@ def split(
 
 
 def within(datagrams: Sequence[bytes], budget: int | None) -> int:
-    """How many datagrams, from the first on, take `budget` bytes at most; None: all."""
+    """How many of the first datagrams take at most `budget` bytes together; None: all."""
     sizes = itertools.accumulate(map(len, datagrams))
     return len(datagrams) if budget is None else sum(size <= budget for size in sizes)
 
 
 def stored(datagram: bytes) -> Tensor:
-    """A datagram for a file."""
+    """A datagram as a tensor, for a file."""
     return torch.frombuffer(bytearray(datagram), dtype=torch.uint8)
 
 
 def loaded(data: Tensor) -> bytes:
-    """What was `stored`."""
+    """The inverse of `stored`."""
     return data.numpy().tobytes()
 
 
 def check_codec(codec: str) -> str:
-    """The codec, if it is one of `CODECS`."""
+    """The codec; raises `InvalidArgumentError` unless it is one of `CODECS`."""
     if codec not in CODECS:
         raise InvalidArgumentError(f"codec={codec!r} must be one of {', '.join(CODECS)}.")
     return codec

@@ -1,4 +1,4 @@
-"""Fields that several messages have: sets of ids, poses and times, as whole numbers in a stream of bits."""
+"""Fields of several messages in a bit stream: sets of ids and keys, intervals, poses and times."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.sharing.messages.envelope import FARTHEST
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, lives
+from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, authors
 
 LARGEST_NUMBER = (1 << 60) - 1
-"""Of a robot, and of anything that a robot numbers."""
+"""Largest robot id, and largest number of anything that a robot counts."""
 STEPS_PER_METRE = 100
-"""Positions go in centimetres."""
+"""Positions are whole centimetres."""
 YAW_STEPS = 256
-"""A turn."""
+"""Steps of a full turn."""
 TICKS = 1000
-"""Times go in milliseconds."""
+"""Times are whole milliseconds."""
 LATEST = 1e9
-"""Seconds."""
-_LEAST_BITS = 8  # of a number
+"""Latest time (s)."""
+_LEAST_BITS = 8  # of a number in the stream
 _FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
 
 
 def check_ids(name: str, ids: Tensor) -> Tensor:
-    """Ids (J, 2), if they are whole, in range and distinct; else `InvalidArgumentError`."""
+    """The ids (J, 2); raises `InvalidArgumentError` unless they are int64, in range and distinct."""
     if ids.shape[1:] != (2,) or ids.dtype != torch.int64:
         raise InvalidArgumentError(f"{name} is {tuple(ids.shape)} of {ids.dtype}; expected (J, 2) of int64.")
     if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) <= LARGEST_NUMBER):
@@ -43,12 +43,13 @@ def check_ids(name: str, ids: Tensor) -> Tensor:
 
 
 def id_order(ids: Tensor) -> Ints:
-    """The order (J,) of rising robots, and of rising numbers of each."""
+    """The order (J,) that sorts ids by robot, then by number."""
     return np.lexsort((ids[:, 1].cpu().numpy(), ids[:, 0].cpu().numpy()))
 
 
 def write_ids(writer: BitWriter, ids: Ints) -> None:
-    """Distinct ids (J, 2) in `id_order`: of each robot how many, the first, and the gaps to the next."""
+    """Write distinct ids (J, 2) in `id_order`: for each robot their number, the first, and the gaps between
+    them."""
     robots, first, n_each = np.unique(ids[:, 0], return_index=True, return_counts=True)
     writer.number(len(robots))
     for robot, begin, n in zip(robots.tolist(), first.tolist(), n_each.tolist(), strict=True):
@@ -61,11 +62,11 @@ def write_ids(writer: BitWriter, ids: Ints) -> None:
 
 
 def read_ids(reader: BitReader) -> Ints:
-    """Ids (J, 2), of which each but a robot's first takes a bit at least: memory is bounded by the data."""
+    """Ids (J, 2). Each but a robot's first takes at least one bit, so the data bound the memory."""
     n_robots = reader.number()
     parts, last = [np.zeros((0, 2), np.int64)], -1
     if n_robots < 0:
-        raise DataError(f"{n_robots} robots are announced.")
+        raise DataError(f"{n_robots} robots: it is damaged.")
     reader.require(3 * 8 * n_robots)
     for _ in range(n_robots):
         robot, n, first = reader.number(), reader.number(), reader.number()
@@ -81,22 +82,23 @@ def read_ids(reader: BitReader) -> Ints:
 
 
 def write_keys(writer: BitWriter, keys: Ints) -> None:
-    """Distinct, rising keys (J,) of records, as ids. A life is a robot of its own: two are far apart."""
-    write_ids(writer, np.stack([lives(keys), keys & (MOST_RECORDS - 1)], 1))
+    """Write distinct, rising keys (J,) of records, as ids of authors, whose keys are far apart."""
+    write_ids(writer, np.stack([authors(keys), keys & (MOST_RECORDS - 1)], 1))
 
 
 def read_keys(reader: BitReader) -> Ints:
-    """Keys (J,), rising; memory as for `read_ids`."""
+    """Keys (J,), rising; memory is bounded as in `read_ids`."""
     names = read_ids(reader)
     if len(names) and (
         int(names[:, 0].max()) >= END >> NUMBER_BITS or int(names[:, 1].max()) >= MOST_RECORDS
     ):
-        raise DataError("Names of records that no robot gives: it is damaged.")
+        raise DataError("Keys of records are out of range: it is damaged.")
     return names[:, 0] << NUMBER_BITS | names[:, 1]
 
 
 def write_intervals(writer: BitWriter, intervals: Intervals, begin: int) -> None:
-    """How many; of each the gap before it, from `begin` or the end of the last, and its length less one."""
+    """Write their number; for each the gap before it, from `begin` or the last end, and its length less
+    one."""
     writer.number(len(intervals))
     for first, end in intervals.pairs():
         writer.number(first - begin)
@@ -108,7 +110,7 @@ def read_intervals(reader: BitReader, begin: int, end: int) -> Intervals:
     """Intervals of numbers from `begin` to `end` − 1."""
     n = reader.number()
     if n < 0:
-        raise DataError(f"{n} intervals are announced: it is damaged.")
+        raise DataError(f"{n} intervals: it is damaged.")
     reader.require(2 * _LEAST_BITS * n)
     edges = [begin]
     for _ in range(n):
@@ -120,7 +122,7 @@ def read_intervals(reader: BitReader, begin: int, end: int) -> Intervals:
 
 
 def quantized_poses(poses: Tensor) -> Tensor:
-    """What poses (N, 4) are to those who receive them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
+    """Poses (N, 4) as messages round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
     return _poses(pose_steps("poses", poses))
 
 
@@ -143,13 +145,13 @@ def pose_steps(name: str, poses: Tensor) -> Ints:
 
 
 def write_poses(writer: BitWriter, steps: Ints) -> None:
-    """Poses (N, 4) that have little to do with one another: four columns."""
+    """Write unrelated poses (N, 4) as four columns."""
     for axis in range(4 if len(steps) else 0):
         writer.column(steps[:, axis])
 
 
 def read_poses(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4). Columns may take no bits at all, so who calls bounds n."""
+    """Poses (n, 4). Columns may take no bits at all, so the caller must bound n."""
     steps = np.zeros((n, 4), np.int64)
     for axis in range(4 if n else 0):
         steps[:, axis] = reader.column(n)
@@ -157,20 +159,20 @@ def read_poses(reader: BitReader, n: int) -> Tensor:
 
 
 def write_path(writer: BitWriter, steps: Ints) -> None:
-    """Poses (S, 4) along a path: the first, then four columns of the way from each to the next.
+    """Write poses (S, 4) along a path: the first, then four columns of the steps from each pose to the next.
 
-    At steady speed and turn the ways are all but equal.
+    At constant speed and turn rate the steps are nearly equal.
     """
     for axis in range(4 if len(steps) else 0):
         ways = np.diff(steps[:, axis])
-        if axis == 3:  # the shorter way round
+        if axis == 3:  # the shorter direction
             ways = (ways + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
         writer.number(int(steps[0, axis]))
         writer.column(ways)
 
 
 def read_path(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4) of a path; n as in `read_poses`."""
+    """Poses (n, 4) of a path. The caller must bound n, as in `read_poses`."""
     steps = np.zeros((n, 4), np.int64)
     for axis in range(4 if n else 0):
         ways = np.concatenate([np.array([reader.number()], np.int64), reader.column(n - 1)])
@@ -181,7 +183,7 @@ def read_path(reader: BitReader, n: int) -> Tensor:
 
 
 def ticks(name: str, seconds: Tensor) -> Ints:
-    """Times (N,) in milliseconds."""
+    """Times (N,) in milliseconds, of times in seconds."""
     times = seconds.detach().double().cpu()
     if times.ndim != 1 or not bool((times.abs() <= LATEST).all()):
         raise InvalidArgumentError(f"{name} must be a row of times (s) of at most {LATEST:g}, and finite.")
@@ -189,19 +191,19 @@ def ticks(name: str, seconds: Tensor) -> Ints:
 
 
 def seconds_of(steps: Ints) -> Tensor:
-    """Times (N,), s."""
+    """Times (N,) in seconds, of times in milliseconds."""
     if len(steps) and int(np.abs(steps).max()) > LATEST * TICKS:
         raise DataError(f"Times are later than {LATEST:g} s: it is damaged.")
     return torch.from_numpy(steps.astype(np.float64) / TICKS)
 
 
 def write_number(writer: BitWriter, name: str, value: int) -> None:
-    """A whole number that somebody counts with."""
+    """Write a robot id, or another whole number ≥ 0."""
     writer.number(_check_number(name, value))
 
 
 def read_number(reader: BitReader) -> int:
-    """A robot, or a whole number ≥ 0 that somebody counts with."""
+    """A robot id, or another whole number ≥ 0."""
     value = reader.number()
     if not 0 <= value <= LARGEST_NUMBER:
         raise DataError(f"A number is {value}, not from 0 to {LARGEST_NUMBER}: it is damaged.")
@@ -209,12 +211,13 @@ def read_number(reader: BitReader) -> int:
 
 
 def check_places(name: str, places: Tensor, farthest: float = FARTHEST) -> Tensor:
-    """Positions (N, D), m, if they are finite and no farther out on any axis; else `InvalidArgumentError`."""
+    """The positions (N, D), m; raises `InvalidArgumentError` unless all coordinates are at most
+    `farthest`."""
     bad = ~(places.abs() <= farthest).all(1)
     if bool(bad.any()):
         first = int(bad.nonzero()[0])
         raise InvalidArgumentError(
-            f"{name}[{first}] is {places[first].tolist()}; positions that can be told are finite, and up to "
+            f"{name}[{first}] is {places[first].tolist()}; positions must be finite, and up to "
             f"{farthest:g} m on each axis. Is it in metres, and the world's origin near?"
         )
     return places

@@ -1,7 +1,7 @@
-"""All that robots say during a mission: one `decode`, and an encoder for each kind of message.
+"""All messages of a mission: an encoder for each kind, and one `decode`.
 
-A datagram stands alone, has at most 1200 bytes, and is checked before it is believed: see
-docs/messages.md, which has the format byte by byte.
+A datagram can be read without any other, has at most 1200 bytes, and is checked completely.
+docs/messages.md has the format byte by byte.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from gmmtorch.sharing.messages import (
 from gmmtorch.sharing.messages.announcements import AnnouncementMessage
 from gmmtorch.sharing.messages.component_messages import ComponentsMessage, encode_components
 from gmmtorch.sharing.messages.count_messages import CountsMessage, encode_counts
-from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, opened
+from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_datagram
 from gmmtorch.sharing.messages.fields import quantized_poses
 from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
-from gmmtorch.sharing.messages.record_messages import CorrectionMessage, SupersessionMessage, TotalsMessage
+from gmmtorch.sharing.messages.record_messages import CorrectionMessage, CountersMessage, SupersessionMessage
 from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
 from gmmtorch.sharing.view_announcements import ViewsHeldMessage
 
@@ -34,12 +34,12 @@ __all__ = [
     "AnnouncementMessage",
     "ComponentsMessage",
     "CorrectionMessage",
+    "CountersMessage",
     "CountsMessage",
     "Message",
     "PlanMessage",
     "PointsMessage",
     "SupersessionMessage",
-    "TotalsMessage",
     "ViewsHeldMessage",
     "ViewsMessage",
     "decode",
@@ -60,7 +60,7 @@ Message = (
     | PlanMessage
     | AnnouncementMessage
     | SupersessionMessage
-    | TotalsMessage
+    | CountersMessage
     | CorrectionMessage
     | ViewsHeldMessage
 )
@@ -77,7 +77,7 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.PLAN: view_messages.read_plan,
     Kind.ANNOUNCEMENT: announcements.read_announcement,
     Kind.SUPERSESSION: record_messages.read_supersession,
-    Kind.TOTALS: record_messages.read_totals,
+    Kind.COUNTERS: record_messages.read_counters,
     Kind.CORRECTION: record_messages.read_correction,
     Kind.VIEWS_HELD: view_announcements.read_views_held,
 }
@@ -90,7 +90,7 @@ _NAMES: dict[Kind, str] = {
     Kind.COUNTS: "counts",
     Kind.FLOAT_COUNTS: "counts",
     Kind.THESIS_COUNTS: "counts",
-    Kind.TOTALS: "counts",
+    Kind.COUNTERS: "counts",
     Kind.POINTS: "points",
     Kind.VIEWS: "views",
     Kind.PLAN: "plans",
@@ -102,21 +102,21 @@ _NAMES: dict[Kind, str] = {
 
 
 def kind_of(datagram: bytes) -> str:
-    """What a datagram is of, for the books: of one that `decode` can read."""
+    """The contents of a valid datagram, by a name for statistics."""
     return _NAMES[Kind(datagram[0] & 15)]
 
 
 def decode(datagram: bytes) -> Message:
-    """What a datagram says; tensors on the CPU.
+    """The message of a datagram, with tensors on the CPU.
 
-    Raises `DataError`, and nothing else, for bytes that are no message, or say what no encoder of this
-    version would; and takes memory that `MAX_BYTES` bounds.
+    Raises `DataError`, and nothing else, for any bytes that no encoder of this version writes. `MAX_BYTES`
+    bounds the memory.
     """
-    kind, body = opened(datagram)
+    kind, body = parse_datagram(datagram)
     try:
         return _READERS[kind](body)
     except DataError:
         raise
     except (GmmTorchError, ValueError, ArithmeticError, LookupError, RuntimeError) as error:
-        # Readers name what is wrong. The others are for what nobody has thought of: the robot goes on.
+        # Readers raise errors of gmmtorch. The others are a safeguard, so that no datagram stops a robot.
         raise DataError(f"The datagram is damaged: {error}") from error

@@ -1,4 +1,4 @@
-"""Novel points of a frame, raw, as datagrams: what a team of grids shares. See docs/messages.md."""
+"""Novel points of a frame as datagrams, for teams that share grids. See docs/messages.md."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram
 from gmmtorch.sharing.messages.fields import check_places
 
 _HEADER = struct.Struct("<HI3dHHH")  # sender, frame, origin, part, parts, points
 _POINT_BYTES = 12
-_SEAL_BYTES = len(sealed(Kind.POINTS, b""))
-POINTS_PER_DATAGRAM = (MAX_BYTES - _SEAL_BYTES - _HEADER.size) * 8 // (8 * _POINT_BYTES + 1)
+_OVERHEAD = len(make_datagram(Kind.POINTS, b""))
+POINTS_PER_DATAGRAM = (MAX_BYTES - _OVERHEAD - _HEADER.size) * 8 // (8 * _POINT_BYTES + 1)
 LARGEST_ROBOT, LARGEST_FRAME, MOST_PARTS = (1 << 16) - 1, (1 << 32) - 1, (1 << 16) - 1
 
 
@@ -24,8 +24,8 @@ LARGEST_ROBOT, LARGEST_FRAME, MOST_PARTS = (1 << 16) - 1, (1 << 32) - 1, (1 << 1
 class PointsMessage:
     """Part `part` of `n_parts` of the novel beams of a robot's frame.
 
-    origin (3,) of all beams, ends (N, 3), float64, metres, world frame; is_hit (N,) bool: the others came
-    back empty, and their ends are where they are cut off.
+    origin (3,) of all beams, ends (N, 3), float64, metres, world frame; is_hit (N,) bool: the others are
+    no-return beams, which end at the range where they are cut off.
     """
 
     sender: int
@@ -38,15 +38,15 @@ class PointsMessage:
 
 
 def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit: Tensor) -> list[bytes]:
-    """Datagrams of beams in order, 12 1/8 bytes each; none of none.
+    """Datagrams of beams in order, 12 1/8 bytes each; empty without beams.
 
-    Ends go as float32 from the origin, so that they are as exact anywhere in the world.
+    Ends are stored as float32 offsets from the origin, so that they are equally exact anywhere in the world.
 
     Args:
-        sender: the robot that speaks, up to 65535. frame: its number, up to 2³² − 1.
-        origin: (3,). ends: (N, 3). is_hit: (N,) bool.
+        sender: id of the robot, up to 65535. frame: its number, up to 2³² − 1.
+        origin: (3,), metres. ends: (N, 3), metres. is_hit: (N,) bool.
 
-    Raises `InvalidArgumentError` for what is out of range, or farther out than `envelope.FARTHEST`.
+    Raises `InvalidArgumentError` for values out of range, and for positions beyond `envelope.FARTHEST`.
     """
     _check_fits("sender", sender, LARGEST_ROBOT)
     _check_fits("frame", frame, LARGEST_FRAME)
@@ -71,7 +71,7 @@ def encode_points(sender: int, frame: int, origin: Tensor, ends: Tensor, is_hit:
         chosen = slice(begin, begin + POINTS_PER_DATAGRAM)
         rows, bits = offsets[chosen], np.packbits(hits[chosen])
         header = _HEADER.pack(sender, frame, *place.tolist(), part, len(starts), len(rows))
-        datagrams.append(sealed(Kind.POINTS, header + rows.astype("<f4").tobytes() + bits.tobytes()))
+        datagrams.append(make_datagram(Kind.POINTS, header + rows.astype("<f4").tobytes() + bits.tobytes()))
     return datagrams
 
 
@@ -84,8 +84,8 @@ def read_points(body: bytes) -> PointsMessage:
     offsets = np.frombuffer(body, "<f4", 3 * n, _HEADER.size).reshape(n, 3)
     bits = np.unpackbits(np.frombuffer(body, np.uint8, offset=_HEADER.size + _POINT_BYTES * n))
     if bits[n:].any() or not np.isfinite(offsets).all():
-        raise DataError("Points are NaN or infinite, or filling bits are set: it is damaged.")
-    offsets = offsets.astype(np.float64)  # not before: some NaNs signal when they are cast
+        raise DataError("Points are NaN or infinite, or padding bits are set: it is damaged.")
+    offsets = offsets.astype(np.float64)  # after the check, as casting some NaNs raises a warning
     origin = torch.tensor([x, y, z], dtype=torch.float64)
     check_places("origin", origin[None])
     return PointsMessage(

@@ -1,7 +1,4 @@
-"""Records of a replicated map that are no components, as datagrams: supersessions, totals, corrections.
-
-See docs/messages.md.
-"""
+"""Records other than components, as datagrams: supersessions, counters, corrections. See docs/messages.md."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT
 from gmmtorch.sharing.messages.count_messages import count_steps, counts_of
-from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, sealed
+from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram
 from gmmtorch.sharing.messages.fields import (
     read_intervals,
     read_keys,
@@ -31,20 +28,21 @@ from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of_robot, robot_of
 
 RECORD_BYTES = 1000
-"""Longest record: so all fit where encryption takes its share of a datagram."""
+"""Longest record. A datagram of 1200 bytes has room for it and for encryption."""
 _POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
 _UNIT = 1e-9
 
 
 def check_size(max_bytes: int) -> None:
-    """Raises `InvalidArgumentError` unless datagrams of so many bytes at most hold any record."""
+    """Raise `InvalidArgumentError` unless datagrams of at most `max_bytes` have room for any record."""
     if not RECORD_BYTES <= check_whole("max_bytes", max_bytes, 0) <= MAX_BYTES:
         raise InvalidArgumentError(f"max_bytes={max_bytes} must be from {RECORD_BYTES} to {MAX_BYTES}.")
 
 
 @dataclass(frozen=True, eq=False)
 class SupersessionMessage:
-    """Record `key`: where all of `new` is held, `old` counts no more. All are keys of one robot."""
+    """Record `key`: in a replica that holds all of `new`, `old` no longer counts. All are keys of one
+    robot."""
 
     key: int
     old: Intervals
@@ -52,10 +50,11 @@ class SupersessionMessage:
 
 
 @dataclass(frozen=True, eq=False)
-class TotalsMessage:
-    """Record `key`: all points that one life of a robot has counted to components of these keys (J,).
+class CountersMessage:
+    """Record `key`: all points that its author has assigned to each of the components with these keys (J,).
 
-    steps (J,): as in `mapping.quantization`. Of two totals of a component the larger is the later.
+    steps (J,): logarithmic, as in `mapping.codec.quantization`. Of two counters of a component the larger is
+    the later.
     """
 
     key: int
@@ -63,17 +62,18 @@ class TotalsMessage:
     steps: Ints
 
     @property
-    def totals(self) -> np.ndarray:
-        """Points (J,)."""
+    def points(self) -> np.ndarray:
+        """(J,)"""
         return counts_of(self.steps)
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectionMessage:
-    """Record `key`: the robot's components `moved` (keys), those of its scan, belong where `pose` takes them.
+    """Record `key`: moves the components `moved` (keys) of one scan of the robot by `pose`.
 
-    pose: position and (cos, sin) of the yaw (4,), or position and unit quaternion x, y, z, w (7,): the
-    motion from where they were published. Of two of one scan the higher version counts, then the higher key.
+    pose: the rigid motion from the published to the corrected position. 2D: translation and (cos, sin) of the
+    yaw (4,); 3D: translation and unit quaternion x, y, z, w (7,). Of two corrections of one scan the one with
+    the higher version counts, then the one with the higher key.
     """
 
     key: int
@@ -99,14 +99,14 @@ class CorrectionMessage:
         return matrix
 
 
-RecordMessage = SupersessionMessage | TotalsMessage | CorrectionMessage
+RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage
 _Record = TypeVar("_Record", bound=RecordMessage)
 
 
 def encode_record(record: RecordMessage) -> bytes:
-    """The datagram of a record. It may be longer than `RECORD_BYTES`; who makes records sees to that.
+    """The datagram of a record. The caller must check that it has at most `RECORD_BYTES`.
 
-    Raises `InvalidArgumentError` for what no receiver would believe.
+    Raises `InvalidArgumentError` for a record that `decode` would refuse.
     """
     _checked(record)
     writer = BitWriter()
@@ -115,18 +115,18 @@ def encode_record(record: RecordMessage) -> bytes:
     if isinstance(record, SupersessionMessage):
         write_intervals(writer, record.old, base)
         write_intervals(writer, record.new, base)
-        return sealed(Kind.SUPERSESSION, writer.to_bytes())
-    if isinstance(record, TotalsMessage):
+        return make_datagram(Kind.SUPERSESSION, writer.to_bytes())
+    if isinstance(record, CountersMessage):
         order = np.argsort(record.components)
         write_keys(writer, record.components[order])
         writer.column(record.steps[order])
-        return sealed(Kind.TOTALS, writer.to_bytes())
+        return make_datagram(Kind.COUNTERS, writer.to_bytes())
     write_number(writer, "scan", record.scan)
     write_number(writer, "version", record.version)
     writer.one(int(record.dim == 3), 1)
     writer.fixed(record.pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
     write_intervals(writer, record.moved, base)
-    return sealed(Kind.CORRECTION, writer.to_bytes())
+    return make_datagram(Kind.CORRECTION, writer.to_bytes())
 
 
 def read_supersession(body: bytes) -> SupersessionMessage:
@@ -137,13 +137,13 @@ def read_supersession(body: bytes) -> SupersessionMessage:
     return _checked(SupersessionMessage(key, old, new))
 
 
-def read_totals(body: bytes) -> TotalsMessage:
+def read_counters(body: bytes) -> CountersMessage:
     reader = BitReader(body)
     key, _ = _read_key(reader)
     components = read_keys(reader)
     steps = reader.column(len(components))
     reader.finish()
-    return _checked(TotalsMessage(key, components, steps))
+    return _checked(CountersMessage(key, components, steps))
 
 
 def read_correction(body: bytes) -> CorrectionMessage:
@@ -159,7 +159,7 @@ def read_correction(body: bytes) -> CorrectionMessage:
 
 
 def _read_key(reader: BitReader) -> tuple[int, Intervals]:
-    """A record's key, and all that its robot may give."""
+    """A record's key, and all keys of its robot."""
     key = reader.number()
     if not 0 <= key < END:
         raise DataError(f"Record {key} is out of range: it is damaged.")
@@ -167,36 +167,40 @@ def _read_key(reader: BitReader) -> tuple[int, Intervals]:
 
 
 def _checked(record: _Record) -> _Record:
-    """Itself, if it says what a record may, whoever writes or reads it; else `InvalidArgumentError`."""
+    """The record; raises `InvalidArgumentError` if it is invalid."""
     key = record.key
     if not 0 <= key < END:
-        raise InvalidArgumentError(f"key={key} names no record: keys go from 0 to {END - 1}.")
+        raise InvalidArgumentError(f"key={key} is out of range: keys go from 0 to {END - 1}.")
     mine = keys_of_robot(robot_of(key))
     if isinstance(record, SupersessionMessage):
         old, new = record.old, record.new
         if not old or key in old or key in new or old & new or not mine.covers(old | new):
             raise InvalidArgumentError(
-                f"Record {key} supersedes {old!r} by {new!r}: it is to supersede records of its robot, at "
-                "least one, by others of it, and neither them nor itself."
+                f"Record {key} supersedes {old!r} by {new!r}: it must supersede at least one record of "
+                "its robot by others of that robot; itself in neither set, and no record in both."
             )
-    elif isinstance(record, TotalsMessage):
-        names, steps = record.components, record.steps
-        if len(np.unique(names)) != len(names) or len(steps) != len(names):
-            raise InvalidArgumentError(f"Record {key} has {len(steps)} totals of {names.tolist()}: one each.")
-        if len(names) and not 0 <= int(names.min()) <= int(names.max()) < END:
-            raise InvalidArgumentError(f"Record {key} counts points of what no robot can have named.")
-        if len(names) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
+    elif isinstance(record, CountersMessage):
+        keys, steps = record.components, record.steps
+        if len(np.unique(keys)) != len(keys) or len(steps) != len(keys):
+            raise InvalidArgumentError(
+                f"Record {key} has {len(steps)} counters of {keys.tolist()}; each component needs one."
+            )
+        if len(keys) and not 0 <= int(keys.min()) <= int(keys.max()) < END:
+            raise InvalidArgumentError(
+                f"Record {key} counts points of components whose keys are out of range."
+            )
+        if len(keys) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
             raise InvalidArgumentError(f"Record {key} counts from {steps.min()} to {steps.max()} steps.")
     elif not (_is_motion(record.pose) and mine.covers(record.moved)):
         raise InvalidArgumentError(
-            f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it is to move components of "
-            f"its robot, by up to {FARTHEST:g} m on each axis and a turn of unit length."
+            f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it must move components "
+            f"of its robot, by up to {FARTHEST:g} m on each axis and a rotation of unit length."
         )
     return record
 
 
 def _is_motion(pose: Tensor) -> bool:
-    """Whether it is one as in a `CorrectionMessage`."""
+    """Whether it is a valid pose of a `CorrectionMessage`."""
     for dim, n in _POSE_NUMBERS.items():
         if pose.shape == (n,):
             near = bool((pose[:dim].abs() <= FARTHEST).all())
@@ -204,15 +208,18 @@ def _is_motion(pose: Tensor) -> bool:
     return False
 
 
-def totals_message(key: int, totals: dict[int, float]) -> TotalsMessage:
-    """Record `key` of totals by the keys of components, rounded as counts are."""
-    components = np.array(sorted(totals), np.int64)
-    counts = torch.tensor([totals[int(name)] for name in components], dtype=torch.float64)
-    return TotalsMessage(key, components, count_steps(counts))
+def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
+    """Record `key` with the points of components by their keys, rounded as counts are."""
+    components = np.array(sorted(points), np.int64)
+    counts = torch.tensor([points[int(component)] for component in components], dtype=torch.float64)
+    return CountersMessage(key, components, count_steps(counts))
 
 
 def pose_of(transform: Tensor) -> Tensor:
-    """The pose of a `CorrectionMessage` of a rigid motion (3, 3) or (4, 4). Raises if it is none."""
+    """The pose of a `CorrectionMessage` of a rigid motion (3, 3) or (4, 4).
+
+    Raises `InvalidArgumentError` if it is not rigid or moves too far.
+    """
     if transform.shape not in ((3, 3), (4, 4)):
         raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
     rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)

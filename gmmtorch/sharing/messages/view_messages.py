@@ -1,4 +1,4 @@
-"""Views worth going to, and what a robot is about to do, as datagrams. See docs/messages.md."""
+"""Views worth visiting, and the plan of a robot, as datagrams. See docs/messages.md."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
-from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, sealed, split
+from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
     check_ids,
     pose_steps,
@@ -31,16 +31,17 @@ from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, ids_of, keys_of
 
 MOST_POSES = 1000
-"""Of a path, and of the views of a plan: a robot at rest takes no bits for its poses."""
+"""Poses of a path, and of the views of a plan. The poses of a robot at rest take no bits, so data do not
+bound their number."""
 _HALF_BITS = 16
 
 
 @dataclass(frozen=True, eq=False)
 class ViewsMessage:
-    """Views that are new or changed, and those that are no longer worth a visit.
+    """Views that are new or changed, and the keys of views that are removed.
 
-    ids (V, 2): (robot, sequence), as of records; poses (V, 4); values (V,); stamps (V,) s.
-    removed: their keys, as in `record_ids`.
+    ids (V, 2): (robot, sequence), as of records; poses (V, 4); values (V,); stamps (V,) s, when the value was
+    found. removed: keys, as in `record_keys`.
     """
 
     ids: Tensor
@@ -52,10 +53,10 @@ class ViewsMessage:
 
 @dataclass(frozen=True, eq=False)
 class PlanMessage:
-    """What `sender` has committed to, its plan number `number`.
+    """Plan number `number` of robot `sender`.
 
-    path (S, 4): poses at time, time + step, time + 2 step, … (s), the last of them at rest;
-    views (V, 4): poses that it means to look from.
+    path (S, 4): poses at time, time + step, time + 2 step, … (s); the robot is at rest at the last one.
+    views (V, 4): camera poses that the robot will observe from.
     """
 
     sender: int
@@ -67,40 +68,40 @@ class PlanMessage:
 
 
 def encode_views(message: ViewsMessage, max_bytes: int = MAX_BYTES) -> list[bytes]:
-    """Datagrams of views, 9 to 11 bytes each, and of tombstones; none of none. Ids may be in any order.
+    """Datagrams of views, 9 to 11 bytes each, and of removed keys; empty without either. Ids in any order.
 
-    Poses go to 1 cm and 1/256 of a turn (`quantized_poses`), values as float16 (65504 at most), stamps to
-    1 ms. Raises `InvalidArgumentError` for what is not finite, for ids that come twice, and for rows that
-    do not match.
+    Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to float16 (65504 at most),
+    stamps to 1 ms. Raises `InvalidArgumentError` for values that are not finite, for duplicate ids, and for
+    rows of different lengths.
     """
     m = message
     sizes = (len(m.poses), len(m.values), len(m.stamps))
     if sizes != (len(m.ids),) * 3:
         raise InvalidArgumentError(
-            f"{len(m.ids)} ids with {sizes[0]} poses, {sizes[1]} values and {sizes[2]} stamps: one each is "
-            "needed."
+            f"{len(m.ids)} ids with {sizes[0]} poses, {sizes[1]} values and {sizes[2]} stamps: each id "
+            "needs one of each."
         )
     if not Intervals.span(0, END).covers(m.removed):
-        raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the keys that robots give.")
+        raise InvalidArgumentError(f"removed={m.removed!r} goes beyond the largest key, {END - 1}.")
     keys = _keys(m.ids)
-    order, dead = np.argsort(keys), m.removed
+    order, removed = np.argsort(keys), m.removed
     keys = keys[order]
     steps, halves = pose_steps("poses", m.poses)[order], _halves(m.values)[order]
     times = ticks("stamps", m.stamps)[order]
 
-    def some(begin: int, end: int) -> bytes:
-        """Views begin … end − 1 of the row of all views and all intervals of tombstones."""
-        seen = slice(min(begin, len(keys)), min(end, len(keys)))
-        gone = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
+    def part(begin: int, end: int) -> bytes:
+        """Items begin … end − 1 of all views, followed by all intervals of removed keys."""
+        views = slice(min(begin, len(keys)), min(end, len(keys)))
+        edges = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
         writer = BitWriter()
-        write_keys(writer, keys[seen])
-        write_poses(writer, steps[seen])
-        writer.fixed(halves[seen], _HALF_BITS)
-        writer.column(times[seen])
-        write_intervals(writer, Intervals(dead.edges[gone]), 0)
-        return sealed(Kind.VIEWS, writer.to_bytes())
+        write_keys(writer, keys[views])
+        write_poses(writer, steps[views])
+        writer.fixed(halves[views], _HALF_BITS)
+        writer.column(times[views])
+        write_intervals(writer, Intervals(removed.edges[edges]), 0)
+        return make_datagram(Kind.VIEWS, writer.to_bytes())
 
-    return split(len(keys) + len(dead), some, "view", max_bytes)
+    return split(len(keys) + len(removed), part, "view", max_bytes)
 
 
 def read_views(body: bytes) -> ViewsMessage:
@@ -119,14 +120,14 @@ def encode_plan(
 ) -> list[bytes]:
     """The datagram of a plan, 1 to 3 bytes a pose of the path, 5 a view.
 
-    Poses go to 1 cm and 1/256 of a turn, times to 1 ms.
+    Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
 
     Args:
-        sender: the robot that speaks. number: rises with each of its plans.
-        time: (s) of the first pose of the path. step: (s) from each to the next, above zero.
+        sender: id of the robot. number: rises with each of its plans.
+        time: (s) of the first pose of the path. step: (s) from each pose to the next, above zero.
         path: (S, 4). views: (V, 4).
 
-    Raises `InvalidArgumentError` where the plan does not fit into a datagram.
+    Raises `InvalidArgumentError` if the plan does not fit into a datagram.
     """
     writer = BitWriter()
     write_number(writer, "sender", sender)
@@ -144,7 +145,7 @@ def encode_plan(
             raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
         writer.number(len(poses))
         write(writer, pose_steps(name, poses))
-    datagram = sealed(Kind.PLAN, writer.to_bytes())
+    datagram = make_datagram(Kind.PLAN, writer.to_bytes())
     if len(datagram) > MAX_BYTES:
         raise InvalidArgumentError(
             f"The plan of {len(path)} poses takes {len(datagram)} bytes; a datagram has room for "
@@ -168,7 +169,7 @@ def read_plan(body: bytes) -> PlanMessage:
 def _read_size(reader: BitReader) -> int:
     n = reader.number()
     if not 0 <= n <= MOST_POSES:
-        raise DataError(f"{n} poses are announced; {MOST_POSES} are the most: it is damaged.")
+        raise DataError(f"{n} poses; {MOST_POSES} are the most: it is damaged.")
     return n
 
 
@@ -180,7 +181,7 @@ def _keys(ids: Tensor) -> Ints:
 
 
 def _halves(values: Tensor) -> Ints:
-    """The bits (V,) of values as float16."""
+    """The bits (V,) of values rounded to float16."""
     rows = values.detach().double().cpu().numpy()
     if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
         raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")

@@ -8,7 +8,7 @@ from typing import Any
 
 from gmmtorch.sharing.messages.announcements import AnnouncementMessage
 from gmmtorch.sharing.messages.envelope import loaded, stored
-from gmmtorch.sharing.replica.intervals import Intervals, excess
+from gmmtorch.sharing.replica.intervals import Intervals, evict
 from gmmtorch.sharing.replica.record_keys import keys_of_robot
 
 _ON_THE_WAY = 3
@@ -88,7 +88,7 @@ class Backlog:
             table[message.sender] = (known - message.scope) | now
             while len(table) > MOST_PEERS:
                 table.popitem(last=False)
-            for robot in excess(table, MOST_REMEMBERED):
+            for robot in evict(table, MOST_REMEMBERED):
                 del table[robot]
 
     def missing(self, held: Intervals) -> Intervals:

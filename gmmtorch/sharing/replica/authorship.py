@@ -20,25 +20,25 @@ from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
+    CountersMessage,
     RecordMessage,
     SupersessionMessage,
-    TotalsMessage,
+    counters_message,
     encode_record,
     pose_of,
-    totals_message,
 )
 from gmmtorch.sharing.replica.anti_entropy import Packet
-from gmmtorch.sharing.replica.component_table import fingerprints, most_sightings
+from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.record_keys import (
     MOST_RECORDS,
+    author_of,
     first_key,
     ids_of,
-    keys_of_life,
+    keys_of_author,
     keys_of_robot,
-    life_of,
 )
-from gmmtorch.sharing.replica.records import MOST_SIGHTINGS, Records
+from gmmtorch.sharing.replica.records import MOST_VIEWPOINTS, Records
 
 _MOST_SUPERSESSIONS = 32
 """Of this life, until they are made one."""
@@ -64,7 +64,7 @@ class Author:
         self._records, self._robot, self._incarnation = records, robot, incarnation
         self._first = first_key(robot, incarnation)
         self._last = self._first + MOST_RECORDS - 1  # takes as many bytes as any: what fits with it fits
-        self._mine, self.life = keys_of_robot(robot), keys_of_life(robot, incarnation)
+        self._mine, self.life = keys_of_robot(robot), keys_of_author(robot, incarnation)
         self._n = 0
         self._totals: dict[int, float] = {}  # exact, by key of the component
         self._told: dict[int, int] = {}  # rounded, as written last
@@ -80,9 +80,9 @@ class Author:
 
     def publish(self, components: Components, old: Intervals, max_bytes: int) -> Published:
         """Components as new records that supersede old ones of this robot."""
-        if most_sightings(components) > MOST_SIGHTINGS:
+        if most_viewpoints(components) > MOST_VIEWPOINTS:
             raise InvalidArgumentError(
-                f"A component was seen from {most_sightings(components)} places; {MOST_SIGHTINGS} fit into "
+                f"A component was seen from {most_viewpoints(components)} places; {MOST_VIEWPOINTS} fit into "
                 "a datagram. Keep the most telling ones: mapping.sightings.limit_origins."
             )
         if not self._mine.covers(old):
@@ -135,7 +135,7 @@ class Author:
             if not 0 <= gain <= 2.0**40:
                 raise InvalidArgumentError(f"A component gained {gain} points; counts go from 0 to 2⁴⁰.")
             self._totals[key] = min(self._totals.get(key, 0.0) + float(gain), 2.0**40)
-        due = totals_message(self._first, {key: self._totals[key] for key in gains})
+        due = counters_message(self._first, {key: self._totals[key] for key in gains})
         lapsed = self._records.dead.contains(due.components)
         rises = {
             key: self._totals[key]
@@ -149,7 +149,7 @@ class Author:
     def _totals_anew(self) -> Intervals:
         """Many records of totals become few, and what is out of date in them goes: all of them where that is
         most; else those that are short."""
-        mine = list(self._records.totals.of(life_of(self._first)).values())
+        mine = list(self._records.totals.of(author_of(self._first)).values())
         if sum(len(record.components) for record in mine) <= 2 * len(self._told) + _SLACK:
             mine = [r for r in mine if len(self._records.datagrams[r.key]) < RECORD_BYTES // 2]
             if len(mine) <= _MOST_SHORT:
@@ -187,12 +187,12 @@ class Author:
         names = sorted(totals)
 
         def part(begin: int, end: int) -> bytes:
-            return encode_record(totals_message(self._last, {key: totals[key] for key in names[begin:end]}))
+            return encode_record(counters_message(self._last, {key: totals[key] for key in names[begin:end]}))
 
         written = Intervals.empty()
         for datagram in split(len(names), part, "total", RECORD_BYTES):
             message = decode(datagram)
-            assert isinstance(message, TotalsMessage)  # `part` wrote it
+            assert isinstance(message, CountersMessage)  # `part` wrote it
             written |= self._write(replace(message, key=self._first + self._n))
             self._told.update(zip(message.components.tolist(), message.steps.tolist(), strict=True))
         return written

@@ -113,7 +113,7 @@ def fingerprints(components: Components) -> list[bytes]:
     ]
 
 
-def most_sightings(components: Components) -> int:
+def most_viewpoints(components: Components) -> int:
     """Of a component."""
     return int(torch.bincount(components.seen_by).max()) if len(components.seen_by) else 0
 

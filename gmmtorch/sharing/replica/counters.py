@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gmmtorch.sharing.messages.count_messages import counts_of
-from gmmtorch.sharing.messages.record_messages import TotalsMessage
+from gmmtorch.sharing.messages.record_messages import CountersMessage
 from gmmtorch.sharing.replica.intervals import Ints
-from gmmtorch.sharing.replica.record_keys import life_of
+from gmmtorch.sharing.replica.record_keys import author_of
 
 _Row = tuple[Ints, Ints]
 """Keys of components (N,), rising, and the largest total of each, in steps."""
@@ -22,23 +22,23 @@ class Totals:
     order: so it does not matter in which order records came, or how often."""
 
     def __init__(self) -> None:
-        self._records: dict[int, dict[int, TotalsMessage]] = {}  # by life and key
+        self._records: dict[int, dict[int, CountersMessage]] = {}  # by life and key
         self._largest: dict[int, _Row] = {}  # by life
 
-    def of(self, life: int) -> Mapping[int, TotalsMessage]:
-        """The records of a life (`life_of` their keys), by key."""
+    def of(self, life: int) -> Mapping[int, CountersMessage]:
+        """The records of a life (`author_of` their keys), by key."""
         return self._records.get(life, {})
 
-    def add(self, record: TotalsMessage) -> None:
-        life = life_of(record.key)
+    def add(self, record: CountersMessage) -> None:
+        life = author_of(record.key)
         self._records.setdefault(life, {})[record.key] = record
         self._largest[life] = _raised(self._largest.get(life, _NOTHING), record.components, record.steps)
 
-    def drop(self, records: Iterable[TotalsMessage]) -> None:
+    def drop(self, records: Iterable[CountersMessage]) -> None:
         """Forget these records, which are here."""
-        by_life: dict[int, list[TotalsMessage]] = {}
+        by_life: dict[int, list[CountersMessage]] = {}
         for record in records:
-            by_life.setdefault(life_of(record.key), []).append(record)
+            by_life.setdefault(author_of(record.key), []).append(record)
         for life, gone in by_life.items():
             left = self._records[life]
             for record in gone:
@@ -83,7 +83,7 @@ def _raised(row: _Row, keys: Ints, steps: Ints) -> _Row:
     return np.insert(names, at, new), np.insert(raised, at, value)
 
 
-def _looked_up(row: _Row, stale: Ints, records: list[TotalsMessage]) -> _Row:
+def _looked_up(row: _Row, stale: Ints, records: list[CountersMessage]) -> _Row:
     """The row with the totals of stale keys as these records have them."""
     place, known = _places(row[0], stale)
     fresh = np.delete(row[0], place[known]), np.delete(row[1], place[known])

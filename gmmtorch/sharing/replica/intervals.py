@@ -158,7 +158,7 @@ class Intervals:
         return places, self.contains(places), other.contains(places)
 
 
-def excess(sets: Mapping[int, Intervals], most: int) -> list[int]:
+def evict(sets: Mapping[int, Intervals], most: int) -> list[int]:
     """Whose sets to forget, the largest, so that the others have at most so many intervals together."""
     gone: list[int] = []
     n_left = sum(map(len, sets.values()))

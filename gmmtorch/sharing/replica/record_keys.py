@@ -1,4 +1,4 @@
-"""Names of records: whose, of which of its lives, and which of them.
+"""Names of records: whose, of which of its authors, and which of them.
 
 A record is named (robot, sequence), as a component is in a map, and a sequence is incarnation · 2²⁸ + number.
 A robot draws a new incarnation whenever it starts, and numbers what it says in it from 0. So a robot that
@@ -43,7 +43,7 @@ def keys_of_robot(robot: int) -> Intervals:
     return Intervals.span(first_key(robot), first_key(robot + 1))
 
 
-def keys_of_life(robot: int, incarnation: int) -> Intervals:
+def keys_of_author(robot: int, incarnation: int) -> Intervals:
     """All keys that a robot may give in one of its lives."""
     begin = first_key(robot, incarnation)
     return Intervals.span(begin, begin + MOST_RECORDS)
@@ -53,12 +53,12 @@ def robot_of(key: int) -> int:
     return key >> SEQUENCE_BITS
 
 
-def life_of(key: int) -> int:
+def author_of(key: int) -> int:
     """Robot and incarnation of a key, as one number."""
     return key >> NUMBER_BITS
 
 
-def lives(keys: Ints) -> Ints:
+def authors(keys: Ints) -> Ints:
     """Robot and incarnation (N,) of keys, as one number."""
     return keys >> NUMBER_BITS
 

@@ -8,19 +8,19 @@ import torch
 from gmmtorch.errors import DataError
 from gmmtorch.mapping.codec.bitstream import BitReader
 from gmmtorch.mapping.codec.lattice import AXIS_ORDERS
-from gmmtorch.sharing.messages.envelope import Kind, opened
+from gmmtorch.sharing.messages.envelope import Kind, parse_datagram
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.record_keys import keys_of
 
-RECORDS = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.TOTALS, Kind.CORRECTION})
+RECORDS = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION})
 
 
-def names_in(datagram: bytes) -> Intervals:
+def keys_in(datagram: bytes) -> Intervals:
     """The keys of the records in a datagram of one of the kinds `RECORDS`, as a replica wrote or merged it.
 
     Of its content it looks at nothing else. Raises `DataError` where it cannot be a record.
     """
-    kind, body = opened(datagram)
+    kind, body = parse_datagram(datagram)
     if kind is Kind.COMPONENTS:
         return Intervals.of(_component_keys(BitReader(body[1:])))
     if kind not in RECORDS:

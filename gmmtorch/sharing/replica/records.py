@@ -16,20 +16,20 @@ from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
+    CountersMessage,
     RecordMessage,
     SupersessionMessage,
-    TotalsMessage,
     encode_record,
 )
 from gmmtorch.sharing.replica.changes import ChangeLog, Changes
-from gmmtorch.sharing.replica.component_table import ComponentTable, fingerprints, most_sightings
+from gmmtorch.sharing.replica.component_table import ComponentTable, fingerprints, most_viewpoints
 from gmmtorch.sharing.replica.counters import Totals
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.materialized_view import corrected, with_gains
 from gmmtorch.sharing.replica.record_keys import keys_of, robot_of
 from gmmtorch.sharing.replica.rejections import RefusedError
 
-MOST_SIGHTINGS = 48
+MOST_VIEWPOINTS = 48
 """Of a component: so one by itself fits into `RECORD_BYTES`, and can be passed on."""
 MOST_COMPONENTS = 1 << 20
 MOST_OTHERS = 1 << 12
@@ -86,17 +86,17 @@ class Records:
         bounded: whether only as far as there is room.
 
         Raises `RefusedError`: "conflict", where a key is held with other content; "full"; "unfit", where they
-        are of another dimension, or seen from more than `MOST_SIGHTINGS` places.
+        are of another dimension, or seen from more than `MOST_VIEWPOINTS` places.
         """
         keys = keys_of(components.ids)
         if not len(keys):
             return Intervals.empty()
-        if components.dim != (self.dim or components.dim) or most_sightings(components) > MOST_SIGHTINGS:
+        if components.dim != (self.dim or components.dim) or most_viewpoints(components) > MOST_VIEWPOINTS:
             raise RefusedError(
                 "unfit",
                 robot_of(int(keys[0])),
-                f"Components in {components.dim}D, seen from up to {most_sightings(components)} places; "
-                f"this map is in {self.dim or components.dim}D, and {MOST_SIGHTINGS} places are the most.",
+                f"Components in {components.dim}D, seen from up to {most_viewpoints(components)} places; "
+                f"this map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} places are the most.",
             )
         fresh = ~self.held.contains(keys)
         if not fresh.all():
@@ -132,7 +132,7 @@ class Records:
         self._n_entries += _n_entries(record)
         if isinstance(record, SupersessionMessage):
             self._waiting[key] = record
-        elif isinstance(record, TotalsMessage):
+        elif isinstance(record, CountersMessage):
             self.totals.add(record)
             self._log.counted(record.components)
         else:
@@ -189,7 +189,7 @@ class Records:
             del self.datagrams[key], self._kinds[type(record)][key]
             self._n_entries -= _n_entries(record)
             self._waiting.pop(key, None)
-            if isinstance(record, TotalsMessage):
+            if isinstance(record, CountersMessage):
                 totals.append(record)
                 self._log.counted(record.components)
             elif isinstance(record, CorrectionMessage):
@@ -316,7 +316,7 @@ class Records:
 
 def _n_entries(record: RecordMessage) -> int:
     """How much of `MOST_ENTRIES` a record takes."""
-    if isinstance(record, TotalsMessage):
+    if isinstance(record, CountersMessage):
         return len(record.components)
     if isinstance(record, SupersessionMessage):
         return len(record.old) + len(record.new)
@@ -325,7 +325,7 @@ def _n_entries(record: RecordMessage) -> int:
 
 def _record(datagram: bytes) -> RecordMessage:
     message = decode(datagram)
-    if not isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+    if not isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
         raise DataError("A record is none: the state is damaged.")
     return message
 

@@ -20,8 +20,8 @@ from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
+    CountersMessage,
     SupersessionMessage,
-    TotalsMessage,
     check_size,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog
@@ -188,7 +188,7 @@ class Replica:
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
             self._check_names(keys_of(message.components.ids))
             self._backlog.heard(self._records.add_components(message.components))
-        elif isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+        elif isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
             self._check_names(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
                 self._check_untouched(message)
@@ -283,7 +283,7 @@ class Replica:
             self._records.load_batch(datagram[1:], self.robot)
             return
         message = decode(datagram)
-        if not isinstance(message, SupersessionMessage | TotalsMessage | CorrectionMessage):
+        if not isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
             raise DataError(f"{type(message).__name__} is no record.")
         self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
 

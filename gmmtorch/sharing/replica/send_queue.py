@@ -8,11 +8,11 @@ import numpy as np
 
 from gmmtorch.mapping.codec.quantization import quantize
 from gmmtorch.sharing.messages.component_messages import fitted
-from gmmtorch.sharing.messages.record_messages import TotalsMessage
+from gmmtorch.sharing.messages.record_messages import CountersMessage
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.materialized_view import information
-from gmmtorch.sharing.replica.record_keys import keys_of, lives
+from gmmtorch.sharing.replica.record_keys import authors, keys_of
 from gmmtorch.sharing.replica.records import Records
 
 _RUN = 96
@@ -38,7 +38,7 @@ def packets(
     shapes = records.table.holds(numbers)
     others = [records.others[key] for key in numbers[~shapes].tolist()]
     for record in others:
-        if not isinstance(record, TotalsMessage):
+        if not isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
     for run in _in_order(records, numbers[shapes], ready, by_information):
         if isinstance(run, tuple):
@@ -47,7 +47,7 @@ def packets(
             for datagram, part in fitted(quantize(records.table.taken(run)), max_bytes):
                 yield datagram, Intervals.of(keys_of(part.ids))
     for record in others:
-        if isinstance(record, TotalsMessage):
+        if isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
 
 
@@ -69,7 +69,7 @@ def _runs(keys: Ints, most: int | None) -> list[Ints]:
     """Rising keys (N,) in runs of one life each; where `most` is given, of so many consecutive ones."""
     if not len(keys):
         return []
-    breaks = np.diff(lives(keys)) != 0  # their sequences are far apart: together they take many bits
+    breaks = np.diff(authors(keys)) != 0  # their sequences are far apart: together they take many bits
     if most is not None:
         breaks |= np.diff(keys) != 1
     parts = np.split(keys, np.flatnonzero(breaks) + 1)
