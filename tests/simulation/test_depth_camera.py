@@ -1,4 +1,4 @@
-"""The depth camera: against the arithmetic of rays, boxes and spheres, and against its announced noise."""
+"""DepthCamera against the geometry of rays, boxes and spheres, and against its noise model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gmmtorch.simulation.worlds.solids import box
 
 LOW, HIGH = torch.tensor([0.0, 0, 0]).double(), torch.tensor([9.0, 7, 4]).double()
 ROOM = MeshWorld(box((0, 0, 0), (9, 7, 4)))
-NOBODY = torch.zeros(0, 3, dtype=torch.float64)
+NO_TEAMMATES = torch.zeros(0, 3, dtype=torch.float64)
 EXACT = DepthCamera(40, 30, noise=0.0, dropout=0.0)
 
 
@@ -30,18 +30,18 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def world_directions(camera: DepthCamera, yaw: float) -> Tensor:
-    """Through complex numbers, which turn by multiplication."""
+    """Directions (N, 3) in the world frame, rotated by complex multiplication."""
     d = camera.directions
     turned = torch.complex(d[:, 0], d[:, 1]) * complex(math.cos(yaw), math.sin(yaw))
     return torch.stack([turned.real, turned.imag, d[:, 2]], 1)
 
 
 def to_walls(origin: Tensor, directions: Tensor) -> Tensor:
-    """Metres (N,) from inside the room to its walls, by slabs."""
+    """Distances (N,) in metres from a point in the room to its walls, by slabs."""
     return torch.where(directions > 0, (HIGH - origin) / directions, (LOW - origin) / directions).amin(1)
 
 
-def test_pixels_are_evenly_spaced_on_the_image_plane_and_fill_the_field_of_view():
+def test_pixels_are_evenly_spaced_and_fill_the_field_of_view():
     camera = DepthCamera(8, 6, horizontal_fov=1.4, vertical_fov=0.9)
     plane = (camera.directions / camera.directions[:, :1]).view(6, 8, 3)
     left, up = plane[..., 1], plane[..., 2]
@@ -52,21 +52,21 @@ def test_pixels_are_evenly_spaced_on_the_image_plane_and_fill_the_field_of_view(
     assert float(camera.directions.norm(dim=1).sub(1).abs().max()) < 1e-15
 
 
-def test_square_pixels_are_those_of_the_other_camera():
+def test_square_pixels_have_the_directions_of_depth_camera():
     angle = 2 * math.atan(math.tan(0.6) * 64 / 80)
     camera = DepthCamera(80, 64, horizontal_fov=1.2, vertical_fov=angle)
     torch.testing.assert_close(camera.directions, depth_camera(80, 64, field_of_view=1.2).directions)
 
 
-def test_the_package_offers_the_function_and_the_class_whose_module_shares_its_name():
+def test_simulation_exports_the_function_and_the_class():
     assert callable(simulation.depth_camera)
     assert simulation.DepthCamera is DepthCamera
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 2.0, -3.0, 40.0])
-def test_without_noise_ends_lie_where_rays_meet_the_walls(yaw):
+def test_ends_without_noise_lie_on_the_walls(yaw):
     where = pose(3.0, 2.5, 1.7, yaw)
-    frame = EXACT.sense(ROOM, where, NOBODY, 0.3, seeded())
+    frame = EXACT.sense(ROOM, where, NO_TEAMMATES, 0.3, seeded())
     directions = world_directions(EXACT, yaw)
     distance = to_walls(where[:3], directions)
     assert torch.equal(frame.pixel, torch.arange(40 * 30))
@@ -77,24 +77,24 @@ def test_without_noise_ends_lie_where_rays_meet_the_walls(yaw):
     assert bool(((beyond - 6.0).abs() < 1e-12).all())
 
 
-def test_five_hundred_kilometres_out_nothing_is_lost():
+def test_frames_are_exact_far_from_the_origin():
     shift = torch.tensor([5e5, -4e6, 100.0], dtype=torch.float64)
     there = MeshWorld(box((0, 0, 0), (9, 7, 4)) + shift)
     moved = pose(3.0, 2.5, 1.7, 0.4)
-    near = EXACT.sense(ROOM, moved, NOBODY, 0.3, seeded())
+    near = EXACT.sense(ROOM, moved, NO_TEAMMATES, 0.3, seeded())
     moved[:3] += shift
-    far = EXACT.sense(there, moved, NOBODY, 0.3, seeded())
+    far = EXACT.sense(there, moved, NO_TEAMMATES, 0.3, seeded())
     assert torch.equal(near.is_hit, far.is_hit)
     assert float((far.ends - shift - near.ends).abs().max()) < 1e-5
 
 
 @pytest.mark.parametrize("depth", [1.0, 3.5])
-def test_depth_errs_by_its_square(depth):
+def test_depth_noise_grows_with_the_square_of_depth(depth):
     camera = DepthCamera(160, 120, noise=0.004, dropout=0.0, max_range=8.0)
     wall = MeshWorld(box((depth, -50, -50), (depth + 1, 50, 50)))
-    frame = camera.sense(wall, pose(0, 0, 0), NOBODY, 0.3, seeded(1))
+    frame = camera.sense(wall, pose(0, 0, 0), NO_TEAMMATES, 0.3, seeded(1))
     error = (camera.image(frame) - depth).flatten()
-    # The same at the corners of the image, where beams are longer, as in its middle.
+    # The noise depends on depth only: it is equal at the corners and in the middle of the image.
     outer = camera.directions[:, 0] < 0.75
     for part in (error[outer], error[~outer]):
         n = len(part)
@@ -102,13 +102,13 @@ def test_depth_errs_by_its_square(depth):
         assert abs(float(part.mean())) < 4.5 * 0.004 * depth**2 / math.sqrt(n)
         assert abs(float(part.std()) / (0.004 * depth**2) - 1) < 4.5 / math.sqrt(2 * n)
     across = torch.linalg.cross(frame.ends, world_directions(camera, 0.0))
-    assert float(across.norm(dim=1).max()) < 1e-9  # readings err along the beam
+    assert float(across.norm(dim=1).max()) < 1e-9  # the error is along the beam
 
 
-def test_readings_that_noise_carries_beyond_the_range_are_free_up_to_it():
+def test_readings_beyond_max_range_become_no_return_beams():
     camera = DepthCamera(60, 60, 0.02, 0.02, max_range=5.0, noise=0.01, dropout=0.0)
     wall = MeshWorld(box((4.9, -9, -9), (6, 9, 9)))
-    frame = camera.sense(wall, pose(0, 0, 0), NOBODY, 0.3, seeded())
+    frame = camera.sense(wall, pose(0, 0, 0), NO_TEAMMATES, 0.3, seeded())
     ranges = frame.ends.norm(dim=1)
     assert bool((ranges[frame.is_hit] < 5.0).all())
     torch.testing.assert_close(ranges[~frame.is_hit], torch.full_like(ranges[~frame.is_hit], 5.0))
@@ -116,23 +116,23 @@ def test_readings_that_noise_carries_beyond_the_range_are_free_up_to_it():
     assert abs(float((~frame.is_hit).double().mean()) - share) < 4.5 * math.sqrt(share * (1 - share) / 3600)
 
 
-def test_nothing_in_sight_is_free_up_to_the_range():
+def test_beams_without_a_surface_end_at_max_range():
     away = pose(100, 100, 50)
-    frame = DepthCamera(dropout=0.0).sense(ROOM, away, NOBODY, 0.3, seeded())
+    frame = DepthCamera(dropout=0.0).sense(ROOM, away, NO_TEAMMATES, 0.3, seeded())
     assert len(frame.ends) == 160 * 120
     assert not bool(frame.is_hit.any())
     assert bool(torch.isfinite(frame.ends).all())
 
 
-def test_noise_never_puts_a_surface_behind_the_camera():
+def test_noise_never_moves_a_hit_behind_the_camera():
     close = MeshWorld(box((0.01, -9, -9), (1, 9, 9)))
-    frame = DepthCamera(noise=1e4, dropout=0.0).sense(close, pose(0, 0, 0), NOBODY, 0.3, seeded())
+    frame = DepthCamera(noise=1e4, dropout=0.0).sense(close, pose(0, 0, 0), NO_TEAMMATES, 0.3, seeded())
     assert float((frame.ends @ torch.tensor([1.0, 0, 0]).double()).min()) > 0
 
 
-def test_the_announced_share_of_pixels_drops_out():
+def test_pixels_drop_out_in_the_given_share():
     camera = DepthCamera(dropout=0.05)
-    frame = camera.sense(ROOM, pose(4, 3, 2), NOBODY, 0.3, seeded())
+    frame = camera.sense(ROOM, pose(4, 3, 2), NO_TEAMMATES, 0.3, seeded())
     n = 160 * 120
     assert abs(len(frame.pixel) / n - 0.95) < 4.5 * math.sqrt(0.05 * 0.95 / n)
     assert bool((frame.pixel[1:] > frame.pixel[:-1]).all())
@@ -140,19 +140,19 @@ def test_the_announced_share_of_pixels_drops_out():
     assert len(frame.ends) == len(frame.is_hit) == len(frame.pixel)
 
 
-def test_what_is_seen_does_not_change_what_is_drawn_next():
+def test_the_number_of_random_draws_does_not_depend_on_the_world():
     camera = DepthCamera(40, 30, dropout=0.2)
     teammates = torch.tensor([[4.5, 3.0, 2.0]], dtype=torch.float64)
     one, other = seeded(3), seeded(3)
     camera.sense(ROOM, pose(4, 3, 2), teammates, 0.3, one)
-    camera.sense(MeshWorld(box((50, 0, 0), (51, 1, 1))), pose(0, 0, 0), NOBODY, 0.3, other)
-    first, second = (camera.sense(ROOM, pose(4, 3, 2), NOBODY, 0.3, g) for g in (one, other))
+    camera.sense(MeshWorld(box((50, 0, 0), (51, 1, 1))), pose(0, 0, 0), NO_TEAMMATES, 0.3, other)
+    first, second = (camera.sense(ROOM, pose(4, 3, 2), NO_TEAMMATES, 0.3, g) for g in (one, other))
     assert torch.equal(first.ends, second.ends)
     assert torch.equal(first.pixel, second.pixel)
 
 
 @pytest.mark.parametrize(
-    ("teammate", "seen"),
+    ("teammate", "is_visible"),
     [
         ((5.0, 3.2, 2.1), True),
         ((4.0, 2.0, 2.0), True),  # at the edge of the image
@@ -161,22 +161,22 @@ def test_what_is_seen_does_not_change_what_is_drawn_next():
         ((8.7, 3.0, 2.0), False),  # beyond the range
     ],
 )
-def test_beams_that_meet_a_teammate_are_absent(teammate, seen):
+def test_beams_that_hit_a_teammate_are_absent(teammate, is_visible):
     where, center, radius = pose(2.0, 3.0, 2.0), torch.tensor(teammate, dtype=torch.float64), 0.35
     frame = EXACT.sense(ROOM, where, center[None], 0.3, seeded())
     blocked = []
     for i, u in enumerate(world_directions(EXACT, 0.0)):
-        # Nearest point of the segment up to the surface, or the range, to the sphere's centre.
+        # Point of the beam, up to the surface or the range, that is nearest to the sphere's centre.
         length = min(6.0, float(to_walls(where[:3], u[None])))
         t = min(max(float(u @ (center - where[:3])), 0.0), length)
         if float((where[:3] + t * u - center).norm()) < radius:
             blocked.append(i)
     absent = sorted(set(range(40 * 30)) - set(frame.pixel.tolist()))
     assert absent == blocked
-    assert bool(blocked) == seen
+    assert bool(blocked) == is_visible
 
 
-def test_a_teammate_behind_a_wall_hides_nothing_and_one_that_touches_hides_all():
+def test_a_teammate_behind_a_wall_hides_no_beam_and_one_at_the_camera_hides_all():
     where = pose(8.0, 3.0, 2.0)
     behind = torch.tensor([[9.6, 3.0, 2.0]], dtype=torch.float64)
     assert len(EXACT.sense(ROOM, where, behind, 0.3, seeded()).pixel) == 1200
@@ -186,10 +186,10 @@ def test_a_teammate_behind_a_wall_hides_nothing_and_one_that_touches_hides_all()
     assert empty.scan().n_beams == 0
 
 
-def test_scan_and_image_hold_the_same_beams():
+def test_scan_and_image_contain_the_same_beams():
     camera = DepthCamera(40, 30, dropout=0.1)
     where = pose(3.0, 2.5, 1.7, 0.4)
-    frame = camera.sense(ROOM, where, NOBODY, 0.3, seeded())
+    frame = camera.sense(ROOM, where, NO_TEAMMATES, 0.3, seeded())
     ends, is_hit = frame.scan().ends()
     assert torch.equal(ends[is_hit], frame.ends[frame.is_hit])
     assert torch.equal(ends[~is_hit], frame.ends[~frame.is_hit])
@@ -206,7 +206,7 @@ def test_scan_and_image_hold_the_same_beams():
     torch.testing.assert_close(rebuilt[frame.is_hit], frame.ends[frame.is_hit])
 
 
-def test_threads_do_not_change_distances():
+def test_the_number_of_threads_does_not_change_distances():
     origin, directions = torch.tensor([3.0, 2.5, 1.7]).double(), EXACT.directions
     assert torch.equal(ROOM.distances(origin, directions, threads=1), ROOM.distances(origin, directions))
 
@@ -226,14 +226,14 @@ def test_threads_do_not_change_distances():
         {"dropout": 1.0},
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(bad):
+def test_depth_camera_rejects_invalid_attributes(bad):
     (name,) = bad
     with pytest.raises(InvalidArgumentError, match=f"{name}="):
         DepthCamera(**bad)
 
 
-def test_poses_and_teammates_must_be_finite():
+def test_sense_rejects_poses_and_teammates_that_are_not_finite():
     with pytest.raises(InvalidArgumentError, match="pose="):
-        EXACT.sense(ROOM, pose(math.nan, 0, 0), NOBODY, 0.3, seeded())
+        EXACT.sense(ROOM, pose(math.nan, 0, 0), NO_TEAMMATES, 0.3, seeded())
     with pytest.raises(InvalidArgumentError, match="others="):
-        EXACT.sense(ROOM, pose(1, 1, 1), NOBODY.new_full((1, 3), math.inf), 0.3, seeded())
+        EXACT.sense(ROOM, pose(1, 1, 1), NO_TEAMMATES.new_full((1, 3), math.inf), 0.3, seeded())

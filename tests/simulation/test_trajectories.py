@@ -1,4 +1,4 @@
-"""Paths and poses: smooth, evenly spaced, looking ahead."""
+"""Paths and poses: smooth, evenly spaced, facing forward."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gmmtorch.simulation import poses_2d, poses_3d, smooth_path
 CORNER = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]])
 
 
-def test_a_path_keeps_its_ends_and_its_spacing():
+def test_path_keeps_its_ends_and_spacing():
     path = smooth_path(CORNER, 0.05)
     assert path[0].tolist() == [0.0, 0.0]
     torch.testing.assert_close(path[-1], CORNER[-1].double())
@@ -21,7 +21,7 @@ def test_a_path_keeps_its_ends_and_its_spacing():
     assert bool(((steps > 0.045) & (steps < 0.0501)).all())
 
 
-def test_corners_are_rounded_and_not_overshot():
+def test_path_rounds_corners_without_overshoot():
     path = smooth_path(CORNER)
     heading = torch.atan2(*(path[1:] - path[:-1]).T.flip(0))
     assert float((heading[1:] - heading[:-1]).abs().max()) < 0.15
@@ -30,18 +30,18 @@ def test_corners_are_rounded_and_not_overshot():
     assert float((path - torch.tensor([4.0, 0.0])).norm(dim=1).min()) > 0.5
 
 
-def test_waypoints_on_a_line_stay_on_it():
+def test_path_is_straight_along_collinear_waypoints():
     path = smooth_path(torch.tensor([[0.0, 1.0], [3.0, 3.0], [3.0, 4.0], [3.0, 5.0], [7.0, 5.0]]))
     middle = path[(path[:, 1] > 3.55) & (path[:, 1] < 4.45)]
     torch.testing.assert_close(middle[:, 0], torch.full_like(middle[:, 0], 3.0))
 
 
-def test_two_waypoints_are_a_line():
+def test_path_between_two_waypoints_is_a_line():
     path = smooth_path(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), 0.25)
     torch.testing.assert_close(path[:, 0], torch.linspace(0, 1, 5, dtype=torch.float64))
 
 
-def test_poses_look_ahead():
+def test_poses_2d_face_forward_at_even_spacing():
     poses = poses_2d(smooth_path(CORNER), 30)
     assert poses.shape == (30, 3, 3)
     torch.testing.assert_close(poses[0], torch.eye(3, dtype=torch.float64))
@@ -53,7 +53,7 @@ def test_poses_look_ahead():
 
 
 @pytest.mark.parametrize(("pitch", "swing"), [(0.0, 0.0), (0.2, 0.0), (0.2, 1.0)])
-def test_poses_3d_are_rigid_and_level(pitch, swing):
+def test_poses_3d_are_rigid_without_roll(pitch, swing):
     poses = poses_3d(smooth_path(CORNER), 20, 1.5, pitch, swing)
     rotation = poses[:, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(20, 3, 3))
@@ -63,12 +63,12 @@ def test_poses_3d_are_rigid_and_level(pitch, swing):
     torch.testing.assert_close(rotation[:, 2, 1], torch.zeros(20, dtype=torch.float64))  # no roll
 
 
-def test_one_pose_is_at_the_start():
+def test_a_single_pose_is_at_the_start():
     assert poses_2d(smooth_path(CORNER), 1)[0, :2, 2].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(
-    ("make", "named"),
+    ("make", "message"),
     [
         (lambda: smooth_path(torch.zeros(1, 2)), "waypoints"),
         (lambda: smooth_path(torch.zeros(4, 3)), "waypoints"),
@@ -76,6 +76,6 @@ def test_one_pose_is_at_the_start():
         (lambda: poses_2d(smooth_path(CORNER), 0), "n=0"),
     ],
 )
-def test_refuses_what_does_not_fit_and_names_it(make, named):
-    with pytest.raises(InvalidArgumentError, match=named):
+def test_paths_and_poses_reject_invalid_arguments(make, message):
+    with pytest.raises(InvalidArgumentError, match=message):
         make()

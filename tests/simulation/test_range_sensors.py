@@ -1,4 +1,4 @@
-"""Sensors: where beams point, how readings err, what becomes of beams that see nothing."""
+"""Range sensors: beam directions, noise, dropout, and beams without return."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.simulation.sensors.range_sensors import depth_camera
 
 
 class Shell:
-    """A world whose only surface is `radius` metres from wherever one stands."""
+    """A world with a surface at a distance of `radius` metres from every origin."""
 
     def __init__(self, radius: float) -> None:
         self.radius = radius
@@ -27,24 +27,24 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def standing(dim: int) -> Tensor:
+def example_pose(dim: int) -> Tensor:
     pose = torch.eye(dim + 1, dtype=torch.float64)
     pose[:dim, dim] = torch.arange(1.0, dim + 1)
     return pose
 
 
-def test_laser_beams_fan_out_symmetrically():
+def test_laser_beams_are_symmetric_and_evenly_spaced():
     directions = laser_2d(n_beams=4, field_of_view=math.pi).directions
     angles = torch.atan2(directions[:, 1], directions[:, 0]).rad2deg()
     torch.testing.assert_close(angles, torch.tensor([-67.5, -22.5, 22.5, 67.5], dtype=torch.float64))
 
 
-def test_a_full_turn_has_no_beam_twice():
+def test_laser_over_a_full_turn_has_distinct_beams():
     directions = laser_2d(n_beams=360, field_of_view=2 * math.pi).directions
     assert float(torch.pdist(directions).min()) == pytest.approx(2 * math.sin(math.pi / 360))
 
 
-def test_lidar_beams():
+def test_lidar_rings_have_the_given_elevations():
     directions = spinning_lidar(3, 4, (-0.5, 0.5)).directions
     assert directions.shape == (12, 3)
     torch.testing.assert_close(directions[4:8, 2], torch.zeros(4, dtype=torch.float64))
@@ -54,7 +54,7 @@ def test_lidar_beams():
     torch.testing.assert_close(directions[5], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
 
 
-def test_camera_beams_run_row_by_row_from_the_top_left():
+def test_camera_pixels_are_row_major_from_the_top_left():
     directions = depth_camera(6, 4, math.radians(90)).directions.view(4, 6, 3)
     assert bool((directions[..., 0] > 0).all())
     assert bool((directions[0, :, 2] > 0).all())
@@ -68,14 +68,14 @@ def test_camera_beams_run_row_by_row_from_the_top_left():
 @pytest.mark.parametrize(
     "sensor", [laser_2d(), spinning_lidar(), depth_camera()], ids=["laser", "lidar", "camera"]
 )
-def test_directions_are_unit_vectors(sensor):
+def test_beam_directions_are_unit_vectors(sensor):
     lengths = sensor.directions.norm(dim=1)
     torch.testing.assert_close(lengths, torch.ones_like(lengths))
 
 
-def test_noise_has_the_announced_spread_along_the_beam():
+def test_noise_has_the_given_deviation_along_the_beam():
     sensor = spinning_lidar(64, 360, range_noise=0.02)
-    pose = standing(3)
+    pose = example_pose(3)
     ends, no_return = sense(sensor, pose, Shell(4.0), generator())
     assert not bool(no_return.any())
     offset = ends - pose[:3, 3]
@@ -87,47 +87,47 @@ def test_noise_has_the_announced_spread_along_the_beam():
     assert float(across.norm(dim=1).max()) < 1e-9
 
 
-def test_without_noise_readings_are_exact():
-    ends, _ = sense(laser_2d(range_noise=0.0), standing(2), Shell(3.0), generator())
+def test_readings_without_noise_are_exact():
+    ends, _ = sense(laser_2d(range_noise=0.0), example_pose(2), Shell(3.0), generator())
     torch.testing.assert_close(
         (ends - torch.tensor([1.0, 2.0])).norm(dim=1), torch.full((180,), 3.0).double()
     )
 
 
 @pytest.mark.parametrize("radius", [12.0, 40.0, math.inf])
-def test_what_is_out_of_range_is_not_seen(radius):
-    scan = simulate_scan(laser_2d(max_range=12.0), standing(2), Shell(radius), generator())
+def test_surfaces_out_of_range_give_no_return(radius):
+    scan = simulate_scan(laser_2d(max_range=12.0), example_pose(2), Shell(radius), generator())
     assert scan.points.shape == (0, 2)
-    reach = (scan.no_return - scan.origin).norm(dim=1)
-    torch.testing.assert_close(reach, torch.full((180,), 12.0, dtype=torch.float64))
+    length = (scan.no_return - scan.origin).norm(dim=1)
+    torch.testing.assert_close(length, torch.full((180,), 12.0, dtype=torch.float64))
 
 
-def test_noise_never_lifts_a_point_beyond_the_range():
-    scan = simulate_scan(laser_2d(2000, max_range=12.0), standing(2), Shell(11.995), generator())
+def test_noise_never_moves_a_hit_beyond_the_range():
+    scan = simulate_scan(laser_2d(2000, max_range=12.0), example_pose(2), Shell(11.995), generator())
     assert 0 < len(scan.points) < 2000
     assert scan.n_beams == 2000
     assert bool(((scan.points - scan.origin).norm(dim=1) < 12.0).all())
 
 
-def test_dropped_beams_say_nothing_and_are_as_many_as_announced():
+def test_dropped_beams_are_absent_in_the_given_share():
     sensor = laser_2d(20_000, dropout=0.25)
-    scan = simulate_scan(sensor, standing(2), Shell(3.0), generator())
+    scan = simulate_scan(sensor, example_pose(2), Shell(3.0), generator())
     assert len(scan.no_return) == 0
     assert scan.n_beams / 20_000 == pytest.approx(0.75, abs=0.02)
-    empty = simulate_scan(sensor, standing(2), Shell(math.inf), generator())
+    empty = simulate_scan(sensor, example_pose(2), Shell(math.inf), generator())
     assert empty.n_beams == scan.n_beams
 
 
-def test_same_generator_same_scan():
+def test_scans_depend_only_on_the_generator():
     first, second, other = (
-        sense(laser_2d(dropout=0.1), standing(2), Shell(3.0), generator(seed))[0] for seed in (1, 1, 2)
+        sense(laser_2d(dropout=0.1), example_pose(2), Shell(3.0), generator(seed))[0] for seed in (1, 1, 2)
     )
     assert torch.equal(first, second)
     assert first.shape != other.shape or not torch.equal(first, other)
 
 
 @pytest.mark.parametrize(
-    ("make", "named"),
+    ("make", "message"),
     [
         (lambda: laser_2d(n_beams=0), "n_beams=0"),
         (lambda: laser_2d(field_of_view=7.0), r"field_of_view=7\.0"),
@@ -141,6 +141,6 @@ def test_same_generator_same_scan():
         (lambda: depth_camera(field_of_view=math.pi), "field_of_view=3.14"),
     ],
 )
-def test_refuses_what_does_not_fit_and_names_it(make, named):
-    with pytest.raises(InvalidArgumentError, match=named):
+def test_sensors_reject_invalid_arguments(make, message):
+    with pytest.raises(InvalidArgumentError, match=message):
         make()

@@ -1,4 +1,4 @@
-"""Rays against segments and triangles: analytic cases, an independent solver, and no leaks."""
+"""Rays against segments and triangles: analytic cases, a linear solver, and shared edges."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def random(shape: tuple[int, ...], seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=DTYPE)
 
 
-def solved(origins: Tensor, directions: Tensor, primitives: Tensor) -> Tensor:
-    """One linear system per pair: o + t d = a + Σ s_k e_k, s_k ≥ 0, Σ s_k ≤ 1, t > 0."""
+def solve_all_pairs(origins: Tensor, directions: Tensor, primitives: Tensor) -> Tensor:
+    """Distances (N,) from one linear system per pair: o + t d = a + Σ s_k e_k, s_k ≥ 0, Σ s_k ≤ 1, t > 0."""
     edges = primitives[:, 1:] - primitives[:, :1]
     n, s, dim = directions.shape[0], primitives.shape[0], primitives.shape[2]
     columns = torch.cat(
@@ -41,17 +41,17 @@ def solved(origins: Tensor, directions: Tensor, primitives: Tensor) -> Tensor:
 
 @pytest.mark.parametrize(("cast", "dim"), [(ray_segments, 2), (ray_triangles, 3)])
 @pytest.mark.parametrize("one_origin", [True, False])
-def test_agrees_with_a_linear_solver(cast, dim, one_origin):
+def test_distances_agree_with_a_linear_solver(cast, dim, one_origin):
     primitives = random((4 if dim == 2 else 60, dim, dim), 0)
     origins = random((dim,), 1) if one_origin else random((500, dim), 1)
     directions = random((500, dim), 2)
-    found, expected = cast(origins, directions, primitives), solved(origins, directions, primitives)
+    found, expected = cast(origins, directions, primitives), solve_all_pairs(origins, directions, primitives)
     assert 0.2 < float(torch.isfinite(expected).double().mean()) < 0.999
     torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize(("cast", "dim"), [(ray_segments, 2), (ray_triangles, 3)])
-def test_chunks_do_not_change_the_result(cast, dim, monkeypatch):
+def test_chunk_sizes_do_not_change_the_distances(cast, dim, monkeypatch):
     primitives, directions = random((30, dim, dim), 0), random((200, dim), 1)
     whole = cast(torch.zeros(dim), directions, primitives)
     monkeypatch.setattr(mesh_raycasting, "_CHUNK_PAIRS", 64)
@@ -60,28 +60,28 @@ def test_chunks_do_not_change_the_result(cast, dim, monkeypatch):
     torch.testing.assert_close(cast(torch.zeros(dim), directions, primitives), whole)
 
 
-def test_bundles_miss_nothing_that_testing_every_pair_finds():
-    """Triangles small, large, and around the origin; directions of any length, along axes, and alone."""
+def test_bundles_give_the_same_distances_as_all_pairs():
+    """Small and large triangles, some around the origin; directions of any length, along axes, and single."""
     small, large = 0.1 * random((300, 3, 3), 6) + 3 * random((300, 1, 3), 7), 5 * random((40, 3, 3), 8)
-    through = torch.cat(
+    around = torch.cat(
         [random((5, 3, 3), 9) - random((5, 3, 3), 9).mean(1, keepdim=True), torch.eye(3).double()[None]]
     )
     directions = torch.cat([7 * random((4000, 3), 10), torch.eye(3).double(), -torch.eye(3).double()])
     origin = tensor([0.2, -0.1, 0.3])
-    triangles = torch.cat([small, large, through + origin])
+    triangles = torch.cat([small, large, around + origin])
     for some in (directions, directions[:1], directions[-3:]):
         expected = ray_triangles(origin.expand(some.shape), some, triangles)
         torch.testing.assert_close(ray_triangles(origin, some, triangles), expected)
 
 
-def test_distances_to_a_segment():
+def test_distances_to_a_segment_are_multiples_of_the_direction():
     wall = tensor([[[2.0, -1.0], [2.0, 1.0]]])
     directions = tensor([[1, 0], [-1, 0], [2, 0], [1, 0.5], [1, 0.6], [0, 1]])
     found = ray_segments(tensor([0.0, 0.0]), directions, wall)
     assert found.tolist() == [2.0, math.inf, 1.0, 2.0, math.inf, math.inf]
 
 
-def test_a_ray_along_a_segment_or_in_the_plane_of_a_triangle_does_not_meet_it():
+def test_a_ray_parallel_to_a_primitive_does_not_hit_it():
     assert ray_segments(tensor([0.0, 0.0]), tensor([[1.0, 0.0]]), tensor([[[1.0, 0], [2, 0]]])).tolist() == [
         math.inf
     ]
@@ -91,7 +91,7 @@ def test_a_ray_along_a_segment_or_in_the_plane_of_a_triangle_does_not_meet_it():
     assert bool(torch.isinf(ray_triangles(inside, along, slanted[None])).all())
 
 
-def test_both_faces_of_a_triangle_count_and_what_lies_behind_does_not():
+def test_both_faces_of_a_triangle_are_hit_and_nothing_behind_the_origin():
     triangle = tensor([[[-1.0, -1, 3], [1, -1, 3], [0, 1, 3]]])
     up, down = tensor([[0.0, 0, 1]]), tensor([[0.0, 0, -1]])
     assert ray_triangles(tensor([0.0, 0, 0]), up, triangle).tolist() == [3.0]
@@ -99,7 +99,7 @@ def test_both_faces_of_a_triangle_count_and_what_lies_behind_does_not():
     assert ray_triangles(tensor([0.0, 0, 5]), up, triangle).tolist() == [math.inf]
 
 
-def test_inside_a_box_every_ray_meets_the_wall_at_the_slab_distance():
+def test_distances_inside_a_box_are_slab_distances():
     directions = torch.nn.functional.normalize(random((5000, 3), 4), dim=1)
     origin = tensor([0.3, -0.2, 0.1])
     low, high = tensor([-1.0, -2.0, -3.0]), tensor([1.0, 2.0, 3.0])
@@ -108,7 +108,7 @@ def test_inside_a_box_every_ray_meets_the_wall_at_the_slab_distance():
     torch.testing.assert_close(found, expected)
 
 
-def test_no_ray_slips_through_edges_and_corners():
+def test_rays_at_edges_and_corners_hit():
     cube = box((-1, -1, -1), (1, 1, 1))
     corners = cube.reshape(-1, 3)
     weights = torch.linspace(0, 1, 33, dtype=DTYPE)[:, None, None]
@@ -123,21 +123,21 @@ def test_no_ray_slips_through_edges_and_corners():
     torch.testing.assert_close(distance, torch.ones_like(distance))
 
 
-def test_a_ball_is_met_close_to_its_radius():
+def test_ball_has_its_radius_within_the_facet_error():
     directions = torch.nn.functional.normalize(random((2000, 3), 5), dim=1)
     distance = ray_triangles(tensor([1.0, 2, 3]), directions, ball((1.0, 2.0, 3.0), 2.0, 32))
     assert bool((distance <= 2 + 1e-12).all())
     assert bool((distance > 2 * math.cos(math.pi / 32) ** 2 - 1e-9).all())
 
 
-def test_a_prism_is_closed_and_its_volume_is_right():
+def test_prism_has_the_exact_volume():
     drum = prism(circle(0.5, 24), 1.0, 3.0)
     volume = float((drum[:, 0] * torch.linalg.cross(drum[:, 1], drum[:, 2])).sum() / 6)
     assert volume == pytest.approx(2.0 * 12 * 0.25 * math.sin(2 * math.pi / 24))
 
 
 @pytest.mark.parametrize(("cast", "dim"), [(ray_segments, 2), (ray_triangles, 3)])
-def test_nothing_to_meet_and_no_rays(cast, dim):
+def test_no_primitives_give_infinity_and_no_rays_give_nothing(cast, dim):
     assert (
         torch.isinf(cast(torch.zeros(dim), torch.ones(3, dim), torch.empty(0, dim, dim))).tolist()
         == [True] * 3
@@ -146,7 +146,7 @@ def test_nothing_to_meet_and_no_rays(cast, dim):
 
 
 @pytest.mark.parametrize(
-    ("origins", "directions", "triangles", "named"),
+    ("origins", "directions", "triangles", "message"),
     [
         ((2,), (5, 3), (1, 3, 3), "origins"),
         ((4, 3), (5, 3), (1, 3, 3), "origins"),
@@ -155,6 +155,6 @@ def test_nothing_to_meet_and_no_rays(cast, dim):
         ((3,), (5, 3), (1, 2, 3), "triangles"),
     ],
 )
-def test_refuses_shapes_that_do_not_fit(origins, directions, triangles, named):
-    with pytest.raises(InvalidArgumentError, match=named):
+def test_ray_triangles_rejects_shapes_that_do_not_match(origins, directions, triangles, message):
+    with pytest.raises(InvalidArgumentError, match=message):
         ray_triangles(torch.zeros(origins), torch.ones(directions), torch.zeros(triangles))
