@@ -1,4 +1,4 @@
-"""One family of errors. Every message names the argument or file, its value, and the remedy."""
+"""The error classes of gmmtorch. Every message names the argument or file, its value, and the remedy."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import Collection
 
 
 class GmmTorchError(Exception):
-    """Base of every error that gmmtorch raises on purpose."""
+    """Base class of all errors that gmmtorch raises deliberately."""
 
 
 class InvalidArgumentError(GmmTorchError, ValueError):
-    """An argument has a value that cannot be worked with."""
+    """An argument has an invalid value."""
 
 
 class DataError(GmmTorchError, ValueError):
-    """A file or an array does not hold what it should."""
+    """The content of a file or array is invalid."""
 
 
 class MissingDataError(GmmTorchError, FileNotFoundError):
-    """A file or folder that was asked for does not exist."""
+    """A requested file or folder does not exist."""
 
     def __str__(self) -> str:  # FileNotFoundError would print a bare tuple
         return str(self.args[0]) if self.args else ""
@@ -34,15 +34,18 @@ class OutputError(GmmTorchError, OSError):
 
 
 class MemoryLimitError(GmmTorchError, MemoryError):
-    """What was asked for does not fit into the memory allowed for it."""
+    """A request does not fit into the memory allowed for it."""
 
 
 class NumericalError(GmmTorchError, ArithmeticError):
-    """A matrix could not be factorised, even with the largest permitted jitter."""
+    """A matrix cannot be factorised, even with the largest permitted jitter."""
 
 
 def check_whole(name: str, value: object, least: int) -> int:
-    """`value` as a whole number of at least `least`, below 2⁶³; else `InvalidArgumentError`."""
+    """Returns `value` as an int.
+
+    Raises `InvalidArgumentError` unless it is a whole number from `least` to below 2⁶³.
+    """
     if not isinstance(value, numbers.Integral) or not least <= int(value) < 2**63:
         raise InvalidArgumentError(f"{name}={value!r} must be a whole number of at least {least}.")
     return int(value)

@@ -1,4 +1,4 @@
-"""Small symmetric matrices in batches: packing, and a Cholesky that mends what can be mended."""
+"""Batches of small symmetric matrices (packing, Cholesky with jitter, checks), and fast sorting."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def triangle_indices(dim: int, device: torch.device | None = None) -> tuple[Tens
 
 
 def pack_symmetric(matrices: Tensor) -> Tensor:
-    """Distinct entries (…, D(D+1)/2) of symmetric matrices (…, D, D), upper triangle by rows."""
+    """Distinct entries (…, D(D+1)/2) of symmetric matrices (…, D, D): the upper triangle, row by row."""
     rows, cols = triangle_indices(matrices.shape[-1], matrices.device)
     return matrices[..., rows, cols]
 
@@ -35,9 +35,9 @@ def unpack_symmetric(packed: Tensor, dim: int) -> Tensor:
 def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
     """Lower Cholesky factors (K, D, D) of symmetric matrices (K, D, D).
 
-    Jitter, growing from 1e-12 to 1e-6 of the mean of the diagonal, is added only to the matrices
-    whose factorisation failed. Raises `NumericalError`, naming the first bad matrix, when that
-    does not help or when a matrix holds NaN or infinite entries.
+    Matrices whose factorisation fails get jitter, which grows from 1e-12 to 1e-6 of the mean of the
+    diagonal. All other matrices stay unchanged. Raises `NumericalError`, which names the first bad
+    matrix, if jitter does not help or if a matrix has NaN or infinite entries.
     """
     factors, info = torch.linalg.cholesky_ex(matrices)
     finite = torch.isfinite(factors).flatten(1).all(1)
@@ -46,15 +46,15 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
         return factors
     if not bool(torch.isfinite(matrices).all()):
         first = int((~torch.isfinite(matrices).flatten(1).all(1)).nonzero()[0])
-        raise NumericalError(f"{name}[{first}] holds NaN or infinite entries; check the input points.")
+        raise NumericalError(f"{name}[{first}] has NaN or infinite entries; check the input points.")
     factors = factors.clone()
     eye = torch.eye(matrices.shape[-1], dtype=matrices.dtype, device=matrices.device)
     for jitter in _JITTERS:
         index = bad.nonzero().squeeze(1)
         scale = matrices[index].diagonal(dim1=-2, dim2=-1).mean(-1).abs()
-        mended, info = torch.linalg.cholesky_ex(matrices[index] + (jitter * scale)[:, None, None] * eye)
+        repaired, info = torch.linalg.cholesky_ex(matrices[index] + (jitter * scale)[:, None, None] * eye)
         good = info == 0
-        factors[index[good]] = mended[good]
+        factors[index[good]] = repaired[good]
         bad[index[good]] = False
         if not bool(bad.any()):
             return factors
@@ -66,28 +66,28 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
 
 
 def inverse_factor(factors: Tensor) -> Tensor:
-    """L⁻ᵀ (K, D, D) of lower Cholesky factors L: the columns that whiten, ‖(x−μ)ᵀ L⁻ᵀ‖² = Mahalanobis²."""
+    """L⁻ᵀ (K, D, D) of lower Cholesky factors L; ‖(x−μ)ᵀ L⁻ᵀ‖² is the squared Mahalanobis distance."""
     eye = torch.eye(factors.shape[-1], dtype=factors.dtype, device=factors.device)
     inverse = torch.linalg.solve_triangular(factors, eye.expand_as(factors), upper=False)
     return inverse.transpose(-2, -1)
 
 
 def check_symmetric(matrices: Tensor, name: str) -> Tensor:
-    """The matrices (K, D, D), if they are symmetric to rounding; else `InvalidArgumentError`."""
+    """Returns the matrices (K, D, D). Raises `InvalidArgumentError` unless they are symmetric to rounding."""
     difference = (matrices - matrices.transpose(-2, -1)).abs()
     scale = matrices.diagonal(dim1=-2, dim2=-1).abs().amax(-1)[..., None, None] if matrices.numel() else 1.0
     if bool((difference > 1e-6 * scale).any()):
         raise InvalidArgumentError(
-            f"{name} are not symmetric; use (C + C.transpose(-2, -1)) / 2 if that is meant."
+            f"{name} are not symmetric; to symmetrise them, use (C + C.transpose(-2, -1)) / 2."
         )
     return matrices
 
 
 def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Rotation (D, D) and translation (D,) of a rigid motion (D+1, D+1), float64.
+    """Rotation (D, D) and translation (D,), float64, of a rigid motion given as a matrix (D+1, D+1).
 
-    Raises `InvalidArgumentError` unless it is one: finite, its rotation orthonormal with
-    determinant +1, its last row 0 … 0 1.
+    Raises `InvalidArgumentError` unless the matrix is finite, its rotation is orthonormal with
+    determinant +1, and its last row is 0 … 0 1.
     """
     shape = (dim + 1, dim + 1)
     if tuple(transform.shape) != shape:
@@ -105,8 +105,8 @@ def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     )
     if not rigid:
         raise InvalidArgumentError(
-            f"transform={matrix.tolist()} is not rigid; give a rotation (orthonormal, determinant 1), a "
-            "translation in metres, and a last row of 0 … 0 1."
+            f"transform={matrix.tolist()} is not rigid; its rotation must be orthonormal with determinant 1, "
+            "its translation in metres, and its last row 0 … 0 1."
         )
     return rotation, translation
 
@@ -115,7 +115,7 @@ def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
 
 
 def argsort(keys: Tensor) -> Tensor:
-    """Indices (N,) that sort keys (N,), equal ones in their order."""
+    """Indices (N,) that sort keys (N,). The sort is stable."""
     if keys.device.type != "cpu":
         return keys.argsort(stable=True)
     array = keys.numpy()
@@ -125,14 +125,14 @@ def argsort(keys: Tensor) -> Tensor:
 
 
 def largest_indices(scores: Tensor, k: int) -> Tensor:
-    """Indices (N, k) of the k largest of each row of scores (N, M), in no order."""
+    """Column indices (N, k) of the k largest values in each row of scores (N, M), in no particular order."""
     if scores.device.type != "cpu":
         return scores.topk(k, 1, sorted=False).indices
     return torch.from_numpy(np.argpartition(scores.numpy(), -k, axis=1)[:, -k:].astype(np.int64))
 
 
 def count_distinct(keys: Tensor) -> int:
-    """How many different keys (N,) there are."""
+    """Number of distinct keys (N,)."""
     if keys.numel() == 0:
         return 0
     ordered = torch.from_numpy(np.sort(keys.numpy())) if keys.device.type == "cpu" else keys.sort().values
@@ -140,7 +140,7 @@ def count_distinct(keys: Tensor) -> int:
 
 
 def dense_ranks(keys: Tensor) -> tuple[Tensor, int]:
-    """Keys (N,) replaced by numbers from 0, in the keys' order, and how many there are."""
+    """Rank of each key (N,) among the distinct keys, from 0, and the number of distinct keys."""
     if keys.device.type != "cpu":
         unique, number = torch.unique(keys, return_inverse=True)
         return number, unique.numel()

@@ -1,4 +1,4 @@
-"""Scan: what one sweep, frame or beam fan of a range sensor saw, in the world frame."""
+"""Scan: the measurements of one sweep, frame or beam fan of a range sensor, in the world frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gmmtorch.linalg import check_rigid
 ArrayLike = Tensor | np.ndarray | list | tuple
 
 _FLOAT32_WARNING_METRES = 1e4
-"""Beyond this distance from the origin float32 coordinates are coarser than about a millimetre."""
+"""Distance from the origin beyond which float32 coordinates are coarser than about a millimetre."""
 
 
 def _as_tensor(name: str, value: ArrayLike) -> Tensor:
@@ -43,13 +43,13 @@ def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
     if not bool(finite.all()):
         row = int((~finite).nonzero()[0])
         raise InvalidArgumentError(
-            f"{name}[{row}] = {tensor[row].tolist()} is not finite; drop such rows first: "
+            f"{name}[{row}] = {tensor[row].tolist()} is not finite; remove such rows first: "
             f"{name} = {name}[torch.isfinite({name}).all(1)]."
         )
     if tensor.dtype == torch.float32 and bool((tensor.abs() > _FLOAT32_WARNING_METRES).any()):
         warnings.warn(
-            f"{name} holds float32 coordinates beyond {_FLOAT32_WARNING_METRES / 1e3:.0f} km from the "
-            "origin, where float32 cannot tell millimetres apart; read them as float64, or move them.",
+            f"{name} has float32 coordinates more than {_FLOAT32_WARNING_METRES / 1e3:.0f} km from the "
+            "origin, where float32 does not resolve millimetres; use float64, or move the frame.",
             UserWarning,
             stacklevel=4,
         )
@@ -58,21 +58,21 @@ def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Measured surface points, and whence they were measured. World frame, metres.
+    """Measured surface points and the sensor position that measured them. World frame, metres.
 
     Attributes:
-        points: (N, D) returns, D = 2 or 3: each is a surface seen from `origin`.
+        points: (N, D) returns, D = 2 or 3. Each is a surface point seen from `origin`.
         origin: (D,) position of the sensor.
-        no_return: (M, D) one row for every beam that came back empty: the point up to which the
-            beam is taken to have met nothing. It speaks of free space and is never a surface.
+        no_return: (M, D) one row for each beam without return: the point up to which the beam is
+            assumed to cross free space. It is never a surface point.
 
-    Arrays, lists and tensors are taken. Raises `InvalidArgumentError` on shapes that disagree and
-    on NaN or infinite coordinates; warns about float32 coordinates too far out to be exact.
+    Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes and for
+    NaN or infinite coordinates. Warns if float32 coordinates are too far from the origin to be precise.
     """
 
     points: Tensor
     origin: Tensor
-    no_return: Tensor = None  # type: ignore[assignment]  # becomes an empty (0, D) tensor
+    no_return: Tensor = None  # type: ignore[assignment]  # None becomes an empty (0, D) tensor
 
     def __post_init__(self) -> None:
         origin = _as_tensor("origin", self.origin)
@@ -93,17 +93,17 @@ class Scan:
 
     @property
     def n_beams(self) -> int:
-        """Beams that say something: returns and no-returns."""
+        """Number of beams: returns and no-returns."""
         return self.points.shape[0] + self.no_return.shape[0]
 
     def ends(self) -> tuple[Tensor, Tensor]:
-        """All beam ends (N + M, D), returns first, and which of them (N + M,) are returns."""
+        """All beam ends (N + M, D), returns first, and a mask (N + M,) of the returns."""
         is_hit = torch.zeros(self.n_beams, dtype=torch.bool, device=self.points.device)
         is_hit[: self.points.shape[0]] = True
         return torch.cat([self.points, self.no_return]), is_hit
 
     def select(self, keep: Tensor) -> Scan:
-        """The scan with only the beams (N + M,) marked in `keep`, in the order of `ends`."""
+        """The scan with only the beams that `keep` (N + M,) marks, in the order of `ends`."""
         n = self.points.shape[0]
         return replace(self, points=self.points[keep[:n]], no_return=self.no_return[keep[n:]])
 
@@ -118,7 +118,7 @@ class Scan:
         return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return))
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
-        """A copy of its own: arrays that scans are read into may be used again for the next one."""
+        """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""
 
         def copy(x: Tensor) -> Tensor:
             return x.detach().to(device or x.device, copy=True)

@@ -1,4 +1,4 @@
-"""Files are never half-written, and never believed before they are checked."""
+"""Atomic writing, and checks of tensor files that are damaged, foreign or hostile."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,12 +15,23 @@ from hypothesis import strategies as st
 from safetensors.torch import save as save_tensors
 
 from gmmtorch.errors import DataError, GmmTorchError, MissingDataError
-from gmmtorch.files import pack_tensors, read_tensors, require, write_atomically, write_bytes, write_json
+from gmmtorch.files import (
+    joined_tensors,
+    narrowest,
+    pack_tensors,
+    read_tensors,
+    require,
+    require_counts,
+    split_tensors,
+    write_atomically,
+    write_bytes,
+    write_json,
+)
 
 KIND, VERSION = "gmmtorch.test", 3
 
 
-def sound_file() -> bytes:
+def valid_file() -> bytes:
     return pack_tensors({"x": torch.arange(4.0), "n": torch.tensor([1, 2])}, KIND, VERSION, note="ä", n=7)
 
 
@@ -28,8 +40,17 @@ def raw_file(header: object, body: bytes = b"") -> bytes:
     return len(text).to_bytes(8, "little") + text + body
 
 
-def metadata(**changes: object) -> dict:
-    return {"__metadata__": {"format": KIND, "version": str(VERSION), "facts": "{}", **changes}}
+def with_entry(value: str) -> dict[str, Any]:
+    """A safetensors header whose gmmtorch entry is `value`."""
+    return {"__metadata__": {"gmmtorch": value}}
+
+
+def with_facts(facts: object) -> dict[str, Any]:
+    return with_entry(json.dumps({"format": KIND, "version": VERSION, "facts": facts}))
+
+
+def with_tensor(dtype: str, shape: list[int], offsets: list[int]) -> dict[str, Any]:
+    return {**with_facts({}), "x": {"dtype": dtype, "shape": shape, "data_offsets": offsets}}
 
 
 def write(folder: Path, data: bytes) -> Path:
@@ -41,21 +62,19 @@ def write(folder: Path, data: bytes) -> Path:
 # -- writing --------------------------------------------------------------------------------------
 
 
-def test_bytes_are_written_and_folders_made(tmp_path):
-    path = write_bytes(tmp_path / "new" / "deeper" / "a.bin", b"content")
-    assert path.read_bytes() == b"content"
+def test_write_bytes_creates_folders_and_replaces_files(tmp_path):
+    path = write_bytes(tmp_path / "new" / "deeper" / "a.bin", b"a longer first content")
+    write_bytes(path, b"second")
+    assert path.read_bytes() == b"second"
     assert [p.name for p in path.parent.iterdir()] == ["a.bin"]
 
 
-def test_writing_again_replaces(tmp_path):
-    write_bytes(tmp_path / "a.bin", b"a longer first content")
-    write_bytes(tmp_path / "a.bin", b"second")
-    assert (tmp_path / "a.bin").read_bytes() == b"second"
-
-
 @pytest.mark.parametrize("error", [OSError("disk full"), ValueError("bad"), KeyboardInterrupt()])
-def test_failing_midway_leaves_the_old_file_and_no_other(tmp_path, error):
-    path = write_bytes(tmp_path / "a.bin", b"old")
+@pytest.mark.parametrize("exists", [True, False])
+def test_failed_write_keeps_the_old_file_and_leaves_no_other(tmp_path, error, exists):
+    path = tmp_path / "a.bin"
+    if exists:
+        write_bytes(path, b"old")
 
     def fail(temporary: Path) -> None:
         temporary.write_bytes(b"half")
@@ -63,47 +82,36 @@ def test_failing_midway_leaves_the_old_file_and_no_other(tmp_path, error):
 
     with pytest.raises(type(error)):
         write_atomically(path, fail)
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == ([("a.bin", b"old")] if exists else [])
 
 
-def test_failing_midway_leaves_no_new_file(tmp_path):
-    def fail(temporary: Path) -> None:
-        temporary.write_bytes(b"half")
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(tmp_path / "a.bin", fail)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_in_the_way_leaves_no_temporary(tmp_path):
+def test_write_onto_a_folder_leaves_no_temporary_file(tmp_path):
     (tmp_path / "a.bin").mkdir()
-    with pytest.raises(OSError):  # noqa: PT011 - which one depends on the system
+    with pytest.raises(OSError):  # noqa: PT011 - the error depends on the system
         write_bytes(tmp_path / "a.bin", b"x")
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
 
 
-def test_the_old_file_is_whole_until_the_new_one_is(tmp_path):
+def test_old_file_is_complete_until_the_new_one_is(tmp_path):
     path = write_bytes(tmp_path / "a.txt", b"old")
     seen = []
 
-    def slow(temporary: Path) -> None:
+    def observe(temporary: Path) -> None:
         temporary.write_bytes(b"new")
         seen.append((path.read_bytes(), temporary.suffix, temporary.parent))
 
-    write_atomically(path, slow)
+    write_atomically(path, observe)
     assert seen == [(b"old", ".txt", tmp_path)]
     assert path.read_bytes() == b"new"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file modes")
-def test_others_can_read_what_was_written(tmp_path):
+def test_written_file_is_readable_by_others(tmp_path):
     path = write_bytes(tmp_path / "a.bin", b"x")
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
-def test_json_comes_back_and_nan_is_refused(tmp_path):
+def test_write_json_round_trips_and_rejects_nan(tmp_path):
     value = {"auc": 0.5, "rows": [1, None, "ä"]}
     assert json.loads(write_json(tmp_path / "r.json", value).read_text()) == value
     with pytest.raises(ValueError, match="JSON compliant"):
@@ -111,64 +119,61 @@ def test_json_comes_back_and_nan_is_refused(tmp_path):
     assert json.loads((tmp_path / "r.json").read_text()) == value
 
 
-def test_the_same_content_is_the_same_bytes():
-    assert len({sound_file() for _ in range(10)}) == 1
+def test_equal_content_gives_equal_bytes():
+    assert len({valid_file() for _ in range(10)}) == 1
 
 
 # -- reading --------------------------------------------------------------------------------------
 
 
-def test_tensors_and_facts_come_back(tmp_path):
-    tensors, facts = read_tensors(write(tmp_path, sound_file()), KIND, VERSION)
+def test_tensors_and_facts_round_trip(tmp_path):
+    tensors, facts = read_tensors(write(tmp_path, valid_file()), KIND, VERSION)
     assert torch.equal(tensors["x"], torch.arange(4.0))
     assert tensors["n"].tolist() == [1, 2]
     assert facts == {"note": "ä", "n": 7}
 
 
-def test_tensors_that_are_views_come_back(tmp_path):
+def test_tensor_views_round_trip(tmp_path):
     value = torch.arange(12.0).reshape(3, 4).T[1:]
     tensors, _ = read_tensors(write(tmp_path, pack_tensors({"x": value}, KIND, VERSION)), KIND, VERSION)
     assert torch.equal(tensors["x"], value)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_large_facts_round_trip(tmp_path):
+    bounds = [-1.2345678901234567 + i for i in range(100_000)]  # a fit of many iterations with tol=0
+    path = write(tmp_path, pack_tensors({}, KIND, VERSION, bounds=bounds))
+    assert read_tensors(path, KIND, VERSION)[1] == {"bounds": bounds}
+
+
+def test_missing_file_and_folder_are_named(tmp_path):
     with pytest.raises(MissingDataError, match=r"nowhere\.safetensors does not exist.*gmmtorch\.test") as e:
         read_tensors(tmp_path / "nowhere.safetensors", KIND, VERSION)
     assert isinstance(e.value, FileNotFoundError)
-
-
-def test_a_folder_is_not_a_file(tmp_path):
     with pytest.raises(MissingDataError, match="does not exist"):
         read_tensors(tmp_path, KIND, VERSION)
 
 
-def test_a_file_cut_at_any_length_is_refused(tmp_path):
-    data = sound_file()
-    for length in range(len(data)):
-        path = write(tmp_path, data[:length])
+def test_truncated_or_extended_file_is_rejected(tmp_path):
+    data = valid_file()
+    for damaged in (*(data[:length] for length in range(len(data))), data + b"\0"):
         with pytest.raises(DataError, match=r"file\.safetensors"):
-            read_tensors(path, KIND, VERSION)
+            read_tensors(write(tmp_path, damaged), KIND, VERSION)
 
 
-def test_trailing_bytes_are_refused(tmp_path):
-    with pytest.raises(DataError):
-        read_tensors(write(tmp_path, sound_file() + b"\0"), KIND, VERSION)
-
-
-def test_another_kind_names_both(tmp_path):
+def test_another_kind_names_both_kinds(tmp_path):
     path = write(tmp_path, pack_tensors({}, "gmmtorch.other", VERSION))
     with pytest.raises(DataError, match=r"gmmtorch\.other.*gmmtorch\.test"):
         read_tensors(path, KIND, VERSION)
 
 
 @pytest.mark.parametrize("version", [2, 4])
-def test_another_version_names_both(tmp_path, version):
+def test_another_version_names_both_versions(tmp_path, version):
     path = write(tmp_path, pack_tensors({}, KIND, version))
     with pytest.raises(DataError, match=rf"version {version} .*version 3"):
         read_tensors(path, KIND, VERSION)
 
 
-def test_someone_elses_safetensors_is_foreign(tmp_path):
+def test_foreign_safetensors_file_is_rejected(tmp_path):
     path = write(tmp_path, save_tensors({"x": torch.ones(2)}))
     with pytest.raises(DataError, match=r"expected 'gmmtorch\.test'"):
         read_tensors(path, KIND, VERSION)
@@ -188,62 +193,49 @@ def test_someone_elses_safetensors_is_foreign(tmp_path):
         raw_file({"__metadata__": None}),
         raw_file(b"[" * 200_000),
         raw_file(b"\xff\xfe\xfa"),
-        raw_file(metadata(facts=7)),
-        raw_file(metadata(facts="{")),
-        raw_file({**metadata(), "x": {"dtype": "F32", "shape": [1 << 62, 4], "data_offsets": [0, 0]}}),
-        raw_file({**metadata(), "x": {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}}, b"\0" * 4),
-        raw_file({**metadata(), "x": {"dtype": "F32", "shape": [-1], "data_offsets": [0, 4]}}, b"\0" * 4),
-        raw_file({**metadata(), "x": {"dtype": "F99", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4),
-        raw_file({**metadata(), "x": {"dtype": "F32", "shape": [1], "data_offsets": [4, 8]}}, b"\0" * 8),
+        raw_file(with_entry("{")),
+        raw_file(with_entry("[]")),
+        raw_file(with_entry("[" * 100_000)),
+        *(raw_file(with_facts(facts)) for facts in ([], 7, None, "text", True)),
+        raw_file(with_tensor("F32", [1 << 62, 4], [0, 0])),
+        raw_file(with_tensor("F32", [2], [0, 8]), b"\0" * 4),
+        raw_file(with_tensor("F32", [-1], [0, 4]), b"\0" * 4),
+        raw_file(with_tensor("F99", [1], [0, 4]), b"\0" * 4),
+        raw_file(with_tensor("F32", [1], [4, 8]), b"\0" * 8),
     ],
 )
-def test_foreign_and_hostile_files_are_refused(tmp_path, data):
+def test_foreign_and_hostile_files_are_rejected(tmp_path, data):
     with pytest.raises(DataError, match=r"file\.safetensors"):
         read_tensors(write(tmp_path, data), KIND, VERSION)
 
 
-def test_facts_nested_too_deeply_are_refused(tmp_path):
-    path = write(tmp_path, raw_file(metadata(facts="[" * 100_000)))
-    with pytest.raises(DataError, match=r"file\.safetensors"):
-        read_tensors(path, KIND, VERSION)
-
-
-@pytest.mark.parametrize("dtype", ["F4", "F6_E2M3", "F6_E3M2", "F8_E8M0"])
-def test_number_formats_that_torch_lacks_are_refused(tmp_path, dtype):
-    # Formats that the safetensors specification has and this package never writes.
-    header = {**metadata(), "x": {"dtype": dtype, "shape": [8], "data_offsets": [0, 8]}}
-    bits = {"F4": 4, "F6_E2M3": 6, "F6_E3M2": 6, "F8_E8M0": 8}[dtype]
-    header["x"]["data_offsets"] = [0, bits]
+@pytest.mark.parametrize(("dtype", "bytes_of_eight"), [("F4", 4), ("F6_E2M3", 6), ("F8_E8M0", 8)])
+def test_dtypes_that_the_package_never_writes_are_rejected(tmp_path, dtype, bytes_of_eight):
+    data = raw_file(with_tensor(dtype, [8], [0, bytes_of_eight]), b"\0" * bytes_of_eight)
     try:
-        tensors, _ = read_tensors(write(tmp_path, raw_file(header, b"\0" * bits)), KIND, VERSION)
+        tensors, _ = read_tensors(write(tmp_path, data), KIND, VERSION)
     except DataError:
         return
     with pytest.raises(DataError):
         require(tensors, "x", (8,), torch.float32, "file.safetensors")
 
 
-def test_a_file_larger_than_allowed_is_not_read(tmp_path, monkeypatch):
+def test_file_above_the_size_limit_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setattr("gmmtorch.files.MAX_FILE_BYTES", 10)
-    with pytest.raises(DataError, match="more than the 10"):
-        read_tensors(write(tmp_path, sound_file()), KIND, VERSION)
-
-
-def test_facts_of_any_size_come_back(tmp_path):
-    bounds = [-1.2345678901234567 + i for i in range(100_000)]  # a fit of many iterations with tol=0
-    path = write(tmp_path, pack_tensors({}, KIND, VERSION, bounds=bounds))
-    assert read_tensors(path, KIND, VERSION)[1] == {"bounds": bounds}
+    with pytest.raises(DataError, match="more than the limit of 10"):
+        read_tensors(write(tmp_path, valid_file()), KIND, VERSION)
 
 
 @given(data=st.binary(max_size=300))
-def test_random_bytes_raise_nothing_but_our_own_errors(tmp_path, data):
+def test_random_bytes_raise_only_package_errors(tmp_path, data):
     with pytest.raises(GmmTorchError):
         read_tensors(write(tmp_path, data), KIND, VERSION)
 
 
 @settings(max_examples=200)
 @given(place=st.integers(0, 10**6), value=st.integers(0, 255), second=st.integers(0, 10**6))
-def test_a_damaged_file_is_refused_or_read_never_worse(tmp_path, place, value, second):
-    data = bytearray(sound_file())
+def test_damaged_file_is_rejected_or_gives_tensors(tmp_path, place, value, second):
+    data = bytearray(valid_file())
     data[place % len(data)] = value
     data[second % len(data)] ^= 1 << (value % 8)
     try:
@@ -254,26 +246,10 @@ def test_a_damaged_file_is_refused_or_read_never_worse(tmp_path, place, value, s
     assert all(isinstance(t, torch.Tensor) for t in tensors.values())
 
 
-@given(facts=st.text(max_size=30))
-def test_facts_are_a_table_or_refused(tmp_path, facts):
-    path = write(tmp_path, raw_file(metadata(facts=facts)))
-    try:
-        found = read_tensors(path, KIND, VERSION)[1]
-    except GmmTorchError:
-        return
-    assert isinstance(found, dict)
-
-
-@pytest.mark.parametrize("facts", ["[]", "7", "null", '"text"', "true"])
-def test_facts_that_are_no_table_are_refused(tmp_path, facts):
-    with pytest.raises(DataError):
-        read_tensors(write(tmp_path, raw_file(metadata(facts=facts))), KIND, VERSION)
-
-
 # -- checking -------------------------------------------------------------------------------------
 
 
-def test_a_tensor_that_fits_is_returned():
+def test_require_returns_a_matching_tensor():
     x = torch.zeros(3, 2)
     assert require({"x": x}, "x", (None, 2), torch.float32, "f") is x
 
@@ -291,7 +267,38 @@ def test_a_tensor_that_fits_is_returned():
         (torch.full((3, 2), float("inf")), "NaN or infinite"),
     ],
 )
-def test_a_tensor_that_does_not_fit_is_named(tensor, message):
+def test_require_names_a_tensor_that_does_not_match(tensor, message):
     tensors = {} if tensor is None else {"x": tensor}
     with pytest.raises(DataError, match=f"map.bin.*{message}"):
         require(tensors, "x", (3, 2), torch.float32, "map.bin")
+
+
+@pytest.mark.parametrize(
+    ("largest", "dtype"),
+    [
+        (0, torch.uint8),
+        (255, torch.uint8),
+        (256, torch.int16),
+        (1 << 15, torch.int32),
+        (1 << 31, torch.int64),
+    ],
+)
+def test_counts_round_trip_in_the_narrowest_dtype(largest, dtype):
+    stored = narrowest(torch.tensor([0, largest]))
+    assert stored.dtype == dtype
+    assert require_counts({"n": stored}, "n", (2,), "f").tolist() == [0, largest]
+    with pytest.raises(DataError, match="negative"):
+        require_counts({"n": torch.tensor([-1, 2])}, "n", (2,), "f")
+
+
+def test_joined_tensors_inverts_split_tensors():
+    value = {"a": [torch.ones(2), 3], "b": {"c": torch.zeros(1), "d": None}}
+    tree, tensors = split_tensors(value)
+    json.dumps(tree)
+    joined = joined_tensors(tree, tensors)
+    assert joined["b"]["d"] is None
+    assert joined["a"][1] == 3
+    assert torch.equal(joined["a"][0], value["a"][0])
+    assert torch.equal(joined["b"]["c"], value["b"]["c"])
+    with pytest.raises(KeyError):
+        joined_tensors(tree, {})

@@ -1,4 +1,4 @@
-"""Small symmetric matrices: packing, and a Cholesky that mends only what needs mending."""
+"""Packing, Cholesky with jitter, whitening and sorting, against NumPy, LAPACK and plain Python."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def random_spd(k: int, dim: int, generator: torch.Generator) -> Tensor:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_packed_entries_are_the_upper_triangle_by_rows(dim, generator):
+def test_pack_symmetric_lists_the_upper_triangle_by_rows(dim, generator):
     matrices = random_spd(5, dim, generator)
     packed = pack_symmetric(matrices)
     assert packed.shape == (5, dim * (dim + 1) // 2)
@@ -40,42 +40,42 @@ def test_packed_entries_are_the_upper_triangle_by_rows(dim, generator):
 
 
 @given(dim=st.integers(1, 4), k=st.integers(0, 4), seed=st.integers(0, 1000))
-def test_unpacking_undoes_packing(dim, k, seed):
+def test_unpack_symmetric_inverts_pack_symmetric(dim, k, seed):
     matrices = random_spd(k, dim, torch.Generator().manual_seed(seed))
     matrices = (matrices + matrices.mT) / 2
     assert torch.equal(unpack_symmetric(pack_symmetric(matrices), dim), matrices)
 
 
-def test_packing_takes_any_leading_shape(generator):
+def test_pack_symmetric_accepts_any_leading_shape(generator):
     matrices = random_spd(6, 3, generator).reshape(2, 3, 3, 3)
     assert torch.equal(unpack_symmetric(pack_symmetric(matrices), 3).tril(), matrices.mT.tril())
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_factors_of_sound_matrices_are_lapacks(dim, generator):
+def test_safe_cholesky_of_definite_matrices_equals_lapack(dim, generator):
     matrices = random_spd(20, dim, generator)
     expected = np.linalg.cholesky(matrices.numpy())
     np.testing.assert_allclose(safe_cholesky(matrices).numpy(), expected, rtol=1e-12, atol=1e-14)
 
 
-def test_jitter_goes_only_where_it_is_needed(generator):
-    sound = random_spd(3, 3, generator)
-    flat = torch.diag(torch.tensor([1.0, 1.0, -1e-13], dtype=torch.float64))  # rounding below zero
-    factors = safe_cholesky(torch.cat([sound[:2], flat[None], sound[2:]]))
-    assert torch.equal(factors[[0, 1, 3]], torch.linalg.cholesky(sound))
+def test_safe_cholesky_adds_jitter_only_to_matrices_that_fail(generator):
+    definite = random_spd(3, 3, generator)
+    flat = torch.diag(torch.tensor([1.0, 1.0, -1e-13], dtype=torch.float64))  # negative by rounding
+    factors = safe_cholesky(torch.cat([definite[:2], flat[None], definite[2:]]))
+    assert torch.equal(factors[[0, 1, 3]], torch.linalg.cholesky(definite))
     change = factors[2] @ factors[2].T - flat
     assert float(change.diagonal().min()) > 0
-    assert float(change.abs().max()) < 2e-12  # the first jitter suffices; no larger one was added
+    assert float(change.abs().max()) < 2e-12  # the smallest jitter suffices
 
 
-def test_jitter_grows_no_further_than_needed():
-    slightly = torch.diag(torch.tensor([1.0, 1.0, -1e-9], dtype=torch.float64))
-    factor = safe_cholesky(slightly[None])[0]
-    added = float((factor @ factor.T - slightly).diagonal().max())
+def test_safe_cholesky_uses_the_smallest_jitter_that_suffices():
+    slightly_indefinite = torch.diag(torch.tensor([1.0, 1.0, -1e-9], dtype=torch.float64))
+    factor = safe_cholesky(slightly_indefinite[None])[0]
+    added = float((factor @ factor.T - slightly_indefinite).diagonal().max())
     assert added == pytest.approx(1e-8 * (2 - 1e-9) / 3, rel=1e-6)
 
 
-def test_jitter_follows_the_scale_of_the_matrix():
+def test_safe_cholesky_scales_jitter_with_the_matrix():
     small = 1e-6 * torch.diag(torch.tensor([1.0, -1e-13], dtype=torch.float64))
     factor = safe_cholesky(small[None])[0]
     assert float((factor @ factor.T - small).abs().max()) < 1e-17
@@ -84,7 +84,7 @@ def test_jitter_follows_the_scale_of_the_matrix():
 @pytest.mark.parametrize(
     "bad", [[[1.0, 0.0], [0.0, -0.5]], [[1.0, 2.0], [2.0, 1.0]], [[0.0, 0.0], [0.0, 0.0]]]
 )
-def test_an_indefinite_matrix_is_named_with_a_remedy(bad):
+def test_safe_cholesky_names_an_indefinite_matrix_and_the_remedy(bad):
     matrices = torch.stack([torch.eye(2), torch.tensor(bad)]).double()
     with pytest.raises(NumericalError, match=r"precisions_init\[1\].*reg_covar") as caught:
         safe_cholesky(matrices, "precisions_init")
@@ -93,25 +93,25 @@ def test_an_indefinite_matrix_is_named_with_a_remedy(bad):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("place", [(0, 0), (1, 0)])
-def test_entries_that_are_not_finite_are_named(value, place):
+def test_safe_cholesky_names_a_matrix_with_nan_or_infinite_entries(value, place):
     matrices = torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
     matrices[(2, *place)] = value
-    with pytest.raises(NumericalError, match=r"covariances\[2\] holds NaN or infinite"):
+    with pytest.raises(NumericalError, match=r"covariances\[2\] has NaN or infinite"):
         safe_cholesky(matrices)
 
 
-def test_no_matrices_have_no_factors():
+def test_safe_cholesky_accepts_an_empty_batch():
     assert safe_cholesky(torch.empty(0, 3, 3, dtype=torch.float64)).shape == (0, 3, 3)
 
 
-def test_the_input_is_left_as_it_was():
+def test_safe_cholesky_does_not_modify_its_input():
     matrices = torch.diag(torch.tensor([1.0, -1e-13], dtype=torch.float64))[None]
     before = matrices.clone()
     safe_cholesky(matrices)
     assert torch.equal(matrices, before)
 
 
-def test_inverse_factors_whiten(generator):
+def test_inverse_factor_gives_the_mahalanobis_distance(generator):
     matrices = random_spd(4, 3, generator)
     x = torch.randn(4, 3, dtype=torch.float64, generator=generator)
     whiten = inverse_factor(safe_cholesky(matrices))
@@ -123,21 +123,21 @@ def test_inverse_factors_whiten(generator):
 # -- sorting ----------------------------------------------------------------------------------------
 
 INTEGERS = st.one_of(
-    st.lists(st.integers(0, 5), max_size=40),  # many equal
-    st.lists(st.integers(0, (1 << 16) + 1), max_size=40),  # around where keys are made shorter
+    st.lists(st.integers(0, 5), max_size=40),  # many ties
+    st.lists(st.integers(0, (1 << 16) + 1), max_size=40),  # around the limit of the radix sort
     st.lists(st.integers(-(1 << 62), 1 << 62), max_size=40),
 )
 
 
 @given(keys=INTEGERS)
-def test_the_order_is_sorted_and_equal_keys_keep_theirs(keys):
+def test_argsort_is_a_stable_sort(keys):
     order = argsort(torch.tensor(keys, dtype=torch.int64))
     assert order.dtype == torch.int64
     assert order.tolist() == sorted(range(len(keys)), key=keys.__getitem__)
 
 
 @pytest.mark.parametrize("top", [10, (1 << 16) - 1, 1 << 16, 1 << 40])
-def test_many_keys_are_sorted_as_numpy_sorts_them(top):
+def test_argsort_equals_numpy_on_many_keys(top):
     keys = torch.randint(0, top + 1, (50_000,), generator=torch.Generator().manual_seed(0))
     keys[7] = top
     before = keys.clone()
@@ -145,7 +145,7 @@ def test_many_keys_are_sorted_as_numpy_sorts_them(top):
     assert torch.equal(keys, before)
 
 
-def test_numbers_and_strided_keys_are_sorted():
+def test_argsort_accepts_strided_floats():
     keys = torch.tensor([[3.5, 0.0], [-1.0, 0.0], [3.5, 0.0], [-torch.inf, 0.0]], dtype=torch.float64)
     assert argsort(keys[:, 0]).tolist() == [3, 1, 0, 2]
 
@@ -157,9 +157,9 @@ def test_numbers_and_strided_keys_are_sorted():
     share=st.floats(0, 1),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-def test_the_largest_are_those_that_sorting_puts_last(seed, n, m, share, dtype):
+def test_largest_indices_equals_a_full_sort(seed, n, m, share, dtype):
     generator = torch.Generator().manual_seed(seed)
-    scores = torch.randn(n, m, generator=generator, dtype=dtype).round(decimals=1)  # some are equal
+    scores = torch.randn(n, m, generator=generator, dtype=dtype).round(decimals=1)  # with ties
     scores[torch.rand(n, m, generator=generator) < share / 2] = -torch.inf
     k = 1 + int(share * (m - 1))
     index = largest_indices(scores, k)
@@ -171,7 +171,7 @@ def test_the_largest_are_those_that_sorting_puts_last(seed, n, m, share, dtype):
 
 
 @given(keys=INTEGERS)
-def test_distinct_keys_are_counted_and_numbered_in_order(keys):
+def test_count_distinct_and_dense_ranks_equal_a_python_dict(keys):
     tensor = torch.tensor(keys, dtype=torch.int64)
     rank = {key: i for i, key in enumerate(sorted(Counter(keys)))}
     assert count_distinct(tensor) == len(rank)

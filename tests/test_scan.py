@@ -1,4 +1,4 @@
-"""Scan: what it takes, what it refuses, and how beams are selected and moved."""
+"""Scan: accepted and rejected input, selection of beams, and rigid motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def make(points=POINTS, origin=(0.0, 0.0, 0.5), no_return=((0.0, 0.0, 3.0),)) ->
 
 
 @pytest.mark.parametrize("convert", [list, np.array, torch.tensor, lambda x: tuple(map(tuple, x))])
-def test_takes_lists_arrays_and_tensors(convert):
+def test_scan_accepts_lists_arrays_and_tensors(convert):
     scan = Scan(convert(POINTS), np.zeros(3))
     assert scan.points.shape == (2, 3)
     assert scan.no_return.shape == (0, 3)
@@ -32,19 +32,19 @@ def test_takes_lists_arrays_and_tensors(convert):
     assert scan.n_beams == 2
 
 
-def test_integers_become_float64():
+def test_scan_converts_integers_to_float64():
     scan = Scan([[1, 2], [3, 4]], [0, 0])
     assert scan.points.dtype == torch.float64
     assert scan.origin.dtype == torch.float64
 
 
-def test_no_return_follows_the_dtype_of_the_points():
+def test_no_return_has_the_dtype_of_the_points():
     scan = Scan(torch.zeros(1, 2), torch.zeros(2), torch.ones(3, 2, dtype=torch.float64))
     assert scan.no_return.dtype == torch.float32
 
 
 @pytest.mark.parametrize("empty", [[], np.empty((0, 3)), torch.empty(0, 3)])
-def test_a_scan_may_be_empty(empty):
+def test_scan_may_be_empty(empty):
     scan = Scan(empty, [0.0, 0.0, 0.0])
     ends, is_hit = scan.ends()
     assert scan.n_beams == 0
@@ -52,7 +52,7 @@ def test_a_scan_may_be_empty(empty):
     assert is_hit.shape == (0,)
 
 
-def test_ends_puts_returns_first():
+def test_ends_lists_returns_first():
     ends, is_hit = make().ends()
     assert ends.tolist() == [*POINTS, [0.0, 0.0, 3.0]]
     assert is_hit.tolist() == [True, True, False]
@@ -74,7 +74,7 @@ def test_transformed_moves_points_origin_and_no_returns():
     assert scan.no_return.tolist() == [[10.0, 0.0, 4.0]]
 
 
-def test_transformed_there_and_back_is_the_same_scan():
+def test_transformed_by_the_inverse_restores_the_scan():
     angle = 0.3
     pose = torch.eye(3, dtype=torch.float64)
     pose[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
@@ -85,9 +85,15 @@ def test_transformed_there_and_back_is_the_same_scan():
     torch.testing.assert_close(back.origin, scan.origin)
 
 
-def test_to_keeps_everything():
-    scan = make().to("cpu")
-    assert scan.n_beams == 3
+def test_to_keeps_all_beams():
+    assert make().to("cpu").n_beams == 3
+
+
+def test_copied_shares_no_memory():
+    points = torch.zeros(2, 3, dtype=torch.float64)
+    copy = Scan(points, torch.zeros(3)).copied()
+    points += 1
+    assert copy.points.abs().max() == 0
 
 
 @pytest.mark.parametrize(
@@ -104,13 +110,13 @@ def test_to_keeps_everything():
         ([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0], [[0.0, 0.0, math.inf]], r"no_return\[0\]"),
     ],
 )
-def test_refuses_what_does_not_fit_and_names_it(points, origin, no_return, named):
+def test_scan_names_the_invalid_argument(points, origin, no_return, named):
     with pytest.raises(InvalidArgumentError, match=named) as caught:
         Scan(points, origin, no_return)
     assert isinstance(caught.value, GmmTorchError)
 
 
-def test_far_float32_coordinates_warn_and_float64_do_not():
+def test_scan_warns_about_far_float32_coordinates_only():
     far = torch.full((1, 3), 5e4)
     with pytest.warns(UserWarning, match="float64"):
         Scan(far, torch.zeros(3))
