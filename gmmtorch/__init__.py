@@ -1,17 +1,19 @@
-"""Gaussian mixture maps from range data. See the README for a tour.
+"""Gaussian mixture maps from range data. The README gives a tour.
 
-Names are imported when they are first used, so that `import gmmtorch` stays light.
+Names are imported on first use, so that `import gmmtorch` is fast.
 """
 
 from __future__ import annotations
 
-import importlib
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from gmmtorch import baselines as baselines
     from gmmtorch import datasets as datasets
+    from gmmtorch import mixture as mixture
     from gmmtorch import sharing as sharing
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
@@ -34,9 +36,7 @@ if TYPE_CHECKING:
         VariationalGaussianMixture as VariationalGaussianMixture,
     )
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture as GaussianMixture
-    from gmmtorch.mixture.reduction.merge import merge as merge
-    from gmmtorch.mixture.reduction.merge import simplify as simplify
-    from gmmtorch.mixture.reduction.pruning import prune as prune
+    from gmmtorch.mixture.streaming.stream_fit import fit_stream as fit_stream
     from gmmtorch.occupancy.evidence import Evidence as Evidence
     from gmmtorch.occupancy.grid import VoxelGrid as VoxelGrid
     from gmmtorch.scan import Scan as Scan
@@ -46,61 +46,29 @@ try:
 except PackageNotFoundError:  # a bare checkout on the path
     __version__ = "0+unknown"
 
-_HOMES = {
-    "DeconvolvedGaussianMixture": "gmmtorch.mixture.estimators.deconvolved",
-    "Evidence": "gmmtorch.occupancy.evidence",
-    "GaussianMap": "gmmtorch.mapping.gaussian_map",
-    "GaussianMixture": "gmmtorch.mixture.gaussian_mixture",
-    "GmmTorchError": "gmmtorch.errors",
-    "HierarchicalGaussianMixture": "gmmtorch.mixture.estimators.trees.hierarchical",
-    "IncrementalRule": "gmmtorch.mapping.learning.rules",
-    "NoveltyRule": "gmmtorch.mapping.learning.rules",
-    "OccupancyGrid": "gmmtorch.baselines.occupancy_grid",
-    "RiemannianGaussianMixture": "gmmtorch.mixture.estimators.riemannian",
-    "Scan": "gmmtorch.scan",
-    "SlicedWassersteinGaussianMixture": "gmmtorch.mixture.estimators.sliced_wasserstein",
-    "VariationalGaussianMixture": "gmmtorch.mixture.estimators.variational",
-    "VoxelGrid": "gmmtorch.occupancy.grid",
-    "WindowedRule": "gmmtorch.mapping.learning.rules",
-    "fit_depth_image": "gmmtorch.mixture.depth_image",
-    "merge": "gmmtorch.mixture.reduction.merge",
-    "prune": "gmmtorch.mixture.reduction.pruning",
-    "simplify": "gmmtorch.mixture.reduction.merge",
-}
-
-__all__ = [
-    "DeconvolvedGaussianMixture",
-    "Evidence",
-    "GaussianMap",
-    "GaussianMixture",
-    "GmmTorchError",
-    "HierarchicalGaussianMixture",
-    "IncrementalRule",
-    "NoveltyRule",
-    "OccupancyGrid",
-    "RiemannianGaussianMixture",
-    "Scan",
-    "SlicedWassersteinGaussianMixture",
-    "VariationalGaussianMixture",
-    "VoxelGrid",
-    "WindowedRule",
-    "baselines",
-    "datasets",
-    "fit_depth_image",
-    "merge",
-    "prune",
-    "sharing",
-    "simplify",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    if name in ("baselines", "datasets", "sharing"):
-        return importlib.import_module(f"gmmtorch.{name}")
-    raise AttributeError(f"module 'gmmtorch' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "DeconvolvedGaussianMixture": "mixture.estimators.deconvolved",
+        "Evidence": "occupancy.evidence",
+        "GaussianMap": "mapping.gaussian_map",
+        "GaussianMixture": "mixture.gaussian_mixture",
+        "GmmTorchError": "errors",
+        "HierarchicalGaussianMixture": "mixture.estimators.trees.hierarchical",
+        "IncrementalRule": "mapping.learning.rules",
+        "NoveltyRule": "mapping.learning.rules",
+        "OccupancyGrid": "baselines.occupancy_grid",
+        "RiemannianGaussianMixture": "mixture.estimators.riemannian",
+        "Scan": "scan",
+        "SlicedWassersteinGaussianMixture": "mixture.estimators.sliced_wasserstein",
+        "VariationalGaussianMixture": "mixture.estimators.variational",
+        "VoxelGrid": "occupancy.grid",
+        "WindowedRule": "mapping.learning.rules",
+        "baselines": "",
+        "datasets": "",
+        "fit_depth_image": "mixture.depth_image",
+        "fit_stream": "mixture.streaming.stream_fit",
+        "mixture": "",
+        "sharing": "",
+    },
+)

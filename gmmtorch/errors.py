@@ -51,22 +51,24 @@ def check_whole(name: str, value: object, least: int) -> int:
     return int(value)
 
 
-def check_number(name: str, value: object, most: float = math.inf, above: bool = False) -> None:
-    """Raise `InvalidArgumentError` unless `value` is a finite number from 0, or `above` it, to `most`."""
+def check_number(name: str, value: object, largest: float = math.inf, above: bool = False) -> None:
+    """Raise `InvalidArgumentError` unless `value` is a finite number from 0 (exclusive if `above`) to
+    `largest`.
+    """
     number = float(value) if isinstance(value, numbers.Real) else math.nan
-    if not (0 <= number <= most and number < math.inf) or (above and number == 0):
-        limit = "above 0" if above else "of at least 0" if most == math.inf else f"from 0 to {most:g}"
+    if not (0 <= number <= largest and number < math.inf) or (above and number == 0):
+        limit = "above 0" if above else "of at least 0" if largest == math.inf else f"from 0 to {largest:g}"
         raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
 
 
-def check_choice(name: str, value: object, known: Collection[str]) -> None:
-    """Raise `InvalidArgumentError` unless `value` is one of `known`, which the message lists."""
-    if not isinstance(value, str) or value not in known:
-        raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(known)}.")
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise `InvalidArgumentError`, which lists the choices, unless `value` is one of them."""
+    if not isinstance(value, str) or value not in choices:
+        raise InvalidArgumentError(f"{name}={value!r} is not one of {', '.join(choices)}.")
 
 
 def check_resolution(resolution: float) -> float:
-    """The side of a cell as a float; raises `InvalidArgumentError` unless it is finite and above zero."""
+    """Returns the cell size as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
     value = float(resolution)
     if not (math.isfinite(value) and value > 0):
         raise InvalidArgumentError(
@@ -76,7 +78,10 @@ def check_resolution(resolution: float) -> float:
 
 
 def check_prior(prior: float) -> float:
-    """The prior count as a float; raises `InvalidArgumentError` unless it is finite and at least zero."""
+    """Returns the prior count as a float.
+
+    Raises `InvalidArgumentError` unless it is finite and at least zero.
+    """
     value = float(prior)
     if not (math.isfinite(value) and value >= 0):
         raise InvalidArgumentError(f"prior={prior} must be a count of at least zero; the thesis uses 1.")

@@ -32,7 +32,7 @@ ROOMS = [
     "report",
     "cli",
 ]
-GROUND = ["errors", "linalg", "files", "scan", "optional_packages"]
+GROUND = ["errors", "lazy_names", "linalg", "files", "scan", "optional_packages"]
 RANK = {**dict.fromkeys(GROUND, 0), **{room: i for i, room in enumerate(ROOMS, 1)}}
 OWNERS = {"hydra": {"cli"}, "omegaconf": {"cli"}, "matplotlib": {"report"}, "tensorboard": {"report"}}
 """Heavy third parties, and the only room that may know each."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.overlap import Motions
 from gmmtorch.localization.overlap_ascent import Ascent, deviations, log_self_overlap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.merge import simplify
-from gmmtorch.mixture.validation import check_choice, check_number
 from gmmtorch.scan import ArrayLike
 
 _ALIKE = 0.2  # squared Hellinger distance up to which blurred components are one

@@ -10,9 +10,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.errors import check_number
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture, touching
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.validation import check_number
 from gmmtorch.occupancy.forms.flux.box_mass import normal_mass
 from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike

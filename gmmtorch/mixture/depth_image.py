@@ -1,11 +1,12 @@
-"""A depth image to a mixture in milliseconds: its moments are summed where the pixels lie.
+"""A mixture from a depth image in milliseconds, through moments that are summed in the image.
 
-A pixel (u, v) of depth z sees the point (u z/f, v z/f, z), u and v from the optical axis. All moments of a
-block of pixels are therefore sums of z and z² times 1, u, v and their products, which strided
-convolutions yield, without a single point being computed. Blocks that are flat together are merged, up
-to 32 × 32 pixels, so that walls become few cells and edges stay sharp; EM then runs on the cells (see
-`cells`). A block is flat if its inverse depth is linear in u and v: of points alone it cannot be
-told, as what a few pixels see lies near the plane through them and the camera, steps and all.
+A pixel (u, v) of depth z sees the point (u z/f, v z/f, z), with u and v relative to the optical axis. All
+moments of a block of pixels are therefore sums of z and z², multiplied by 1, u, v and their products.
+Strided convolutions compute these sums without computing the points. Blocks that are flat together
+are merged into cells of up to 32 × 32 pixels, so that walls become few cells and edges stay sharp. EM
+then runs on the cells (see `cells`). A block is flat if its inverse depth is linear in u and v. The
+points alone do not show this: the points of a few pixels lie close to the plane through them and the
+camera, even across a depth step.
 
 Camera frame: x right, y down, z forward, metres.
 """
@@ -18,26 +19,26 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.grouping import Rows
-from gmmtorch.mixture.em.initialization import copied, flat_pieces
+from gmmtorch.mixture.em.initialization import flat_pieces, replicated
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
-_BLOCK = 8  # pixels along the side of the smallest cell
-_LEVELS = 2  # doublings of it
-_FARTHEST = 1e15  # metres: what is beyond is no depth, and its square may be no number
-_LEAST_VARIANCE = 1e-3  # of the pixels of a cell, along u and v (pixels²)
+_BLOCK = 8  # side of the smallest cell in pixels
+_LEVELS = 2  # number of times that the side can double
+_FARTHEST = 1e15  # metres; larger values are invalid, and their squares may overflow
+_LEAST_VARIANCE = 1e-3  # added to the variance of a cell's pixels along u and v (pixels²)
 
 
 def pool_depth_image(
     depth: Tensor, intrinsics: Tensor, *, max_range: float = float("inf"), noise: float = 0.01
 ) -> Rows:
-    """Cells of a depth image (H, W), metres along the optical axis: mean features and pixel counts.
+    """Cells of a depth image (H, W), in metres along the optical axis: mean features and pixel counts.
 
-    Pixels that are not finite, not above zero, or not below `max_range` are left out. Four cells
-    become one where depth deviates from a plane by at most half of `noise` (root mean square), in
-    metres, and times z² beyond one metre, as the error of depth cameras grows. Sums of features are
-    those of the back-projected points, to float32 of what depth spans within a block.
+    Excludes pixels that are not finite, not above zero, or not below `max_range`. Four cells become one if
+    the root mean square deviation of depth from a plane is at most half of `noise` (m), times z² beyond
+    one metre, because the error of depth cameras grows with z². Sums of features are those of the
+    back-projected points, to float32 precision of the depth range within a block.
 
-    Raises `InvalidArgumentError` for another shape, or where no pixel is left.
+    Raises `InvalidArgumentError` for invalid arguments, and if no pixel remains.
     """
     _check(depth, intrinsics, max_range, noise)
     sums, inverse = _block_features(depth.detach(), intrinsics, max_range)
@@ -51,7 +52,7 @@ def pool_depth_image(
     cells = torch.cat(found, 1).T
     if cells.shape[0] == 0:
         raise InvalidArgumentError(
-            "depth holds no pixel above zero and below max_range; there is nothing to fit."
+            "depth has no pixel above zero and below max_range; there is nothing to fit."
         )
     return Rows(cells / cells[:, :1], cells[:, 0].contiguous(), are_points=False)
 
@@ -65,21 +66,21 @@ def fit_depth_image(
     noise: float = 0.01,
     max_iter: int = 4,
 ) -> GaussianMixture:
-    """A mixture of a depth image (H, W) in the camera frame; move it by `transform(T_world_camera)`.
+    """A mixture of a depth image (H, W) in the camera frame. `transform(T_world_camera)` moves it.
 
-    Flat pieces of the cells (see `pool_depth_image`), then `max_iter` iterations of EM on the cells.
-    `noise` squared is the least variance of a component (m²).
+    The start is the flat pieces of the cells (see `pool_depth_image`), followed by `max_iter` iterations
+    of EM on the cells. `noise` squared is the smallest variance of a component (m²).
 
-    Raises `InvalidArgumentError` for bad arguments, and if there are fewer cells than components.
+    Raises `InvalidArgumentError` for invalid arguments, and for fewer cells than components.
     """
     check_whole("n_components", n_components, 1)
     check_whole("max_iter", max_iter, 1)
-    with torch.inference_mode():  # a tenth of the time is book-keeping for gradients
+    with torch.inference_mode():  # gradient book-keeping would take a tenth of the time
         cells = pool_depth_image(depth, intrinsics, max_range=max_range, noise=noise)
         n_cells = cells.weight.shape[0]
         if n_cells < n_components:
             raise InvalidArgumentError(
-                f"n_components={n_components} is more than the {n_cells} cells of the image; ask for fewer."
+                f"n_components={n_components} is more than the {n_cells} cells of the image; reduce it."
             )
         share = (cells.weight / cells.weight.sum())[:, None]
         center = (cells.points * share).sum(0)
@@ -87,7 +88,7 @@ def fit_depth_image(
         centered = Rows(features, cells.weight, are_points=False)
         first, _ = flat_pieces(centered.points, cells.weight, n_components, noise**2, features)
         step = em.natural_step(features, cells.weight, noise**2)
-        found = em.run_em(step, copied(first, n_components)[0], tol=0.0, max_iter=max_iter)
+        found = em.run_em(step, replicated(first, n_components)[0], tol=0.0, max_iter=max_iter)
         weights, means, covariances = found.parameters
         means = means + center
     return GaussianMixture.from_parameters(
@@ -102,14 +103,14 @@ def fit_depth_image(
 def _check(depth: Tensor, intrinsics: Tensor, max_range: float, noise: float) -> None:
     if depth.ndim != 2 or not depth.is_floating_point() or 0 in depth.shape:
         raise InvalidArgumentError(
-            f"depth has shape {tuple(depth.shape)} and dtype {depth.dtype}; expected (H, W), floating, "
-            "metres."
+            f"depth has shape {tuple(depth.shape)} and dtype {depth.dtype}; expected a floating (H, W) image "
+            "in metres."
         )
     is_pinhole = tuple(intrinsics.shape) == (3, 3) and bool(torch.isfinite(intrinsics).all())
     if not is_pinhole or not bool((intrinsics.diagonal()[:2] > 0).all()):
         raise InvalidArgumentError(
-            f"intrinsics={intrinsics.tolist()} must be a 3×3 pinhole matrix in pixels, finite, focal lengths "
-            "above zero."
+            f"intrinsics={intrinsics.tolist()} must be a finite 3×3 pinhole matrix in pixels with focal "
+            "lengths above zero."
         )
     if not max_range > 0:
         raise InvalidArgumentError(f"max_range={max_range} must be above zero metres.")
@@ -120,12 +121,12 @@ def _check(depth: Tensor, intrinsics: Tensor, max_range: float, noise: float) ->
 def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tuple[Tensor, Tensor]:
     """Sums of features over blocks of pixels: of the points, and of (u, v, 1/z), (10, h, w) each.
 
-    u and v are pixels: from the optical axis for the points, else from the middle of the largest
-    cell. h and w are rounded up to whole largest cells.
+    u and v are in pixels: relative to the optical axis for the points, and to the middle of the largest
+    cell for (u, v, 1/z). h and w are rounded up to whole largest cells.
     """
     side = _BLOCK << _LEVELS
     padded = torch.nn.functional.pad(depth, (0, -depth.shape[1] % side, 0, -depth.shape[0] % side))
-    valid = (padded > 0) & (padded < min(max_range, _FARTHEST))  # false for NaN, too
+    valid = (padded > 0) & (padded < min(max_range, _FARTHEST))  # False for NaN
     of_one, (of_z, of_zz), (of_w, of_ww) = _block_sums(valid, padded)
     u, v = (
         (_BLOCK - 1) / 2 + _BLOCK * torch.arange(n, dtype=torch.float64, device=depth.device)
@@ -146,9 +147,9 @@ def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tupl
 def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Σ1, (Σz, Σz²) and (Σw, Σw²), w = 1/z, over the valid pixels of blocks of an image (H, W).
 
-    Each of them times 1, d, e, d², de, e², d and e being the pixels from the middle of the block:
-    (6, h, w), float64. The sums over pixels run in float32, about a value within the block (0 if none is
-    at hand), so that thin cells far off keep their digits.
+    Each is multiplied by 1, d, e, d², de, e², with d and e in pixels from the middle of the block: (6, h, w),
+    float64. Pixels are summed in float32 relative to a value of the block (0 if none is valid), so that
+    thin and distant cells keep their digits.
     """
     images = torch.empty(5, *z.shape, dtype=torch.float32, device=z.device)
     images[0] = valid
@@ -161,7 +162,7 @@ def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]
             torch.sub(blocks, middle[:, None, :, None], out=local)
         else:
             local.copy_(blocks - middle[:, None, :, None])
-        images[place].masked_fill_(missing, 0.0)  # also of NaN
+        images[place].masked_fill_(missing, 0.0)  # replaces NaN too
         torch.square(images[place], out=images[place + 1])
         middles.append(middle.double())
     d = torch.arange(_BLOCK, dtype=torch.float32, device=z.device) - (_BLOCK - 1) / 2
@@ -177,7 +178,9 @@ def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]
 
 
 def _some_value(valid: Tensor, image: Tensor) -> Tensor:
-    """The largest valid one of four values (h, w) of each block, or 0: far cheaper than that of all."""
+    """The largest valid one of four values of each block (h, w), or 0: much faster than the largest of
+    all.
+    """
     near, far = _BLOCK // 4, _BLOCK - 1 - _BLOCK // 4
     four = [
         torch.where(valid[i::_BLOCK, j::_BLOCK], image[i::_BLOCK, j::_BLOCK], 0.0)
@@ -188,20 +191,20 @@ def _some_value(valid: Tensor, image: Tensor) -> Tensor:
 
 
 def _about(sums: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
-    """Σg, Σgu, Σgv, Σgu², Σguv, Σgv² from the sums (6, h, w) of d and e: u = a + d, v = b + e."""
+    """Σg, Σgu, Σgv, Σgu², Σguv, Σgv² for u = a + d, v = b + e, from the sums (6, h, w) over d and e."""
     s, sd, se, sdd, sde, see = sums
     su, sv = a * s + sd, b * s + se
     return s, su, sv, a * (su + sd) + sdd, a * sv + b * sd + sde, b * (sv + se) + see
 
 
 def _is_flat(sums: Tensor, deviation: float) -> Tensor:
-    """Whether depth is a plane's to within a deviation (m, times z² beyond one metre), (h, w).
+    """Whether depth deviates from a plane by at most `deviation` (m, times z² beyond one metre), (h, w).
 
-    By the variance of inverse depth w given u and v, which it is linear in on a plane; it deviates by
-    that of depth over z².
+    Uses the variance of inverse depth w given u and v. On a plane w is linear in u and v, and a deviation
+    of w is that of depth divided by z².
     """
     u, v, w, uu, uv, uw, vv, vw, ww = sums[1:] / sums[0].clamp_min(1)
-    # A little wider than they are: pixels in one line have a slope, too.
+    # The added variance keeps the slope of pixels in one line finite.
     suu, suv, svv = uu - u * u + _LEAST_VARIANCE, uv - u * v, vv - v * v + _LEAST_VARIANCE
     suw, svw, sww = uw - u * w, vw - v * w, ww - w * w
     explained = (svv * suw * suw - 2 * suv * suw * svw + suu * svw * svw) / (suu * svv - suv * suv)

@@ -8,73 +8,67 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import stepwise
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import EMResult, Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, copied, flat_pieces, start
-from gmmtorch.mixture.em.surface_rule import surface_pieces
-from gmmtorch.mixture.em.truncated import Settings, learn_truncated
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.validation import (
-    Array,
-    RandomState,
-    as_generator,
-    check_choice,
-    check_enough,
-    check_number,
-    checked_parameter,
+from gmmtorch.mixture.em.initialization import (
+    INITIALIZATIONS,
+    flat_pieces,
+    initialize,
+    replicated,
+    surface_pieces,
 )
+from gmmtorch.mixture.em.truncated import Settings, fit_truncated
+from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
 
-_KMEANS_IS_CHEAP = 2_000_000  # pairs of point and component: about a second
-_MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # from which on truncated EM is faster
+_KMEANS_IS_CHEAP = 2_000_000  # pairs of point and component: k-means takes about a second
+_MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # truncated EM is faster from here on
 
 
 class GaussianMixture(MixtureEstimator):
-    """Weighted full-covariance EM (thesis 2.1.1) on any device.
+    """Weighted EM with full covariances (thesis 2.1.1), on any device.
 
-    Arrays in, arrays out; tensors in, tensors out. Parameters are kept in float64, and
-    clouds are centred while they are worked on, so points 500 km away lose no digits.
+    Arrays give arrays and tensors give tensors.
 
     Args:
-        n_components: K, at most the number of points. None: as many as the cloud asks for, which is
-            cut into flat pieces until each is as thin as the noise explains; EM starts from them
-            (see `component_count`). K is then `means_.shape[0]`.
-        noise: standard deviation of the sensor, in the points' unit (m), for n_components=None.
+        n_components: K, at most the number of points. None: determined from the cloud, which is
+            partitioned into flat pieces until each is as thin as the noise explains (see `partition`).
+            EM starts from these pieces, and K is `means_.shape[0]`.
+        noise: standard deviation of the sensor, in the unit of the points (m), for n_components=None.
         tol: EM stops when the mean log-likelihood changes by less (nats a point).
-        reg_covar: added to each variance, in the square of the points' unit (m²).
-        max_iter: EM iterations at most, in each start.
-        n_init: starts; the one with the best lower bound is kept.
+        reg_covar: added to each variance, in the squared unit of the points (m²).
+        max_iter: largest number of EM iterations of each start.
+        n_init: number of starts; the one with the best lower bound is kept.
         init_params: "kmeans" (scikit-learn's), "kmeans_restarts", "random_points", "bounding_box" or
-            "flat_pieces"; "auto": k-means for small problems, flat pieces for large ones, where they
-            are as good and take a thousandth of the time. Without n_components, EM starts from the
-            pieces that were counted.
-        weights_init, means_init, precisions_init: (K,), (K, D), (K, D, D): given parameters, in
-            place of those the initialization finds.
-        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
-        algorithm: "exact": every point meets every component. "truncated": only those near it, with a
-            momentum (see `truncated`): the way to many components; `lower_bound_` is then a few
-            thousandths of a nat below the mean log-likelihood. "auto": truncated from 48 components
-            and 4·10⁶ pairs of point and component on.
-        max_cells: EM runs on the moments of at most so many cells of points, not on the points: much
-            faster for many points to a component, and a little less likely (see `cells`; 2D and 3D).
-        dtype: of the exponentials inside exact EM, whose products always run in float64, and of the
-            whole E-step of truncated EM; with "float64" nothing at all runs in float32.
-        compiled: truncated EM's E-step by torch.compile: the same to rounding; it pays from some 10⁵ points
-            and 10³ components on (a tenth of the time), after about five seconds for its first use in a
-            process. Needs a C++ compiler. Exact EM gains nothing by it.
-        warm_start: go on from the last fit's parameters.
+            "flat_pieces". "auto": k-means for small problems; flat pieces for large ones, where they are
+            as good and take a thousandth of the time. Unused for n_components=None.
+        weights_init, means_init, precisions_init: (K,), (K, D), (K, D, D): initial parameters that
+            replace those of the initialization.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
+        algorithm: "exact" compares every point with every component. "truncated" compares it with nearby
+            components only, with a momentum (see `truncated`): the method for many components, whose
+            `lower_bound_` is a few thousandths of a nat below the mean log-likelihood. "auto": truncated
+            from 48 components and 4·10⁶ pairs of point and component on.
+        max_cells: if given, EM runs on the moments of at most this number of cells of points (see
+            `cells`; 2D and 3D): much faster for many points a component, at a slightly lower likelihood.
+        dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step
+            in truncated EM. With "float64" all computation is in float64.
+        compiled: run the E-step of truncated EM through torch.compile. The result is the same to rounding.
+            Worthwhile from about 10⁵ points and 10³ components on (a tenth of the time), after about five
+            seconds for the first use in a process. Needs a C++ compiler. No effect on exact EM.
+        warm_start: `fit` continues from the parameters of the last fit.
 
-    Fitted attributes, in the kind (array or tensor) of the points given to `fit`: `weights_` (K,),
-    `means_` (K, D), `covariances_` (K, D, D), `precisions_` (K, D, D); and `lower_bound_`,
-    `lower_bounds_`, `n_iter_`, `converged_`, `n_features_in_`; `n_samples_seen_`, how many points
-    the mixture stands for, None if not known. The buffers `weights`, `means` and `covariances` are
-    tensors always, and move with `.to(device)`.
+    Fitted attributes: those of every `MixtureEstimator`, and `n_samples_seen_`, the number of points
+    that the mixture stands for, or None if unknown.
     """
 
+    _init_choices = ("auto", *INITIALIZATIONS)
+    _optional_n_components = True
     n_samples_seen_: float | None
 
     def __init__(
@@ -124,19 +118,7 @@ class GaussianMixture(MixtureEstimator):
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> GaussianMixture:
-        """Learn the mixture of points X (N, D).
-
-        Args:
-            X: points, finite.
-            y: ignored, as in scikit-learn.
-            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
-            on_iteration: called with the iteration (from 1) and the mean log-likelihood.
-
-        Raises:
-            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
-                number of points of non-zero weight.
-            NumericalError: a component collapsed, as happens with reg_covar = 0.
-        """
+        """Fit the mixture to points X (N, D) by EM. Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
         rows = self._rows(points, weight)
         generator = as_generator(self.random_state)
@@ -147,7 +129,7 @@ class GaussianMixture(MixtureEstimator):
                 best = found
         assert best is not None
         seen = {"n_samples_seen": weight.sum()}
-        self._keep(best.parameters, center, best.lower_bounds, best.converged, seen)
+        self._store_fit(best.parameters, center, best.lower_bounds, best.converged, seen)
         self._warn_unless_converged("EM")
         return self
 
@@ -160,30 +142,30 @@ class GaussianMixture(MixtureEstimator):
         kappa: float = 0.6,
         memory: float | None = None,
     ) -> GaussianMixture:
-        """Learn from one more batch of points X (N, D) by a step of stepwise EM (see `stepwise`).
+        """Update the mixture with a batch of points X (N, D), by a step of stepwise EM (see `stepwise`).
 
-        The first batch is taken whole: one EM step from where `fit` would begin. Later ones may be of
-        any size; a fitted or loaded mixture goes on from its parameters. A batch of weight n after
-        points of weight m, `n_samples_seen_`, counts for (n/(m+n))^kappa, what was learned for the rest.
-        Steps are exact: `algorithm` and `max_cells` are for `fit`.
+        The first batch gets one EM step from the starting point of `fit`. Later batches may have any size. A
+        fitted or loaded mixture continues from its parameters. A batch of weight n after points of weight m
+        (`n_samples_seen_`) has the share (n/(m+n))^kappa in the result. Steps are exact: `algorithm` and
+        `max_cells` apply to `fit` only.
 
         Args:
             X, y, sample_weight: as in `fit`.
-            kappa: above 0.5, at most 1. With 1 all points count the same; less forgets early batches,
-                whose responsibilities were poor: better for small batches, and for many passes.
-            memory: what was learned counts for so many points at most (m), so that a scene that
-                changes is followed. Needed where m is not known: a mixture of given parameters.
+            kappa: above 0.5, at most 1. With 1 all points count equally. Smaller values forget early batches,
+                whose responsibilities were poor, and suit small batches and many passes.
+            memory: upper limit of m, so that the mixture follows a changing scene. Required if m is unknown:
+                for a mixture of given parameters.
 
         Raises:
-            InvalidArgumentError (a ValueError): as in `fit`; another dimension or n_components than
-                the mixture's; a kappa or memory that cannot be. NumericalError: as in `fit`.
+            InvalidArgumentError: as in `fit`; another dimension or n_components than the mixture; an
+                invalid kappa or memory. NumericalError: as in `fit`.
         """
         stepwise.check_kappa(kappa)
         started = hasattr(self, "means")
         past = stepwise.weight_of_past(getattr(self, "n_samples_seen_", None) if started else 0.0, memory)
         points, weight, center = self._prepare(X, sample_weight, reset=not started)
         if started:
-            previous = self._where_left(points, center)
+            previous = self._current_parameters(points, center)
         else:
             previous = self._start(points, weight, center, as_generator(self.random_state))
         features, dtype = em.quadratic_features(points), em.SOFTMAX_DTYPES[self.dtype]
@@ -191,11 +173,10 @@ class GaussianMixture(MixtureEstimator):
         update, bound = step(previous)
         eta = stepwise.step_size(float(weight.sum()), past, kappa)
         blended = stepwise.blend(previous, update, eta)
-        self._keep(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
+        self._store_fit(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
         return self
 
-    # How many points the mixture stands for goes with files and motions, but not with the state,
-    # which is the parameters alone.
+    # n_samples_seen is part of files and motions, but not of the state dict, which has only parameters.
 
     def _extra_tensors(self) -> dict[str, Tensor]:
         seen = getattr(self, "n_samples_seen_", None)
@@ -210,15 +191,15 @@ class GaussianMixture(MixtureEstimator):
         self.n_samples_seen_ = None if seen is None else float(seen)
 
     def _rows(self, points: Tensor, weight: Tensor) -> Rows:
-        """What EM runs on: the points, or the cells they are summed into."""
+        """Input of EM: the points, or the cells they are summed into."""
         if self.max_cells is None:
             return Rows(points, weight)
         if points.shape[1] > 3:
             raise InvalidArgumentError(
-                f"max_cells={self.max_cells} is for points in at most three dimensions, not "
-                f"{points.shape[1]}; leave it None."
+                f"max_cells={self.max_cells} needs points in at most three dimensions, not "
+                f"{points.shape[1]}; set it to None."
             )
-        # Cells as fine as the least deviation of a component: finer ones would change nothing.
+        # No cells smaller than the least standard deviation of a component: they would change nothing.
         cells = pool_into_cells(points, self.max_cells, max(float(self.reg_covar), 1e-12) ** 0.5, weight)
         return Rows(cells.features, cells.weight, are_points=False)
 
@@ -231,7 +212,7 @@ class GaussianMixture(MixtureEstimator):
     ) -> EMResult:
         """EM from one start."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
-        first, owner = self._begin(rows, center, generator)
+        first, owner = self._start_and_owner(rows, center, generator)
         if not self._truncates(rows.weight.shape[0], first.weights.shape[0]):
             step = em.natural_step(
                 rows.features(), rows.weight, reg, dtype, rows.points if rows.are_points else None
@@ -242,35 +223,35 @@ class GaussianMixture(MixtureEstimator):
         settings = Settings(
             reg, self.tol, self.max_iter, dtype, on_iteration=on_iteration, compiled=bool(self.compiled)
         )
-        return learn_truncated(rows, owner, first, settings)
+        return fit_truncated(rows, owner, first, settings)
 
-    def _begin(
+    def _start_and_owner(
         self, rows: Rows, center: Tensor, generator: torch.Generator
     ) -> tuple[Parameters, Tensor | None]:
-        """Where EM begins, in the centred frame; and a likely component of each row (N,), if known."""
+        """Start of EM in the centred frame, and a likely component of each row (N,), if known."""
         n, k, reg = rows.weight.shape[0], self.n_components, float(self.reg_covar)
-        if self._is_free_to_start():
+        if self._has_free_start():
             features = None if rows.are_points else rows.values
             if k is None:
                 return surface_pieces(rows.points, rows.weight, float(self.noise), reg, features)
             if self._truncates(n, k) and self._initialization(n, k) == "flat_pieces":
                 found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
-                return copied(found, k)[0], owner
+                return replicated(found, k)[0], owner
         return self._start(rows.points, rows.weight, center, generator), None
 
     def _initialization(self, n_rows: int, n_components: int) -> str:
-        """`init_params`, decided on."""
+        """The initialization that `init_params` selects."""
         if self.init_params != "auto":
             return self.init_params
         return "kmeans" if n_rows * n_components <= _KMEANS_IS_CHEAP else "flat_pieces"
 
     def _truncates(self, n_rows: int, n_components: int) -> bool:
-        """`algorithm`, decided on."""
+        """Whether `algorithm` selects truncated EM."""
         if self.algorithm != "auto":
             return self.algorithm == "truncated"
         return n_components >= _MANY_COMPONENTS and n_rows * n_components >= _MANY_PAIRS
 
-    def _is_free_to_start(self) -> bool:
+    def _has_free_start(self) -> bool:
         given = (self.weights_init, self.means_init, self.precisions_init)
         return not self._continues() and all(value is None for value in given)
 
@@ -280,9 +261,9 @@ class GaussianMixture(MixtureEstimator):
     def _start(
         self, points: Tensor, weight: Tensor, center: Tensor, generator: torch.Generator
     ) -> Parameters:
-        """Where EM begins, in the centred frame."""
+        """Start of EM in the centred frame."""
         if self._continues():
-            return self._where_left(points, center)
+            return self._current_parameters(points, center)
         if self.n_components is None:
             return surface_pieces(points, weight, float(self.noise), float(self.reg_covar))[0]
         given = (self.weights_init, self.means_init, self.precisions_init)
@@ -295,7 +276,7 @@ class GaussianMixture(MixtureEstimator):
         )
         if first_weights is None or first_means is None or precisions is None:
             method = self._initialization(points.shape[0], k)
-            found = start(method, points, weight, k, float(self.reg_covar), generator)
+            found = initialize(method, points, weight, k, float(self.reg_covar), generator)
         else:
             found = Parameters(first_weights, first_means, precisions)
         covariances = found.covariances
@@ -308,14 +289,14 @@ class GaussianMixture(MixtureEstimator):
             covariances,
         )
 
-    def _where_left(self, points: Tensor, center: Tensor) -> Parameters:
-        """The parameters there are, in the centred frame."""
+    def _current_parameters(self, points: Tensor, center: Tensor) -> Parameters:
+        """The current parameters, in the centred frame."""
         k = self.means.shape[0] if self.n_components is None else self.n_components
         if self.means.shape != (k, points.shape[1]):
             raise InvalidArgumentError(
-                f"warm_start=True and partial_fit go on from means of shape {tuple(self.means.shape)}, but "
-                f"n_components={self.n_components} and the points have {points.shape[1]} dimensions; "
-                "set n_components back, or fit anew with warm_start=False."
+                f"warm_start=True and partial_fit continue from means of shape {tuple(self.means.shape)}, "
+                f"but n_components={self.n_components} and the points have {points.shape[1]} dimensions; "
+                "restore n_components, or start a new fit with warm_start=False."
             )
         means = self.means.to(points.device) - center
         return Parameters(self.weights.to(points.device), means, self.covariances.to(points.device))
@@ -323,34 +304,19 @@ class GaussianMixture(MixtureEstimator):
     # -- arguments --------------------------------------------------------------------------------
 
     def check_parameters(self, n_points: int | None = None) -> None:
-        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
-        for name in ("n_components", "max_iter", "n_init"):
-            value = getattr(self, name)
-            if name == "n_components" and value is None:
-                self._check_found()
-            else:
-                check_whole(name, value, 1)
+        super().check_parameters(n_points)
         check_number("noise", self.noise, above=True)
-        for name in ("tol", "reg_covar"):
-            check_number(name, getattr(self, name))
-        choices = {
-            "init_params": ("auto", *INITIALIZATIONS),
-            "algorithm": ("auto", "exact", "truncated"),
-            "dtype": tuple(em.SOFTMAX_DTYPES),
-        }
-        for name, known in choices.items():
-            check_choice(name, getattr(self, name), known)
+        check_choice("algorithm", self.algorithm, ("auto", "exact", "truncated"))
         if self.max_cells is not None:
             check_whole("max_cells", self.max_cells, 1)
-        as_generator(self.random_state)
-        if self.n_components is not None:
-            check_enough(self.n_components, n_points)
+        if self.n_components is None:
+            self._check_no_given_start()
 
-    def _check_found(self) -> None:
-        """Raise `InvalidArgumentError` for a start that is given where it is to be found."""
+    def _check_no_given_start(self) -> None:
+        """Raise `InvalidArgumentError` for initial parameters together with n_components=None."""
         for name in ("weights_init", "means_init", "precisions_init"):
             if getattr(self, name) is not None:
                 raise InvalidArgumentError(
-                    f"{name} is given, but n_components=None looks for components of its own; "
+                    f"{name} is given, but n_components=None determines the components from the cloud; "
                     "set n_components to their number."
                 )

@@ -1,4 +1,4 @@
-"""A mixture's file: safetensors, checked as it is read."""
+"""The safetensors file of a mixture: writing, and reading with checks."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
-_EXTRA = "extra."  # before the names of the tensors that not every mixture has
+_EXTRA = "extra."  # prefix of the names of extra tensors
 _EXTRA_DTYPES = (torch.float64, torch.int64, torch.bool)
 
 
 class StoredMixture(NamedTuple):
-    """What the file holds: weights (K,), means (K, D), covariances (K, D, D), and how they were found.
+    """Content of the file: weights (K,), means (K, D), covariances (K, D, D), and facts about the fit.
 
-    arrays: whether the points were arrays; parameters: the estimator's, those that JSON can hold;
-    extra: what an estimator keeps beside the mixture (a posterior, a tree), float64, int64 or bool.
+    arrays: whether the fitted points were arrays. parameters: the scalar options of the estimator.
+    extra: further tensors of an estimator (a posterior, a tree), float64, int64 or bool.
     """
 
     weights: Tensor
@@ -37,7 +37,7 @@ class StoredMixture(NamedTuple):
 
 
 def write(path: str | Path, mixture: StoredMixture) -> None:
-    """Write the file, atomically."""
+    """Write the file atomically."""
     facts = mixture._asdict()
     tensors = {name: facts.pop(name) for name in ("weights", "means", "covariances")}
     tensors |= {_EXTRA + name: value for name, value in facts.pop("extra").items()}
@@ -45,10 +45,10 @@ def write(path: str | Path, mixture: StoredMixture) -> None:
 
 
 def read(path: str | Path) -> StoredMixture:
-    """Read the file. Raises `DataError` unless its tensors have the shapes of a mixture's.
+    """Read the file. Raises `DataError` unless its tensors have the shapes of a mixture.
 
-    Whether they are one (weights that add up to one, definite covariances), and what the shapes of
-    the extra tensors mean, is left to who uses them.
+    The caller checks the values (weights that add up to one, positive definite covariances) and the
+    shapes of the extra tensors.
     """
     tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
     means = require(tensors, "means", (None, None), torch.float64, path)
@@ -60,7 +60,7 @@ def read(path: str | Path) -> StoredMixture:
         for name in tensors
         if name.startswith(_EXTRA)
     }
-    with naming(path):
+    with errors_naming(path):
         return StoredMixture(
             weights,
             means,
@@ -74,7 +74,10 @@ def read(path: str | Path) -> StoredMixture:
 
 
 def _require_extra(tensors: Mapping[str, Tensor], name: str, path: str | Path) -> Tensor:
-    """A tensor of any shape, finite, of a type that `write` is given."""
+    """An extra tensor.
+
+    Raises `DataError` unless it is finite and of an allowed dtype; any shape is allowed.
+    """
     tensor = tensors[name]
     if tensor.dtype not in _EXTRA_DTYPES:
         raise DataError(f"{path}: {name} is {tensor.dtype}; expected one of {_EXTRA_DTYPES}.")
@@ -82,8 +85,8 @@ def _require_extra(tensors: Mapping[str, Tensor], name: str, path: str | Path) -
 
 
 @contextmanager
-def naming(path: str | Path) -> Iterator[None]:
-    """Whatever is wrong with what a file holds becomes a `DataError` that names the file."""
+def errors_naming(path: str | Path) -> Iterator[None]:
+    """Turns errors about the content of a file into a `DataError` that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, GmmTorchError) as error:

@@ -1,4 +1,4 @@
-"""What the arguments of a mixture may be: types, checks, and the errors of those that cannot be."""
+"""Types and checks of estimator arguments."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.errors import check_choice as check_choice
-from gmmtorch.errors import check_number as check_number
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 
@@ -19,7 +17,10 @@ RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 
 def as_generator(random_state: RandomState) -> torch.Generator:
-    """A CPU generator from a seed, a NumPy RandomState, a generator (returned as it is), or None (fresh)."""
+    """A CPU generator from a seed, a NumPy RandomState, or None (random seed).
+
+    A generator is returned as it is.
+    """
     if isinstance(random_state, torch.Generator):
         return random_state
     generator = torch.Generator()
@@ -37,17 +38,17 @@ def as_generator(random_state: RandomState) -> torch.Generator:
     return generator
 
 
-def check_enough(n_components: int, n_points: int | None) -> None:
-    """Raise `InvalidArgumentError` for more components than points, if their number is known."""
+def check_component_count(n_components: int, n_points: int | None) -> None:
+    """Raise `InvalidArgumentError` if there are more components than points, if that number is known."""
     if n_points is not None and n_points < n_components:
         raise InvalidArgumentError(
             f"n_components={n_components} is more than the n_samples={n_points} points of "
-            "non-zero weight; ask for fewer components, or give more points."
+            "non-zero weight; use fewer components or more points."
         )
 
 
 def warn_if_coarse(X: Array, points: Tensor) -> None:
-    """Warn about float32 points so far from the origin that rounding is over 1 % of their spread."""
+    """Warn if X is float32 and so far from the origin that rounding exceeds 1 % of its spread."""
     if getattr(X, "dtype", None) not in (torch.float32, np.float32):
         return
     rounding = torch.finfo(torch.float32).eps * points.abs().amax(0)
@@ -55,13 +56,17 @@ def warn_if_coarse(X: Array, points: Tensor) -> None:
     if bool(((rounding > 0.01 * spread) & (spread > 0)).any()):
         warnings.warn(
             f"X is float32 and up to {float(points.abs().max()):.3g} from the origin, where it is rounded to "
-            f"{float(rounding.max()):.1g}; give float64, or subtract an offset before it becomes float32.",
+            f"{float(rounding.max()):.1g}; use float64, or subtract an offset before the cast to float32.",
             UserWarning,
             stacklevel=3,
         )
 
 
 def checked_tensor(X: Tensor) -> Tensor:
+    """Returns points X (N, D).
+
+    Raises `InvalidArgumentError` unless N, D ≥ 1 and all values are real and finite.
+    """
     if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
         raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
     if X.is_complex():
@@ -70,24 +75,28 @@ def checked_tensor(X: Tensor) -> Tensor:
     if not bool(finite.all()):
         row = int((~finite).nonzero()[0])
         raise InvalidArgumentError(
-            f"X[{row}] = {X[row].tolist()} is not finite; drop such rows: X = X[torch.isfinite(X).all(1)]."
+            f"X[{row}] = {X[row].tolist()} is not finite; remove such rows: X = X[torch.isfinite(X).all(1)]."
         )
     return X
 
 
 def checked_parameter(value: Array, shape: tuple[int, ...], name: str, device: torch.device) -> Tensor:
+    """`value` as a float64 tensor. Raises `InvalidArgumentError` unless it is finite and has this shape."""
     tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
     if tuple(tensor.shape) != shape or not bool(torch.isfinite(tensor).all()):
         raise InvalidArgumentError(
             f"{name} has shape {tuple(tensor.shape)}; expected finite numbers of shape {shape}."
         )
     if name == "weights_init" and (bool((tensor < 0).any()) or float(tensor.sum()) <= 0):
-        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be ≥ 0 and not all zero.")
+        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be at least zero, and not all zero.")
     return tensor
 
 
 def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
-    """Weights (N,) of the points, float64; ones if not given."""
+    """Weights (N,) of the points, float64; ones if not given.
+
+    Raises `InvalidArgumentError` for invalid weights.
+    """
     n = points.shape[0]
     if sample_weight is None:
         return points.new_ones(n)
@@ -99,17 +108,17 @@ def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
             f"sample_weight has shape {tuple(weight.shape)}; expected ({n},), one weight for each point."
         )
     if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()):
-        raise InvalidArgumentError("sample_weight holds NaN, infinite or negative weights; make them ≥ 0.")
+        raise InvalidArgumentError("sample_weight has NaN, infinite or negative weights; all must be ≥ 0.")
     if float(weight.max()) == 0:
-        raise InvalidArgumentError("sample_weight is all zero; at least one point must count.")
+        raise InvalidArgumentError("sample_weight is all zero; at least one weight must be above zero.")
     return weight
 
 
 def check_weight_scale(weight: Tensor) -> None:
-    """Raise `InvalidArgumentError` for weights (N,) whose sums lose digits beside 1, or beyond all range."""
+    """Raise `InvalidArgumentError` for weights (N,) so large or small that their sums lose digits."""
     mean = float((weight / weight.shape[0]).sum())
     if not _LEAST_MEAN_WEIGHT <= mean <= _LARGEST_MEAN_WEIGHT:
         raise InvalidArgumentError(
-            f"sample_weight is {mean:.3g} on the average, where sums of it lose digits; scale it to about 1 "
-            "(a weight says how many points a row stands for)."
+            f"sample_weight has a mean of {mean:.3g}, at which sums lose digits; scale it to about 1 "
+            "(a weight is the number of points that a row stands for)."
         )

@@ -23,7 +23,8 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.files import pack_tensors
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.mixture.estimator import MixtureEstimator, NotFittedError
+from gmmtorch.mixture.density import NotFittedError
+from gmmtorch.mixture.estimator import MixtureEstimator
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 kinds = pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])

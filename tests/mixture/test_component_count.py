@@ -19,9 +19,9 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import flatness_rule
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import surface_rule as component_count
-from gmmtorch.mixture.em.partition import FlatnessRule
-from gmmtorch.mixture.em.surface_rule import least_support, surface_pieces, surface_rule
+from gmmtorch.mixture.em import initialization
+from gmmtorch.mixture.em.initialization import surface_pieces
+from gmmtorch.mixture.em.partition import FlatnessRule, least_support, surface_rule
 
 NOISE = 0.01
 
@@ -154,7 +154,7 @@ def test_neither_motion_nor_order_matters(dim):
 def test_cells_ask_for_about_as_many_components_as_their_points(monkeypatch):
     points = torch.cat([room(3000), sphere(10_000)])
     exact = count(points)
-    monkeypatch.setattr(component_count, "_MOST_CELLS", 8000)
+    monkeypatch.setattr(initialization, "_SURFACE_CELLS", 8000)
     assert count(points) == pytest.approx(exact, rel=0.1)
 
 

@@ -20,8 +20,15 @@ from torch.distributions import MultivariateNormal
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators import deconvolution, noisy_pairs
-from gmmtorch.mixture.estimators.deconvolution import Block, blocks, constrained, expectation, maximization
+from gmmtorch.mixture.estimators import deconvolution
+from gmmtorch.mixture.estimators.deconvolution import (
+    Block,
+    bound_variances,
+    expectation,
+    group_by_noise,
+    maximization,
+    pair_chunks,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -139,7 +146,7 @@ def test_chunks_add_up(monkeypatch):
     rng = np.random.default_rng(0)
     block, parameters = noisy_cloud(rng, 50, 3), random_mixture(rng, 4, 3)
     whole = step(block, parameters)
-    monkeypatch.setattr(noisy_pairs, "_CHUNK_ELEMENTS", 12)
+    monkeypatch.setattr(deconvolution, "_CHUNK_ELEMENTS", 12)
     chunked = step(block, parameters)
     assert whole[1] == pytest.approx(chunked[1], rel=1e-12)
     torch.testing.assert_close(whole[0].covariances, chunked[0].covariances)
@@ -163,8 +170,8 @@ def test_pairs_left_out_would_have_had_no_share(monkeypatch):
     points[:5] += 20  # strays far from everything
     block = Block(points, torch.ones(400, dtype=torch.float64), noise)
     few, value = expectation(block, parameters)
-    n_few = sum(len(pairs.row) for _, pairs in noisy_pairs.chunks(points, noise, parameters))
-    monkeypatch.setattr(noisy_pairs, "_NEGLIGIBLE", 1e300)
+    n_few = sum(len(pairs.row) for _, pairs in pair_chunks(points, noise, parameters))
+    monkeypatch.setattr(deconvolution, "_NEGLIGIBLE", 1e300)
     every, expected = expectation(block, parameters)
     assert n_few < 0.5 * 400 * 30
     assert float(value) == pytest.approx(float(expected), rel=1e-13)
@@ -186,14 +193,14 @@ def test_points_that_share_a_covariance_are_taken_together():
     block, parameters = noisy_cloud(rng, 3000, 2), random_mixture(rng, 3, 2)
     kinds = torch.from_numpy(rng.integers(3, size=3000))
     noise = block.noise[:3][kinds]
-    parts = blocks(block.points, block.weight, noise)
+    parts = group_by_noise(block.points, block.weight, noise)
     assert [part.noise.ndim for part in parts] == [2, 2, 2]
     assert sum(len(part.points) for part in parts) == 3000
     together = deconvolution.deconvolution_step(parts)(parameters)
     apart = deconvolution.deconvolution_step([block._replace(noise=noise)])(parameters)
     assert together[1] == pytest.approx(apart[1], rel=1e-10)
     torch.testing.assert_close(together[0].covariances, apart[0].covariances, rtol=1e-9, atol=1e-9)
-    assert len(blocks(*block)) == 1  # all different: no use
+    assert len(group_by_noise(*block)) == 1  # all different: no use
 
 
 def test_thin_components_far_from_the_centre_lose_no_digits():
@@ -371,7 +378,7 @@ def test_the_bounded_m_step_is_the_maximiser(dim, bounds):
     low, high = bounds
     rng = np.random.default_rng(dim)
     scatter = random_spd(rng, 1, dim)[0]
-    found = constrained(torch.from_numpy(scatter)[None], low**2, high)[0].numpy()
+    found = bound_variances(torch.from_numpy(scatter)[None], low**2, high)[0].numpy()
 
     def cost(covariance: np.ndarray) -> float:
         return np.linalg.slogdet(covariance)[1] + np.trace(np.linalg.inv(covariance) @ scatter)
@@ -401,7 +408,7 @@ def test_the_bounded_m_step_is_the_maximiser(dim, bounds):
 
 def test_a_cap_thins_a_thick_component_only():
     covariances = torch.diag_embed(torch.tensor([[0.04, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
-    found = constrained(covariances, 0.0, 0.1)
+    found = bound_variances(covariances, 0.0, 0.1)
     expected = torch.diag_embed(torch.tensor([[0.01, 1.0, 2.0], [1e-6, 1.0, 2.0]], dtype=torch.float64))
     torch.testing.assert_close(found, expected)
 
@@ -415,7 +422,7 @@ def test_a_cap_thins_a_thick_component_only():
         (np.zeros((239, 2, 2)), r"shape \(239, 2, 2\)"),
         (np.zeros((3, 3)), r"shape \(3, 3\)"),
         (np.zeros(240), r"shape \(240,\)"),
-        (np.full((2, 2), np.nan), r"\[0\] holds NaN"),
+        (np.full((2, 2), np.nan), r"\[0\] has NaN"),
         (np.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric"),
         (np.array([[1.0, 2.0], [2.0, 1.0]]), "negative eigenvalue"),
         (-np.eye(2), "negative eigenvalue"),

@@ -119,7 +119,7 @@ def test_when_a_process_is_lost_the_others_say_so_and_the_checkpoint_goes_on(clo
     assert workers[1].returncode == -signal.SIGKILL
     assert "lost: rank 0 of 2" in said
     assert "in iteration 6" in said
-    assert f"{path}, is of iteration 4; start again with resume=true" in said
+    assert f"{path}, is of iteration 4; start the run again with resume=true" in said
     assert len(read_state(path)[0].lower_bounds) == 4
     options = {"dtype": "float64", "tol": 0, "max_iter": 12, "random_state": 0}
     source = open_points(cloud, chunk_points=200)
@@ -135,5 +135,8 @@ def test_processes_that_never_meet_give_up(monkeypatch):
     for name, value in group.items():
         monkeypatch.setenv(name, value)
     assert is_launched()
-    with pytest.raises(LostProcessError, match="rank 0 did not find the other 1"), joined(timeout=1.0):
+    with (
+        pytest.raises(LostProcessError, match="rank 0 of 2 did not find the other processes"),
+        joined(timeout=1.0),
+    ):
         pass

@@ -33,7 +33,7 @@ from gmmtorch.errors import (
 )
 from gmmtorch.files import pack_tensors
 from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.estimator import NotFittedError
+from gmmtorch.mixture.density import NotFittedError
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -911,7 +911,7 @@ def test_a_damaged_file_is_refused_or_is_a_mixture(tmp_path, sound_bytes, place,
 def test_float32_points_far_out_warn_and_float64_ones_do_not():
     points = np.random.default_rng(0).normal(size=(200, 3))
     far = points + 5e5
-    with pytest.warns(UserWarning, match=r"float32 and up to 5e\+05.*give float64"):
+    with pytest.warns(UserWarning, match=r"float32 and up to 5e\+05.*use float64"):
         GaussianMixture(2, random_state=0).fit(far.astype(np.float32))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -937,7 +937,7 @@ def test_how_many_points_a_given_mixture_stands_for_is_not_known():
 @pytest.mark.parametrize("scale", [1e-30, 1e-9, 1e15, 1e39, 1e300])
 def test_weights_that_would_lose_digits_are_refused(scale):
     x = blobs()
-    with pytest.raises(InvalidArgumentError, match=r"sample_weight is .* scale it"):
+    with pytest.raises(InvalidArgumentError, match=r"sample_weight has a mean of .* scale it"):
         GaussianMixture(3).fit(x, sample_weight=np.full(len(x), scale))
 
 

@@ -24,16 +24,16 @@ from gmmtorch import datasets
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
-from gmmtorch.mixture.estimators.trees.growth import GrowthRule, grow
-from gmmtorch.mixture.estimators.trees.mixture_tree import Tree, check_tree
+from gmmtorch.mixture.estimators.trees.growth import GrowthRule, Tree, grow
+from gmmtorch.mixture.estimators.trees.hierarchical import check_tree
 from gmmtorch.mixture.estimators.trees.nested import (
     Children,
     Members,
+    assign_members,
+    drop_weak_children,
     pack,
-    partition,
     principal_axes_start,
     run_em,
-    without_weak,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -275,7 +275,7 @@ def test_nodes_are_learned_as_if_each_were_alone():
     together, values = learn(members, centers)
     assert (together.weights > 0).sum(1).tolist() == [1, 2, 6, 6, 6]
     for i in range(5):
-        alone, _ = learn(members.of(torch.tensor([i]), 5), centers[i : i + 1])
+        alone, _ = learn(members.select(torch.tensor([i]), 5), centers[i : i + 1])
         for found, expected in zip(present(together, i), present(alone, 0), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
     rises = torch.stack(values).diff(dim=0)
@@ -300,7 +300,7 @@ def test_points_go_to_the_children_of_enough_responsibility_and_keep_their_weigh
     members = Members(torch.arange(40), torch.from_numpy(node), torch.from_numpy(weight))
     packed = pack(torch.from_numpy(points), members, torch.from_numpy(centers), torch.float64)
     children = Children(*(torch.from_numpy(value) for value in (weights, means, covariances)))
-    found = partition(packed, children, members, threshold)
+    found = assign_members(packed, children, members, threshold)
     shares = np.zeros((40, 12))
     shares[found.members.point, found.members.node] = found.members.weight
     values = np.zeros(3)
@@ -451,7 +451,7 @@ def test_thin_nodes_are_not_split():
 def test_weak_children_are_dropped_and_their_siblings_take_over():
     weights = torch.tensor([[0.7, 0.25, 0.05], [0.04, 0.03, 0.93], [0.5, 0.5, 0.0]]).double()
     children = Children(weights, torch.zeros(3, 3, 2), torch.zeros(3, 3, 2, 2))
-    found = without_weak(children, torch.tensor([100.0, 100.0, 3.0]).double(), 6.0).weights
+    found = drop_weak_children(children, torch.tensor([100.0, 100.0, 3.0]).double(), 6.0).weights
     expected = [[0.7 / 0.95, 0.25 / 0.95, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0]]
     torch.testing.assert_close(found, torch.tensor(expected).double())
 

@@ -12,11 +12,11 @@ from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
-    copied,
     distinct_points,
     flat_pieces,
+    initialize,
     moments_of,
-    start,
+    replicated,
 )
 
 METHODS = sorted(INITIALIZATIONS)
@@ -31,7 +31,7 @@ def cloud(n: int, dim: int, seed: int = 0) -> Tensor:
 
 def begin(method: str, points: Tensor, k: int, weight: Tensor | None = None, seed: int = 0):
     weight = points.new_ones(len(points)) if weight is None else weight
-    return start(method, points, weight, k, 1e-6, torch.Generator().manual_seed(seed))
+    return initialize(method, points, weight, k, 1e-6, torch.Generator().manual_seed(seed))
 
 
 def test_distinct_points_are_sorted_and_carry_the_summed_weight():
@@ -205,7 +205,7 @@ def test_moments_of_thin_pieces_far_apart_keep_their_digits():
 def test_copies_share_the_weight_of_what_they_are_copies_of(k):
     weights = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
     found = Parameters(weights, cloud(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1))
-    many, copy = copied(found, k)
+    many, copy = replicated(found, k)
     assert many.weights.shape == (k,)
     assert torch.equal(many.means, found.means[copy])
     sums = torch.zeros(3, dtype=torch.float64).index_add_(0, copy, many.weights)

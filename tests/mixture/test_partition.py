@@ -158,7 +158,7 @@ def test_a_few_far_returns_do_not_keep_a_cloud_in_one_piece(n_strays, distance):
 
 # -- a given number of pieces ------------------------------------------------------------------------
 
-ALL = {"thickness": 0.0, "length": 0.0, "min_weight": 0.0, "min_weight_thick": 0.0, "apart": 0.0}
+ALL = {"thickness": 0.0, "length": 0.0, "min_weight": 0.0, "min_weight_thick": 0.0, "outlier_gap": 0.0}
 
 
 @given(

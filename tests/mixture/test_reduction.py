@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -17,11 +15,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.mixture import GaussianMixture, merge, simplify
+from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimator import NotFittedError
-from gmmtorch.mixture.reduction.merge import merge as reduction
-from gmmtorch.mixture.reduction.merge_costs import COSTS, Gaussians
-from gmmtorch.mixture.reduction.moments import merge_components, merge_pairs
+from gmmtorch.mixture.reduction.moments import COSTS, Gaussians, merge_components, merge_pairs
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 costs = pytest.mark.parametrize("cost", list(COSTS))
@@ -41,15 +37,8 @@ def take(parameters: Parameters, index: Tensor) -> Parameters:
     return Parameters(*(value[index] for value in parameters))
 
 
-@contextmanager
-def following(path: str) -> Iterator[None]:
-    """All merges by the exact loop, or all in rounds."""
-    before = reduction._MOST_EXACT
-    reduction._MOST_EXACT = {"exact": 10**6, "rounds": 0}[path]
-    try:
-        yield
-    finally:
-        reduction._MOST_EXACT = before
+MOST_EXACT = {"exact": 10**6, "rounds": 0}
+"""Values of `most_exact` that merge one pair at a time, or in rounds only."""
 
 
 def total_moments(parameters: Parameters) -> tuple[float, np.ndarray, np.ndarray]:
@@ -303,8 +292,7 @@ def test_merging_stops_where_the_naive_loop_stops(cost):
 @paths
 def test_what_is_left_is_the_merge_of_its_members(cost, path):
     parameters = mixture(90, 3)
-    with following(path):
-        found = simplify(parameters, 17, cost=cost)
+    found = simplify(parameters, 17, cost=cost, most_exact=MOST_EXACT[path])
     merged = merge_components(*parameters, found.labels, 17)
     for mine, expected in zip(found.parameters, merged, strict=True):
         torch.testing.assert_close(mine, expected, rtol=1e-9, atol=1e-10)
@@ -316,10 +304,8 @@ def test_what_is_left_is_the_merge_of_its_members(cost, path):
 @pytest.mark.parametrize("n", [20, 100, 250])
 def test_rounds_cost_hardly_more_than_greedy_merging(dim, n):
     parameters = mixture(300, dim, spread=6.0)
-    with following("exact"):
-        exact = simplify(parameters, n)
-    with following("rounds"):
-        rounds = simplify(parameters, n)
+    exact = simplify(parameters, n, most_exact=MOST_EXACT["exact"])
+    rounds = simplify(parameters, n, most_exact=MOST_EXACT["rounds"])
     assert len(rounds.parameters.weights) == n
     assert rounds.bound < 1.05 * exact.bound
     labels = torch.arange(300) % n
@@ -334,8 +320,13 @@ def test_rounds_stop_at_the_cost_that_greedy_merging_stops_at(cost):
     limit = {"kullback_leibler": 4.0, "hellinger": 0.4}[cost]
     left = []
     for path in ("exact", "rounds"):
-        with following(path):
-            left.append(len(simplify(parameters, max_cost=limit, cost=cost).parameters.weights))
+        left.append(
+            len(
+                simplify(
+                    parameters, max_cost=limit, cost=cost, most_exact=MOST_EXACT[path]
+                ).parameters.weights
+            )
+        )
     assert 30 < left[0] < 270
     assert abs(left[1] - left[0]) <= 0.05 * left[0]
 
@@ -344,8 +335,9 @@ def test_rounds_stop_at_the_cost_that_greedy_merging_stops_at(cost):
 @paths
 def test_no_cheap_pair_is_left(cost, path):
     limit = {"kullback_leibler": 4.0, "hellinger": 0.4}[cost]
-    with following(path):
-        found = simplify(mixture(120, 2, spread=6.0), max_cost=limit, cost=cost, neighbors=119)
+    found = simplify(
+        mixture(120, 2, spread=6.0), max_cost=limit, cost=cost, neighbors=119, most_exact=MOST_EXACT[path]
+    )
     left = Gaussians.of(found.parameters)
     i, j = torch.triu_indices(len(left.weights), len(left.weights), 1)
     assert float(COSTS[cost](left.at(i), left.at(j)).min()) > limit
@@ -359,8 +351,7 @@ def test_the_bound_bounds_the_divergence(cost, path):
     gmm = GaussianMixture.from_parameters(parameters.weights / total, *parameters[1:], random_state=0)
     points, _ = gmm.sample(40_000)
     for n in (50, 20, 4):
-        with following(path):
-            found = simplify(parameters, n, cost=cost)
+        found = simplify(parameters, n, cost=cost, most_exact=MOST_EXACT[path])
         left = found.parameters
         smaller = GaussianMixture.from_parameters(left.weights / left.weights.sum(), *left[1:])
         difference = gmm.score_samples(points) - smaller.score_samples(points)
@@ -387,8 +378,7 @@ def test_weight_mean_and_covariance_stay(seed, dim, k, n, cost, path, zeros, cop
         parameters.weights[1::2] = 0
     if copies:
         parameters = take(parameters, torch.arange(k) // 3)
-    with following(path):
-        found = simplify(parameters, n, cost=cost)
+    found = simplify(parameters, n, cost=cost, most_exact=MOST_EXACT[path])
     assert len(found.parameters.weights) == min(n, k)
     assert sorted(found.labels.unique().tolist()) == list(range(min(n, k)))
     assert_same_moments(found.parameters, parameters, atol=1e-10)
@@ -411,9 +401,8 @@ def test_the_order_of_the_components_does_not_matter(cost, path, regular):
     else:
         parameters = mixture(64, 2)
     order = torch.from_numpy(np.random.default_rng(0).permutation(64))
-    with following(path):
-        one = simplify(parameters, 13, cost=cost)
-        other = simplify(take(parameters, order), 13, cost=cost)
+    one = simplify(parameters, 13, cost=cost, most_exact=MOST_EXACT[path])
+    other = simplify(take(parameters, order), 13, cost=cost, most_exact=MOST_EXACT[path])
     back = torch.empty_like(order)
     back[order] = torch.arange(64)
     assert groups(one.labels) == groups(other.labels[back])
@@ -432,9 +421,8 @@ def test_a_motion_commutes_with_simplifying(cost, path, offset):
         parameters.means @ rotation.T + offset,
         rotation @ parameters.covariances @ rotation.T,
     )
-    with following(path):
-        one = simplify(parameters, 13, cost=cost)
-        other = simplify(moved, 13, cost=cost)
+    one = simplify(parameters, 13, cost=cost, most_exact=MOST_EXACT[path])
+    other = simplify(moved, 13, cost=cost, most_exact=MOST_EXACT[path])
     assert torch.equal(one.labels, other.labels)
     torch.testing.assert_close(
         one.parameters.means @ rotation.T + offset, other.parameters.means, atol=1e-8, rtol=0
@@ -471,8 +459,7 @@ def test_what_is_not_merged_keeps_every_bit():
 @pytest.mark.parametrize("k", [0, 1])
 def test_none_and_one_are_left_as_they_are(path, k):
     parameters = take(mixture(3, 2), torch.arange(k))
-    with following(path):
-        found = simplify(parameters, 1)
+    found = simplify(parameters, 1, most_exact=MOST_EXACT[path])
     assert all(torch.equal(*pair) for pair in zip(found.parameters, parameters, strict=True))
     assert (found.labels.tolist(), found.bound) == ([0] * k, 0.0)
 
@@ -504,8 +491,7 @@ def test_components_without_weight_do_no_harm(cost, path):
     parameters.weights[::2] = 0
     nothing = parameters._replace(weights=torch.zeros_like(parameters.weights))
     for given_parameters in (parameters, nothing):
-        with following(path):
-            found = simplify(given_parameters, 5, cost=cost)
+        found = simplify(given_parameters, 5, cost=cost, most_exact=MOST_EXACT[path])
         assert all(bool(torch.isfinite(value).all()) for value in found.parameters)
         assert float(found.parameters.weights.sum()) == pytest.approx(float(given_parameters.weights.sum()))
 

@@ -25,8 +25,8 @@ from gmmtorch.errors import NumericalError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.initialization import start
-from gmmtorch.mixture.estimators.ascent import SOLVERS, LimitedMemory, ascend, search
+from gmmtorch.mixture.em.initialization import initialize
+from gmmtorch.mixture.estimators.ascent import LBFGS, SOLVERS, ascend, search
 from gmmtorch.mixture.estimators.riemannian import (
     Frames,
     Iterate,
@@ -270,12 +270,12 @@ def test_rosenbrocks_valley_is_followed_to_its_end(solver):
 
 def test_the_two_loops_are_the_dense_bfgs_formula():
     rng = np.random.default_rng(0)
-    solver, dense = LimitedMemory(9), 0.5 * np.eye(4)
+    solver, dense = LBFGS(9), 0.5 * np.eye(4)
     for _ in range(4):
         step, root = rng.normal(size=4), rng.normal(size=(4, 4))
         fall = (root @ root.T + np.eye(4)) @ step
         before, after = (Flat(np.zeros(4), None, lambda x, g=g: g, []) for g in (fall, np.zeros(4)))
-        solver.learn(before, torch.from_numpy(step / 2), 2.0, after)
+        solver.update(before, torch.from_numpy(step / 2), 2.0, after)
         rho = 1 / (fall @ step)
         left = np.eye(4) - rho * np.outer(step, fall)
         dense = left @ dense @ left.T + rho * np.outer(step, step)  # Nocedal & Wright, 6.17
@@ -418,7 +418,7 @@ def test_where_clusters_overlap_it_needs_a_fifth_of_ems_steps(seed):
         ours = RiemannianGaussianMixture(4, tol=1e-8, max_iter=3000, random_state=0).fit(points)
     weight = torch.ones(len(points)).double()
     x = torch.from_numpy(points)
-    first = start("kmeans", x, weight, 4, 1e-6, torch.Generator().manual_seed(0))
+    first = initialize("kmeans", x, weight, 4, 1e-6, torch.Generator().manual_seed(0))
     run = em.run_em(
         em.natural_step(em.quadratic_features(x), weight, 1e-6, torch.float64),
         first,

@@ -20,7 +20,7 @@ from torch import Tensor
 from gmmtorch.errors import NumericalError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.initialization import start
+from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimators import optimal_transport as lines
 from gmmtorch.mixture.estimators.optimal_transport import (
     LEVELS,
@@ -317,7 +317,7 @@ def test_it_ends_nearer_than_its_start_and_than_em(init_params):
         8, n_projections=32, init_params=init_params, random_state=0, max_iter=40
     ).fit(points)
     center = torch.from_numpy(points.mean(0))
-    first = start(
+    first = initialize(
         init_params, torch.from_numpy(points) - center, torch.ones(len(points)).double(), 8, 1e-6,
         torch.Generator().manual_seed(0),
     )  # fmt: skip

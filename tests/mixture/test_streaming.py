@@ -227,7 +227,7 @@ def test_degenerate_clouds_are_what_fit_makes_of_them(n, k, kind, chunk_points):
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.full((5, 3), np.nan)])
 def test_a_source_without_points_is_an_error(points):
-    with pytest.raises(DataError, match="no points"):
+    with pytest.raises(DataError, match="no valid points"):
         fit_stream(exact(1), in_memory(points))
 
 
@@ -349,7 +349,7 @@ def test_a_damaged_checkpoint_is_an_error_that_names_it(tmp_path):
     state, run = read_state(path)
     fewer = Parameters(*(value[:1] for value in state.parameters))
     write_state(path, State(fewer, state.center, state.lower_bounds), run)
-    with pytest.raises(DataError, match="other parameters"):
+    with pytest.raises(DataError, match="does not match its own description"):
         fit_stream(exact(2), source_of(), checkpoint=Checkpoint(path, resume=True))
 
 

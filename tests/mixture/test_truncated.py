@@ -25,17 +25,17 @@ from gmmtorch.mixture import GaussianMixture, gaussian_mixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import grouping, truncated
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.grouping import Rows, choose_candidates, group_rows, nearest
-from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
-from gmmtorch.mixture.em.momentum import Momentum
-from gmmtorch.mixture.em.truncated import (
-    Settings,
-    learn_truncated,
+from gmmtorch.mixture.em.grouping import (
+    Rows,
+    choose_candidates,
+    group_rows,
     local_parameters,
+    nearest,
     rounding,
-    run_truncated,
     truncated_expectation,
 )
+from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.em.truncated import Momentum, Settings, fit_truncated, run_truncated
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 from gmmtorch.mixture.streaming.distributed import Processes
 from gmmtorch.mixture.streaming.stream_fit import fit_stream
@@ -142,7 +142,7 @@ def test_every_row_is_in_one_slot_of_its_owner_and_the_rest_weighs_nothing(
 @kinds
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
 def test_with_every_component_a_candidate_it_is_the_e_step(dim, are_points, dtype, tolerance, monkeypatch):
-    monkeypatch.setattr(truncated, "CHUNK_ELEMENTS", 500)  # several chunks
+    monkeypatch.setattr(grouping, "CHUNK_ELEMENTS", 500)  # several chunks
     points, weight, parameters = cloud(400, dim), random_weight(400), random_parameters(7, dim)
     owner = torch.randint(0, 7, (400,), generator=torch.Generator().manual_seed(3))
     groups = group_rows(rows_of(points, weight, are_points), owner, parameters.means, dtype)
@@ -382,17 +382,17 @@ def test_undoing_gives_ems_own_step_and_starts_anew():
     for moves in (False, False, True, True):
         plain = step(parameters)[0]
         following = momentum.step(expect(parameters), parameters)
-        assert momentum.is_moving is moves
+        assert momentum.is_extrapolated is moves
         close = torch.allclose(following.means, plain.means, rtol=0, atol=1e-9)
         assert close is not moves
         if moves:
-            torch.testing.assert_close(tuple(momentum._plain), tuple(plain), rtol=1e-9, atol=1e-10)
+            torch.testing.assert_close(tuple(momentum._em_step), tuple(plain), rtol=1e-9, atol=1e-10)
         parameters = following
     undone = momentum.undo()
     torch.testing.assert_close(tuple(undone), tuple(plain), rtol=1e-9, atol=1e-10)
-    assert not momentum.is_moving
+    assert not momentum.is_extrapolated
     momentum.step(expect(undone), undone)
-    assert not momentum.is_moving
+    assert not momentum.is_extrapolated
 
 
 class Spy:
@@ -511,7 +511,7 @@ def test_a_large_thin_cloud_is_worked_on_in_float64_and_agrees_with_em(size, dty
     rows, parameters = rows_of(points), two_halves(points)
     wishes = Settings(1e-6, 0.0, 1)
     owner = nearest(points, parameters.means)
-    groups, _ = truncated._sets(rows, owner, parameters, wishes)
+    groups, _ = truncated._candidate_sets(rows, owner, parameters, wishes)
     assert groups.features.dtype == dtype
     found, *_ = run_truncated(rows, owner, parameters, wishes)
     expected, total = em.direct_step(points, rows.weight, parameters, 1e-6)
@@ -526,7 +526,7 @@ def test_components_that_become_thin_are_worked_on_in_float64_from_then_on(monke
     rows, parameters = rows_of(points), two_halves(points)
     parameters = parameters._replace(covariances=parameters.covariances + torch.eye(3, dtype=torch.float64))
     owner = nearest(points, parameters.means)
-    assert truncated._sets(rows, owner, parameters, Settings())[0].features.dtype == torch.float32
+    assert truncated._candidate_sets(rows, owner, parameters, Settings())[0].features.dtype == torch.float32
     spy = Spy()
     monkeypatch.setattr(truncated, "truncated_expectation", spy)
     found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
@@ -563,7 +563,10 @@ def test_a_large_thin_piece_keeps_its_digits_though_it_weighs_little():
         counts.append(len(own))
     assert worst == pytest.approx(max(errors), rel=1e-4)
     assert average == pytest.approx(np.average(errors, weights=counts), rel=1e-4)
-    assert truncated._sets(rows_of(points), owner, parameters, Settings())[0].features.dtype == torch.float64
+    assert (
+        truncated._candidate_sets(rows_of(points), owner, parameters, Settings())[0].features.dtype
+        == torch.float64
+    )
 
 
 @pytest.mark.parametrize("k", [4, 24])  # all components are candidates, or not
@@ -611,7 +614,7 @@ def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, 
         patch.setattr(
             truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
         )
-        found = learn_truncated(Rows(points, weight), owner, first, wishes)
+        found = fit_truncated(Rows(points, weight), owner, first, wishes)
     assert [rows.are_points for rows in runs] == [False, True]
     assert float(runs[0].weight.sum()) == pytest.approx(float(weight.sum()))
     check_run(found, max_iter, slack=1e-6 if dtype == torch.float32 else 1e-10)
@@ -622,14 +625,14 @@ def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
     monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
     monkeypatch.setattr(truncated, "pool_into_cells", None)  # would fail
     for points, k, max_iter in ((cloud(900, 2), 2, 9), (cloud(1200, 4), 2, 9), (cloud(1200, 2), 20, 9)):
-        learn_truncated(
+        fit_truncated(
             rows_of(points),
             torch.zeros(len(points), dtype=torch.int64),
             random_parameters(k, points.shape[1]),
             Settings(max_iter=max_iter),
         )
     cells = Rows(em.quadratic_features(cloud(1200, 2)), torch.ones(1200, dtype=torch.float64), False)
-    learn_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
+    fit_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
 
 
 def test_by_way_of_cells_the_fit_is_as_good(monkeypatch):
@@ -679,9 +682,9 @@ def test_auto_is_truncated_for_many_pairs_and_exact_for_few(monkeypatch):
 
     def learn(rows, owner, parameters, wishes):
         called.append(len(owner))
-        return learn_truncated(rows, owner, parameters, wishes)
+        return fit_truncated(rows, owner, parameters, wishes)
 
-    monkeypatch.setattr(gaussian_mixture, "learn_truncated", learn)
+    monkeypatch.setattr(gaussian_mixture, "fit_truncated", learn)
     monkeypatch.setattr(gaussian_mixture, "_MANY_PAIRS", 48 * 500)
     x = room(500)
     for k, n in ((47, 500), (48, 499)):
@@ -872,7 +875,7 @@ def test_of_many_points_it_begins_on_a_sample_whose_bounds_are_left_out(monkeypa
     monkeypatch.setattr(
         truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
     )
-    found = learn_truncated(
+    found = fit_truncated(
         Rows(points, torch.ones(6000).double()),
         owner,
         first,
@@ -910,13 +913,13 @@ def test_processes_that_share_the_rows_find_what_one_finds(n):
     weight = torch.ones(n, dtype=torch.float64)
     first, owner = flat_pieces(points, weight, 5, 1e-6)
     wishes = Settings(1e-6, 1e-6, 60, torch.float64)  # all components are candidates
-    alone = learn_truncated(Rows(points, weight), owner, first, wishes)
+    alone = fit_truncated(Rows(points, weight), owner, first, wishes)
     barrier, board = threading.Barrier(2), [None, None]
 
     def work(rank: int) -> em.EMResult:
         mine = slice(rank, None, 2)
         shared = replace(wishes, processes=Halves(rank, barrier, board))
-        return learn_truncated(Rows(points[mine], weight[mine]), owner[mine], first, shared)
+        return fit_truncated(Rows(points[mine], weight[mine]), owner[mine], first, shared)
 
     with ThreadPoolExecutor(2) as pool:
         one, other = pool.map(work, range(2))

@@ -22,9 +22,9 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.initialization import start
-from gmmtorch.mixture.estimator import NotFittedError
+from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimators.gaussian_wishart import (
     expected_log_weights,
     expected_weights,
@@ -60,7 +60,7 @@ class GivenStart(BayesianGaussianMixture):
 
     def _initialize_parameters(self, X, random_state, xp=None):
         center = X.mean(0)
-        found = start(
+        found = initialize(
             "kmeans",
             torch.from_numpy(X - center),
             torch.ones(len(X), dtype=torch.float64),

@@ -3,7 +3,7 @@
 A cloud is fitted with K components for a range of K: the curve of quality against bytes. On it lie the
 points that are chosen by
 
-    flat_pieces    the cloud's pieces that are flat, for the sensor's noise (`mixture.component_count`)
+    flat_pieces    the cloud's pieces that are flat, for the sensor's noise (`mixture.em.partition`)
     bic            the least Bayesian information criterion over the range of K: as dear as the curve
     mean_shift     the modes of a flat-kernel mean shift of the points. (Goel, Michael & Tabib's SOGMM
                    counts those of range and intensity, 2023; a cloud has only positions.)
@@ -38,7 +38,7 @@ from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.studies.fitting import Material, OnRows, Row, row_of
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mixture.em.surface_rule import surface_pieces
+from gmmtorch.mixture.em.initialization import surface_pieces
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture

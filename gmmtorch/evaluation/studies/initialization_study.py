@@ -13,7 +13,7 @@ from gmmtorch.evaluation.estimators import FitOptions
 from gmmtorch.evaluation.events import Event
 from gmmtorch.evaluation.studies.fitting import Material, OnRows, Row, row_of
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, start
+from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
 
@@ -75,7 +75,7 @@ def fit_timed(material: Material, n_components: int, options: FitOptions, seed: 
     points, weight = points - center, points.new_ones(len(points))
     generator = torch.Generator().manual_seed(seed)
     begin = time.perf_counter()
-    first = start(options.init_params, points, weight, n_components, options.reg_covar, generator)
+    first = initialize(options.init_params, points, weight, n_components, options.reg_covar, generator)
     between = time.perf_counter()
     step = em.natural_step(
         em.quadratic_features(points), weight, options.reg_covar, em.SOFTMAX_DTYPES[options.dtype], points

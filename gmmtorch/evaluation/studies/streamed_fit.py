@@ -14,7 +14,8 @@ from gmmtorch.evaluation.studies.fitting import Material, Row, row_of
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 from gmmtorch.mixture.streaming.distributed import ALONE, Processes
-from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream, survey_all
+from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream
+from gmmtorch.mixture.streaming.stream_start import survey_all
 
 _SPLIT_SALT = 0x5EED  # so that what is held out and what is drawn have nothing to do with each other
 
@@ -89,7 +90,7 @@ def fit_streamed(
         fit_stream(
             mixture,
             train,
-            found=found,
+            survey=found,
             device=device,
             processes=processes,
             checkpoint=checkpoint,

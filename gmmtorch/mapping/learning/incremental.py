@@ -89,7 +89,7 @@ def cell_fit(
         length=length,
         min_weight=3 * (dim - 1),
         max_components=max_components,
-        apart=10 * length,
+        outlier_gap=10 * length,
     )
     return SurfaceFit(noise, cell, flatness, iterations)
 

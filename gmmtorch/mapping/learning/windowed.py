@@ -12,8 +12,7 @@ from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.viewpoints import sampled_origins
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES
-from gmmtorch.mixture.em.partition import FlatnessRule
-from gmmtorch.mixture.em.surface_rule import surface_rule
+from gmmtorch.mixture.em.partition import FlatnessRule, surface_rule
 from gmmtorch.scan import Scan
 
 
@@ -44,5 +43,5 @@ def flatness_rule(rule: WindowedRule, dim: int) -> FlatnessRule:
         length=rule.length,
         min_weight_thick=1 if dim == 2 else flatness.min_weight,
         max_components=rule.n_components,
-        apart=10 * rule.length,
+        outlier_gap=10 * rule.length,
     )

@@ -1,1 +1,1 @@
-"""Expectation maximization: exact, truncated and stepwise, with its initializations (thesis 2.1)."""
+"""Expectation–maximisation: exact, truncated and stepwise, and its starting points."""

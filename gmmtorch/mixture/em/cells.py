@@ -1,7 +1,7 @@
-"""Cell moments: many points summed into few cells before EM sees them.
+"""Cells: points summed into few cells before EM.
 
 A cell's mean feature gives its expected log-density exactly, so EM on cells has an exact M-step and
-a bound that rises (see `em`); it costs what the cells cost, not what the points cost.
+an increasing bound (see `exact`). Its cost depends on the number of cells, not of points.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from torch import Tensor
 from gmmtorch.linalg import count_distinct, dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 
-_KEY_BITS = 20  # of a cell's coordinate within its key
-_MOST_CELLS = (1 << _KEY_BITS) - 2  # along the longest side
+_KEY_BITS = 20  # bits of one cell coordinate in a key
+_MAX_CELLS_ALONG = (1 << _KEY_BITS) - 2  # along the longest side
 _CHUNK_POINTS = 1 << 17
 
 
 class Cells(NamedTuple):
-    """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): each point's cell."""
+    """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): cell of each
+    point.
+    """
 
     features: Tensor
     weight: Tensor
@@ -29,12 +31,11 @@ class Cells(NamedTuple):
 
 
 def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tensor | None = None) -> Cells:
-    """Sum centred points (N, D), float64, D ≤ 3, into at most `max_cells` cubes of one size.
+    """Sum centred points (N, D), float64, D ≤ 3, into at most `max_cells` cubic cells of one size.
 
-    The cubes have side `finest` (m; the sensor's noise is a good choice), or one of a sequence,
-    each a third of an octave coarser than the last, that just keeps within the limit. Nothing is
-    pooled when there are no more than `max_cells` points. `weight` (N,): how many points each row
-    stands for, above zero; one if not given.
+    The cells have side `finest` (m; the sensor's noise is a good choice). If that gives too many cells,
+    the side grows in steps of a third of an octave until the limit holds. At most `max_cells` points are
+    not pooled. `weight` (N,): number of points that each row stands for, above zero; default one.
     """
     n = points.shape[0]
     weight = points.new_ones(n) if weight is None else weight
@@ -49,10 +50,10 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
 
 
 def _cell_keys(points: Tensor, max_cells: int, finest: float) -> Tensor:
-    """A number (N,) for each point, the same for all points of a cell."""
+    """A key (N,) for each point; points of one cell have the same key."""
     low = points.amin(0)
     extent = float((points.amax(0) - low).max())
-    side = max(finest, extent / _MOST_CELLS) or 1.0  # one cell for equal points
+    side = max(finest, extent / _MAX_CELLS_ALONG) or 1.0  # equal points share one cell
     fine = (points - low) / side
 
     def keys(thirds: int) -> Tensor:
@@ -60,7 +61,7 @@ def _cell_keys(points: Tensor, max_cells: int, finest: float) -> Tensor:
 
     if count_distinct(keys(0)) <= max_cells:
         return keys(0)
-    too_fine, enough = 0, 3 * math.ceil(math.log2(extent / side + 2))  # one cell at last
+    too_fine, enough = 0, 3 * math.ceil(math.log2(extent / side + 2))  # the upper limit gives one cell
     while enough - too_fine > 1:
         middle = (too_fine + enough) // 2
         if count_distinct(keys(middle)) <= max_cells:

@@ -1,13 +1,13 @@
-"""Expectation–maximisation of a Gaussian mixture as two matrix products.
+"""Exact expectation–maximisation of a Gaussian mixture, as two matrix products.
 
-With features φ(x) = [1, x, x_i x_j (i ≤ j)] the log-density plus log-weight of every component is
-linear in φ: L = φ Wᵀ, W the natural parameters. One iteration is Γ = softmax(L), S = Γᵀ diag(p) φ,
-and S (K × F) holds all sufficient statistics: N_k, Σ γ x and Σ γ xxᵀ.
+With the features φ(x) = [1, x, x_i x_j (i ≤ j)], the log-density plus log-weight of every component
+is linear in φ: L = φ Wᵀ, with natural parameters W. One iteration is Γ = softmax(L), S = Γᵀ diag(p) φ.
+S (K × F) contains all sufficient statistics: N_k, Σ γ x and Σ γ xxᵀ.
 
-A row of features need not be one point. The mean feature of a cell of points, with their number as
-its weight, gives the cell's expected log-density exactly; EM then shares one responsibility among
-the points of a cell, the M-step stays exact, and Σ_c n_c logsumexp_k bounds the log-likelihood from
-below and never falls (Verbeek, Nunnink & Vlassis, 2006).
+A row of features may also stand for a cell of points. The mean feature of the cell, weighted by its
+number of points, gives the cell's expected log-density exactly. All points of a cell then share one
+responsibility, the M-step stays exact, and Σ_c n_c logsumexp_k is a lower bound of the log-likelihood
+that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from torch import Tensor
 from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
 
 CHUNK_ELEMENTS = 1 << 17
-"""Entries of the N×K block worked on at once, so that it stays in a core's cache."""
+"""Entries of an N×K block, small enough for the cache of a core."""
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
-"""What the exponentials of the E-step may be computed in, by name."""
+"""Dtypes for the exponentials of the E-step, by name."""
 
 _LOG_2PI = 1.8378770664093453
-_MIN_LOG_WEIGHT = -1e30  # stands for log 0: finite, so that products stay free of NaN
+_MIN_LOG_WEIGHT = -1e30  # replaces log 0: finite, so that products are not NaN
 
 
 class Parameters(NamedTuple):
@@ -42,7 +42,7 @@ class Parameters(NamedTuple):
 
 @dataclass(frozen=True)
 class EMResult:
-    """Parameters, and the lower bound (mean log-likelihood, nats) before each iteration's M-step."""
+    """Parameters, and the lower bound (mean log-likelihood, nats) before the M-step of each iteration."""
 
     parameters: Parameters
     lower_bounds: list[float]
@@ -59,12 +59,14 @@ def quadratic_features(points: Tensor) -> Tensor:
 
 
 def _products(left: Tensor, right: Tensor) -> Tensor:
-    """x_i y_j, i ≤ j: (…, D) and (…, D) → (…, D(D+1)/2). By slices: far faster than by indices."""
+    """x_i y_j, i ≤ j: (…, D) and (…, D) → (…, D(D+1)/2). Slices are much faster here than index arrays."""
     return torch.cat([left[..., i : i + 1] * right[..., i:] for i in range(left.shape[-1])], -1)
 
 
 def shift_features(features: Tensor, offset: Tensor) -> Tensor:
-    """Features (…, F) of points moved by offset (…, D): of x + d, from those of x; sums of features alike."""
+    """Features (…, F) of points x + d from those of points x, for offsets d (…, D); also for sums of
+    features.
+    """
     dim = offset.shape[-1]
     count, first, second = features[..., :1], features[..., 1 : 1 + dim], features[..., 1 + dim :]
     second = second + _products(first, offset) + _products(offset, first) + count * _products(offset, offset)
@@ -84,7 +86,7 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     constant = log_weight - half_log_det - 0.5 * (dim * _LOG_2PI + (linear * means).sum(1))
     rows, cols = triangle_indices(dim, means.device)
     doubled = means.new_ones(rows.shape[0])
-    doubled[rows == cols] = 0.5  # off-diagonal products occur once in φ, and stand for two
+    doubled[rows == cols] = 0.5  # φ has each off-diagonal product once, for two matrix entries
     return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
 
 
@@ -93,13 +95,12 @@ def expectation(
 ) -> tuple[Tensor, Tensor]:
     """One E-step: sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar).
 
-    The products run in the features' dtype (float64: in float32 the quadratic form cancels by
-    many digits), the exponentials in `softmax_dtype`, after the row's maximum is taken off.
+    Products are computed in the dtype of the features (float64, because the quadratic form cancels many
+    digits). Exponentials are computed in `softmax_dtype`, after subtraction of the row's maximum.
     """
     n, k = features.shape[0], natural.shape[0]
     rows = max(64, CHUNK_ELEMENTS // k)
-    # exp of less would be denormal: it weighs nothing, and is ten times slower to compute.
-    floor = -80.0 if softmax_dtype == torch.float32 else -700.0
+    floor = exponent_floor(softmax_dtype)
     statistics = torch.zeros_like(natural.T, memory_format=torch.contiguous_format)
     total = features.new_zeros(())
     transposed = natural.T.contiguous()
@@ -116,6 +117,11 @@ def expectation(
     return statistics.T, total
 
 
+def exponent_floor(dtype: torch.dtype) -> float:
+    """Smallest exponent whose exp is not denormal: denormals are negligible, but slow to compute."""
+    return -80.0 if dtype == torch.float32 else -700.0
+
+
 def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
     """The component (N,) with the largest responsibility for each row of features."""
     natural = natural_parameters(parameters).T.contiguous()
@@ -124,9 +130,9 @@ def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
 
 
 def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | None = None) -> Parameters:
-    """M-step: parameters from sufficient statistics; `reg_covar` (m²) is added to each variance.
+    """M-step: parameters from sufficient statistics. `reg_covar` (m²) is added to each variance.
 
-    A component that lost all its points keeps its `previous` mean and covariance, at weight 0.
+    A component that lost all its points keeps its `previous` mean and covariance, with weight 0.
     """
     dim = feature_dimension(statistics.shape[1])
     eps = 10 * torch.finfo(statistics.dtype).eps
@@ -135,10 +141,10 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
     second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
     covariances = second - means[:, :, None] * means[:, None, :]
     covariances.diagonal(dim1=-2, dim2=-1).clamp_min_(0).add_(reg_covar)
-    return _keep_dead(Parameters(count / count.sum(), means, covariances), statistics[:, 0] > eps, previous)
+    return _keep_empty(Parameters(count / count.sum(), means, covariances), statistics[:, 0] > eps, previous)
 
 
-def _keep_dead(new: Parameters, alive: Tensor, previous: Parameters | None) -> Parameters:
+def _keep_empty(new: Parameters, alive: Tensor, previous: Parameters | None) -> Parameters:
     if previous is None or bool(alive.all()):
         return new
     return Parameters(
@@ -153,14 +159,14 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- the slow, exact form -------------------------------------------------------------------------
+# -- the direct form: slower, without cancellation ------------------------------------------------
 
 
 def is_ill_conditioned(parameters: Parameters) -> bool:
-    """Whether the natural parameters would cancel by more than about 1e-6 nats in float64.
+    """Whether natural parameters lose more than about 1e-6 nats to cancellation in float64.
 
-    φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats: with a component 1 mm thick this happens 10 km
-    from the centre of the cloud.
+    φ·W sums terms as large as μᵀΣ⁻¹μ to a few nats. For a component 1 mm thick this fails 10 km from the
+    centre of the cloud.
     """
     whiten = inverse_factor(safe_cholesky(parameters.covariances))
     size = (parameters.means[:, None, :] @ whiten).square().sum((1, 2))
@@ -168,9 +174,9 @@ def is_ill_conditioned(parameters: Parameters) -> bool:
 
 
 def _has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
-    """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance needs, or the next step would.
+    """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance, or the next step, needs.
 
-    Works on what may be no covariance at all: nothing is factorised.
+    Accepts covariances that are not positive definite: nothing is factorised.
     """
     alive = parameters.weights > 0
     variance = torch.linalg.eigvalsh(parameters.covariances)[:, 0]
@@ -180,7 +186,7 @@ def _has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
 
 
 def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
-    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖²: no cancellation, however far out."""
+    """log π_k + log N(x_n | μ_k, Σ_k), (N, K), from ‖L⁻¹(x − μ)‖², without cancellation at any distance."""
     weights, means, covariances = parameters
     factors = safe_cholesky(covariances)
     whiten = inverse_factor(factors)
@@ -194,7 +200,7 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
 def _responsibilities(
     points: Tensor, sample_weight: Tensor, parameters: Parameters
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Points (n, D), their weighted responsibilities (n, K) and Σ_n p_n log p(x_n), chunk by chunk."""
+    """Points (n, D), their weighted responsibilities (n, K) and Σ_n p_n log p(x_n), in chunks."""
     rows = max(1, CHUNK_ELEMENTS // parameters.weights.shape[0])
     for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
         joint = log_joint(part, parameters)
@@ -203,7 +209,7 @@ def _responsibilities(
 
 
 def direct_sums(points: Tensor, sample_weight: Tensor, parameters: Parameters) -> tuple[Tensor, Tensor]:
-    """First pass of the direct form: (K, 1 + D), N_k and Σγx, and Σ_n p_n log p(x_n)."""
+    """First pass of the direct form: N_k and Σγx (K, 1 + D), and Σ_n p_n log p(x_n)."""
     sums = torch.cat([torch.zeros_like(parameters.weights)[:, None], torch.zeros_like(parameters.means)], 1)
     total = points.new_zeros(())
     for part, gamma, value in _responsibilities(points, sample_weight, parameters):
@@ -225,13 +231,15 @@ def direct_scatter(points: Tensor, sample_weight: Tensor, parameters: Parameters
 def direct_maximization(
     sums: Tensor, scatter: Callable[[Tensor], Tensor], reg_covar: float, previous: Parameters
 ) -> Parameters:
-    """M-step from the sums (K, 1 + D) of the first pass; `scatter` makes the second, about means (K, D)."""
+    """M-step from the sums (K, 1 + D) of the first pass; `scatter` computes the second pass for means (K,
+    D).
+    """
     eps = 10 * torch.finfo(sums.dtype).eps
     count = sums[:, 0] + eps
     means = sums[:, 1:] / count[:, None]
     covariances = scatter(means) / count[:, None, None]
     covariances.diagonal(dim1=-2, dim2=-1).add_(reg_covar)
-    return _keep_dead(Parameters(count / count.sum(), means, covariances), sums[:, 0] > eps, previous)
+    return _keep_empty(Parameters(count / count.sum(), means, covariances), sums[:, 0] > eps, previous)
 
 
 def direct_step(
@@ -239,7 +247,7 @@ def direct_step(
 ) -> tuple[Parameters, Tensor]:
     """One E- and M-step without natural parameters: new parameters and Σ_n p_n log p(x_n).
 
-    Second moments are taken about the new means, in a second pass over the points.
+    A second pass over the points computes the second moments about the new means.
     """
     sums, total = direct_sums(points, sample_weight, parameters)
     new = direct_maximization(
@@ -251,7 +259,7 @@ def direct_step(
 # -- the loop -------------------------------------------------------------------------------------
 
 Step = Callable[[Parameters], tuple[Parameters, float]]
-"""From parameters to better ones, and the mean lower bound (nats) of those it was given."""
+"""One EM step: from parameters to improved ones, and the mean lower bound (nats) of the given ones."""
 
 
 def natural_step(
@@ -261,10 +269,10 @@ def natural_step(
     softmax_dtype: torch.dtype = torch.float32,
     points: Tensor | None = None,
 ) -> Step:
-    """EM steps on features (N, F), which may be those of cells. Both are float64.
+    """EM steps on features (N, F), float64, of points or cells.
 
-    With `points` (N, D), the ones the features are of, steps whose natural parameters would
-    cancel are taken in the direct form instead.
+    If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
+    digits to cancellation uses the direct form instead.
     """
 
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
@@ -282,9 +290,9 @@ def guarded_step(
     reg_covar: float,
     total: float,
 ) -> Step:
-    """EM steps by `gather`, the E-step: parameters → S (K, F) and Σ_n p_n log p(x_n); Σ_n p_n is `total`.
+    """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
 
-    Where natural parameters cancel, or S has, the step is taken by `direct` instead, if there is one.
+    If the natural parameters or S lose digits to cancellation, `direct` takes the step, if it is given.
     """
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
@@ -310,10 +318,10 @@ def run_em(
 ) -> EMResult:
     """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations.
 
-    `lower_bounds` are those of the iterations that led to `parameters`, when EM goes on from there.
+    To continue a run, pass as `lower_bounds` those of the iterations that led to `parameters`.
     """
     bounds = list(lower_bounds)
-    while not (converged := _has_settled(bounds, tol)) and len(bounds) < max_iter:
+    while not (converged := _has_converged(bounds, tol)) and len(bounds) < max_iter:
         parameters, bound = step(parameters)
         bounds.append(bound)
         if on_iteration is not None:
@@ -321,5 +329,5 @@ def run_em(
     return EMResult(parameters, bounds, converged)
 
 
-def _has_settled(bounds: list[float], tol: float) -> bool:
+def _has_converged(bounds: list[float], tol: float) -> bool:
     return len(bounds) > 1 and abs(bounds[-1] - bounds[-2]) < tol

@@ -1,7 +1,15 @@
-"""Rows grouped by the component that owns them, and the components that each group may come from."""
+"""Truncated E-step: rows grouped by their owner, with a few candidate components for each group.
+
+In a mixture of a thousand surface patches, only a few components near a point have responsibilities
+above zero to many digits. Each row (a point, or a cell of points) therefore has an owner, its most
+likely component. All rows of an owner form a group, and a group is compared with the owner's
+candidate components only.
+"""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,25 +17,33 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.linalg import argsort, largest_indices, pack_symmetric
+from gmmtorch.linalg import (
+    argsort,
+    inverse_factor,
+    largest_indices,
+    pack_symmetric,
+    safe_cholesky,
+    unpack_symmetric,
+)
 from gmmtorch.mixture.em.exact import (
     CHUNK_ELEMENTS,
     Parameters,
+    exponent_floor,
     feature_dimension,
     natural_parameters,
     quadratic_features,
     shift_features,
 )
 
-_SAMPLES = 64  # rows of a group asked which components matter, at most
+_SAMPLES = 64  # most rows of a group that are compared with all components
 _BUILD_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
 class Rows:
-    """What EM is run on, in one frame, float64: points (N, D), or the mean features (N, F) of cells.
+    """Input of EM, in one frame, float64: points (N, D), or the mean features (N, F) of cells.
 
-    weight (N,): how many points each row stands for.
+    weight (N,): number of points that each row stands for.
     """
 
     values: Tensor
@@ -46,7 +62,7 @@ class Rows:
         return quadratic_features(self.values) if self.are_points else self.values
 
     def local_features(self, index: Tensor, center: Tensor, dtype: torch.dtype) -> Tensor:
-        """Features (n, F) of the rows `index` (n,), each about its own center (n, D)."""
+        """Features (n, F) of the rows `index` (n,), each relative to its own center (n, D)."""
         values = self.values.index_select(0, index)
         if self.are_points:
             return quadratic_features((values - center).to(dtype))
@@ -54,11 +70,11 @@ class Rows:
 
 
 class Groups(NamedTuple):
-    """Rows sorted by owner, in blocks of B, filled up with rows of weight 0.
+    """Rows sorted by owner, in blocks of B rows of one owner. Rows of weight 0 fill incomplete blocks.
 
-    features (b, B, F) about the block's center, weight (b, B), owner (b,) of each block, centers
-    (K, D) of the owners; n_rows, mass and spread (K,) of their rows: number, Σp and Σp‖x − center‖²;
-    row (N,) and slot (N,): the row that went into each slot of b·B.
+    features: (b, B, F) relative to the center of the owner. weight: (b, B). owner: (b,) of each block.
+    centers: (K, D) of the owners. n_rows, mass, spread: (K,) number of rows, Σp and Σp‖x − center‖² of
+    each owner. row, slot: (N,) row `row[i]` is stored in slot `slot[i]` of the b·B slots.
     """
 
     features: Tensor
@@ -73,9 +89,9 @@ class Groups(NamedTuple):
 
 
 def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -> Groups:
-    """Rows in blocks of the same owner (N,), about the owner's center (K, D), in `dtype`."""
+    """Group rows by owner (N,), relative to the owner's center (K, D), in `dtype`."""
     n, k = owner.shape[0], centers.shape[0]
-    # Small blocks waste little on filling up; large ones are faster to multiply.
+    # Small blocks need little padding; large blocks multiply faster.
     block = 16 if n < 48 * k else 32 if n < 200 * k else 64
     row = argsort(owner)
     count = torch.bincount(owner, minlength=k)
@@ -111,19 +127,32 @@ def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -
     )
 
 
-def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int) -> Tensor:
-    """For each component (K,) the `n_candidates` (K, m) that its group's rows are likeliest from.
+def owners_of(groups: Groups) -> Tensor:
+    """The owner of each row, (N,)."""
+    owner = torch.empty_like(groups.row)
+    owner[groups.row] = groups.owner[groups.slot // groups.weight.shape[1]]
+    return owner
 
-    A sample of each group's rows is compared with all components. The owner is always among them.
+
+def nearest(points: Tensor, means: Tensor) -> Tensor:
+    """The component (N,) whose mean (K, D) is nearest to each point (N, D)."""
+    tree = cKDTree(means.detach().cpu().numpy())
+    return torch.from_numpy(tree.query(points.detach().cpu().numpy())[1]).to(points.device)
+
+
+def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int) -> Tensor:
+    """The `n_candidates` most likely components (K, m) for the group of each of the K owners.
+
+    A sample of each group's rows is compared with all components. The owner is always a candidate.
     """
     k = parameters.weights.shape[0]
     if k <= n_candidates:
         return torch.arange(k, device=groups.owner.device).expand(k, k)
     n_samples = max(8, min(_SAMPLES, 4096 // k))
-    # Evenly out of all of a group's rows: neighbours in a scan are neighbours in space.
+    # Evenly spaced over the rows of a group, because adjacent rows of a scan are adjacent in space.
     count, steps = groups.n_rows[:, None], torch.arange(n_samples, device=groups.n_rows.device)
     place = torch.cumsum(count, 0) - count + (2 * steps + 1) * count // (2 * n_samples)
-    place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates do not matter
+    place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
     samples = groups.features.flatten(0, 1)[groups.slot[place]]
     natural = natural_parameters(parameters).T.contiguous()
     chosen = []
@@ -140,14 +169,107 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     return torch.cat(chosen)
 
 
-def owners_of(groups: Groups) -> Tensor:
-    """The owner of each row, (N,)."""
-    owner = torch.empty_like(groups.row)
-    owner[groups.row] = groups.owner[groups.slot // groups.weight.shape[1]]
-    return owner
+# -- the E-step over candidates -------------------------------------------------------------------
 
 
-def nearest(points: Tensor, means: Tensor) -> Tensor:
-    """The component (N,) whose mean (K, D) is nearest to each point (N, D)."""
-    tree = cKDTree(means.detach().cpu().numpy())
-    return torch.from_numpy(tree.query(points.detach().cpu().numpy())[1]).to(points.device)
+class Expectation(NamedTuple):
+    """Result of a truncated E-step.
+
+    statistics: (K, F) relative to the components' means, float64. value: Σ p log Σ_candidates, nats.
+    owner: (N,) the most likely candidate of each row, if requested.
+    """
+
+    statistics: Tensor
+    value: float
+    owner: Tensor | None
+
+
+def truncated_expectation(
+    groups: Groups,
+    candidates: Tensor,
+    parameters: Parameters,
+    want_owner: bool = False,
+    compiled: bool = False,
+) -> Expectation:
+    """E-step of `exact.expectation`, restricted to the candidates (G, m) of each of the G groups.
+
+    With `want_owner`, also returns each row's most likely candidate. `compiled`: use torch.compile.
+    """
+    n_groups, m = candidates.shape
+    n_blocks, block, n_features = groups.features.shape
+    dtype = groups.features.dtype
+    natural = local_parameters(parameters, groups.centers, candidates).to(dtype)
+    sums = torch.zeros(n_groups, n_features * m, dtype=dtype, device=candidates.device)
+    value = torch.zeros((), dtype=torch.float64, device=candidates.device)
+    likeliest = torch.empty_like(groups.weight, dtype=torch.int64) if want_owner else None
+    block_sums = _compiled_block_sums() if compiled else _block_sums
+    step = max(1, CHUNK_ELEMENTS // (block * m))
+    for begin in range(0, n_blocks, step):
+        part = slice(begin, begin + step)
+        owner = groups.owner[part]
+        block_natural = natural.index_select(0, owner)
+        block_statistics, block_value = block_sums(block_natural, groups.features[part], groups.weight[part])
+        sums.index_add_(0, owner, block_statistics)
+        value += block_value
+        if likeliest is not None:
+            likeliest[part] = candidates[owner].gather(1, _likeliest(block_natural, groups.features[part]))
+    by_pair = sums.view(n_groups, n_features, m).transpose(1, 2).double()
+    about_means = shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
+    statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)
+    statistics.index_add_(0, candidates.flatten(), about_means.flatten(0, 1))
+    owners = None
+    if likeliest is not None:
+        owners = torch.empty_like(groups.row)
+        owners[groups.row] = likeliest.flatten()[groups.slot]
+    return Expectation(statistics, float(value), owners)
+
+
+def local_parameters(parameters: Parameters, centers: Tensor, candidates: Tensor) -> Tensor:
+    """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D)."""
+    zero = Parameters(parameters.weights, torch.zeros_like(parameters.means), parameters.covariances)
+    natural = natural_parameters(zero)  # of the components relative to their own means
+    dim = centers.shape[1]
+    doubled = natural[:, 1 + dim :]
+    scale = pack_symmetric(0.5 + 0.5 * torch.eye(dim, dtype=natural.dtype, device=natural.device))
+    precision = unpack_symmetric(-2 * doubled * scale, dim)
+    offset = parameters.means[candidates] - centers[:, None]
+    linear = (precision[candidates] @ offset[..., None]).squeeze(-1)
+    constant = natural[:, 0][candidates] - 0.5 * (linear * offset).sum(-1)
+    return torch.cat([constant[..., None], linear, doubled[candidates]], -1)
+
+
+def _block_sums(natural: Tensor, features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Σγφ (b, F·m) and Σ p log Σ exp of blocks: natural (b, m, F), features (b, B, F), weight (b, B)."""
+    floor = exponent_floor(features.dtype)
+    # Candidates are the rows, so that reductions over candidates run along contiguous memory.
+    gamma = torch.bmm(natural, features.transpose(1, 2))  # (b, m, B)
+    peak = gamma.amax(1, keepdim=True)
+    norm = gamma.sub_(peak).clamp_(min=floor).exp_().sum(1)
+    value = (weight * (peak[:, 0] + norm.log())).sum(dtype=torch.float64)
+    gamma.mul_((weight / norm)[:, None])
+    return torch.bmm(features.transpose(1, 2), gamma.transpose(1, 2)).flatten(1), value
+
+
+@functools.cache
+def _compiled_block_sums() -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
+    compiled: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+    compiled = torch.compile(_block_sums, dynamic=True)
+    return compiled
+
+
+def _likeliest(natural: Tensor, features: Tensor) -> Tensor:
+    """Position (b, B) of the most likely candidate of each row."""
+    joint = torch.bmm(natural, features.transpose(1, 2))
+    # A mask, because argmax along a dimension other than the last is slow.
+    place = torch.arange(joint.shape[1], dtype=joint.dtype, device=joint.device)[:, None]
+    return torch.where(joint == joint.amax(1, keepdim=True), place, 0).amax(1).long()
+
+
+def rounding(groups: Groups, parameters: Parameters) -> tuple[float, float]:
+    """Expected error of a float32 E-step, nats a point: the mean, and that of the worst group.
+
+    The error is ε/2 E[‖x‖²] tr Σ⁻¹. It is also the relative error of a component's smallest variance.
+    """
+    precision = inverse_factor(safe_cholesky(parameters.covariances)).square().sum((1, 2))
+    error = groups.spread * precision * (torch.finfo(torch.float32).eps / 2)
+    return float(error.sum() / groups.mass.sum()), float((error / groups.mass.clamp_min(1e-300)).max())

@@ -1,7 +1,7 @@
-"""Where EM starts (thesis 2.1.3): k-means, random points, uniform in the bounding box, or flat pieces.
+"""Starting parameters of EM (thesis 2.1.3): k-means, random points, the bounding box, or flat pieces.
 
-Starts are drawn from the distinct points, in sorted order, with their summed weights: so a point of
-weight 2 and the same point given twice start EM from the very same place.
+Starts are computed from the distinct points, in sorted order, with summed weights. A point of weight 2
+and the same point given twice therefore give exactly the same start.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from sklearn.cluster import KMeans
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.mixture.em.cells import pool_into_cells
@@ -23,10 +21,11 @@ from gmmtorch.mixture.em.exact import (
     quadratic_features,
     shift_features,
 )
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool
+from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, surface_rule
 
-_FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # that flat pieces are cut from
+_FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
+_SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this number of points on
 
 Initialization = Callable[[Tensor, Tensor, int, float, torch.Generator], Parameters]
 """(points (N, D), weight (N,), K, reg_covar, generator) → parameters. Points centred, float64."""
@@ -47,11 +46,14 @@ def from_kmeans(
     generator: torch.Generator,
     n_init: int = 1,
 ) -> Parameters:
-    """One covariance for each of scikit-learn's k-means clusters, the tightest of `n_init` runs."""
+    """The moments of scikit-learn's k-means clusters; of `n_init` runs, the clustering with least scatter."""
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
     seed = int(torch.randint(2**31 - 1, (), generator=generator))
     kmeans = KMeans(n_components, n_init=n_init, random_state=seed)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # fewer clusters than asked for: see start()
+        warnings.simplefilter("ignore", ConvergenceWarning)  # raised for empty clusters
         labels = kmeans.fit(points.cpu().numpy(), sample_weight=weight.cpu().numpy()).labels_
     labels = torch.from_numpy(labels.astype(np.int64)).to(points.device)
     return moments_of(quadratic_features(points), weight, labels, n_components, reg_covar, points)
@@ -60,7 +62,7 @@ def from_kmeans(
 def from_kmeans_restarts(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
-    """The tightest of ten k-means clusterings."""
+    """The moments of the best of ten k-means clusterings."""
     return from_kmeans(points, weight, n_components, reg_covar, generator, n_init=10)
 
 
@@ -68,7 +70,7 @@ def from_random_points(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
     """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    # Exponential race: the K smallest of E/w are a weighted draw without replacement.
+    # The K smallest of E/w, E exponential, are a weighted draw without replacement.
     race = torch.empty(weight.shape, dtype=torch.float64).exponential_(generator=generator)
     chosen = (race.to(weight.device) / weight).argsort()[:n_components]
     return _isotropic(points[chosen], points, weight, reg_covar)
@@ -84,7 +86,7 @@ def from_bounding_box(
 
 
 def _isotropic(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) -> Parameters:
-    """The cloud's mean variance, shrunk as if the components tiled it: σ² K^(−2/D)."""
+    """Components with the cloud's mean variance, reduced as if they tile the cloud: σ² K^(−2/D)."""
     n_components, dim = means.shape
     center = (weight[:, None] * points).sum(0) / weight.sum()
     spread = (weight[:, None] * (points - center) ** 2).sum() / weight.sum() / dim
@@ -97,29 +99,47 @@ def _isotropic(means: Tensor, points: Tensor, weight: Tensor, reg_covar: float) 
 def from_flat_pieces(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
-    """One component for each of the cloud's flat pieces: nothing random, and cheap for any K."""
+    """One component for each of the cloud's flat pieces: deterministic, and fast for any K."""
     found, _ = flat_pieces(points, weight, n_components, reg_covar)
-    return copied(found, n_components)[0]
+    return replicated(found, n_components)[0]
 
 
 def flat_pieces(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, features: Tensor | None = None
 ) -> tuple[Parameters, Tensor]:
-    """At most K components, and the one that each point (N, D) belongs to, (N,).
+    """At most K components, and the component (N,) of each point (N, D).
 
-    The cloud is halved again and again, the longest and thickest pieces first (see `partition`). In
-    2D and 3D, that is done on cells where there are many points to a component. The points may be
-    the means of cells already, and `features` (N, F) their mean features.
+    The cloud is halved repeatedly; long and thick pieces are halved first (see `partition`). In 2D and 3D,
+    if there are many points a component, cells are partitioned instead of points. The points may already
+    be the means of cells, with mean features `features` (N, F).
     """
     rule = FlatnessRule(
-        0.0, 0.0, min_weight=0.0, min_weight_thick=0.0, max_components=n_components, apart=0.0
+        0.0, 0.0, min_weight=0.0, min_weight_thick=0.0, max_components=n_components, outlier_gap=0.0
     )
     n_cells = max(_FEWEST_CELLS, _CELLS_OF_A_COMPONENT * n_components)
     finest = float((points.amax(0) - points.amin(0)).max()) / _FINEST_CELLS
-    return pieces_by(rule, points, weight, reg_covar, n_cells, finest, features)
+    return partition_components(rule, points, weight, reg_covar, n_cells, finest, features)
 
 
-def pieces_by(
+def surface_pieces(
+    points: Tensor, weight: Tensor, noise: float, reg_covar: float, features: Tensor | None = None
+) -> tuple[Parameters, Tensor]:
+    """As many components as the cloud has flat pieces, and the component (N,) of each point (N, D).
+
+    The cloud is partitioned by `surface_rule`. Outliers aside, there are at most as many components as
+    the total weight divided by `least_support`.
+
+    Args:
+        points: (N, D), centred, float64; or the means of cells with mean `features` (N, F).
+        weight: (N,) number of points that each row stands for; a component needs enough of them.
+        noise: standard deviation of the sensor, in the unit of the points.
+        reg_covar: added to each variance, in the squared unit of the points.
+    """
+    rule = surface_rule(noise, points.shape[1])
+    return partition_components(rule, points, weight, reg_covar, _SURFACE_CELLS, noise, features)
+
+
+def partition_components(
     rule: FlatnessRule,
     points: Tensor,
     weight: Tensor,
@@ -128,9 +148,9 @@ def pieces_by(
     finest: float,
     features: Tensor | None = None,
 ) -> tuple[Parameters, Tensor]:
-    """What `flat_pieces` gives, of the pieces that a rule cuts.
+    """Components of the pieces that `rule` gives, and the component (N,) of each point (N, D).
 
-    Where there are more than twice `n_cells` points (2D, 3D), cells of side `finest` or more are cut.
+    If there are at least twice `n_cells` points (2D, 3D), cells of side `finest` or more are partitioned.
     """
     dim = points.shape[1]
     exact = None
@@ -153,14 +173,15 @@ def moments_of(
     reg_covar: float,
     points: Tensor | None = None,
 ) -> Parameters:
-    """Weight, mean and covariance of the rows of each label: (N, F) features, labels (N,) below K.
+    """Weight, mean and covariance of the rows (N, F) of each label (N,), labels below K.
 
-    `points` (N, D), if the features are those of points: far out, they have digits that products lack.
+    Pass `points` (N, D) if the features are those of points: far from the origin, points have digits that
+    their products lack.
     """
     dim = feature_dimension(features.shape[1])
     sums = pool(features[:, : 1 + dim], weight, labels, n_components)
     means = sums[:, 1:] / sums[:, :1].clamp_min(1e-300)
-    # Second moments about each one's own mean: pieces may be thin, and far apart.
+    # Second moments are taken about each piece's own mean, because pieces may be thin and far apart.
     center = means.index_select(0, labels)
     local = shift_features(features, -center) if points is None else quadratic_features(points - center)
     found = maximization(pool(local, weight, labels, n_components), reg_covar)
@@ -176,7 +197,7 @@ INITIALIZATIONS: dict[str, Initialization] = {
 }
 
 
-def start(
+def initialize(
     method: str,
     points: Tensor,
     weight: Tensor,
@@ -184,19 +205,22 @@ def start(
     reg_covar: float,
     generator: torch.Generator,
 ) -> Parameters:
-    """Starting parameters of K components for centred points, whatever their number of distinct rows.
+    """Starting parameters of K components for centred points with any number of distinct rows.
 
-    Fewer distinct points than components: the start has one component for each, and the rest are
-    copies that share the weight, so the density is what the distinct points ask for.
+    If there are fewer distinct points than components, each distinct point gives one component, and the
+    other components are copies that share its weight. The density is then that of the distinct points.
     """
     points, weight = distinct_points(points, weight)
     n = min(n_components, points.shape[0])
     found = INITIALIZATIONS[method](points, weight, n, reg_covar, generator)
-    return copied(found, n_components)[0]
+    return replicated(found, n_components)[0]
 
 
-def copied(found: Parameters, n_components: int) -> tuple[Parameters, Tensor]:
-    """K components from fewer: copies that share the weight; and which (K,) each is a copy of."""
+def replicated(found: Parameters, n_components: int) -> tuple[Parameters, Tensor]:
+    """K components from fewer: copies share the weight.
+
+    Also the index (K,) of the component each one copies.
+    """
     n = found.weights.shape[0]
     copy = torch.arange(n_components, device=found.weights.device) % n
     shares = torch.bincount(copy, minlength=n)[copy]

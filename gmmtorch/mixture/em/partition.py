@@ -1,15 +1,20 @@
-"""Cutting a cloud into flat pieces: how many components it needs, and where they begin.
+"""Partition of a cloud into flat pieces: the number of components, and the start of EM.
 
-A piece is halved at its mean, across its longest direction, as long as it is thicker than the
-sensor's noise explains or longer than a component should be, and both halves keep enough points.
-The pieces of one level are cut in one batch of tensor operations. What a surface looks like thus
-decides the number of components: a wall takes few, clutter many, and never more than its points
-can support. Where their number is given, the pieces that are worth most are cut first: large,
-long, and above all thick ones.
+A piece is halved at its mean, across its longest direction, while it is thicker than the sensor's
+noise explains, or longer than a component may be, and both halves keep enough points. All pieces of
+a level are halved as one batch of tensor operations. A wall thus gives few pieces, a curved surface
+more pieces the lower the noise, and edges and clutter as many as their points support. If the number
+of pieces is limited, pieces with many points, large extent and above all large thickness come first.
+
+Nothing is random, and only the noise has a unit: points and noise in millimetres give the same pieces.
+For points that are not on surfaces, or noise in another unit than the points, the result is one piece
+if the noise explains all points, and otherwise as many pieces as have enough points. BENCHMARKS.md
+compares this rule with BIC and mean shift.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,20 +25,27 @@ from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
-_WORTH_OF_THICKNESS = 30.0
-"""A piece's variance across counts so many times its variance along. It is the thick pieces, those
-that span several surfaces, that put matter where there is none (BENCHMARKS.md, "Where EM starts")."""
+_THICKNESS_PRIORITY = 30.0
+"""Weight of a piece's smallest variance, relative to its largest, in the priority of halving it. Thick
+pieces span several surfaces, and so put matter into free space (BENCHMARKS.md, "Where EM starts")."""
+
+_FLAT = 2.0
+"""Largest thickness of a flat piece, in standard deviations of the noise."""
+
+_OUTLIER_GAP = 100.0
+"""Distance from which on a few stray points form a piece, in standard deviations of the noise."""
 
 
 @dataclass(frozen=True)
 class FlatnessRule:
-    """When a piece is cut: standard deviations in metres, weights in points.
+    """When a piece is halved. Standard deviations are in metres, weights in points.
 
-    thickness: pieces whose thinnest direction exceeds it are not flat. length: pieces whose
-    longest direction exceeds it are too long. min_weight: no half may weigh less;
-    min_weight_thick: nor the halves of a piece of over twice the thickness, which spans several
-    surfaces. max_components: pieces at most; half of them are cut at a time, those worth most first.
-    apart: halves may weigh anything if they lie further apart than this (m), as stray returns do.
+    thickness: a piece whose smallest standard deviation is larger is not flat. length: a piece whose
+    largest standard deviation is larger is too long. min_weight: smallest weight of a half.
+    min_weight_thick: smallest weight of a half of a piece of over twice the thickness, which spans several
+    surfaces. max_components: largest number of pieces; then at most half of the pieces are halved per
+    level, in the order of `_split_priority`. outlier_gap: a half may have any weight if it is farther
+    than this from the other half (m), as outliers are.
     """
 
     thickness: float = 0.02
@@ -41,11 +53,31 @@ class FlatnessRule:
     min_weight: float = 3.0
     min_weight_thick: float = 1.0
     max_components: int | None = None
-    apart: float = 3.0
+    outlier_gap: float = 3.0
+
+
+def least_support(dim: int) -> int:
+    """Fewest points of a component: 6 in 2D, 20 in 3D, and twice its parameters in more dimensions."""
+    return 6 if dim <= 2 else 2 + dim * (dim + 3)
+
+
+def surface_rule(noise: float, dim: int, min_points: float | None = None) -> FlatnessRule:
+    """The rule for a cloud (N, dim) measured with this noise (standard deviation, unit of the points).
+
+    `min_points`: fewest points of a piece; None: `least_support`.
+    """
+    least = least_support(dim) if min_points is None else min_points
+    return FlatnessRule(
+        thickness=_FLAT * noise,
+        length=math.inf,
+        min_weight=least,
+        min_weight_thick=least,
+        outlier_gap=_OUTLIER_GAP * noise,
+    )
 
 
 class Partition(NamedTuple):
-    """labels (N,): the piece of each point; n_pieces: how many there are, none of them empty."""
+    """labels (N,): the piece of each point; n_pieces: number of pieces, none of them empty."""
 
     labels: Tensor
     n_pieces: int
@@ -60,10 +92,10 @@ def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Ten
 def partition(
     points: Tensor, weight: Tensor, rule: FlatnessRule, features: Tensor | None = None
 ) -> Partition:
-    """Cut points (N, D), centred, float64, N ≥ 1, with weights (N,) into flat pieces.
+    """Partition points (N, D), centred, float64, N ≥ 1, with weights (N,), into flat pieces.
 
-    Where the points are the means of cells, `features` (N, F), the cells' mean features, tell how
-    thick the pieces are within the cells, too.
+    If the points are the means of cells, pass the cells' mean features `features` (N, F), so that the
+    extent within the cells counts towards the thickness.
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
@@ -83,9 +115,9 @@ def partition(
             points - means.index_select(0, labels), directions[:, :, -1].index_select(0, labels)
         )
         beyond = along > 0
-        supported = _is_supported(along, labels, weight, n_pieces, least, rule.apart)
+        supported = _is_supported(along, labels, weight, n_pieces, least, rule.outlier_gap)
         cut = wanted & supported & (count >= 2 * least) & (deviation[:, -1] > 0)
-        cut = _within_budget(cut, _worth(count, variances), n_pieces, rule.max_components)
+        cut = _limit_splits(cut, _split_priority(count, variances), n_pieces, rule.max_components)
         n_new = int(cut.sum())
         if n_new == 0:
             break
@@ -95,31 +127,33 @@ def partition(
     return Partition(labels, n_pieces)
 
 
-def _worth(count: Tensor, variances: Tensor) -> Tensor:
-    """What cutting pieces of these weights (n,) and variances (n, D), ascending, is worth."""
-    return count * (variances[:, -1] + _WORTH_OF_THICKNESS * variances[:, 0].clamp_min(0))
+def _split_priority(count: Tensor, variances: Tensor) -> Tensor:
+    """Priority (n,) of halving pieces with weights (n,) and ascending variances (n, D)."""
+    return count * (variances[:, -1] + _THICKNESS_PRIORITY * variances[:, 0].clamp_min(0))
 
 
-def _within_budget(cut: Tensor, worth: Tensor, n_pieces: int, limit: int | None) -> Tensor:
-    """Of the pieces to be cut, those worth most: half of all, once they are many; within the `limit`."""
+def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:
+    """The pieces of highest priority among those to halve, within the limit, and half of all once there
+    are many.
+    """
     if limit is None:
         return cut
-    order = torch.where(cut, worth, -torch.inf).argsort(descending=True)
+    order = torch.where(cut, priority, -torch.inf).argsort(descending=True)
     chosen = torch.zeros_like(cut)
-    # All of a few pieces will be cut anyway.
+    # While there are few pieces, the limit allows to halve all of them.
     at_once = n_pieces if 4 * n_pieces <= limit else (n_pieces + 1) // 2
     chosen[order[: max(0, min(limit - n_pieces, at_once))]] = True
     return chosen & cut
 
 
 def _is_supported(
-    along: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor, far: float
+    along: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor, outlier_gap: float
 ) -> Tensor:
-    """Whether a cut at 0 of positions (N,) along each piece's axis is worth it, (n_pieces,).
+    """Whether a cut at 0 of the positions (N,) along each piece's axis leaves enough points, (n_pieces,).
 
-    Both sides must weigh `least` (n_pieces,). A smaller side is cut off all the same if it lies apart:
-    further than `far` (m) and than six deviations of the larger side. Else a few stray returns would
-    keep the cloud that they belong to whole.
+    Both halves must weigh `least` (n_pieces,). A smaller half is also allowed if it is an outlier: farther
+    than `outlier_gap` (m), and farther than six standard deviations of the larger half. Otherwise a few stray
+    returns would prevent the partition of their whole piece.
     """
     side = labels * 2 + (along > 0)
     if not bool(least.any()):
@@ -130,5 +164,5 @@ def _is_supported(
     mean, square = (sums[..., i] / count.clamp_min(1e-300) for i in (1, 2))
     deviation = (square - mean**2).clamp_min(0).sqrt().gather(1, count.argmax(1, keepdim=True)).squeeze(1)
     gap = mean[:, 1] - mean[:, 0]
-    apart = (gap > far) & (gap > 6 * deviation)
-    return (count.amin(1) > 0) & ((count.amin(1) >= least) | apart)
+    is_outlier = (gap > outlier_gap) & (gap > 6 * deviation)
+    return (count.amin(1) > 0) & ((count.amin(1) >= least) | is_outlier)

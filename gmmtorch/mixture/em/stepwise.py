@@ -1,36 +1,35 @@
-"""Stepwise EM: a mixture that learns from one batch of points after another.
+"""Stepwise EM: a mixture that is updated batch by batch.
 
-Running statistics S ← (1 − η) S + η s, s those of the batch a point, and parameters from S by the
-M-step (Cappé & Moulines, 2009; Liang & Klein, 2009). Weights, means and covariances say what S
-does, so a mixture needs no statistics beside it: it is merged, component by component, with what
-one EM step makes of the batch. Nothing cancels, wherever the points are, and covariances stay
-definite.
+The running statistics are S ← (1 − η) S + η s, with s the statistics of the batch a point, and the
+M-step gives the parameters from S (Cappé & Moulines, 2009; Liang & Klein, 2009). Weights, means and
+covariances are equivalent to S, so no statistics are stored. Each update merges, component by
+component, the mixture with the result of one EM step on the batch. Nothing cancels at any distance
+from the origin, and covariances stay positive definite.
 """
 
 from __future__ import annotations
 
-import math
 import numbers
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.moments import merge_pairs
 
 
 def step_size(batch: float, seen: float, kappa: float) -> float:
-    """η = (n / (m + n))^κ, of a batch of weight n after points of weight m.
+    """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
 
-    For batches of one size it is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first
-    batch that is taken whole. With κ = 1 every point counts the same, whatever the batches.
+    For batches of equal size η is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first batch
+    with η = 1. With κ = 1 every point counts equally, whatever the batches.
     """
     return float((batch / (seen + batch)) ** kappa)
 
 
 def blend(previous: Parameters, update: Parameters, step: float) -> Parameters:
-    """The M-step on (1 − η) S + η s, η = `step`, of the parameters that S and s have, in one frame.
+    """The M-step on (1 − η) S + η s, η = `step`, where `previous` and `update` are the parameters of S and s.
 
-    `update` is an EM step from `previous`. The variance that regularisation added to both is in
-    the result once.
+    `update` is an EM step from `previous`, in the same frame. The regularisation variance, which is part
+    of both, is in the result once.
     """
     return merge_pairs(
         previous._replace(weights=(1 - step) * previous.weights),
@@ -39,31 +38,27 @@ def blend(previous: Parameters, update: Parameters, step: float) -> Parameters:
 
 
 def weight_of_past(seen: float | None, memory: float | None) -> float:
-    """For how many points what was learned counts: `memory` at most; `seen` is None if not known.
+    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`.
 
     Raises:
-        InvalidArgumentError: a memory that cannot be, or none where nothing else is known.
+        InvalidArgumentError: an invalid memory, or memory=None if `seen` is unknown.
     """
     if memory is None:
         if seen is None:
             raise InvalidArgumentError(
-                "memory=None, but how many points this mixture stands for is not known; give memory, the "
-                "number of points it is to count for."
+                "memory=None, but the number of points that this mixture stands for is unknown; pass memory, "
+                "the number of points that it counts as."
             )
         return seen
-    most = check_points("memory", memory)
-    return most if seen is None else min(seen, most)
-
-
-def check_points(name: str, value: object) -> float:
-    """`value` as a number of points, whole or not; else `InvalidArgumentError`."""
-    if not isinstance(value, numbers.Real) or not 0 <= float(value) < math.inf:
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite number of points of at least 0.")
-    return float(value)
+    check_number("memory", memory)
+    return float(memory) if seen is None else min(seen, float(memory))
 
 
 def check_kappa(kappa: object) -> float:
-    """κ of `step_size`, if steps of that size converge: 0.5 < κ ≤ 1; else `InvalidArgumentError`."""
+    """Returns κ of `step_size`.
+
+    Raises `InvalidArgumentError` unless 0.5 < κ ≤ 1, for which steps converge.
+    """
     if not isinstance(kappa, numbers.Real) or not 0.5 < float(kappa) <= 1:
         raise InvalidArgumentError(f"kappa={kappa!r} must be above 0.5 and at most 1.")
     return float(kappa)

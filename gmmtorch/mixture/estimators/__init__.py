@@ -1,1 +1,1 @@
-"""Other ways to learn a mixture: hierarchical, variational, deconvolved, Riemannian, sliced Wasserstein."""
+"""Mixture estimators beyond plain EM, and sensor models."""

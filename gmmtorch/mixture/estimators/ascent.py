@@ -1,8 +1,9 @@
-"""Ascent of a smooth function by L-BFGS or conjugate gradients, along geodesics.
+"""Maximisation of a smooth function on a manifold, by L-BFGS or conjugate gradients along geodesics.
 
-For manifolds whose points carry a frame in which parallel transport along a geodesic is the
-identity: tangent vectors are plain tensors that may be added up wherever they were found, and all
-that a step needs of the manifold is `Point.move` (Nocedal & Wright, 2006, chapters 3, 5 and 7).
+The manifold's points must have a frame in which parallel transport along a geodesic is the identity.
+Tangent vectors are then plain tensors that may be added wherever they were computed, and a step needs
+only `Point.move` (Nocedal & Wright, 2006, chapters 3, 5 and 7). Library optimisers assume a vector
+space, so they do not apply.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from torch import Tensor
 
 from gmmtorch.errors import NumericalError
 
-_ARMIJO = 1e-4  # share of the promised rise that a step must deliver
+_ARMIJO = 1e-4  # share of the predicted gain that a step must reach
 _TRIALS = 30  # lengths tried along one direction
 
 
 class Point(Protocol):
-    """A place on the manifold, the function there, and the way from there."""
+    """A point of the manifold, with the function value and the map along geodesics."""
 
     @property
     def value(self) -> float: ...
@@ -31,28 +32,30 @@ class Point(Protocol):
 
     @property
     def inverse_hessian(self) -> Tensor:
-        """First guess of it, diagonal and above zero: it times the gradient leads uphill."""
+        """First guess of the inverse Hessian: diagonal and positive, so that it times the gradient is an
+        ascent.
+        """
 
     def bounded(self, direction: Tensor) -> Tensor:
-        """A direction no part of which goes further than a step may."""
+        """The direction, shortened where it exceeds the longest allowed step."""
 
     def move(self: P, tangent: Tensor) -> P:
-        """Where the exponential map takes a tangent vector."""
+        """The point that the exponential map gives for a tangent vector."""
 
 
 P = TypeVar("P", bound=Point)
 
 
-class LimitedMemory:
-    """L-BFGS: the inverse Hessian that the last `memory` steps and changes of gradient tell of."""
+class LBFGS:
+    """L-BFGS: the inverse Hessian implied by the last `memory` steps and gradient changes."""
 
-    slope_left = 0.9  # share of the slope that a step may leave (the curvature condition)
+    slope_left = 0.9  # largest remaining share of the slope (the curvature condition)
 
     def __init__(self, memory: int) -> None:
         self._pairs: deque[tuple[Tensor, Tensor, float]] = deque(maxlen=memory)
 
     def direction(self, point: Point) -> Tensor:
-        """Inverse Hessian times gradient, in two loops over the pairs."""
+        """Inverse Hessian times gradient, by the two-loop recursion."""
         vector = point.gradient
         shares = []
         for step, fall, product in reversed(self._pairs):
@@ -63,21 +66,21 @@ class LimitedMemory:
             vector = vector + (share - _dot(fall, vector) / product) * step
         return vector
 
-    def learn(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
+    def update(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
         step, fall = length * direction, before.gradient - after.gradient
         product = _dot(step, fall)
         if product > 1e-12 * math.sqrt(_dot(step, step) * _dot(fall, fall)):
             self._pairs.append((step, fall, product))
 
-    def forget(self) -> bool:
-        """Go back to the first guess; False where nothing more was known."""
-        known = len(self._pairs) > 0
+    def reset(self) -> bool:
+        """Reset to the first guess. False if there was nothing to reset."""
+        had_memory = len(self._pairs) > 0
         self._pairs.clear()
-        return known
+        return had_memory
 
 
 class ConjugateGradients:
-    """Preconditioned conjugate gradients after Polak & Ribière, with β no less than 0."""
+    """Preconditioned conjugate gradients by Polak & Ribière, with β ≥ 0."""
 
     slope_left = 0.1
 
@@ -93,34 +96,33 @@ class ConjugateGradients:
         beta = _dot(point.gradient - before.gradient, uphill) / size
         return uphill + max(0.0, beta) * direction
 
-    def learn(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
+    def update(self, before: Point, direction: Tensor, length: float, after: Point) -> None:
         self._last = before, direction
 
-    def forget(self) -> bool:
-        known, self._last = self._last is not None, None
-        return known
+    def reset(self) -> bool:
+        had_memory, self._last = self._last is not None, None
+        return had_memory
 
 
-SOLVERS: dict[str, Callable[[int], LimitedMemory | ConjugateGradients]] = {
-    "lbfgs": LimitedMemory,
+SOLVERS: dict[str, Callable[[int], LBFGS | ConjugateGradients]] = {
+    "lbfgs": LBFGS,
     "cg": ConjugateGradients,
 }
-"""Which way to go, by name; each is made with the number of steps it may remember."""
+"""Solvers by name; the argument is the number of steps to store."""
 
 
 def ascend(
     point: P,
-    solver: LimitedMemory | ConjugateGradients,
+    solver: LBFGS | ConjugateGradients,
     *,
     tol: float,
     max_iter: int,
     on_iteration: Callable[[int, float], None] | None = None,
 ) -> tuple[P, list[float], bool]:
-    """Climb from a point: where that led, the value after each iteration, and whether it converged.
+    """Climb from a point. Returns the final point, the value after each iteration, and whether it converged.
 
-    Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian
-    would gain less, too, to second order; or nothing near is higher, to rounding. No value is
-    below the one before.
+    Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
+    gain less, to second order; or no higher point was found, to rounding. Values never decrease.
     """
     values: list[float] = []
     for iteration in range(max_iter):
@@ -130,28 +132,31 @@ def ascend(
         values.append(point.value)
         if on_iteration is not None:
             on_iteration(iteration + 1, point.value)
-        if gain == 0 or max(gain, _promise(point)) < tol:
+        if gain == 0 or max(gain, _predicted_gain(point)) < tol:
             return point, values, True
     return point, values, False
 
 
-def _climb(point: P, solver: LimitedMemory | ConjugateGradients) -> P:
-    """A higher point; the same one if there is none. What does not lead up is forgotten."""
+def _climb(point: P, solver: LBFGS | ConjugateGradients) -> P:
+    """A higher point, or the same point if there is none.
+
+    Resets the solver if its direction does not ascend.
+    """
     while True:
         direction = point.bounded(solver.direction(point))
         length, found = search(point, direction, solver.slope_left)
         if length > 0:
-            solver.learn(point, direction, length, found)
+            solver.update(point, direction, length, found)
             return found
-        if not solver.forget():
+        if not solver.reset():
             return point
 
 
 def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
-    """How far to go along a direction, and the point there; 0 and `point` if it leads nowhere up.
+    """Step length along a direction, and the point there; 0 and `point` if the direction does not ascend.
 
-    Steps that rise too little are halved, those that leave the slope too steep doubled, until the
-    (weak) Wolfe conditions hold (Nocedal & Wright, 3.6).
+    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the
+    weak Wolfe conditions hold (Nocedal & Wright, 3.6).
     """
     slope = _dot(point.gradient, direction)
     best: tuple[float, P] = (0.0, point)
@@ -171,14 +176,14 @@ def search(point: P, direction: Tensor, slope_left: float) -> tuple[float, P]:
 
 
 def _moved(point: P, tangent: Tensor) -> P | None:
-    """Where a tangent vector leads; None if nothing can be computed there."""
+    """The point for a tangent vector, or None if it cannot be computed."""
     try:
         return point.move(tangent)
     except NumericalError:
         return None
 
 
-def _promise(point: Point) -> float:
+def _predicted_gain(point: Point) -> float:
     return 0.5 * _dot(point.gradient, point.inverse_hessian * point.gradient)
 
 

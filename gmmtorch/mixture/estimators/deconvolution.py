@@ -1,38 +1,53 @@
-"""EM for points that each come with the covariance of their noise: extreme deconvolution.
+"""Extreme deconvolution: EM for points with known noise covariances.
 
 A point is x_n = v_n + ε_n, with v_n from the mixture and ε_n ~ N(0, R_n), R_n known. So x_n has the
-density Σ_k π_k N(x | μ_k, T_nk), T_nk = Σ_k + R_n, and EM learns the mixture of v, what the sensor
-would have measured had it no noise (Bovy, Hogg & Roweis, 2011). Given component k, v_n has
+density Σ_k π_k N(x | μ_k, T_nk), T_nk = Σ_k + R_n, and EM learns the mixture of the noise-free
+positions v (Bovy, Hogg & Roweis, 2011). Given component k, v_n has
 
     mean        b_nk = μ_k + Σ_k T⁻¹(x_n − μ_k) = x_n − R_n T⁻¹(x_n − μ_k)
     covariance  B_nk = Σ_k − Σ_k T⁻¹ Σ_k        = R_n T⁻¹ Σ_k
 
-(the second forms lose no digits where R is small: with R = 0 they are x_n and 0, plain EM). The
-M-step takes b for x and b bᵀ + B for x xᵀ. Here moments are taken about the component's last mean.
+(the second forms lose no digits if R is small: with R = 0 they are x_n and 0, plain EM). The M-step
+uses b in place of x and b bᵀ + B in place of x xᵀ. Moments are relative to the component's last mean.
+
+Each of the N·K pairs has its own covariance T. Two measures keep this fast. Two plain mixtures,
+evaluated as matrix products, exclude the pairs without a share in double precision. And small
+matrices are stored entry by entry, so that each step of a factorisation is one tensor operation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import NumericalError
 from gmmtorch.linalg import inverse_factor, safe_cholesky, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators.noisy_pairs import chunks, dot, gathered
 
 _WORTH_SHARING = 256
-"""Points a distinct covariance must have on average before it is taken for itself."""
+"""Average number of points per distinct covariance from which on points are grouped by covariance."""
 
 _ROUNDING = 1e-13
-"""Least variance of a component, as a share of its largest: less would be rounding's."""
+"""Smallest variance of a component relative to its largest: a smaller one is rounding error."""
+
+
+_CHUNK_ELEMENTS = 1 << 16
+"""Entries of an N×K block, small enough for the cache of a core."""
+
+_NEGLIGIBLE = 40.0
+"""Nats below a point's most likely component at which another has no share in double precision."""
+
+Entries = list[list[Tensor]]
+"""A batch of small matrices, as one tensor per entry."""
 
 
 class Block(NamedTuple):
-    """Points (n, D) of weights (n,), whose noise is one covariance (D, D) or one each (n, D, D)."""
+    """Points (n, D) with weights (n,) and either one shared noise covariance (D, D) or one each (n, D, D)."""
 
     points: Tensor
     weight: Tensor
@@ -40,16 +55,18 @@ class Block(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Of the noise-free positions about the components' means: Σγ (K,), Σγ(b−μ) (K, D), and the
-    second moments Σγ[(b−μ)(b−μ)ᵀ + B] (K, D, D)."""
+    """Moments of the noise-free positions relative to the components' means.
+
+    mass: Σγ (K,). first: Σγ(b−μ) (K, D). second: Σγ[(b−μ)(b−μ)ᵀ + B] (K, D, D).
+    """
 
     mass: Tensor
     first: Tensor
     second: Tensor
 
 
-def blocks(points: Tensor, weight: Tensor, noise: Tensor) -> list[Block]:
-    """Points (N, D) with noise (D, D) or (N, D, D): a block each covariance if these are few."""
+def group_by_noise(points: Tensor, weight: Tensor, noise: Tensor) -> list[Block]:
+    """Points (N, D) with noise (D, D) or (N, D, D), one block per distinct covariance if there are few."""
     if noise.ndim == 2:
         return [Block(points, weight, noise)]
     distinct, group, sizes = torch.unique(noise.flatten(1), dim=0, return_inverse=True, return_counts=True)
@@ -72,17 +89,17 @@ def expectation(block: Block, parameters: Parameters) -> tuple[Moments, Tensor]:
 
 
 def log_likelihood(points: Tensor, noise: Tensor, parameters: Parameters) -> Tensor:
-    """log Σ_k π_k N(x_n | μ_k, Σ_k + R_n) of points (N, D) with noise (D, D) or (N, D, D): (N,)."""
+    """log Σ_k π_k N(x_n | μ_k, Σ_k + R_n) (N,) of points (N, D) with noise (D, D) or (N, D, D)."""
     noise = noise.expand(points.shape[0], -1, -1)
-    return torch.cat([pairs.log_likelihood for _, pairs in chunks(points, noise, parameters)])
+    return torch.cat([pairs.log_likelihood for _, pairs in pair_chunks(points, noise, parameters)])
 
 
 def maximization(
-    moments: Moments, parameters: Parameters, least: float = 0.0, thickness: float | None = None
+    moments: Moments, parameters: Parameters, min_variance: float = 0.0, thickness: float | None = None
 ) -> Parameters:
-    """M-step from moments about the means of `parameters`, with variances bounded as in `constrained`.
+    """M-step from moments about the means of `parameters`, with the limits of `bound_variances`.
 
-    A component that lost all its points keeps its mean and covariance, at weight 0.
+    A component that lost all its points keeps its mean and covariance, with weight 0.
     """
     alive = moments.mass > 10 * torch.finfo(moments.mass.dtype).eps
     count = torch.where(alive, moments.mass, 1.0)
@@ -92,42 +109,44 @@ def maximization(
     return Parameters(
         torch.where(alive, moments.mass, 0.0) / moments.mass.sum(),
         parameters.means + torch.where(alive[:, None], shift, 0.0),
-        constrained(covariances, least, thickness),
+        bound_variances(covariances, min_variance, thickness),
     )
 
 
-def constrained(covariances: Tensor, least: float = 0.0, thickness: float | None = None) -> Tensor:
-    """The likeliest covariances (K, D, D) whose every variance is at least `least` (m²) and whose
-    smallest is at most `thickness`² (thickness in metres), given the unconstrained M-step's.
+def bound_variances(covariances: Tensor, min_variance: float = 0.0, thickness: float | None = None) -> Tensor:
+    """The most likely covariances (K, D, D) within the limits, given those of the unconstrained M-step.
 
-    The M-step maximises −½N(log|Σ| + tr Σ⁻¹S), S the unconstrained covariance. For given eigenvalues
-    λ₁ ≤ … ≤ λ_D of Σ, tr Σ⁻¹S ≥ Σ s_i/λ_i (von Neumann), with equality when Σ has S's eigenvectors in
-    the same order. What is left, Σ (log λ_i + s_i/λ_i), falls up to λ_i = s_i and rises beyond: every
-    λ_i is s_i clamped to its interval. Bounding another than the smallest from above would cost
-    log(t²/s) + s/t² − 1 at a larger s, and so more. Hence, from parameters that keep the bounds, EM
-    with them never lowers the likelihood; adding a constant to Σ each time would, and because Σ is
-    part of B, what is added would pile up.
+    Every variance is at least `min_variance` (m²), and the smallest is at most `thickness`² (thickness in
+    metres).
+
+    The M-step maximises −½N(log|Σ| + tr Σ⁻¹S), with S the unconstrained covariance. For given eigenvalues
+    λ₁ ≤ … ≤ λ_D of Σ, tr Σ⁻¹S ≥ Σ s_i/λ_i (von Neumann), with equality if Σ has the eigenvectors of S in
+    the same order. The remaining term Σ (log λ_i + s_i/λ_i) decreases up to λ_i = s_i and increases
+    beyond it, so every λ_i is s_i clamped to its interval. An upper limit on another eigenvalue than the
+    smallest would cost log(t²/s) + s/t² − 1 at a larger s, which is more. Therefore EM with these limits,
+    from parameters that satisfy them, never decreases the likelihood. Adding a constant to Σ in each
+    iteration would decrease it, and would accumulate because Σ is part of B.
     """
     variances, directions = torch.linalg.eigh(covariances)
     variances = variances.clone()
     if thickness is not None:
         variances[:, 0].clamp_(max=thickness**2)
-    floor = (_ROUNDING * variances[:, -1:]).clamp_min(least)
+    floor = (_ROUNDING * variances[:, -1:]).clamp_min(min_variance)
     variances = torch.maximum(variances, floor)
     return (directions * variances[:, None, :]) @ directions.transpose(-2, -1)
 
 
 def deconvolution_step(
-    parts: list[Block], least: float = 0.0, thickness: float | None = None
+    blocks: list[Block], min_variance: float = 0.0, thickness: float | None = None
 ) -> Callable[[Parameters], tuple[Parameters, float]]:
-    """EM steps for `em.run_em`: better parameters, and the mean log-likelihood of those given."""
-    total = float(sum(block.weight.sum() for block in parts))
+    """EM steps for `exact.run_em`: improved parameters, and the mean log-likelihood of the given ones."""
+    total = float(sum(block.weight.sum() for block in blocks))
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:
-        found = [expectation(block, parameters) for block in parts]
+        found = [expectation(block, parameters) for block in blocks]
         sums = Moments(*(torch.stack(values).sum(0) for values in zip(*(m for m, _ in found), strict=True)))
         value = sum(float(likelihood) for _, likelihood in found)
-        return maximization(sums, parameters, least, thickness), value / total
+        return maximization(sums, parameters, min_variance, thickness), value / total
 
     return step
 
@@ -136,7 +155,7 @@ def deconvolution_step(
 
 
 def _expectation_shared(block: Block, parameters: Parameters, noisy: Parameters) -> tuple[Moments, Tensor]:
-    """Plain EM's sums with covariances T = Σ + R, of which b and B are linear functions."""
+    """Sums of plain EM with covariances T = Σ + R; b and B are linear functions of them."""
     dim = block.points.shape[1]
     features = em.quadratic_features(block.points)
     sums, value = em.expectation(features, block.weight, em.natural_parameters(noisy), torch.float64)
@@ -161,14 +180,14 @@ def _symmetric(matrices: Tensor) -> Tensor:
 
 
 def _expectation_each(block: Block, parameters: Parameters) -> tuple[Moments, Tensor]:
-    """b and B of every pair that matters, summed by component; Σγ B = (Σγ R T⁻¹) Σ."""
+    """b and B of every pair with a share, summed by component; Σγ B = (Σγ R T⁻¹) Σ."""
     k, dim = parameters.means.shape
     axes = range(dim)
     sums = parameters.means.new_zeros(k, 1 + dim + 2 * dim * dim)
     value = sums.new_zeros(())
-    for part, pairs in chunks(block.points, block.noise, parameters):
+    for part, pairs in pair_chunks(block.points, block.noise, parameters):
         value += torch.dot(block.weight[part], pairs.log_likelihood)
-        noise = gathered(block.noise[part], pairs.row)
+        noise = gather_entries(block.noise[part], pairs.row)
         share = torch.exp(pairs.joint - pairs.log_likelihood[pairs.row]) * block.weight[part][pairs.row]
         white = [dot(line, pairs.offset[: len(line)]) for line in pairs.whiten]
         upper = [[line[i] for line in pairs.whiten[i:]] for i in axes]
@@ -183,3 +202,116 @@ def _expectation_each(block: Block, parameters: Parameters) -> tuple[Moments, Te
     mass, first, second, lost = sums.split([1, dim, dim * dim, dim * dim], 1)
     remaining = lost.reshape(k, dim, dim) @ parameters.covariances
     return Moments(mass[:, 0], first, second.reshape(k, dim, dim) + _symmetric(remaining)), value
+
+
+# -- pairs of a noisy point and a component ---------------------------------------------------------
+
+
+class Pairs(NamedTuple):
+    """P pairs of one of n points and one of K components that may have a share in it.
+
+    row (P,), component (P,). joint (P,): log π + log N(x | μ, T). log_likelihood (n,): log Σ_k over all
+    pairs of a point. whiten: entries (P,) of W, with WᵀW = T⁻¹. offset: entries (P,) of x − μ.
+    """
+
+    row: Tensor
+    component: Tensor
+    joint: Tensor
+    log_likelihood: Tensor
+    whiten: Entries
+    offset: list[Tensor]
+
+
+def pair_chunks(points: Tensor, noise: Tensor, parameters: Parameters) -> Iterator[tuple[slice, Pairs]]:
+    """Chunks of rows of the points with their pairs, without pairs certainly below e^−40 of the largest."""
+    bounds = _log_bounds(noise, parameters)
+    rows = max(1, _CHUNK_ELEMENTS // parameters.weights.shape[0])
+    for begin in range(0, points.shape[0], rows):
+        part = slice(begin, begin + rows)
+        at_least, at_most = bounds(points[part].detach())
+        at_most = torch.maximum(at_most, at_least)  # keeps the most likely pair despite rounding
+        row, component = (at_most >= at_least.amax(1, keepdim=True) - _NEGLIGIBLE).nonzero(as_tuple=True)
+        yield part, _pairs(points[part], noise[part], parameters, row, component)
+
+
+def _log_bounds(noise: Tensor, parameters: Parameters) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """A function that bounds log π_k + log N(x | μ_k, Σ_k + R) (n, K) from below and above, for any of the R.
+
+    Because low I ≼ R ≼ high I, the determinant and the quadratic form of Σ + R are between those of
+    Σ + low I and Σ + high I. Two plain mixtures, which are fast to evaluate, thus bound every log-density.
+    """
+    spread = torch.linalg.eigvalsh(noise)
+    low, high = spread[:, 0].amin().clamp_min(0), spread[:, -1].amax()
+    eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
+    thin, wide = (parameters._replace(covariances=parameters.covariances + r * eye) for r in (low, high))
+    slack = 0.5 * (torch.logdet(wide.covariances) - torch.logdet(thin.covariances))
+    if em.is_ill_conditioned(thin):
+        return lambda x: (em.log_joint(x, thin) - slack, em.log_joint(x, wide) + slack)
+    lower, upper = em.natural_parameters(thin).T, em.natural_parameters(wide).T
+
+    def bounds(points: Tensor) -> tuple[Tensor, Tensor]:
+        features = em.quadratic_features(points)
+        return features @ lower - slack, features @ upper + slack
+
+    return bounds
+
+
+def _pairs(points: Tensor, noise: Tensor, parameters: Parameters, row: Tensor, component: Tensor) -> Pairs:
+    """Densities and factors of the pairs (row, component). Every row has at least one pair."""
+    weights, means, covariances = parameters
+    axes = range(points.shape[1])
+    own, other = gather_entries(covariances, component), gather_entries(noise, row)
+    whiten, half_log_det = _inverse_factor_entries(
+        [[own[i][j] + other[i][j] for j in axes[: i + 1]] for i in axes]
+    )
+    offset = list((points.T.index_select(1, row) - means.T.index_select(1, component)).unbind())
+    squared = torch.zeros_like(half_log_det)
+    for line in whiten:
+        squared = squared + dot(line, offset[: len(line)]).square()
+    constant = torch.log(weights).clamp_min(-1e30) - 0.5 * len(axes) * math.log(2 * math.pi)
+    joint = constant[component] - half_log_det - 0.5 * squared
+    peak = joint.detach().new_empty(points.shape[0])
+    peak.scatter_reduce_(0, row, joint.detach(), "amax", include_self=False)
+    total = torch.zeros_like(peak).index_add(0, row, torch.exp(joint - peak[row]))
+    likelihood = peak + torch.log(total)
+    return Pairs(row, component, joint, likelihood, whiten, offset)
+
+
+def gather_entries(matrices: Tensor, index: Tensor) -> Entries:
+    """Entries of the matrices (M, D, D) at an index (P,), each (P,) and contiguous."""
+    dim = matrices.shape[-1]
+    entries = matrices.flatten(1).T.contiguous().index_select(1, index).unbind()
+    return [list(entries[i * dim : (i + 1) * dim]) for i in range(dim)]
+
+
+def dot(left: list[Tensor], right: list[Tensor]) -> Tensor:
+    total = left[0] * right[0]
+    for a, b in zip(left[1:], right[1:], strict=True):
+        total = torch.addcmul(total, a, b)
+    return total
+
+
+def _inverse_factor_entries(lower: Entries) -> tuple[Entries, Tensor]:
+    """L⁻¹ and log|L| of symmetric matrices M = LLᵀ, given by the entries of their lower triangle."""
+    dim = len(lower)
+    factor: Entries = []
+    inverse: Entries = []
+    log_det = torch.zeros_like(lower[0][0])
+    for i in range(dim):
+        row: list[Tensor] = []
+        for j in range(i):
+            rest = lower[i][j] - dot(row, factor[j][:j]) if j else lower[i][j]
+            row.append(rest * inverse[j][j])
+        pivot = lower[i][i] - dot(row, row) if i else lower[i][i]
+        if not bool((pivot > 0).all()):  # NaN fails too
+            raise NumericalError(
+                "A component's covariance plus a point's noise is not positive definite; raise reg_covar "
+                "(1e-6 m² is usual), and check noise_covariances."
+            )
+        root = pivot.rsqrt()
+        log_det = log_det + 0.5 * pivot.log()
+        inverse.append(
+            [-dot(row[j:], [inverse[m][j] for m in range(j, i)]) * root for j in range(i)] + [root]
+        )
+        factor.append([*row, pivot * root])
+    return inverse, log_det

@@ -1,12 +1,12 @@
-"""The conjugate posterior of a mixture: its weights' Dirichlet, its components' Gaussian–Wishart.
+"""The conjugate posterior of a mixture: Dirichlet weights and Gaussian–Wishart components.
 
     p(μ_k, Λ_k) = N(μ_k | m₀, (β₀Λ_k)⁻¹) Wishart(Λ_k | W₀, ν₀)
-    p(π)        = Dirichlet(γ₀, …, γ₀), or, a Dirichlet process, π_k = v_k Π_{j<k} (1 − v_j) with
+    p(π)        = Dirichlet(γ₀, …, γ₀), or for a Dirichlet process π_k = v_k Π_{j<k} (1 − v_j) with
                   sticks v_k ~ Beta(1, γ₀)
 
-Given the moments of each component's points, the posterior has the same form (`update`). Its
-expected log-density is that of Gaussians with other weights (`expected_log_density`), so the E-step
-of variational Bayes is EM's (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
+Given the moments of each component's points, the posterior has the same form (`update`). Its expected
+log-density is that of Gaussians with modified weights (`expected_log_density`), so variational Bayes
+uses the E-step of EM (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LOG_2PI = math.log(2 * math.pi)
 
 
 class Prior(NamedTuple):
-    """γ₀ (), β₀ (), m₀ (D,), ν₀ () and W₀⁻¹ (D, D), of which one point's share is about W₀⁻¹/ν₀."""
+    """γ₀ (), β₀ (), m₀ (D,), ν₀ () and W₀⁻¹ (D, D); a typical covariance is W₀⁻¹/ν₀."""
 
     concentration: Tensor
     mean_precision: Tensor
@@ -35,11 +35,11 @@ class Prior(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """What is known of K components.
+    """Posterior of K components.
 
-    concentration: (2, K), the Beta parameters of each stick, or (1, K), the Dirichlet's;
-    mean_precision: β (K,), so many points each mean is known from; means: m (K, D);
-    degrees_of_freedom: ν (K,); covariances: W⁻¹/ν (K, D, D), the inverse of the expected precision.
+    concentration: (2, K) the Beta parameters of the sticks, or (1, K) the Dirichlet parameters.
+    mean_precision: β (K,), the number of points that determine each mean. means: m (K, D).
+    degrees_of_freedom: ν (K,). covariances: W⁻¹/ν (K, D, D), the inverse of the expected precision.
     """
 
     concentration: Tensor
@@ -50,12 +50,12 @@ class Posterior(NamedTuple):
 
 
 def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Tensor:
-    """Covariance (D, D) of points about the origin, their mean.
+    """Covariance (D, D) of points whose mean is the origin.
 
-    Where the points are flat their variance is `thickness` (m²) instead of zero.
+    In directions in which the points are flat, the variance is `thickness` (m²) instead of zero.
     """
     total = float(weight.sum())
-    # Below two points there is no unbiased estimate; W/2 goes on from where W − 1 leaves off.
+    # No unbiased estimate exists below two points; W/2 continues W − 1 continuously.
     covariance = (points * weight[:, None]).T @ points / max(total - 1, total / 2)
     variances, directions = torch.linalg.eigh(covariance)
     if float(variances[0]) > 1e-14 * float(variances[-1]):
@@ -64,9 +64,9 @@ def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Ten
 
 
 def update(prior: Prior, moments: Parameters, process: bool) -> Posterior:
-    """The posterior given N_k points (K,) in each component, their means and their covariances.
+    """The posterior given the points N_k (K,) of each component, their means and their covariances.
 
-    `moments` has N_k in place of weights; process: a Dirichlet process rather than a Dirichlet.
+    `moments` has N_k in place of weights. process: whether the weights have a Dirichlet process prior.
     Bishop (10.58)–(10.63); Blei & Jordan (18)–(19).
     """
     count, mean, covariance = moments
@@ -86,13 +86,13 @@ def update(prior: Prior, moments: Parameters, process: bool) -> Posterior:
 
 
 def _sticks(concentration: Tensor, count: Tensor) -> Tensor:
-    """Beta parameters (2, K): 1 + N_k points took stick k, and γ₀ + Σ_{j>k} N_j passed it."""
+    """Beta parameters (2, K): 1 + N_k for taking stick k, and γ₀ + Σ_{j>k} N_j for passing it."""
     later = torch.cat([count.flip(0).cumsum(0).flip(0)[1:], count.new_zeros(1)])
     return torch.stack([1 + count, concentration + later])
 
 
 def expected_weights(concentration: Tensor) -> Tensor:
-    """E[π] (K,); of a Dirichlet process, those of the K sticks, scaled to add up to one."""
+    """E[π] (K,). For a Dirichlet process, the expected weights of the K sticks, scaled to add up to one."""
     if concentration.shape[0] == 1:
         return concentration[0] / concentration.sum()
     share = concentration / concentration.sum(0)
@@ -101,7 +101,7 @@ def expected_weights(concentration: Tensor) -> Tensor:
 
 
 def expected_log_weights(concentration: Tensor) -> Tensor:
-    """E[log π] (K,). Bishop (10.66); of sticks, E[log v_k] + Σ_{j<k} E[log(1 − v_j)]."""
+    """E[log π] (K,). Bishop (10.66); for sticks E[log v_k] + Σ_{j<k} E[log(1 − v_j)]."""
     expected = torch.digamma(concentration)
     if concentration.shape[0] == 1:
         return expected[0] - torch.digamma(concentration.sum())
@@ -112,7 +112,7 @@ def expected_log_weights(concentration: Tensor) -> Tensor:
 def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
     """ω (K,) and Gaussians such that E[log π_k + log N(x | μ_k, Λ_k⁻¹)] = ω_k + log N(x | m_k, Σ_k).
 
-    Σ = E[Λ]⁻¹; ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66).
+    Σ = E[Λ]⁻¹, and ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66).
     """
     dim = posterior.means.shape[1]
     dof = posterior.degrees_of_freedom
@@ -120,13 +120,13 @@ def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
     log_det = torch.digamma(0.5 * (dof[:, None] - steps)).sum(1) - dim * torch.log(0.5 * dof)
     weight = expected_log_weights(posterior.concentration)
     weight = weight + 0.5 * (log_det - dim / posterior.mean_precision)
-    # Whatever is a million nats below takes no part, and must not be infinite.
+    # Log-weights a million nats below the largest have no effect, but must not be infinite.
     weight = weight.clamp_min(float(weight.max()) - 1e6)
     return weight, Parameters(torch.ones_like(weight), posterior.means, posterior.covariances)
 
 
 def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Parameters) -> Tensor:
-    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with these moments (N_k, x̄_k, S_k)."""
+    """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with moments (N_k, x̄_k, S_k)."""
     count, mean, covariance = moments
     factors = safe_cholesky(gaussians.covariances)
     whiten = inverse_factor(factors)
@@ -138,11 +138,11 @@ def assigned_log_density(moments: Parameters, log_weight: Tensor, gaussians: Par
 
 
 def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
-    """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` has seen.
+    """log p(X | assignments) + log p(assignments), nats, of the points that `posterior` includes.
 
-    The ratio of the two distributions' normalisers, and (2π)^(−ND/2). With the entropy of the
-    responsibilities added it is the lower bound of log p(X), once q(θ) is optimal for them. With
-    sticks it is that of the whole process: components beyond the K-th have no points, and the prior.
+    This is the ratio of the normalisers of posterior and prior, times (2π)^(−ND/2). Plus the entropy of the
+    responsibilities, it is the lower bound of log p(X) once q(θ) is optimal for them. For sticks it is
+    the value of the whole process: components beyond the K-th have no points and equal the prior.
     """
     dim = prior.mean.shape[0]
     scatter = posterior.covariances * posterior.degrees_of_freedom[:, None, None]
@@ -159,7 +159,7 @@ def log_evidence(prior: Prior, posterior: Posterior, n_points: float) -> Tensor:
 
 
 def _log_wishart(degrees_of_freedom: Tensor, scatter: Tensor) -> Tensor:
-    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), scatter W⁻¹ (K, D, D). Bishop (B.79)."""
+    """log ∫ |Λ|^((ν−D−1)/2) exp(−½ tr W⁻¹Λ) dΛ (K,), with scatter W⁻¹ (K, D, D). Bishop (B.79)."""
     dim = scatter.shape[-1]
     log_det = 2 * torch.log(safe_cholesky(scatter).diagonal(dim1=-2, dim2=-1)).sum(1)
     half = 0.5 * degrees_of_freedom
@@ -167,14 +167,14 @@ def _log_wishart(degrees_of_freedom: Tensor, scatter: Tensor) -> Tensor:
 
 
 def _log_dirichlet(concentration: Tensor) -> Tensor:
-    """log of the multivariate beta function, over the first axis."""
+    """Logarithm of the multivariate beta function, over the first axis."""
     return torch.lgamma(concentration).sum(0) - torch.lgamma(concentration.sum(0))
 
 
 def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
     """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D).
 
-    Its scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
+    The scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
     """
     k, dim = posterior.means.shape
     dof = posterior.degrees_of_freedom + 1 - dim
@@ -207,10 +207,10 @@ def variational_step(
     reg_covar: float,
     softmax_dtype: torch.dtype,
 ) -> em.Step:
-    """One iteration for `em.run_em`: from moments to the moments of the next responsibilities.
+    """One iteration for `exact.run_em`: from moments to the moments of the next responsibilities.
 
-    Moments are `Parameters` with N_k, in points, in place of weights; `reg_covar` (m²) is part of
-    their covariances. The bound (nats a point) is that of the moments returned.
+    Moments are `Parameters` with N_k, in points, in place of weights; their covariances include
+    `reg_covar` (m²). The bound (nats a point) is that of the returned moments.
     """
     features = em.quadratic_features(points)
     total = float(sample_weight.sum())
@@ -221,7 +221,7 @@ def variational_step(
             features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
         )
         posterior = update(prior, found, process)
-        entropy = value - assigned_log_density(_without(found, reg_covar), log_weight, gaussians)
+        entropy = value - assigned_log_density(_unregularized(found, reg_covar), log_weight, gaussians)
         return found, float(entropy + log_evidence(prior, posterior, total)) / total
 
     return step
@@ -236,9 +236,9 @@ def _expected_moments(
     reg_covar: float,
     softmax_dtype: torch.dtype,
 ) -> tuple[Parameters, Tensor]:
-    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n log of what they are normalised by.
+    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n times the log of their normaliser.
 
-    As two products of `features`, or, where these would cancel, directly from `points`.
+    Computed as two products with `features`, or directly from `points` if the products would cancel.
     """
     weights = torch.exp(log_weight - log_weight.max())
     unnormalised = gaussians._replace(weights=weights)
@@ -250,14 +250,14 @@ def _expected_moments(
         found = found._replace(weights=sums[:, 0])
         least = torch.linalg.eigvalsh(found.covariances)[:, 0]
         second = sums[:, 1:].abs().amax(1) / sums[:, 0].clamp_min(1e-300)
-        lost = torch.finfo(least.dtype).eps * second > 1e-6 * least
-        if not bool((lost & (sums[:, 0] > 1e-9)).any()):
+        has_cancelled = torch.finfo(least.dtype).eps * second > 1e-6 * least
+        if not bool((has_cancelled & (sums[:, 0] > 1e-9)).any()):
             return found, value
     found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
     total = sample_weight.sum()
     return found._replace(weights=found.weights * total), value + log_weight.max() * total
 
 
-def _without(moments: Parameters, reg_covar: float) -> Parameters:
+def _unregularized(moments: Parameters, reg_covar: float) -> Parameters:
     eye = torch.eye(moments.means.shape[1], dtype=moments.means.dtype, device=moments.means.device)
     return moments._replace(covariances=moments.covariances - reg_covar * eye)

@@ -1,15 +1,16 @@
-"""Optimal transport along lines: from one-dimensional mixtures to the coordinates of a cloud.
+"""Optimal transport along lines, from one-dimensional mixtures to the coordinates of a cloud.
 
 Along a direction θ the points have coordinates θᵀx, and a mixture is Σ_k w_k N(m_k, s_k²), m = θᵀμ
-and s² = θᵀΣθ. The coordinates are gathered into J values u_1 ≤ … ≤ u_J at levels 0 = t_0 < … <
-t_J = 1. The map that is optimal for W₂ sends the mixture's mass between its quantiles a_{j−1} and a_j
-to u_j. With a convex potential Ψ, of slope u_j there, and its conjugate Ψ*,
+and s² = θᵀΣθ. The coordinates are summarised by J values u_1 ≤ … ≤ u_J at levels 0 = t_0 < … <
+t_J = 1. The optimal map for W₂ sends the mixture's mass between its quantiles a_{j−1} and a_j to u_j.
+With a convex potential Ψ, of slope u_j there, and its conjugate Ψ*,
 
     W₂² = E_mixture[x² − 2Ψ(x)] + E_data[u² − 2Ψ*(u)].
 
-As Ψ is piecewise linear, E_k[Ψ] is a sum of E_k[(x − a_j)₊]: closed in Φ and φ. Any ordered cuts give
-a lower bound, the quantiles the largest, so that an error in them costs its square only; and the
-derivatives by w, m and s are those at fixed Ψ: exact integrals over each component, however narrow.
+Because Ψ is piecewise linear, E_k[Ψ] is a sum of E_k[(x − a_j)₊], which is closed in Φ and φ. Any
+ordered cuts a_j give a lower bound, and the quantiles give the largest, so an error in the quantiles has
+a second-order effect. The derivatives by w, m and s are those at fixed Ψ: exact integrals over each
+component, however narrow.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ import torch
 from torch import Tensor, nn
 
 LEVELS = 256
-"""J: how many values stand for a cloud along a direction."""
+"""J: number of values that summarise a cloud along a direction."""
 
-_BLOCK_ELEMENTS = 1 << 21  # entries of (directions, points) and (directions, J, K) worked on at once
-_NODES = (-2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # standard deviations, where quantiles are first sought
+_BLOCK_ELEMENTS = 1 << 21  # entries of one chunk of (directions, points) or (directions, J, K)
+_NODES = (-2.0, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0)  # points of each component, in standard deviations
 _NEWTON_STEPS = 2
 
 
 class Slices(NamedTuple):
-    """A cloud along P directions, gathered at J levels.
+    """A cloud along P directions, summarised at J levels.
 
-    directions: unit vectors (P, D); values: u (P, J), each the mean of the coordinates between
-    two levels; levels: t_1 … t_{J−1} (J − 1,); power: E[u²] (P,).
+    directions: unit vectors (P, D). values: u (P, J), each the mean of the coordinates between two
+    levels. levels: t_1 … t_{J−1} (J − 1,). power: E[u²] (P,).
     """
 
     directions: Tensor
@@ -41,7 +42,7 @@ class Slices(NamedTuple):
     power: Tensor
 
     def rows(self, index: Tensor | slice) -> Slices:
-        """Some of the directions."""
+        """The slices of some directions."""
         return Slices(self.directions[index], self.values[index], self.levels, self.power[index])
 
     def to(self, dtype: torch.dtype) -> Slices:
@@ -58,7 +59,7 @@ class Transport(NamedTuple):
 
 
 def random_directions(n: int, dim: int, generator: torch.Generator) -> Tensor:
-    """Unit vectors (n, D), uniform on the sphere; on the line there is but one, up to its sign."""
+    """Unit vectors (n, D), uniform on the sphere. In 1D there is only one direction, up to its sign."""
     if dim == 1:
         return torch.ones(1, 1, dtype=torch.float64)
     normal = torch.randn(n, dim, generator=generator, dtype=torch.float64)
@@ -66,9 +67,9 @@ def random_directions(n: int, dim: int, generator: torch.Generator) -> Tensor:
 
 
 def slice_cloud(points: Tensor, weight: Tensor, directions: Tensor) -> Slices:
-    """Points (N, D) of weights (N,) along directions (P, D).
+    """Points (N, D) with weights (N,) along directions (P, D).
 
-    Levels are denser towards 0 and 1, where coordinates spread: t_j = (1 − cos(πj/J)) / 2.
+    Levels are denser near 0 and 1, where coordinates spread more: t_j = (1 − cos(πj/J)) / 2.
     """
     step = torch.arange(LEVELS + 1, dtype=points.dtype, device=points.device)
     levels = 0.5 * (1 - torch.cos(math.pi / LEVELS * step))
@@ -87,7 +88,9 @@ def slice_cloud(points: Tensor, weight: Tensor, directions: Tensor) -> Slices:
 
 
 def interpolate(x: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
-    """Piecewise linear functions, a row each: of x (P, M), through knots (P, R), increasing, and heights."""
+    """Piecewise linear functions, one per row, at x (P, M), through increasing knots (P, R) and heights
+    (P, R).
+    """
     index = torch.searchsorted(knots, x.contiguous(), right=True).clamp(1, knots.shape[1] - 1)
     x0, x1 = knots.gather(1, index - 1), knots.gather(1, index)
     y0, y1 = heights.gather(1, index - 1), heights.gather(1, index)
@@ -96,9 +99,9 @@ def interpolate(x: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
 
 
 def mixture_quantiles(levels: Tensor, weights: Tensor, means: Tensor, deviations: Tensor) -> Tensor:
-    """Where 1-D mixtures of means and deviations (P, K), weights (K,), reach levels (M,): about, (P, M).
+    """Approximate quantiles (P, M) at levels (M,) of 1-D mixtures: means, deviations (P, K), weights (K,).
 
-    Newton's method within brackets on Φ⁻¹(F(a)) = Φ⁻¹(t), which for one component is linear, from
+    Newton's method within brackets on Φ⁻¹(F(a)) = Φ⁻¹(t), which is linear for one component. The start is
     a mixture of a few points in each component.
     """
     n = means.shape[0]
@@ -115,7 +118,7 @@ def mixture_quantiles(levels: Tensor, weights: Tensor, means: Tensor, deviations
         z = (cuts[:, :, None] - means[:, None]) / deviations[:, None]
         below = torch.special.ndtr(z) @ weights
         density = (normal_density(z) @ (weights / deviations)[:, :, None]).squeeze(2)
-        # The cuts on either side bound a quantile, as its own last place does.
+        # The neighbouring cuts bound a quantile, and so does its own last position.
         index = torch.searchsorted(below, wanted)
         knots = torch.cat([low[:, :1], cuts, high[:, -1:]], 1)
         low = torch.maximum(low, knots.gather(1, index))
@@ -132,9 +135,9 @@ def normal_density(z: Tensor) -> Tensor:
 
 
 def transport(slices: Slices, weights: Tensor, means: Tensor, deviations: Tensor) -> Transport:
-    """From 1-D mixtures of means and deviations (P, K), weights (K,), to the slices of a cloud.
+    """Transport from 1-D mixtures, means and deviations (P, K), weights (K,), to the slices of a cloud.
 
-    In the dtype of the mixtures, some directions at a time.
+    Computed in the dtype of the mixtures, in chunks of directions.
     """
     rows = max(1, _BLOCK_ELEMENTS // (LEVELS * weights.shape[0]))
     parts = [
@@ -156,8 +159,8 @@ def _transport(slices: Slices, weights: Tensor, means: Tensor, deviations: Tenso
     def summed(over_cuts: Tensor) -> Tensor:
         return (rise[:, None] @ over_cuts).squeeze(1)
 
-    mapped = first + summed(above)  # E_k of where x goes
-    stretched = summed(density)  # E_k[z · where x goes]
+    mapped = first + summed(above)  # E_k of the target of x
+    stretched = summed(density)  # E_k[z · target of x]
     potential = first * means + deviations * summed(density - z * above)
     by_weight = means.square() + deviations.square() - 2 * potential
     conjugate = (rise * cuts * (1 - slices.levels)).sum(1)

@@ -1,79 +1,72 @@
 """Riemannian optimisation of a Gaussian mixture's likelihood (Hosseini & Sra, 2015 and 2020; thesis 2.1.5).
 
-With y = [x; 1] a component is one zero-mean Gaussian of a (D+1) × (D+1) covariance S_k, which at the
-optimum holds [[Σ + μμᵀ, μ], [μᵀ, 1]]. What is maximised, over (SPD manifold)^K and log-weights η, is
+With y = [x; 1] a component is one zero-mean Gaussian with a (D+1) × (D+1) covariance S_k, which at the
+optimum equals [[Σ + μμᵀ, μ], [μᵀ, 1]]. The objective, over (SPD manifold)^K and log-weights η, is
 
     f = Σ_n p_n log Σ_k softmax(η)_k q(x_n | S_k) / Σ_n p_n,
     log q(x | S) = ½ − D/2 log 2π − ½ log|S| − ½ (yᵀS⁻¹y + ε tr Σ⁻¹).
 
-ε = `reg_covar` is the variance (m²) of a blur: log q is then the expected log-density of a point
-scattered isotropically about x, as it is of a cell of points in `em`. It bounds f, and the M-step of
-f is EM's: what EM adds to the covariance is ε, in the E-step too. S_k may have a last entry s ≠ 1;
-q is then a Gaussian times √(e/s) e^(−1/2s) ≤ 1, so f bounds the mixture's likelihood from below.
+ε = `reg_covar` is the variance (m²) of a blur: log q is the expected log-density of a point with
+isotropic noise around x, like that of a cell of points in `exact`. The blur bounds f. The M-step of f is
+EM's, except that ε, which EM adds to the covariance, is also in the E-step. S_k may have a last entry
+s ≠ 1; q is then a Gaussian times √(e/s) e^(−1/2s) ≤ 1, so f is a lower bound of the log-likelihood.
 
-The metric is the affine-invariant one. S_k is kept as a frame H_k with H_k S_k H_kᵀ = I, and tangent
-vectors as symmetric matrices Ξ in that frame. The exponential map is S ← H⁻¹ exp(Ξ) H⁻ᵀ, that is
-H ← exp(−Ξ/2) H; the inner product is tr(Ξ Ξ'), and parallel transport along the geodesic is the
-identity. So quasi-Newton steps on the manifold are Euclidean ones on the entries of Ξ. In the frame
-the gradient is ½ (H M_k Hᵀ − N_k I), M_k = Σ γ yyᵀ: the statistics of an E-step, and N_k/2 times the
-step that EM takes. That factor, undone, is the first guess of the inverse Hessian.
+The metric is affine-invariant. S_k is stored as a frame H_k with H_k S_k H_kᵀ = I, and tangent vectors
+as symmetric matrices Ξ in that frame. The exponential map is S ← H⁻¹ exp(Ξ) H⁻ᵀ, that is
+H ← exp(−Ξ/2) H. The inner product is tr(Ξ Ξ'), and parallel transport along the geodesic is the
+identity. Quasi-Newton steps on the manifold are therefore Euclidean steps on the entries of Ξ. In the
+frame the gradient is ½ (H M_k Hᵀ − N_k I), M_k = Σ γ yyᵀ: it follows from the statistics of an E-step,
+and is N_k/2 times the step of EM. The first guess of the inverse Hessian removes that factor.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import NumericalError, check_whole
+from gmmtorch.errors import NumericalError, check_choice, check_whole
 from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, triangle_indices, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, start
+from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators.ascent import SOLVERS, ascend
-from gmmtorch.mixture.validation import (
-    Array,
-    RandomState,
-    as_generator,
-    check_choice,
-    check_enough,
-    check_number,
-)
+from gmmtorch.mixture.validation import Array, RandomState, as_generator
 
-_LONGEST_GUESS = 2.0  # of ‖Ξ‖ where nothing is known of the curvature
-_LEAST_SHARE = 0.1  # of 1/K: what a component counts for in that guess, at least
-_LONGEST_STEP = 4.0  # of ‖Ξ‖: variances change by e⁴ at most
+_LONGEST_GUESS = 2.0  # limit of ‖Ξ‖ for steps by the first guess of the Hessian
+_LEAST_SHARE = 0.1  # smallest share of a component in that guess, relative to 1/K
+_LONGEST_STEP = 4.0  # limit of ‖Ξ‖ for any step: a variance changes by e⁴ at most
 
 
 class RiemannianGaussianMixture(MixtureEstimator):
-    """Gaussian mixture by L-BFGS or conjugate gradients on the manifold of covariances.
+    """Gaussian mixture fitted by L-BFGS or conjugate gradients on the manifold of covariances.
 
-    Good where components overlap and the tolerance is tight: five clusters that hide one another
-    (20 000 points, tol=1e-6) take 55 iterations and 0.30 s to the likelihood that takes EM 294 and
-    0.76 s. On surfaces, which overlap little, it is EM's equal from k-means (20 000 points of a
-    lidar scan, K=100: 0.7 s either way, held-out −3.48 and −3.51 nats) and no match for it from
-    random points (PSNR2 89 and 93 dB).
+    Suitable for overlapping components and a small tolerance: five clusters that hide one another
+    (20 000 points, tol=1e-6) take 55 iterations and 0.30 s to the likelihood that takes EM 294
+    iterations and 0.76 s. On surfaces, which overlap little, it equals EM from k-means (20 000 points of
+    a lidar scan, K=100: 0.7 s for both, held-out −3.48 and −3.51 nats) and is worse than EM from random
+    points (PSNR2 89 and 93 dB).
 
     Args:
         n_components: K, at most the number of points.
-        tol: converged when an iteration gains less, and an EM step would, too (nats a point).
-        reg_covar: ε, the variance of a blur of the points, in the square of their unit (m²): what
-            EM adds to each variance.
-        max_iter: iterations at most, in each start.
-        n_init: starts; the one with the best likelihood is kept.
+        tol: converged if an iteration gains less, and an EM step would gain less too (nats a point).
+        reg_covar: ε, the variance of a blur of the points, in their squared unit (m²); EM adds it to
+            each variance.
+        max_iter: largest number of iterations of each start.
+        n_init: number of starts; the one with the best likelihood is kept.
         init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
         solver: "lbfgs", or "cg" for conjugate gradients.
-        memory: how many steps L-BFGS remembers.
-        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
-        dtype: of the exponentials. In "float32" an ascent ends where rises are below 1e-8 nats.
+        memory: number of steps that L-BFGS stores.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
+        dtype: of the exponentials. With "float32" the ascent stops when gains are below 1e-8 nats.
 
-    `lower_bounds_` holds the mean log-likelihood of the blurred points after each iteration.
+    `lower_bounds_` contains the mean log-likelihood of the blurred points after each iteration.
     """
 
     def __init__(
@@ -109,26 +102,14 @@ class RiemannianGaussianMixture(MixtureEstimator):
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> RiemannianGaussianMixture:
-        """Learn the mixture of points X (N, D).
-
-        Args:
-            X: points, finite.
-            y: ignored, as in scikit-learn.
-            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
-            on_iteration: called with the iteration (from 1) and the mean log-likelihood.
-
-        Raises:
-            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
-                number of points of non-zero weight.
-            NumericalError: a component collapsed, as happens with reg_covar = 0.
-        """
+        """Fit the mixture to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
         blur, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         likelihood = Likelihood(points, weight, blur, dtype)
         generator = as_generator(self.random_state)
         best: tuple[Iterate, list[float], bool] | None = None
         for _ in range(self.n_init):
-            first = start(self.init_params, points, weight, self.n_components, blur, generator)
+            first = initialize(self.init_params, points, weight, self.n_components, blur, generator)
             found = ascend(
                 likelihood.at(first),
                 SOLVERS[self.solver](self.memory),
@@ -144,28 +125,17 @@ class RiemannianGaussianMixture(MixtureEstimator):
         safe_cholesky(mixture.covariances)
         if blur == 0:
             check_thickness(mixture, points)
-        self._keep(mixture, center, values, converged)
+        self._store_fit(mixture, center, values, converged)
         self._warn_unless_converged("The ascent")
         return self
 
     def check_parameters(self, n_points: int | None = None) -> None:
-        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
-        for name in ("n_components", "max_iter", "n_init", "memory"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("tol", "reg_covar"):
-            check_number(name, getattr(self, name))
-        choices: dict[str, Collection[str]] = {
-            "init_params": INITIALIZATIONS,
-            "solver": SOLVERS,
-            "dtype": em.SOFTMAX_DTYPES,
-        }
-        for name, known in choices.items():
-            check_choice(name, getattr(self, name), known)
-        as_generator(self.random_state)
-        check_enough(self.n_components, n_points)
+        super().check_parameters(n_points)
+        check_whole("memory", self.memory, 1)
+        check_choice("solver", self.solver, SOLVERS)
 
 
-# -- the function, and the manifold it lives on ---------------------------------------------------
+# -- the objective and its manifold ---------------------------------------------------------------
 
 
 class Frames(NamedTuple):
@@ -181,7 +151,7 @@ class Frames(NamedTuple):
 
 @dataclass(frozen=True)
 class Likelihood:
-    """f of centred points (N, D) of weights (N,), float64. blur: ε, m²."""
+    """The objective f for centred points (N, D) with weights (N,), float64. blur: ε, m²."""
 
     points: Tensor
     weight: Tensor
@@ -197,7 +167,9 @@ class Likelihood:
         return self.evaluate(Frames(linear, means, offset), torch.log(weights.clamp_min(1e-300)))
 
     def evaluate(self, frames: Frames, log_weights: Tensor) -> Iterate:
-        """f and its gradient at frames of K components and log-weights η (K,), of any norm."""
+        """f and its gradient for frames of K components and log-weights η (K,), not necessarily
+        normalised.
+        """
         linear, means, offset = frames
         log_weights = torch.log_softmax(log_weights, 0)
         whiten = torch.linalg.qr(linear).R  # Σ⁻¹ = RᵀR
@@ -214,10 +186,10 @@ class Likelihood:
         scatter = linear @ second @ linear.mT + mixed + mixed.mT
         scatter = scatter + count[:, None, None] * (offset[:, :, None] * offset[:, None, :] + blurred)
         eye = torch.eye(offset.shape[1], dtype=offset.dtype, device=offset.device)
-        rise = 0.5 * (scatter - count[:, None, None] * eye)
+        half_excess = 0.5 * (scatter - count[:, None, None] * eye)
         share = log_weights.exp()
-        gradient = pack_tangent(rise, count - share)
-        # 2/N_k makes EM's step of the gradient. Bounded, so that a component with few points does not leap.
+        gradient = pack_tangent(half_excess, count - share)
+        # 2/N_k turns the gradient into EM's step. The limit keeps steps short for components with few points.
         size = torch.stack([count, share], 1).clamp_min(_LEAST_SHARE / len(count))
         scale = torch.cat([2 / size[:, :1].expand(-1, gradient.shape[1] - 1), 1 / size.amax(1, True)], 1)
         reach = (scale * gradient)[:, :-1].norm(dim=1, keepdim=True) / _LONGEST_GUESS
@@ -225,7 +197,7 @@ class Likelihood:
         return Iterate(self, frames, covariances, log_weights, value, gradient, scale)
 
     def _moments(self, parameters: Parameters) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Of responsibilities γ, over Σp: N (K,), Σγ(x−μ) (K, D), Σγ(x−μ)(x−μ)ᵀ (K, D, D); and f."""
+        """Moments divided by Σp: N (K,), Σγ(x−μ) (K, D), Σγ(x−μ)(x−μ)ᵀ (K, D, D); and f."""
         means, total = parameters.means, self.weight.sum()
         dim = means.shape[1]
         if em.is_ill_conditioned(parameters):
@@ -247,9 +219,9 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of the manifold, f and its gradient there. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
+    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
 
-    A row holds the entries of Ξ, as `pack_tangent` has them, and the change of η.
+    Each row of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η.
     """
 
     likelihood: Likelihood
@@ -261,11 +233,14 @@ class Iterate:
     inverse_hessian: Tensor
 
     def bounded(self, direction: Tensor) -> Tensor:
-        """A component whose points are leaving it may be sent anywhere by what was learned before."""
+        """The direction with a limited norm in each component.
+
+        Outdated curvature can give an arbitrarily long step to a component that loses its points.
+        """
         return direction / (direction.norm(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1)
 
     def move(self, tangent: Tensor) -> Iterate:
-        """H ← exp(−Ξ/2) H and η ← η + its change; then x is taken about the new means."""
+        """H ← exp(−Ξ/2) H and η ← η + Δη; then x is taken relative to the new means."""
         matrices, change = unpack_tangent(tangent, self.frames.offset.shape[1])
         spread = torch.linalg.matrix_exp(-0.5 * matrices)
         linear = spread @ self.frames.linear
@@ -283,7 +258,7 @@ class Iterate:
 
 
 def pack_tangent(matrices: Tensor, change: Tensor) -> Tensor:
-    """Rows [Ξ, Δη] of symmetric Ξ (K, D+1, D+1) and Δη (K,); their products add up to tr ΞΞ' + Δη Δη'."""
+    """Rows [Ξ, Δη] of symmetric Ξ (K, D+1, D+1) and Δη (K,). Their dot products are tr ΞΞ' + Δη Δη'."""
     rows, cols = triangle_indices(matrices.shape[-1], matrices.device)
     entries = pack_symmetric(matrices) * torch.where(rows == cols, 1.0, math.sqrt(2)).to(matrices)
     return torch.cat([entries, change[:, None]], 1)
@@ -297,11 +272,11 @@ def unpack_tangent(tangent: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 def check_thickness(parameters: Parameters, points: Tensor) -> None:
-    """Raise `NumericalError` if a component is thinner than the points' coordinates are exact."""
+    """Raise `NumericalError` if a component is thinner than the rounding of the points' coordinates."""
     least = (16 * torch.finfo(points.dtype).eps * points.abs().max()) ** 2
     thin = (torch.linalg.eigvalsh(parameters.covariances)[:, 0] <= least) & (parameters.weights > 0)
     if bool(thin.any()):
         raise NumericalError(
-            f"covariances[{int(thin.nonzero()[0])}] collapsed: its points span less than the space; "
+            f"covariances[{int(thin.nonzero()[0])}] collapsed: its points do not span all dimensions; "
             "raise reg_covar (1e-6 m² is usual)."
         )

@@ -1,16 +1,16 @@
-"""What a range sensor does to a point: how its reading errs, and how densely it samples a surface.
+"""Sensor models: the error of a range reading, and the density of points on a surface.
 
-A reading errs along its beam by the sensor's own noise, and across it by the noise of the beam's
-direction. A beam also has width: on a surface met at incidence θ (0 is head-on) its footprint of
-standard deviation f spans depths f tan θ, which the reading takes somewhere in between:
+A reading has an error along its beam, from the sensor's own noise, and across it, from the noise of the
+beam's direction. A beam also has a width: on a surface at incidence θ (0 is head-on), a footprint with
+standard deviation f covers depths of f tan θ, and the reading is somewhere among them:
 
     σ_along² = σ(r)² + (f tan θ)²        R = σ_across² I + (σ_along² − σ_across²) u uᵀ
 
-with u the unit vector of the beam, r the range. A slanted surface is also met by fewer beams: the
-expected density falls with cos θ.
+with u the unit vector of the beam and r the range. A slanted surface also receives fewer beams: the
+expected density is proportional to cos θ.
 
-What a scan does not keep is done without: a camera's depth is taken to be the range (which is 15 %
-more at 30° off the axis), and a lidar's beams to be as dense at every elevation.
+Scans do not contain all quantities, so two approximations are made: a camera's depth is used as the
+range (which is 15 % larger at 30° off the axis), and a lidar's beams are equally dense at every elevation.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 _CLOSEST = 1e-3
-"""Metres; nearer readings are taken to be at this range, where noise and density are finite."""
+"""Metres. Nearer readings are treated as at this range, so that noise and density stay finite."""
 
 _CHUNK_POINTS = 1 << 15
 
 
 class Deviations(NamedTuple):
-    """Standard deviations (m) at some ranges: along the beam, across it, and of its footprint."""
+    """Standard deviations (m) at given ranges: along the beam, across it, and of its footprint."""
 
     along: Tensor
     across: Tensor
@@ -42,10 +42,10 @@ class Deviations(NamedTuple):
 
 
 class SensorModel(Protocol):
-    """What learning needs to know of a sensor."""
+    """The sensor properties that fitting and pruning use."""
 
     def noise_covariances(self, points: Tensor, origin: Tensor, normals: Tensor | None = None) -> Tensor:
-        """Covariances (N, D, D), m², of the points' errors, world frame."""
+        """Covariances (N, D, D), m², of the errors of the points, world frame."""
         ...
 
     def point_density(self, distance: Tensor, cos_incidence: Tensor | float = 1.0) -> Tensor:
@@ -55,10 +55,10 @@ class SensorModel(Protocol):
 
 @dataclass(frozen=True)
 class _BeamModel(ABC):
-    """What the kinds of sensor share.
+    """Base of the sensor models.
 
-    max_incidence: radians; surfaces more slanted are taken to be met at this angle. It bounds
-        f tan θ, and the density from below: what is seen at all is not seen edge-on.
+    max_incidence: radians. A surface at a larger incidence is treated as at this angle. It limits f tan θ
+        from above and the density from below: an observed surface is not exactly edge-on.
     """
 
     max_incidence: float = math.radians(80)
@@ -71,19 +71,19 @@ class _BeamModel(ABC):
 
     @abstractmethod
     def deviations(self, distance: Tensor) -> Deviations:
-        """Standard deviations at ranges (m) of any shape, at no incidence."""
+        """Standard deviations at ranges (m) of any shape, at incidence 0."""
 
     @abstractmethod
     def _density(self, distance: Tensor) -> Tensor:
-        """Points per m² (or m) of a surface that faces the sensor."""
+        """Points per m² (or per metre) of a surface that faces the sensor."""
 
     def noise_covariances(self, points: Tensor, origin: Tensor, normals: Tensor | None = None) -> Tensor:
-        """Covariances (N, D, D), m², positive definite, of the points' errors, world frame.
+        """Covariances (N, D, D), m², positive definite, of the errors of the points, world frame.
 
         Args:
             points: (N, D) readings, world frame, metres.
-            origin: (D,) or (N, D), where they were measured from.
-            normals: (N, D) unit normals of the surfaces, of either sign; None: all met head-on.
+            origin: (D,) or (N, D) sensor origins, world frame, metres.
+            normals: (N, D) unit normals of the surfaces, of either sign. None: incidence 0.
         """
         points, origin = points.double(), origin.to(points.device).double()
         beam, distance = beams(points, origin)
@@ -96,7 +96,7 @@ class _BeamModel(ABC):
         return across[:, None, None] ** 2 * (eye - outer) + along[:, None, None] ** 2 * outer
 
     def point_density(self, distance: Tensor, cos_incidence: Tensor | float = 1.0) -> Tensor:
-        """Expected points of one scan on a surface at range `distance` (m), per m² (per m in 2D)."""
+        """Expected points of one scan on a surface at range `distance` (m), per m² (per metre in 2D)."""
         distance = distance.clamp_min(_CLOSEST)
         return self._cosine(torch.as_tensor(cos_incidence).to(distance)) * self._density(distance)
 
@@ -106,10 +106,10 @@ class _BeamModel(ABC):
 
 @dataclass(frozen=True)
 class DepthCameraModel(_BeamModel):
-    """A structured-light or stereo camera: σ(z) = a + b z + c z², for disparity is measured.
+    """A structured-light or stereo camera: σ(z) = a + b z + c z², because it measures disparity.
 
-    The defaults are those of a Kinect: axial noise 1.2 mm + 1.9 mm (z − 0.4)², lateral noise 0.8
-    pixels (Nguyen, Izadi & Lovell, 2012); Khoshelham & Elberink (2012) give 1.4 mm z² for the same.
+    The defaults are those of a Kinect: axial noise 1.2 mm + 1.9 mm (z − 0.4)², lateral noise 0.8 pixels
+    (Nguyen, Izadi & Lovell, 2012). Khoshelham & Elberink (2012) give 1.4 mm z² for the same camera.
 
     axial: (a, b, c) in m, 1, 1/m. lateral: pixels. pixel_angle: radians between neighbouring pixels.
     """
@@ -122,15 +122,15 @@ class DepthCameraModel(_BeamModel):
         super().__post_init__()
         _above_zero(lateral=self.lateral, pixel_angle=self.pixel_angle)
         a, b, c = self.axial
-        # Positive at every range: at 0, far away, and at the lowest point if that lies between.
+        # Positive at every range: at 0, at infinity, and at the minimum if that is between them.
         if not (a > 0 and c >= 0 and b > -2 * math.sqrt(a * c) and all(map(math.isfinite, self.axial))):
-            raise InvalidArgumentError(f"axial={self.axial} must be above zero metres at every range.")
+            raise InvalidArgumentError(f"axial={self.axial} must give noise above zero at every range.")
 
     def deviations(self, distance: Tensor) -> Deviations:
         a, b, c = self.axial
         z = distance.clamp_min(_CLOSEST)
         pixel = z * self.pixel_angle
-        # Somewhere within the pixel: a uniform distribution's standard deviation.
+        # The footprint is uniform within the pixel.
         return Deviations(a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12))
 
     def _density(self, distance: Tensor) -> Tensor:
@@ -139,13 +139,13 @@ class DepthCameraModel(_BeamModel):
 
 @dataclass(frozen=True)
 class LidarModel(_BeamModel):
-    """A spinning or solid-state lidar: constant and proportional range noise, a beam that widens.
+    """A spinning or solid-state lidar: constant and proportional range noise, and a beam that widens.
 
-    The defaults are a 16-ring spinning lidar's by its data sheet, but for the noise, which in
-    practice is below the accuracy of 3 cm stated. On incidence see Soudarissanane et al. (2011).
+    The defaults are those of a 16-ring spinning lidar's data sheet, except for the noise, which in
+    practice is below the stated accuracy of 3 cm. On incidence see Soudarissanane et al. (2011).
 
-    noise: m. proportional_noise: m per m of range. divergence: full angle (rad) of the beam, which
-    holds four standard deviations. azimuth_step, elevation_step: radians between beams.
+    noise: m. proportional_noise: m per m of range. divergence: full angle (rad) of the beam, which is
+    four standard deviations. azimuth_step, elevation_step: radians between beams.
     """
 
     noise: float = 0.015
@@ -173,9 +173,9 @@ class LidarModel(_BeamModel):
 
 @dataclass(frozen=True)
 class LaserModel(_BeamModel):
-    """A laser that sweeps a plane: as `LidarModel`, in 2D.
+    """A laser that sweeps a plane: `LidarModel` in 2D.
 
-    The defaults are those of the widespread indoor scanners of the 2000s: 1 cm, 0.25° of beam, 1° apart.
+    The defaults are those of common indoor scanners of the 2000s: 1 cm, beams of 0.25°, 1° apart.
     """
 
     noise: float = 0.01
@@ -198,7 +198,7 @@ class LaserModel(_BeamModel):
 def beams(points: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vectors (N, D) from the origin (D,) or (N, D) to the points, and their distances (N,).
 
-    A point at the origin has no direction: that of the first axis is given.
+    A point at the origin has no direction; it gets the first axis.
     """
     offset = points - origin
     distance = offset.norm(dim=1)
@@ -214,10 +214,10 @@ def cos_incidence(points: Tensor, origin: Tensor, normals: Tensor) -> Tensor:
 
 
 def estimate_normals(points: Tensor, n_neighbors: int = 16) -> Tensor:
-    """Unit normals (N, D), float64, of either sign: across which each point's neighbours vary least.
+    """Unit normals (N, D), float64, of either sign: directions of least variance of each point's neighbours.
 
-    Points (N, D) with N ≥ 1. Where the neighbours span no surface (a lidar's lone ring, or too few
-    points) the direction is one of those they do not span: take more neighbours there.
+    Points (N, D) with N ≥ 1. If the neighbours do not span a surface (a single lidar ring, or too few
+    points), the normal is one of the directions that they do not span; use more neighbours there.
     """
     check_whole("n_neighbors", n_neighbors, 1)
     cloud = (points.double() - points.double().mean(0)).cpu()
@@ -245,4 +245,4 @@ def _above_zero(**values: float) -> None:
 def _not_negative(**values: float) -> None:
     for name, value in values.items():
         if not 0 <= value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be zero or more, and finite.")
+            raise InvalidArgumentError(f"{name}={value} must be at least zero and finite.")

@@ -1,63 +1,56 @@
-"""Mixtures by the sliced Wasserstein distance (Kolouri, Rohde & Hoffmann, 2018; thesis 2.1.5).
+"""Mixtures fitted by the sliced Wasserstein distance (Kolouri, Rohde & Hoffmann, 2018; thesis 2.1.5).
 
-SW² of a cloud and a mixture is the mean, over directions, of W₂² between what both are along a
-line (`transport`). Directions are drawn once, and the points sorted along each once; then Adam
-descends on a few of the directions at a time, and a pass over all of them is an iteration.
+SW² of a cloud and a mixture is the mean, over directions, of W₂² between their projections on a line
+(see `optimal_transport`). Directions are drawn once, and the points are sorted along each once. Adam
+then descends on batches of directions; one iteration is a pass over all directions.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import nn
 
-from gmmtorch.errors import check_whole
+from gmmtorch.errors import check_number, check_whole
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, start
+from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators.optimal_transport import Slices, random_directions, slice_cloud, transport
-from gmmtorch.mixture.validation import (
-    Array,
-    RandomState,
-    as_generator,
-    check_choice,
-    check_enough,
-    check_number,
-)
+from gmmtorch.mixture.validation import Array, RandomState, as_generator
 
-_BATCH = 16  # directions to a step of Adam
-_STEPS = 8  # of a pass, at least: few directions are visited again, or it would say little
-_HALVINGS = 6  # of the learning rate, before the descent is over
-_THINNEST = 1e-6  # variance of the start's components, and deviation of any, where the cloud's is 1
-_MOMENTS = (0.9, 0.99)  # Adam's: a pass is a few steps, so its memory is short
+_BATCH = 16  # directions of one step of Adam
+_STEPS = 8  # fewest steps of a pass; if there are few directions, a pass visits them repeatedly
+_HALVINGS = 6  # halvings of the learning rate before the descent ends
+_THINNEST = 1e-6  # least variance at the start and least deviation, for a cloud of spread 1
+_MOMENTS = (0.9, 0.99)  # of Adam; short memory, because a pass has few steps
 
 
 class SlicedWassersteinGaussianMixture(MixtureEstimator):
-    """Gaussian mixture closest to the points in the sliced Wasserstein distance.
+    """Gaussian mixture with the smallest sliced Wasserstein distance to the points.
 
-    Good against poor starts: on 20 000 points of a lidar scan, K=32 from random points, SW² is 0.011 m²
-    and PSNR2 88.8 dB, where EM has 0.089 m² and 87.0 dB. Poor as a density, and slow: few lines see
-    how thin a wall is, so from k-means EM has 94.3 dB to its 91.8, −4.0 nats held out to its −5.8, in
-    0.2 s to its 4.
+    Robust against poor starts: on 20 000 points of a lidar scan, K=32 from random points, SW² is 0.011 m²
+    and PSNR2 88.8 dB, while EM reaches 0.089 m² and 87.0 dB. Poor as a density, and slow, because few
+    directions show how thin a wall is: from k-means EM reaches 94.3 dB against 91.8, −4.0 nats held out
+    against −5.8, and takes 0.2 s against 4.
 
     Args:
         n_components: K, at most the number of points.
-        n_projections: directions, drawn once; 256 are enough in 3D, and time grows with them.
-        learning_rate: Adam's first, in units of a component's own size.
-        tol: a pass that lowers the distance by a smaller share halves the learning rate; converged
-            when that has happened seven times.
-        reg_covar: added to each variance, in the square of the points' unit (m²).
-        max_iter: passes over the directions at most.
+        n_projections: number of directions, drawn once. 256 are enough in 3D; time grows with them.
+        learning_rate: initial learning rate of Adam, in units of a component's size.
+        tol: a pass that decreases the distance by a smaller share halves the learning rate; converged
+            after seven such passes.
+        reg_covar: added to each variance, in the squared unit of the points (m²).
+        max_iter: largest number of passes over the directions.
         init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
-        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         dtype: of Φ and φ.
 
-    `lower_bounds_` holds −SW² (m²) after each pass, as the mean over its steps: not a likelihood,
-    which this fit may lower.
+    `lower_bounds_` contains −SW² (m²) of each pass, as the mean over its steps. It is not a likelihood,
+    and this fit may decrease the likelihood.
     """
 
     def __init__(
@@ -91,26 +84,17 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> SlicedWassersteinGaussianMixture:
-        """Learn the mixture of points X (N, D).
+        """Fit the mixture to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`.
 
-        Args:
-            X: points, finite.
-            y: ignored, as in scikit-learn.
-            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
-            on_iteration: called with the pass (from 1) and −SW² (m²).
-
-        Raises:
-            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
-                number of points of non-zero weight.
-            NumericalError: a component collapsed, as happens with reg_covar = 0.
+        `on_iteration` is called with the pass (from 1) and −SW² (m²).
         """
         points, weight, center = self._prepare(X, sample_weight)
         generator = as_generator(self.random_state)
         epsilon, dim = float(self.reg_covar), points.shape[1]
         spread = float((weight[:, None] * points.square()).sum() / weight.sum()) / dim
-        floor = min(epsilon, _THINNEST * spread) or epsilon  # of a single point there is but ε
-        first = start(self.init_params, points, weight, self.n_components, floor, generator)
-        # In units of the cloud's spread, so that a step means the same for any cloud.
+        floor = min(epsilon, _THINNEST * spread) or epsilon  # a single point has only ε
+        first = initialize(self.init_params, points, weight, self.n_components, floor, generator)
+        # In units of the cloud's spread, so that the learning rate suits any cloud.
         unit = math.sqrt(spread or epsilon) or 1.0
         directions = random_directions(self.n_projections, dim, generator).to(points.device)
         slices = slice_cloud(points / unit, weight, directions)
@@ -136,32 +120,24 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         covariances.diagonal(dim1=-2, dim2=-1).add_(epsilon)
         safe_cholesky(covariances)
         found = Parameters(weights, means * unit, covariances)
-        self._keep(found, center, [-cost * unit**2 for cost in costs], converged)
+        self._store_fit(found, center, [-cost * unit**2 for cost in costs], converged)
         self._warn_unless_converged("The descent")
         return self
 
     def check_parameters(self, n_points: int | None = None) -> None:
-        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
-        for name in ("n_components", "n_projections", "max_iter"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("tol", "reg_covar"):
-            check_number(name, getattr(self, name))
+        super().check_parameters(n_points)
+        check_whole("n_projections", self.n_projections, 1)
         check_number("learning_rate", self.learning_rate, above=True)
-        choices: dict[str, Collection[str]] = {"init_params": INITIALIZATIONS, "dtype": SOFTMAX_DTYPES}
-        for name, known in choices.items():
-            check_choice(name, getattr(self, name), known)
-        as_generator(self.random_state)
-        check_enough(self.n_components, n_points)
 
 
 # -- the descent -----------------------------------------------------------------------------------
 
 
 class Shape(nn.Module):
-    """A mixture as numbers that may take any value, zero at the start but for the logits.
+    """A mixture as unconstrained parameters, zero at the start except the logits.
 
-    Weights are a softmax. Means move by multiples of K^(−1/D), the size of a component's share of a
-    cloud of spread 1. Covariances are L T Tᵀ Lᵀ, L of the start, T triangular with exp on its diagonal.
+    Weights are a softmax. Means move by multiples of K^(−1/D), the size of a component in a cloud of
+    spread 1. Covariances are L T Tᵀ Lᵀ, with L of the start and T triangular with exp on its diagonal.
     """
 
     def __init__(self, first: Parameters) -> None:
@@ -172,7 +148,7 @@ class Shape(nn.Module):
         self.factors = safe_cholesky(covariances)
         self.logits = nn.Parameter(weights.clamp_min(1e-12).log())
         self.shift = nn.Parameter(torch.zeros_like(means))
-        self.stretch = nn.Parameter(torch.zeros_like(covariances))  # the upper triangle does not count
+        self.stretch = nn.Parameter(torch.zeros_like(covariances))  # the upper triangle is unused
 
     def forward(self) -> Parameters:
         diagonal = torch.diag_embed(self.stretch.diagonal(dim1=-2, dim2=-1).exp())
@@ -192,9 +168,9 @@ def descend(
     dtype: torch.dtype = torch.float64,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> tuple[list[float], bool]:
-    """Adam on the mean W₂² along the slices: what it was in each pass, and whether it converged.
+    """Adam on the mean W₂² along the slices: its value in each pass, and whether it converged.
 
-    Where a pass gains less than a share `tol` on the one before, the learning rate is halved.
+    The learning rate is halved after a pass that decreases the value by less than a share `tol`.
     """
     adam = torch.optim.Adam(shape.parameters(), lr=learning_rate, betas=_MOMENTS)
     n = slices.directions.shape[0]
@@ -223,13 +199,16 @@ def descend(
 
 
 def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float64) -> float:
-    """Mean W₂² along the slices; its derivatives by the parameters of the shape go to their `grad`."""
+    """Mean W₂² along the slices.
+
+    Its derivatives by the parameters of the shape are stored in their `grad`.
+    """
     n = slices.directions.shape[0]
     with torch.enable_grad():
         weights, means, covariances = shape()
         along = slices.directions @ means.T
         deviations = torch.einsum("pi,kij,pj->pk", slices.directions, covariances, slices.directions)
-        deviations = (deviations + _THINNEST**2).sqrt()  # nothing is divided by zero
+        deviations = (deviations + _THINNEST**2).sqrt()  # avoids division by zero
     moved = transport(slices, *(value.detach().to(dtype) for value in (weights, along, deviations)))
     shape.zero_grad()
     torch.autograd.backward(

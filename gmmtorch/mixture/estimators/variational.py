@@ -1,4 +1,4 @@
-"""VariationalGaussianMixture: a posterior over mixtures, in which components that are not needed die out."""
+"""VariationalGaussianMixture: a posterior over mixtures, in which unneeded components lose their weight."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number
 from gmmtorch.linalg import check_symmetric, safe_cholesky
+from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import EMResult, Parameters
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, start
-from gmmtorch.mixture.estimator import Cloud, MixtureEstimator, NotFittedError
+from gmmtorch.mixture.em.initialization import initialize
+from gmmtorch.mixture.estimator import Cloud, MixtureEstimator
 from gmmtorch.mixture.estimators.gaussian_wishart import (
     Posterior,
     Prior,
@@ -23,67 +24,59 @@ from gmmtorch.mixture.estimators.gaussian_wishart import (
     update,
     variational_step,
 )
-from gmmtorch.mixture.validation import (
-    Array,
-    RandomState,
-    as_generator,
-    check_choice,
-    check_enough,
-    check_number,
-    checked_parameter,
-)
+from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
 
 WEIGHT_PRIORS = ("dirichlet_process", "dirichlet_distribution")
 
 
-def _kept(buffer: str, doc: str) -> Any:
-    """A fitted attribute: a buffer in the kind of the points given to `fit`, or a float if it is a scalar."""
+def _posterior_attribute(buffer: str, doc: str) -> Any:
+    """A fitted attribute that returns a buffer: of the kind of the points given to `fit`, or a float."""
 
     def read(self: VariationalGaussianMixture) -> Array | float:
         self._posterior()
         value: Tensor = getattr(self, buffer)
-        return self._as_fitted(value) if value.ndim else float(value)
+        return self._as_fit_kind(value) if value.ndim else float(value)
 
     return property(read, doc=doc)
 
 
 class VariationalGaussianMixture(MixtureEstimator):
-    """Variational Bayes of a full-covariance mixture (thesis 2.1.5; Bishop, 2006, section 10.2).
+    """Variational Bayes of a mixture with full covariances (thesis 2.1.5; Bishop, 2006, section 10.2).
 
-    The fit is a posterior over mixtures, found as scikit-learn's `BayesianGaussianMixture` finds it.
-    Components that explain too little end with hardly any weight: `n_components_used_` counts those
-    left, and `gmmtorch.mixture.prune` gives the mixture without the others (and without a posterior).
+    The fit is a posterior over mixtures, computed as in scikit-learn's `BayesianGaussianMixture`.
+    Components that explain too few points end with almost no weight. `n_components_used_` counts the
+    others, and `gmmtorch.mixture.prune` returns the mixture (without posterior) of the others.
 
-    `weights_` and `means_` are expectations and `covariances_` the inverse of the expected precision;
-    `score_samples`, `predict` and `sample` are those of this one mixture (scikit-learn's are of
-    expected log-densities). The density that accounts for what is not known is
-    `score_samples_predictive`.
+    `weights_` and `means_` are posterior expectations, and `covariances_` is the inverse of the expected
+    precision. `score_samples`, `predict` and `sample` refer to this single mixture (scikit-learn's refer
+    to expected log-densities). `score_samples_predictive` is the density that includes the uncertainty.
 
-    Points count as evidence against the prior, so a `sample_weight` of 2 is another fit than 1.
+    Points are evidence against the prior, so a `sample_weight` of 2 gives another fit than 1.
 
     Args:
-        n_components: K, the most components there may be, at most the number of points.
+        n_components: K, the largest number of components, at most the number of points.
         tol: stops when the lower bound changes by less (nats a point).
-        reg_covar: added to each variance, in the square of the points' unit (m²).
-        max_iter: iterations at most, in each start.
-        n_init: starts; the one with the best lower bound is kept.
+        reg_covar: added to each variance, in the squared unit of the points (m²).
+        max_iter: largest number of iterations of each start.
+        n_init: number of starts; the one with the best lower bound is kept.
         init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
         weight_concentration_prior_type: "dirichlet_process" (stick-breaking, truncated at K) or
             "dirichlet_distribution".
-        weight_concentration_prior: γ₀, the smaller the fewer components are used; None: 1/K.
-        mean_precision_prior: β₀, so many points the prior mean counts for; None: 1.
-        mean_prior: m₀ (D,); None: the points' mean.
-        degrees_of_freedom_prior: ν₀ > D − 1, so many points the prior covariance counts for; None: D.
-        covariance_prior: W₀⁻¹ (D, D), ν₀ times a typical covariance; None: the points' covariance.
-        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a fresh one.
+        weight_concentration_prior: γ₀; smaller values use fewer components. None: 1/K.
+        mean_precision_prior: β₀, the number of points that the prior mean counts as. None: 1.
+        mean_prior: m₀ (D,). None: the mean of the points.
+        degrees_of_freedom_prior: ν₀ > D − 1, the number of points that the prior covariance counts as.
+            None: D.
+        covariance_prior: W₀⁻¹ (D, D), ν₀ times a typical covariance. None: the covariance of the points.
+        random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         dtype: of the exponentials of the E-step, as in `GaussianMixture`.
 
-    Fitted attributes: those of every `MixtureEstimator`; the posterior's `weight_concentration_`
-    ((K,), or for sticks the pair of Beta parameters, (K,) each), `mean_precision_` (K,) and
-    `degrees_of_freedom_` (K,); and the prior's `weight_concentration_prior_`,
-    `mean_precision_prior_`, `mean_prior_`, `degrees_of_freedom_prior_`, `covariance_prior_`.
-    `lower_bounds_` are of log p(X), all constants included (scikit-learn leaves some out, and does
-    not divide by the points), nats a point, after each iteration.
+    Fitted attributes: those of every `MixtureEstimator`; of the posterior `weight_concentration_` ((K,),
+    or for a process a pair of Beta parameters, (K,) each), `mean_precision_` (K,) and
+    `degrees_of_freedom_` (K,); and of the prior `weight_concentration_prior_`, `mean_precision_prior_`,
+    `mean_prior_`, `degrees_of_freedom_prior_`, `covariance_prior_`. `lower_bounds_` are lower bounds of
+    log p(X) with all constants, nats a point, after each iteration. Scikit-learn's bound omits some
+    constants and is not divided by the number of points.
     """
 
     _extra_names: ClassVar[tuple[str, ...]] = (
@@ -92,7 +85,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         "degrees_of_freedom",
         *(f"prior_{name}" for name in Prior._fields),
     )
-    _takes_any_total_weight = True
+    _accepts_any_total_weight = True
     concentration: Tensor
     mean_precision: Tensor
     degrees_of_freedom: Tensor
@@ -141,19 +134,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> VariationalGaussianMixture:
-        """Learn the posterior given points X (N, D).
-
-        Args:
-            X: points, finite.
-            y: ignored, as in scikit-learn.
-            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
-            on_iteration: called with the iteration (from 1) and the lower bound, nats a point.
-
-        Raises:
-            InvalidArgumentError (a ValueError): a bad argument, weight or point; K above the
-                number of points of non-zero weight.
-            NumericalError: a covariance collapsed, as happens with reg_covar = 0.
-        """
+        """Compute the posterior given points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         cloud = self._prepare(X, sample_weight)
         prior = self._prior(cloud)
         process = self.weight_concentration_prior_type == "dirichlet_process"
@@ -163,11 +144,11 @@ class VariationalGaussianMixture(MixtureEstimator):
         generator = as_generator(self.random_state)
         best: EMResult | None = None
         for _ in range(self.n_init):
-            first = start(
+            first = initialize(
                 self.init_params, cloud.points, cloud.weight, self.n_components, reg_covar, generator
             )
-            # Sticks are broken in turn: the bound is best, and the frame does not matter, with the
-            # largest component first.
+            # Stick-breaking depends on the order of components. With the largest component first the
+            # bound is best and does not depend on the frame.
             order = first.weights.argsort(descending=True, stable=True)
             moments = Parameters(first.weights[order] * total, first.means[order], first.covariances[order])
             found = em.run_em(step, moments, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
@@ -181,12 +162,12 @@ class VariationalGaussianMixture(MixtureEstimator):
         extra = {name: getattr(posterior, name) for name in self._extra_names[:3]}
         extra |= {f"prior_{name}": value for name, value in prior._asdict().items()}
         extra["prior_mean"] = prior.mean + cloud.center
-        self._keep(mixture, cloud.center, best.lower_bounds, best.converged, extra)
+        self._store_fit(mixture, cloud.center, best.lower_bounds, best.converged, extra)
         self._warn_unless_converged("The fit")
         return self
 
     def _prior(self, cloud: Cloud) -> Prior:
-        """The prior about the cloud's centre: as given, and where it is not, the cloud's own."""
+        """The prior relative to the cloud's centre; values not given come from the cloud."""
         points, weight, center = cloud
         dim = points.shape[1]
         dof = self.degrees_of_freedom_prior
@@ -214,19 +195,19 @@ class VariationalGaussianMixture(MixtureEstimator):
     # -- the posterior ----------------------------------------------------------------------------
 
     def score_samples_predictive(self, X: Array) -> Array:
-        """log p(x | X) of each point, (N,), nats, given all that was fitted and the prior.
+        """log p(x | X) of each point, (N,), nats, given all fitted points and the prior.
 
-        A mixture of Student-t densities: wider than `score_samples`, most of all where a component
-        has seen few points.
+        This is a mixture of Student-t densities. It is wider than `score_samples`, above all for components
+        with few points.
         """
         points = self._as_points(X)
-        return self._like(log_predictive(points, self._posterior()), X)
+        return self._as_kind_of(X, log_predictive(points, self._posterior()))
 
     def _posterior(self) -> Posterior:
         self._fitted()
         if "concentration" not in self._buffers:
             raise NotFittedError(
-                f"This {type(self).__name__} is of given parameters and has no posterior; fit it to points."
+                f"This {type(self).__name__} has given parameters and no posterior; fit it to points first."
             )
         return Posterior(
             self.concentration, self.mean_precision, self.means, self.degrees_of_freedom, self.covariances
@@ -235,26 +216,26 @@ class VariationalGaussianMixture(MixtureEstimator):
     @property
     def support_(self) -> Array:
         """Expected number of points N_k of each component, (K,)."""
-        return self._as_fitted(self._posterior().mean_precision - self.prior_mean_precision)
+        return self._as_fit_kind(self._posterior().mean_precision - self.prior_mean_precision)
 
     @property
     def n_components_used_(self) -> int:
-        """How many components explain a point: N_k, rounded, is not zero."""
+        """Number of components that explain at least one point: N_k, rounded, is above zero."""
         return int((torch.as_tensor(self.support_).round() > 0).sum())
 
     @property
     def weight_concentration_(self) -> Array | tuple[Array, Array]:
-        """Dirichlet parameters (K,), or the sticks' Beta parameters, (K,) each."""
-        rows = [self._as_fitted(row) for row in self._posterior().concentration]
+        """Dirichlet parameters (K,), or the Beta parameters of the sticks, (K,) each."""
+        rows = [self._as_fit_kind(row) for row in self._posterior().concentration]
         return (rows[0], rows[1]) if len(rows) == 2 else rows[0]
 
-    mean_precision_ = _kept("mean_precision", "β (K,).")
-    degrees_of_freedom_ = _kept("degrees_of_freedom", "ν (K,).")
-    weight_concentration_prior_ = _kept("prior_concentration", "γ₀.")
-    mean_precision_prior_ = _kept("prior_mean_precision", "β₀.")
-    mean_prior_ = _kept("prior_mean", "m₀ (D,).")
-    degrees_of_freedom_prior_ = _kept("prior_degrees_of_freedom", "ν₀.")
-    covariance_prior_ = _kept("prior_covariance", "W₀⁻¹ (D, D).")
+    mean_precision_ = _posterior_attribute("mean_precision", "β (K,).")
+    degrees_of_freedom_ = _posterior_attribute("degrees_of_freedom", "ν (K,).")
+    weight_concentration_prior_ = _posterior_attribute("prior_concentration", "γ₀.")
+    mean_precision_prior_ = _posterior_attribute("prior_mean_precision", "β₀.")
+    mean_prior_ = _posterior_attribute("prior_mean", "m₀ (D,).")
+    degrees_of_freedom_prior_ = _posterior_attribute("prior_degrees_of_freedom", "ν₀.")
+    covariance_prior_ = _posterior_attribute("prior_covariance", "W₀⁻¹ (D, D).")
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         k, dim = self.means.shape
@@ -266,20 +247,20 @@ class VariationalGaussianMixture(MixtureEstimator):
         }
         for name in self._extra_names if tensors else ():
             if name not in tensors:
-                raise InvalidArgumentError(f"The posterior lacks {name}; give all of it or nothing.")
+                raise InvalidArgumentError(f"The posterior lacks {name}; pass all of its tensors, or none.")
             shape, value = tuple(tensors[name].shape), tensors[name]
             expected = [(1, k), (2, k)] if name == "concentration" else [shapes.get(name, ())]
             least = dim - 1 if "degrees_of_freedom" in name else 0
             signed = name in ("prior_mean", "prior_covariance")
-            sound = bool(torch.isfinite(value).all()) and (signed or bool((value > least).all()))
-            if shape not in expected or value.dtype != torch.float64 or not sound:
+            valid = bool(torch.isfinite(value).all()) and (signed or bool((value > least).all()))
+            if shape not in expected or value.dtype != torch.float64 or not valid:
                 raise InvalidArgumentError(
                     f"{name} is {value.dtype} {shape}; expected finite numbers above {least}, float64 "
                     f"{expected[-1]}."
                 )
         super()._set_extra(tensors)
 
-    def _moved_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
+    def _transformed_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
         extra = self._extra_tensors()
         if extra:
             extra["prior_mean"] = rotation @ extra["prior_mean"] + translation
@@ -289,19 +270,8 @@ class VariationalGaussianMixture(MixtureEstimator):
     # -- arguments --------------------------------------------------------------------------------
 
     def check_parameters(self, n_points: int | None = None) -> None:
-        """Raise `InvalidArgumentError` for a parameter that cannot be, or K above the number of points."""
-        for name in ("n_components", "max_iter", "n_init"):
-            check_whole(name, getattr(self, name), 1)
-        for name in ("tol", "reg_covar"):
-            check_number(name, getattr(self, name))
+        super().check_parameters(n_points)
         for name in ("weight_concentration_prior", "mean_precision_prior", "degrees_of_freedom_prior"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=True)
-        for name, choices in (
-            ("init_params", INITIALIZATIONS),
-            ("weight_concentration_prior_type", WEIGHT_PRIORS),
-            ("dtype", em.SOFTMAX_DTYPES),
-        ):
-            check_choice(name, getattr(self, name), choices)
-        as_generator(self.random_state)
-        check_enough(self.n_components, n_points)
+        check_choice("weight_concentration_prior_type", self.weight_concentration_prior_type, WEIGHT_PRIORS)

@@ -1,1 +1,1 @@
-"""Mixtures with fewer components: merging and pruning (thesis 2.1.4)."""
+"""Reduction of mixtures: merging and pruning of components."""

@@ -1,39 +1,43 @@
-"""Fewer components for nearly the same density: greedy merging of a mixture's cheapest pairs.
+"""Mixture reduction: merge the pairs of components whose merge costs least.
 
-What a merge costs is Runnalls' bound on the Kullback–Leibler divergence (IEEE Trans. AES 43(3),
-2007) or the squared Hellinger distance. A few hundred components are merged one pair after the
-other, always the cheapest of all. More of them are merged in rounds: candidates are pairs of near
-neighbours, and a round merges disjoint pairs, each of whose two has no cheaper partner. A round is
-a handful of batched operations; its pairs are, but for the last, those that greedy merging takes.
+The cost of a merge is Runnalls' bound on the Kullback–Leibler divergence (IEEE Trans. AES 43(3),
+2007) or the squared Hellinger distance. Up to a few hundred components are merged greedily: always
+the cheapest of all pairs. More components are merged in rounds. A round considers pairs of near
+neighbours and merges disjoint pairs in which each component is the other's cheapest partner, as one
+batch. Except in the last round, greedy merging takes the same pairs.
 """
 
 from __future__ import annotations
 
 import math
 import numbers
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_symmetric, pack_symmetric
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.stepwise import check_points
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.reduction.merge_costs import COSTS, Cost, Gaussians
+from gmmtorch.mixture.reduction.moments import COSTS, Cost, Gaussians
 from gmmtorch.mixture.validation import checked_parameter
 
-_MOST_EXACT = 512  # components whose pairs are all looked at
+if TYPE_CHECKING:  # an estimator imports scikit-learn, which `simplify` does not need
+    from gmmtorch.mixture.estimator import MixtureEstimator
+    from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+
+_MOST_EXACT = 512  # components up to which all pairs are considered
 _PAIRS_AT_ONCE = 1 << 16
 
 
 class Reduction(NamedTuple):
-    """The mixture that is left; labels (K,): which of its components each given one went into;
-    bound: Runnalls' on what that cost, as of `kullback_leibler_bound`, whichever cost chose."""
+    """The reduced mixture.
+
+    labels (K,): the component that each given component was merged into. bound: Runnalls' bound on the
+    total cost (see `kullback_leibler_bound`), whichever cost selected the merges.
+    """
 
     parameters: Parameters
     labels: Tensor
@@ -48,70 +52,70 @@ def simplify(
     neighbors: int = 8,
     most_exact: int | None = None,
 ) -> Reduction:
-    """Merge the pairs that cost least until few enough components, or only costly pairs, are left.
+    """Merge the cheapest pairs until few enough components, or only expensive pairs, are left.
 
-    Total weight, mean and covariance of the mixture stay as they are, and what is not merged keeps
-    every bit. The components are left in the order in which the first of their members were given;
-    that order changes nothing else.
+    Total weight, mean and covariance of the mixture do not change. Components that are not merged keep
+    their exact values. The result lists components in the order of their first given member. Otherwise
+    the order of the given components has no effect.
 
     Args:
-        parameters: weights (K,), not negative, that need not add up to one (supports in points, say);
-            means (K, D); covariances (K, D, D). K may be 0.
-        n_components: no merging below so many.
-        max_cost: no merge that costs more; see `cost` for the unit.
-        cost: "kullback_leibler" (see `kullback_leibler_bound`: in nats times the unit of the weights),
-            or "hellinger" (`squared_hellinger`: 0 to 1), which merges what looks alike, however
-            much it weighs.
-        neighbors: of a component, by distance of the means, that it may merge with in a round;
-            above `most_exact` components only.
-        most_exact: components whose pairs are all looked at, and merged one after the other; 512 if
-            not given. Rounds alone (0) are many times faster and nearly as good.
+        parameters: weights (K,), not negative, which need not add up to one (supports in points are
+            allowed); means (K, D); covariances (K, D, D). K may be 0.
+        n_components: stop at this number of components.
+        max_cost: stop if every merge costs more; see `cost` for the unit.
+        cost: "kullback_leibler" (`kullback_leibler_bound`: nats times the unit of the weights) or
+            "hellinger" (`squared_hellinger`: 0 to 1), which merges similar components of any weight.
+        neighbors: nearest components, by distance of the means, that a component may merge with in a
+            round. Used above `most_exact` components only.
+        most_exact: up to this number of components, all pairs are considered and merged one at a time;
+            512 if None. With 0 all merges are in rounds: many times faster, with nearly the same result.
 
     Raises:
-        InvalidArgumentError: neither n_components nor max_cost, or one that cannot be; parameters
-            that are no mixture. NumericalError: an indefinite covariance.
+        InvalidArgumentError: neither n_components nor max_cost, or an invalid one; parameters that are
+            not a mixture. NumericalError: a covariance that is not positive definite.
     """
     weights, means, covariances = _checked(parameters)
     if n_components is None and max_cost is None:
-        raise InvalidArgumentError("n_components=None and max_cost=None: give one, or both, to merge until.")
-    least = 1 if n_components is None else check_whole("n_components", n_components, 1)
+        raise InvalidArgumentError("n_components=None and max_cost=None: give at least one as the limit.")
+    min_components = 1 if n_components is None else check_whole("n_components", n_components, 1)
     limit = math.inf if max_cost is None else _checked_cost(max_cost)
-    if cost not in COSTS:
-        raise InvalidArgumentError(f"cost={cost!r} is not one of {', '.join(COSTS)}.")
+    check_choice("cost", cost, COSTS)
     check_whole("neighbors", neighbors, 1)
     exact = check_whole("most_exact", _MOST_EXACT if most_exact is None else most_exact, 0)
 
     order = _canonical_order(weights, means, covariances)
     given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
-    left, labels = _merge_in_rounds(given, max(least, exact), limit, COSTS[cost], neighbors)
+    left, labels = _merge_in_rounds(given, max(min_components, exact), limit, COSTS[cost], neighbors)
     if left.weights.shape[0] <= exact:
-        left, merged = _merge_greedily(left, least, limit, COSTS[cost])
+        left, merged = _merge_greedily(left, min_components, limit, COSTS[cost])
         labels = merged[labels]
     bound = given.weights @ (left.half_log_dets[labels] - given.half_log_dets)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), left.weights.shape[0])
     return Reduction(Parameters(*left.at(kept)[:3]), labels, max(0.0, float(bound)))
 
 
-def _merge_greedily(given: Gaussians, least: int, limit: float, cost: Cost) -> tuple[Gaussians, Tensor]:
-    """Merge the cheapest of all pairs, again and again; also labels (K,), of those left."""
+def _merge_greedily(
+    given: Gaussians, min_components: int, limit: float, cost: Cost
+) -> tuple[Gaussians, Tensor]:
+    """Merge the cheapest of all pairs repeatedly; also returns the new component of each old one (K,)."""
     state = Gaussians(*(value.clone() for value in given))
     k = state.weights.shape[0]
     owner = torch.arange(k, device=state.weights.device)
-    alive = torch.ones(k, dtype=torch.bool, device=state.weights.device)
+    present = torch.ones(k, dtype=torch.bool, device=state.weights.device)
     i, j = torch.triu_indices(k, k, 1, device=state.weights.device)
     costs = state.weights.new_full((k, k), torch.inf)
     costs[i, j] = costs[j, i] = _pair_costs(state, i, j, cost)
-    for _ in range(k - least):
-        kept, gone = divmod(int(costs.argmin()), k)
-        if not float(costs[kept, gone]) <= limit:
+    for _ in range(k - min_components):
+        kept, removed = divmod(int(costs.argmin()), k)
+        if not float(costs[kept, removed]) <= limit:
             break
-        merged = state.at(slice(kept, kept + 1)).merged(state.at(slice(gone, gone + 1)))
+        merged = state.at(slice(kept, kept + 1)).merged(state.at(slice(removed, removed + 1)))
         for value, new in zip(state, merged, strict=True):
             value[kept] = new[0]
-        owner[owner == gone] = kept
-        alive[gone] = False
-        costs[gone] = costs[:, gone] = torch.inf
-        row = cost(merged, state).masked_fill_(~alive, torch.inf)
+        owner[owner == removed] = kept
+        present[removed] = False
+        costs[removed] = costs[:, removed] = torch.inf
+        row = cost(merged, state).masked_fill_(~present, torch.inf)
         row[kept] = torch.inf
         costs[kept] = costs[:, kept] = row
     left, labels = torch.unique(owner, return_inverse=True)
@@ -119,19 +123,19 @@ def _merge_greedily(given: Gaussians, least: int, limit: float, cost: Cost) -> t
 
 
 def _merge_in_rounds(
-    state: Gaussians, least: int, limit: float, cost: Cost, neighbors: int
+    state: Gaussians, min_components: int, limit: float, cost: Cost, neighbors: int
 ) -> tuple[Gaussians, Tensor]:
-    """Merge many disjoint cheap pairs of near neighbours at once; also labels (K,), of those left."""
+    """Merge many disjoint cheap pairs of near neighbours per round; also returns labels (K,)."""
     labels = torch.arange(state.weights.shape[0], device=state.weights.device)
-    while (k := state.weights.shape[0]) > least:
+    while (k := state.weights.shape[0]) > min_components:
         i, j = _near_pairs(state.means, neighbors)
         costs = _pair_costs(state, i, j, cost)
         cheap = costs <= limit
         i, j = _mutual_choices(i[cheap], j[cheap], costs[cheap], k)
         if len(i) == 0:
             break
-        # The dearer half waits: cheaper partners may yet come of the merges.
-        n_merges = min((len(i) + 1) // 2, k - least)
+        # Only the cheaper half is merged: the merges may create cheaper partners for the rest.
+        n_merges = min((len(i) + 1) // 2, k - min_components)
         i, j = i[:n_merges], j[:n_merges]
         merged = state.at(i).merged(state.at(j))
         state = Gaussians(*(v.index_copy(0, i, new) for v, new in zip(state, merged, strict=True)))
@@ -148,10 +152,10 @@ def _pair_costs(state: Gaussians, i: Tensor, j: Tensor, cost: Cost) -> Tensor:
 
 
 def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once, shuffled.
+    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once, in a fixed random order.
 
-    Of more means in one place than a search for neighbours returns, it finds but a few; so the
-    next row, which is in the same place then, is a neighbour too.
+    If more means coincide than the neighbour search returns, it finds only some of them. Each row is
+    therefore also paired with the next row, because rows at the same place are adjacent.
     """
     k, device = means.shape[0], means.device
     positions = means.cpu().numpy()
@@ -161,17 +165,17 @@ def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     a = torch.cat([rows[:, None].expand_as(nearest).reshape(-1), rows[:-1]])
     b = torch.cat([nearest.reshape(-1), rows[1:]])
     keys = torch.unique(torch.minimum(a, b)[a != b] * k + torch.maximum(a, b)[a != b])
-    # Shuffled, always alike: among equal costs the earlier pair is chosen, and in sorted order
-    # each pair would wait for the one before it.
+    # A fixed shuffle: of pairs with equal costs the earlier is chosen, and in sorted order each
+    # pair would block the next one.
     shuffle = torch.randperm(keys.numel(), generator=torch.Generator().manual_seed(0))
     keys = keys[shuffle.to(device)]
     return keys // k, keys % k
 
 
 def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Those of the pairs i, j (P,) of which each is the other's cheapest, the cheapest pair first.
+    """The pairs i, j (P,) in which each component is the other's cheapest partner, the cheapest pair first.
 
-    No component is in two of them, and the cheapest pair of all is one.
+    No component occurs in two of these pairs, and the cheapest of all pairs is one of them.
     """
     order = costs.argsort(stable=True)
     i, j = i[order], j[order]
@@ -186,7 +190,7 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
 
 
 def _checked(parameters: Parameters) -> Parameters:
-    """The parameters, float64, if they are a mixture's; weights need not add up to one."""
+    """The parameters in float64. Raises unless they are a mixture; the weights need not add up to one."""
     means = torch.as_tensor(parameters.means).detach()
     if means.ndim != 2 or means.shape[1] == 0:
         raise InvalidArgumentError(f"means has shape {tuple(means.shape)}; expected (K, D).")
@@ -212,13 +216,13 @@ def _checked_cost(max_cost: object) -> float:
 
 
 def _canonical_order(weights: Tensor, means: Tensor, covariances: Tensor) -> Tensor:
-    """The order (K,) that sorts components by their numbers, so that none given to them matters."""
+    """Order (K,) that sorts components by their values, so that the given order has no effect."""
     columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
     return torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
 
 
 def _in_order_given(labels: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Labels (K,) renumbered by first occurrence, and which old label (n,) each new one was."""
+    """Labels (K,) renumbered by first occurrence, and the old label (n,) of each new one."""
     rows = torch.arange(labels.shape[0], device=labels.device)
     first = rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
     kept = first.argsort()
@@ -240,31 +244,37 @@ def merge(
     neighbors: int = 8,
     **options: Any,
 ) -> GaussianMixture:
-    """The mixture of what two fitted ones were learned from, on the device and in the kind of `a`.
+    """Merge two fitted mixtures into one mixture of the points that both were fitted to.
+
+    The result is on the device, and has the array kind, of `a`.
 
     Args:
-        a, b: mixtures of one dimension.
-        weight_a, weight_b: how many points each stands for.
-        n_components, max_cost, cost, neighbors: how far the union is simplified, see `simplify`
-            (weights add up to one: a max_cost is in nats a point); not at all without the first two.
-        options: of the `GaussianMixture`.
+        a, b: mixtures of equal dimension.
+        weight_a, weight_b: number of points that each mixture stands for.
+        n_components, max_cost, cost, neighbors: how the union is simplified, see `simplify`. The weights
+            add up to one, so max_cost is in nats a point. The union is not simplified without
+            n_components and max_cost.
+        options: constructor options of the resulting `GaussianMixture`.
 
     Raises:
-        NotFittedError: a mixture without parameters. InvalidArgumentError: other dimensions; weights
-            that are negative or all zero; what `simplify` refuses.
+        NotFittedError: a mixture without parameters. InvalidArgumentError: different dimensions;
+            weights that are negative or both zero; arguments that `simplify` rejects.
     """
+    from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+
     dims = a._fitted().shape[1], b._fitted().shape[1]
     if dims[0] != dims[1]:
         raise InvalidArgumentError(
-            f"a is a mixture in {dims[0]}D, b in {dims[1]}D; give two of one dimension."
+            f"a is a mixture in {dims[0]}D, b in {dims[1]}D; both must have the same dimension."
         )
-    n_a, n_b = check_points("weight_a", weight_a), check_points("weight_b", weight_b)
-    total = n_a + n_b
+    check_number("weight_a", weight_a)
+    check_number("weight_b", weight_b)
+    total = float(weight_a) + float(weight_b)
     if total == 0:
-        raise InvalidArgumentError("weight_a and weight_b are both zero; at least one mixture must count.")
+        raise InvalidArgumentError("weight_a and weight_b are both zero; at least one must be above zero.")
     device = a.means.device
     union = Parameters(
-        torch.cat([a.weights * (n_a / total), b.weights.to(device) * (n_b / total)]),
+        torch.cat([a.weights * (weight_a / total), b.weights.to(device) * (weight_b / total)]),
         torch.cat([a.means, b.means.to(device)]),
         torch.cat([a.covariances, b.covariances.to(device)]),
     )

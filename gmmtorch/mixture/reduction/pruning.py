@@ -1,33 +1,34 @@
-"""Removing components that no surface explains (thesis 2.1.4).
+"""Pruning: removal of components that do not fit any surface (thesis 2.1.4).
 
-EM may spread a component over several surfaces, through free space. Such a component has few points,
-or few for its size: a surface at range r is sampled with a density σ(r) that the sensor dictates, and
-a component much sparser than that is no surface.
+EM may place a component across several surfaces, through free space. Such a component has few points,
+absolutely or for its size: a sensor samples a surface at range r with a known density σ(r), and a
+component with much fewer points than that is not a surface.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
-from sklearn.base import BaseEstimator
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators.sensor_model import SensorModel, cos_incidence
 
-Mixture = TypeVar("Mixture", bound=Parameters | MixtureEstimator)
+if TYPE_CHECKING:
+    from gmmtorch.mixture.estimator import MixtureEstimator
+
+Mixture = TypeVar("Mixture", bound="Parameters | MixtureEstimator")
 
 
 def support_density(support: Tensor, covariances: Tensor) -> Tensor:
-    """Points (K,) per m² of a component's 2σ ellipse, N/(4π√(λ₀λ₁)), in 3D; per m, N/(4√λ₀), in 2D.
+    """Points (K,) per m² of a component's 2σ ellipse, N/(4π√(λ₀λ₁)), in 3D; per metre, N/(4√λ₀), in 2D.
 
-    λ₀ ≥ λ₁ are the largest eigenvalues of the covariances (K, D, D), support (K,) the points. The
-    ellipse of a square evenly covered has 1.05 times its area, the interval of a segment 1.15 times
-    its length: a surface well sampled has about the density of its points.
+    λ₀ ≥ λ₁ are the largest eigenvalues of the covariances (K, D, D), and support (K,) is the number of
+    points N. The 2σ ellipse of an evenly covered square has 1.05 times the area of the square, and the
+    interval of a segment 1.15 times its length. A well-sampled surface thus has about its point density.
     """
     variances = torch.linalg.eigvalsh(covariances).clamp_min(torch.finfo(covariances.dtype).tiny)
     if covariances.shape[-1] == 3:
@@ -38,16 +39,17 @@ def support_density(support: Tensor, covariances: Tensor) -> Tensor:
 def expected_density(
     means: Tensor, covariances: Tensor, sensor: SensorModel, origins: Tensor, counts: Tensor | None = None
 ) -> Tensor:
-    """Points (K,) per m² (m in 2D) that surfaces where the components lie would have.
+    """Points (K,) per m² (per metre in 2D) of a surface at the place of each component.
 
-    The sensor's σ(r) at the component's mean, met at the angle of its smallest eigenvector. With one
-    origin (D,) that is all. Of several (S, D) the nearest counts, as if only it had seen the
-    component; unless `counts` (K, S) say how many of its points were seen from each. Then it is
+    The density is the sensor's σ(r) at the component's mean, with the smallest eigenvector as surface
+    normal. With one origin (D,), this is the result. With several origins (S, D) and no `counts`, the
+    nearest origin alone determines the density. With `counts` (K, S), the points of each component seen
+    from each origin, the density is
 
         (Σ c_s σ_s)(Σ c_s) / Σ c_s²,
 
-    which is Σ σ_s, all views together, if the views saw it in the proportions that they should,
-    and σ of one view if one saw it.
+    which equals Σ σ_s if the counts are in proportion to the expected densities σ_s, and σ_s if all
+    points were seen from origin s.
     """
     origins = origins.to(means).reshape(-1, means.shape[1])
     k, s = means.shape[0], origins.shape[0]
@@ -74,30 +76,29 @@ def prune(
     origins: Tensor | None = None,
     counts: Tensor | None = None,
 ) -> tuple[Mixture, Tensor]:
-    """The mixture without components of too little support, or too sparse for a surface.
+    """Remove components with too little support, or with too low a density for a surface.
 
-    Returns what is left, its weights adding up to one, and which components (K,) of the old these are.
+    Returns the remaining mixture, with weights that add up to one, and a mask (K,) of the components
+    that it keeps.
 
     Args:
-        mixture: parameters, or a fitted estimator; it stays as it is.
-        n_points: Σ p, the (weighted) number of points it was fitted to: N_j = π_j Σ p.
-        min_support: components with N_j below it go, in points.
-        min_density_share: components whose `support_density` is below this share of
-            `expected_density` go. Needs sensor and origins, and 2D or 3D.
+        mixture: parameters or a fitted estimator; it is not modified.
+        n_points: Σ p, the (weighted) number of points of the fit; component j has N_j = π_j Σ p points.
+        min_support: smallest number of points N_j of a component that is kept.
+        min_density_share: smallest ratio of `support_density` to `expected_density` of a component that
+            is kept. If above zero, needs `sensor` and `origins`, and a mixture in 2D or 3D.
         sensor: see `sensor_model`.
-        origins: (D,) or (S, D), where the points were measured from, world frame.
-        counts: (K, S) points of each component seen from each origin, if that is known; a component
-            with none is not judged by its density.
+        origins: (D,) or (S, D), sensor origins, world frame.
+        counts: (K, S) points of each component seen from each origin, if known. Components without
+            any are kept whatever their density.
 
-    Raises `InvalidArgumentError` for arguments that cannot be, and when no component would be left.
+    Raises `InvalidArgumentError` for invalid arguments, and if no component would remain.
     """
     parameters = _parameters(mixture)
     weights, means, covariances = parameters
-    for name, value in (("min_support", min_support), ("min_density_share", min_density_share)):
-        if not 0 <= value < math.inf:
-            raise InvalidArgumentError(f"{name}={value} must be a finite number of at least 0.")
-    if not 0 < n_points < math.inf:
-        raise InvalidArgumentError(f"n_points={n_points} must be a finite number above 0.")
+    check_number("min_support", min_support)
+    check_number("min_density_share", min_density_share)
+    check_number("n_points", n_points, above=True)
     support = weights * n_points
     kept = support >= min_support
     largest = f"the largest support is {float(support.max()):.4g} points"
@@ -112,10 +113,10 @@ def prune(
     if not bool((kept & (weights > 0)).any()):
         raise InvalidArgumentError(
             f"min_support={min_support}, min_density_share={min_density_share} would prune all "
-            f"{len(weights)} components: {largest}; lower them."
+            f"{len(weights)} components: {largest}; lower these limits."
         )
-    left = Parameters(weights[kept] / weights[kept].sum(), means[kept], covariances[kept])
-    return _rebuilt(mixture, left), kept
+    remaining = Parameters(weights[kept] / weights[kept].sum(), means[kept], covariances[kept])
+    return _as_given_type(mixture, remaining), kept
 
 
 def _parameters(mixture: Mixture) -> Parameters:
@@ -125,18 +126,15 @@ def _parameters(mixture: Mixture) -> Parameters:
     return Parameters(mixture.weights, mixture.means, mixture.covariances)
 
 
-def _rebuilt(mixture: Mixture, left: Parameters) -> Mixture:
-    """The components left, as what the mixture was."""
+def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
+    """The remaining components, in the type of the given mixture."""
     if isinstance(mixture, Parameters):
-        return cast(Mixture, left)
-    # Starting values for K components are of no use to fewer.
-    options: dict[str, Any] = {
-        name: value
-        for name, value in BaseEstimator.get_params(mixture, deep=False).items()
-        if name != "n_components" and isinstance(value, int | float | str | bool | None)
-    }
+        return cast(Mixture, remaining)
+    # The scalar options only: initial parameters for K components do not fit fewer.
+    options = mixture._scalar_options()
+    options.pop("n_components")
     pruned = type(mixture).from_parameters(
-        *left, lower_bounds=mixture.lower_bounds_, converged=mixture.converged_, **options
+        *remaining, lower_bounds=mixture.lower_bounds_, converged=mixture.converged_, **options
     )
     pruned._tensors = mixture._tensors
     return cast(Mixture, pruned)
@@ -149,7 +147,7 @@ def _checked(
     if dim not in (2, 3):
         raise InvalidArgumentError(f"min_density_share needs a mixture in 2D or 3D; this one has D = {dim}.")
     if sensor is None or origins is None:
-        raise InvalidArgumentError("min_density_share needs sensor and origins; give both.")
+        raise InvalidArgumentError("min_density_share needs sensor and origins; pass both.")
     origins = torch.as_tensor(origins)
     if origins.ndim not in (1, 2) or origins.shape[-1] != dim or origins.numel() == 0:
         raise InvalidArgumentError(

@@ -1,1 +1,1 @@
-"""Mixtures of clouds that are larger than memory, or shared by several processes."""
+"""Fits of clouds that are larger than memory, or shared by several processes."""

@@ -1,4 +1,4 @@
-"""Where a long fit has got to, kept in a file from which it goes on as if it had never stopped."""
+"""Checkpoints of a long fit: a file with its state, from which a later run continues."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from gmmtorch.mixture.em.exact import Parameters
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.checkpoint", 1
 
-Facts = Mapping[str, Any]
-"""What tells a run from others: its settings and its cloud, in JSON's types; n_components and dimensions."""
+RunFacts = Mapping[str, Any]
+"""Description of a run, in JSON types: settings and cloud, including n_components and dimensions."""
 
 
 class State(NamedTuple):
-    """Parameters about `center` (D,), and the lower bounds (nats) of the iterations that led to them."""
+    """Parameters relative to `center` (D,), and the lower bounds (nats) of the iterations so far."""
 
     parameters: Parameters
     center: Tensor
     lower_bounds: list[float]
 
     def pack(self) -> Tensor:
-        """As one vector (n,), float64."""
+        """The state as one vector (n,), float64."""
         bounds = self.center.new_tensor(self.lower_bounds)
         return torch.cat([part.flatten() for part in (*self.parameters, self.center, bounds)])
 
@@ -46,13 +46,13 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A file that a fit keeps its state in.
+    """A file in which a fit stores its state.
 
     Args:
-        path: the file, safetensors; written whole or not at all.
+        path: the safetensors file, written atomically.
         every: iterations between two writes.
-        seconds: as many seconds after the last write, it is written all the same; None: never.
-        resume: go on from the file, if it is there. Without it, a file that is there is an error.
+        seconds: also write after this time since the last write; None: no time limit.
+        resume: continue from the file if it exists. Without it, an existing file is an error.
     """
 
     path: Path
@@ -63,68 +63,68 @@ class Checkpoint:
     def __post_init__(self) -> None:
         check_whole("every", self.every, 1)
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0):
-            raise InvalidArgumentError(f"seconds={self.seconds} must be above zero, or None.")
+            raise InvalidArgumentError(f"seconds={self.seconds} must be above zero and finite, or None.")
 
-    def read(self, run: Facts) -> State | None:
-        """The state to go on from; None: there is none.
+    def read(self, run: RunFacts) -> State | None:
+        """The state to continue from; None if there is none.
 
-        Raises `InvalidArgumentError` if there is one of another run, or one that nobody asked to go on
-        from, and `DataError` for a damaged file.
+        Raises `InvalidArgumentError` if the file is of another run, or exists without `resume`, and
+        `DataError` if the file is damaged.
         """
         if not self.path.exists():
             return None
         if not self.resume:
             raise InvalidArgumentError(
-                f"checkpoint={self.path} exists already; go on from it with resume=true, or delete it."
+                f"checkpoint={self.path} already exists; continue from it with resume=true, or delete it."
             )
         state, facts = read_state(self.path)
         for name in dict.fromkeys([*run, *facts]):
             if facts.get(name) != run.get(name):
                 raise InvalidArgumentError(
-                    f"checkpoint={self.path} is of another run: it has {name}={facts.get(name)!r}, this one "
-                    f"{name}={run.get(name)!r}. Make them the same, or give another checkpoint."
+                    f"checkpoint={self.path} is of another run: it has {name}={facts.get(name)!r}, this run "
+                    f"has {name}={run.get(name)!r}. Use the same value, or another checkpoint."
                 )
         if tuple(state.parameters.means.shape) != (run["n_components"], run["dimensions"]):
-            raise DataError(f"{self.path} holds other parameters than it says; the file is damaged.")
+            raise DataError(f"{self.path} does not match its own description; the file is damaged.")
         return state
 
-    def advice(self) -> str:
-        """Where to go on from, in words."""
+    def resume_hint(self) -> str:
+        """A sentence that says how to continue."""
         try:
             state, _ = read_state(self.path)
         except GmmTorchError:
-            return f"There is no checkpoint at {self.path} yet; start again."
+            return f"There is no checkpoint at {self.path} yet; start the run again."
         return (
-            f"The last checkpoint, {self.path}, is of iteration {len(state.lower_bounds)}; start again "
-            "with resume=true to go on from there."
+            f"The last checkpoint, {self.path}, is of iteration {len(state.lower_bounds)}; start the run "
+            "again with resume=true to continue from it."
         )
 
 
 class CheckpointWriter:
     """Writes the state of one run when it is due."""
 
-    def __init__(self, checkpoint: Checkpoint, run: Facts, center: Tensor) -> None:
+    def __init__(self, checkpoint: Checkpoint, run: RunFacts, center: Tensor) -> None:
         self._checkpoint, self._run, self._center = checkpoint, run, center
         self._last = time.monotonic()
 
-    def offer(self, parameters: Parameters, lower_bounds: list[float], final: bool = False) -> None:
-        """Write the state after an iteration if it is due, or the `final` one."""
+    def write_if_due(self, parameters: Parameters, lower_bounds: list[float], final: bool = False) -> None:
+        """Write the state after an iteration if it is due, or if it is `final`."""
         seconds, now = self._checkpoint.seconds, time.monotonic()
-        late = seconds is not None and now - self._last >= seconds
-        if final or late or len(lower_bounds) % self._checkpoint.every == 0:
+        is_late = seconds is not None and now - self._last >= seconds
+        if final or is_late or len(lower_bounds) % self._checkpoint.every == 0:
             write_state(self._checkpoint.path, State(parameters, self._center, lower_bounds), self._run)
             self._last = now
 
 
-def write_state(path: Path, state: State, run: Facts) -> None:
-    """Write a state and the run it is of, atomically."""
+def write_state(path: Path, state: State, run: RunFacts) -> None:
+    """Write a state and a description of its run, atomically."""
     tensors = {**state.parameters._asdict(), "center": state.center}
     tensors["lower_bounds"] = torch.tensor(state.lower_bounds, dtype=torch.float64)
     write_bytes(path, pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, run=dict(run)))
 
 
 def read_state(path: Path) -> tuple[State, dict[str, Any]]:
-    """The state and the run it is of. Raises `DataError` for a file that holds none."""
+    """The state and the description of its run. Raises `DataError` if the file is not a checkpoint."""
     tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
     means = require(tensors, "means", (None, None), torch.float64, path)
     k, dim = means.shape
@@ -134,5 +134,5 @@ def read_state(path: Path) -> tuple[State, dict[str, Any]]:
     bounds = require(tensors, "lower_bounds", (None,), torch.float64, path)
     run = facts.get("run")
     if not isinstance(run, dict):
-        raise DataError(f"{path} does not say what run it is of; the file is damaged.")
+        raise DataError(f"{path} lacks the description of its run; the file is damaged.")
     return State(Parameters(weights, means, covariances), center, bounds.tolist()), run

@@ -1,7 +1,7 @@
-"""Several processes that share one fit: each reads its own points, and all hold the same parameters.
+"""Processes that share one fit: each reads its own points, and all have the same parameters.
 
-What they exchange is little: one sum of K × F sufficient statistics an iteration, whatever the number
-of points. Started by torchrun, they find each other; started alone, a process is the whole group.
+They exchange one sum of K × F sufficient statistics per iteration, whatever the number of points.
+Processes started by torchrun form a group; a single process is a group of one.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 TIMEOUT = 600.0
-"""Seconds that a process waits for the others, unless the caller says otherwise."""
+"""Default time (s) that a process waits for the others."""
 
 
 class LostProcessError(GmmTorchError, RuntimeError):
-    """Another process of the group has ended, or did not answer in time."""
+    """Another process of the group ended, or did not answer in time."""
 
 
 class Processes:
-    """Those that share a fit. This is one process alone, whose points are all the points."""
+    """The processes that share a fit. This base class is a single process with all points."""
 
     rank = 0
     size = 1
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """The sum of everyone's tensor, of the same shape and dtype in all."""
+        """The sum of the tensors of all processes, of equal shape and dtype."""
         return tensor
 
     def gather(self, rows: Tensor) -> list[Tensor]:
-        """Everyone's rows (n, C), by rank; n may differ."""
+        """The rows (n, C) of all processes, by rank; n may differ."""
         return [rows]
 
     def broadcast(self, vector: Tensor | None) -> Tensor:
-        """Rank 0's vector (n,), which the others need not have, nor know the length of; float64."""
+        """The vector (n,), float64, of rank 0. Other ranks may pass None."""
         assert vector is not None
         return vector
 
@@ -62,7 +62,7 @@ class ProcessGroup(Processes):
 
     def sum(self, tensor: Tensor) -> Tensor:
         total = tensor.to(self._device).contiguous()
-        with self._answering():
+        with self._detect_lost_process():
             self._distributed.all_reduce(total)
         return total.to(tensor.device)
 
@@ -72,10 +72,10 @@ class ProcessGroup(Processes):
         counts = [int(n) for n in self.sum(lengths)]
         padded = rows.new_zeros(max(counts), rows.shape[1]).to(self._device)
         padded[: rows.shape[0]] = rows
-        everyone = [torch.empty_like(padded) for _ in counts]
-        with self._answering():
-            self._distributed.all_gather(everyone, padded)
-        return [part[:n].to(rows.device) for part, n in zip(everyone, counts, strict=True)]
+        all_rows = [torch.empty_like(padded) for _ in counts]
+        with self._detect_lost_process():
+            self._distributed.all_gather(all_rows, padded)
+        return [part[:n].to(rows.device) for part, n in zip(all_rows, counts, strict=True)]
 
     def broadcast(self, vector: Tensor | None) -> Tensor:
         length = 0 if vector is None or self.rank else vector.numel()
@@ -83,34 +83,34 @@ class ProcessGroup(Processes):
         if vector is None or self.rank:
             vector = torch.empty(length, dtype=torch.float64)
         sent = vector.to(self._device).contiguous()
-        with self._answering():
+        with self._detect_lost_process():
             self._distributed.broadcast(sent, 0)
         return sent.to(vector.device)
 
     @contextmanager
-    def _answering(self) -> Iterator[None]:
-        """What torch raises when a process is gone becomes a `LostProcessError`."""
+    def _detect_lost_process(self) -> Iterator[None]:
+        """Turns errors of torch about a lost process into a `LostProcessError`."""
         try:
             yield
         except RuntimeError as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise LostProcessError(
-                f"rank {self.rank} of {self.size} lost another process, or had no answer within "
+                f"rank {self.rank} of {self.size} lost another process, or got no answer within "
                 f"{self._timeout:g} s ({reason})."
             ) from error
 
 
 def is_launched() -> bool:
-    """Whether torchrun, or something like it, started this process as one of several."""
+    """Whether torchrun (or a similar launcher) started this process as one of several."""
     return all(name in os.environ for name in _LAUNCHED) and int(os.environ["WORLD_SIZE"]) > 1
 
 
 @contextmanager
 def joined(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Iterator[Processes]:
-    """The processes that torchrun started together (gloo on CPU, nccl on CUDA), or this one alone.
+    """The processes that torchrun started (gloo on CPU, nccl on CUDA), or this single process.
 
-    `timeout` (s) bounds how long one waits for another. Raises `LostProcessError` if they do not find
-    each other, `InvalidArgumentError` for a timeout that is none.
+    `timeout` (s) limits how long one process waits for another. Raises `LostProcessError` if the processes
+    do not connect, and `InvalidArgumentError` for an invalid timeout.
     """
     if not (math.isfinite(timeout) and timeout > 0):
         raise InvalidArgumentError(f"timeout={timeout} must be above zero seconds, and finite.")
@@ -122,14 +122,14 @@ def joined(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Iter
     device = torch.device(device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
-        os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")  # else nccl ends the process by itself
+        os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")  # otherwise nccl aborts the process
     try:
         distributed.init_process_group(
             "nccl" if device.type == "cuda" else "gloo", timeout=datetime.timedelta(seconds=timeout)
         )
     except RuntimeError as error:
         raise LostProcessError(
-            f"rank {os.environ['RANK']} did not find the other {int(os.environ['WORLD_SIZE']) - 1} at "
+            f"rank {os.environ['RANK']} of {os.environ['WORLD_SIZE']} did not find the other processes at "
             f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']} within {timeout:g} s ({error})."
         ) from error
     try:

@@ -1,4 +1,6 @@
-"""How a tree of Gaussians grows: level by level, every node that is worth it at once (thesis 2.7–2.9)."""
+"""Growth of a tree of Gaussians, level by level; a level splits all its nodes as one batch (thesis
+2.7–2.9).
+"""
 
 from __future__ import annotations
 
@@ -11,32 +13,31 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mixture.em.exact import Parameters, log_joint
-from gmmtorch.mixture.estimators.trees.mixture_tree import Tree
 from gmmtorch.mixture.estimators.trees.nested import (
+    Assignment,
     Children,
     Fitted,
     Members,
     Packed,
-    Partition,
+    assign_members,
+    drop_weak_children,
     expectation,
     maximization,
     pack,
-    partition,
     principal_axes_start,
     run_em,
-    without_weak,
 )
 
-_WORST_ROUNDING = 0.02  # nats a point, in float32; above it, float64 is used
-_SHORTLIST = 3  # nodes fitted for each that the budget allows to be split
+_WORST_ROUNDING = 0.02  # nats a point of float32 error above which float64 is used
+_SHORTLIST = 3  # nodes that are fully fitted, per node that the limit of leaves allows to split
 _TRIAL_ITERATIONS = 2
 
 
 @dataclass(frozen=True)
 class GrowthRule:
-    """When a node is split, into how many, and how its children are learned.
+    """When a node is split, into how many children, and how the children are fitted.
 
-    The parameters of `HierarchicalGaussianMixture` of the same names; dtype is a torch dtype.
+    The fields are the parameters of `HierarchicalGaussianMixture`; dtype is a torch dtype.
     """
 
     n_components: int | None = None
@@ -53,11 +54,47 @@ class GrowthRule:
     dtype: torch.dtype = torch.float32
 
 
-class Nodes(NamedTuple):
-    """The nodes of a level, their place in the tree and their members' likelihoods.
+class Tree(NamedTuple):
+    """Nodes of a tree of Gaussians, level by level, parents before children.
 
-    own (G,): Σ p log N(x) over a node's members, nats; bound (G,): Σ p log(π N(x)/q), what the node
-    adds to the lower bound of the whole, q being the shares of the points.
+    The root, which is the whole cloud, is not a node. parents: (M,) the parent of each node, −1 on the
+    first level. weights: (M,) share of the cloud; the children of a node have its weight in total. means:
+    (M, D). covariances: (M, D, D).
+    """
+
+    parents: Tensor
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+
+    def leaves(self) -> Tensor:
+        """The nodes (K,) without children, in order."""
+        is_leaf = torch.ones_like(self.parents, dtype=torch.bool)
+        is_leaf[self.parents[self.parents >= 0]] = False
+        return is_leaf.nonzero().squeeze(1)
+
+    def levels(self) -> Tensor:
+        """Level (M,) of each node, from 1."""
+        level, ancestor = torch.ones_like(self.parents), self.parents.clone()
+        while bool((ancestor >= 0).any()):
+            inner = ancestor >= 0
+            level[inner] += 1
+            ancestor[inner] = self.parents[ancestor[inner]]
+        return level
+
+    def at_level(self, level: int) -> Tensor:
+        """The nodes of a level and the leaves of earlier levels. Together they represent the whole cloud."""
+        levels = self.levels()
+        is_leaf = torch.zeros_like(levels, dtype=torch.bool)
+        is_leaf[self.leaves()] = True
+        return ((levels == level) | (is_leaf & (levels < level))).nonzero().squeeze(1)
+
+
+class Nodes(NamedTuple):
+    """Nodes of a level, with their place in the tree and the likelihoods of their members.
+
+    own: (G,) Σ p log N(x) over a node's members, nats. bound: (G,) Σ p log(π N(x)/q), with q the shares of
+    the points: the node's part of the lower bound of the whole cloud.
     """
 
     place: Tensor
@@ -69,13 +106,13 @@ class Nodes(NamedTuple):
     def n(self) -> int:
         return self.place.shape[0]
 
-    def of(self, nodes: Tensor) -> Nodes:
+    def select(self, nodes: Tensor) -> Nodes:
         parameters = Parameters(*(value[nodes] for value in self.parameters))
         return Nodes(self.place[nodes], parameters, self.own[nodes], self.bound[nodes])
 
 
 class Growth(NamedTuple):
-    """tree; lower_bounds of the mean log-likelihood, nats; converged: whether EM did, in all nodes."""
+    """tree; lower_bounds of the mean log-likelihood, nats; converged: whether EM converged in all nodes."""
 
     tree: Tree
     lower_bounds: list[float]
@@ -89,25 +126,25 @@ def grow(
     on_iteration: Callable[[int, float], None] | None = None,
     on_level: Callable[[Nodes, Members], None] | None = None,
 ) -> Growth:
-    """The tree of centred points (N, D) of weights (N,) above zero, float64.
+    """Grow the tree of centred points (N, D) with weights (N,) above zero, float64.
 
     Args:
         points, weight: the cloud.
         rule: when nodes are split.
         on_iteration: called with the EM iteration, from 1, and the lower bound, nats a point.
-        on_level: called with the nodes of each level, the root's 0 first, and their members.
+        on_level: called with the nodes of each level, starting with the root (level 0), and their members.
     """
     nodes, members = _root(points, weight, rule.reg_covar)
     root, score, n_leaves, converged = nodes, nodes.bound.sum(), 1, True
     bounds: list[float] = []
     levels: list[Tree] = []
 
-    def note(value: Tensor) -> None:
+    def report_bound(value: Tensor) -> None:
         bounds.append(float(value / weight.sum()))
         if on_iteration is not None:
             on_iteration(len(bounds), bounds[-1])
 
-    note(score)
+    report_bound(score)
     if on_level is not None:
         on_level(nodes, members)
     for _ in range(rule.max_levels):
@@ -115,21 +152,24 @@ def grow(
         if free < 1:
             break
         m = int(min(rule.branching, free + 1))
-        chosen = _divisible(nodes, members.mass(nodes.n), rule)
+        chosen = _splittable(nodes, members.mass(nodes.n), rule)
         if chosen.numel() * (m - 1) > free:
-            chosen = _shortlist(points, members.of(chosen, nodes.n), nodes.of(chosen), chosen, m, free, rule)
+            chosen = _shortlist(
+                points, members.select(chosen, nodes.n), nodes.select(chosen), chosen, m, free, rule
+            )
         if chosen.numel() == 0:
             break
-        members, nodes = members.of(chosen, nodes.n), nodes.of(chosen)
-        split = _split(points, members, nodes, m, rule, note, rest=score - nodes.own.sum())
-        accepted = _worth_it(split, nodes, members.mass(nodes.n), free, rule)
+        members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
+        split = _split(points, members, nodes, m, rule, report_bound, rest=score - nodes.own.sum())
+        accepted = _accepted_splits(split, nodes, members.mass(nodes.n), free, rule)
         score = score - nodes.bound[accepted].sum()
-        nodes, members, level = _descend(split, nodes, accepted, weight, sum(len(t.parents) for t in levels))
+        n_before = sum(len(level.parents) for level in levels)
+        nodes, members, level = _build_children(split, nodes, accepted, weight, n_before)
         levels.append(level)
         score = score + nodes.bound.sum()
         n_leaves += nodes.n - int(accepted.sum())
         converged &= split.converged
-        note(score)
+        report_bound(score)
         if on_level is not None:
             on_level(nodes, members)
     if n_leaves == 1:
@@ -138,7 +178,7 @@ def grow(
 
 
 def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Members]:
-    """The whole cloud as one Gaussian, and every point its member."""
+    """The whole cloud as one Gaussian, with every point as its member."""
     total = weight.sum()
     mean = (weight[:, None] * points).sum(0) / total
     offset = points - mean
@@ -150,8 +190,8 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
     return Nodes(index.new_tensor([-1]), root, own, own), Members(index, torch.zeros_like(index), weight)
 
 
-def _divisible(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
-    """The nodes that have points enough for two children, and are not flat (2.9)."""
+def _splittable(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
+    """The nodes with enough points for two children that are not flat (2.9)."""
     variance = torch.linalg.eigvalsh(nodes.parameters.covariances)
     is_flat = variance[:, 0] < rule.planarity_threshold * variance.sum(1)
     is_flat |= variance[:, 0] < rule.thickness**2
@@ -161,7 +201,7 @@ def _divisible(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
 def _shortlist(
     points: Tensor, members: Members, nodes: Nodes, chosen: Tensor, m: int, free: float, rule: GrowthRule
 ) -> Tensor:
-    """Of the nodes, which are the `chosen` of a level, those that a first look says to gain most."""
+    """Of the nodes `chosen` for splitting, those that gain most in a few trial iterations."""
     n_kept = _SHORTLIST * math.ceil(free / (m - 1))
     if nodes.n <= n_kept:
         return chosen
@@ -175,10 +215,10 @@ def _shortlist(
 
 
 class _Split(NamedTuple):
-    """children of nodes, and how the nodes' members are handed down to them."""
+    """children of nodes; the assignment of the nodes' members to them; whether EM converged."""
 
     children: Children
-    handed: Partition
+    assignment: Assignment
     converged: bool
 
 
@@ -188,10 +228,10 @@ def _split(
     nodes: Nodes,
     m: int,
     rule: GrowthRule,
-    note: Callable[[Tensor], None],
+    report_bound: Callable[[Tensor], None],
     rest: Tensor,
 ) -> _Split:
-    """At most m children in each node; `note` is given `rest` and Σ p log Σ_children in each iteration."""
+    """At most m children in each node. `report_bound` gets `rest` + Σ p log Σ_children per iteration."""
     mass = members.mass(nodes.n)
 
     def learn(dtype: torch.dtype, start: Children | None, max_iter: int) -> tuple[Packed, Fitted]:
@@ -204,55 +244,55 @@ def _split(
             tol=rule.tol,
             max_iter=max_iter,
             worst_error=_WORST_ROUNDING if dtype == torch.float32 else math.inf,
-            on_values=lambda value: note(rest + value.sum()),
+            on_values=lambda value: report_bound(rest + value.sum()),
         )
 
     packed, found = learn(rule.dtype, None, rule.max_iter)
     if found.is_coarse:
         packed, found = learn(torch.float64, found.children, max(1, rule.max_iter - found.n_iter))
-    children = without_weak(found.children, mass, rule.min_support)
-    return _Split(children, partition(packed, children, members, rule.soft_threshold), found.converged)
+    children = drop_weak_children(found.children, mass, rule.min_support)
+    return _Split(children, assign_members(packed, children, members, rule.soft_threshold), found.converged)
 
 
-def _worth_it(split: _Split, nodes: Nodes, mass: Tensor, free: float, rule: GrowthRule) -> Tensor:
-    """Which nodes (G,) are split: those whose members it explains better; if they are too many, the best."""
-    gain = split.handed.value - nodes.own
+def _accepted_splits(split: _Split, nodes: Nodes, mass: Tensor, free: float, rule: GrowthRule) -> Tensor:
+    """Mask (G,) of nodes whose split gains enough; if these exceed the limit of leaves, the best of them."""
+    gain = split.assignment.value - nodes.own
     added = (split.children.weights > 0).sum(1) - 1
     dim = nodes.parameters.means.shape[1]
     n_parameters = added * (1 + dim + dim * (dim + 1) // 2)
-    worth = (added > 0) & (gain > rule.tol * mass) & (gain >= rule.min_gain * n_parameters)
-    if int(added[worth].sum()) > free:
-        order = torch.where(worth, gain / added.clamp_min(1), -torch.inf).argsort(
+    accepted = (added > 0) & (gain > rule.tol * mass) & (gain >= rule.min_gain * n_parameters)
+    if int(added[accepted].sum()) > free:
+        order = torch.where(accepted, gain / added.clamp_min(1), -torch.inf).argsort(
             descending=True, stable=True
         )
-        worth[order] &= torch.cumsum(added[order], 0) <= free
-    return worth
+        accepted[order] &= torch.cumsum(added[order], 0) <= free
+    return accepted
 
 
-def _descend(
+def _build_children(
     split: _Split, nodes: Nodes, accepted: Tensor, weight: Tensor, n_before: int
 ) -> tuple[Nodes, Members, Tree]:
-    """The children of the accepted nodes, with their members, and as a level of the tree.
+    """The children of the accepted nodes, their members, and the new level of the tree.
 
-    weight (N,): of the points; n_before: nodes in the levels above.
+    weight: (N,) of the points. n_before: number of nodes in earlier levels.
     """
-    children, (handed, log_density, _) = split.children, split.handed
+    children, (assignment, log_density, _) = split.children, split.assignment
     m = children.weights.shape[1]
     chosen = ((children.weights > 0) & accepted[:, None]).flatten().nonzero().squeeze(1)
-    above = nodes.parameters
+    parents = nodes.parameters
     parent = chosen // m
     local = children.flat()
-    path_weights = (above.weights[:, None] * children.weights).flatten()
+    path_weights = (parents.weights[:, None] * children.weights).flatten()
     parameters = Parameters(
-        path_weights[chosen], above.means[parent] + local.means[chosen], local.covariances[chosen]
+        path_weights[chosen], parents.means[parent] + local.means[chosen], local.covariances[chosen]
     )
-    p, child = handed.weight, handed.node
+    p, child = assignment.weight, assignment.node
     own = torch.zeros_like(path_weights).index_add_(0, child, p * log_density)
-    shared = p * path_weights.log()[child] - torch.xlogy(p, p / weight[handed.point])
+    shared = p * path_weights.log()[child] - torch.xlogy(p, p / weight[assignment.point])
     bound = own.index_add(0, child, shared)
     place = n_before + torch.arange(chosen.shape[0], device=chosen.device)
     return (
         Nodes(place, parameters, own[chosen], bound[chosen]),
-        handed.of(chosen, path_weights.shape[0]),
+        assignment.select(chosen, path_weights.shape[0]),
         Tree(nodes.place[parent], *parameters),
     )

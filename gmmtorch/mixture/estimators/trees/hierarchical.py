@@ -1,4 +1,4 @@
-"""HierarchicalGaussianMixture: a tree of Gaussians, whose leaves and whose every level are a mixture."""
+"""HierarchicalGaussianMixture: a tree of Gaussians whose leaves, and whose levels, are mixtures."""
 
 from __future__ import annotations
 
@@ -8,54 +8,52 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.estimators.trees.growth import GrowthRule, grow
-from gmmtorch.mixture.estimators.trees.mixture_tree import Tree, check_tree
+from gmmtorch.mixture.estimators.trees.growth import GrowthRule, Tree, grow
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.validation import Array, RandomState, as_generator, check_choice, check_number
+from gmmtorch.mixture.validation import Array, RandomState
 
 
 class HierarchicalGaussianMixture(MixtureEstimator):
     """Hierarchical EM (thesis 2.1.2, equations 2.7–2.9; Eckart et al., 2016): a tree of Gaussians.
 
-    The cloud is split into at most `branching` Gaussians by EM, the points of each into as many
-    again, and so on: all nodes of a level in one batch. A point goes to every child that is nearly
-    as likely as its likeliest one, and takes a share of its weight to each. The leaves, weighted by
-    their paths, are the mixture; `level` gives coarser ones of the same cloud. What a point costs
-    grows with the levels, not with the leaves.
+    EM splits the cloud into at most `branching` Gaussians, then splits the points of each Gaussian again,
+    and so on. All nodes of a level are one batch. A point is assigned to every child that is nearly as
+    likely as its most likely one, with a share of its weight for each. The leaves, weighted by their
+    paths, are the mixture; `level` returns coarser mixtures of the same cloud. The cost of a point grows
+    with the number of levels, not of leaves.
 
     Args:
-        n_components: leaves at most. Where they do not suffice to split all nodes of a level, those
-            are split that gain most. None: as many as the other limits make.
-        branching: children of a node at most.
-        max_levels: levels at most, so branching^max_levels leaves.
-        tol: EM in a node stops when its mean log-likelihood rises by less (nats a point), and a
-            node whose split gains less is not split.
-        max_iter: EM iterations at most, on each level.
-        reg_covar: added to each variance, in the square of the points' unit (m²).
-        soft_threshold: λ_p, from 0 to 1: a point goes to the children of more than this share of its
-            largest responsibility (2.7). 1: to the likeliest only.
-        planarity_threshold: nodes whose smallest variance is a lesser share of all three are flat,
-            and are not split (2.9).
-        thickness: nor are those whose smallest standard deviation is less (m), such as the noise
-            of the sensor.
-        min_support: children of fewer points (weight) are dropped, and their points given to their
+        n_components: largest number of leaves. If it is too small to split all nodes of a level, the
+            splits that gain most are made. None: limited by the other parameters only.
+        branching: largest number of children of a node.
+        max_levels: largest number of levels, so at most branching^max_levels leaves.
+        tol: EM in a node stops when its mean log-likelihood increases by less (nats a point), and a
+            split that gains less is not made.
+        max_iter: largest number of EM iterations on each level.
+        reg_covar: added to each variance, in the squared unit of the points (m²).
+        soft_threshold: λ_p, from 0 to 1: a point is assigned to children with more than this share of
+            its largest responsibility (2.7). With 1, to the most likely child only.
+        planarity_threshold: a node whose smallest variance is a smaller share of the sum of its
+            variances is flat and is not split (2.9).
+        thickness: a node whose smallest standard deviation is less (m) is not split. The sensor's noise
+            is a suitable value.
+        min_support: children with less weight (points) are removed, and their points assigned to their
             siblings.
-        min_gain: nats of log-likelihood that a split must gain for each free parameter that it
-            adds: 1 is Akaike's criterion, ½ log N the Bayesian one, with 0 any gain will do.
-        random_state: of `sample`; nothing in the fit is drawn at random. A seed, a `RandomState`, a
-            `torch.Generator`, or None for a fresh one.
-        dtype: of the E-step. With "float32", levels on which that would err too much are worked
-            on in float64.
+        min_gain: log-likelihood (nats) that a split must gain per free parameter that it adds. 1 is
+            Akaike's criterion, ½ log N the Bayesian one, and 0 accepts any gain.
+        random_state: used by `sample` only; the fit is deterministic. A seed, a `RandomState`, a
+            `torch.Generator`, or None for a random seed.
+        dtype: of the E-step. With "float32", levels on which its error is too large use float64.
 
-    Fitted attributes: those of every `MixtureEstimator`, of the leaves; and of the tree `n_levels_`,
+    Fitted attributes: those of every `MixtureEstimator`, for the leaves; and for the tree `n_levels_`,
     `node_parents_` (M,), −1 on the first level, `node_levels_` (M,), from 1, `node_weights_` (M,),
-    `node_means_` (M, D), `node_covariances_` (M, D, D), level by level. Leaves are in the nodes'
-    order. `lower_bounds_` are of the mean log-likelihood, nats: of one Gaussian, after each EM
-    iteration on a level, and of each level as it is kept. They do not fall within a level's EM.
+    `node_means_` (M, D), `node_covariances_` (M, D, D), level by level. Leaves have the order of the
+    nodes. `lower_bounds_` bound the mean log-likelihood, nats: of one Gaussian, after each EM iteration on
+    a level, and of each accepted level. They do not decrease within the EM of a level.
     """
 
     _extra_names: ClassVar[tuple[str, ...]] = (
@@ -64,6 +62,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         "node_means",
         "node_covariances",
     )
+    _optional_n_components = True
     _finds_n_components = True
     node_parents: Tensor
     node_weights: Tensor
@@ -111,25 +110,14 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
     ) -> HierarchicalGaussianMixture:
-        """Learn the tree of points X (N, D).
-
-        Args:
-            X: points, finite.
-            y: ignored, as in scikit-learn.
-            sample_weight: (N,) how many points each row stands for: not negative, not all zero.
-            on_iteration: called with the iteration (from 1) and the lower bound, nats a point.
-
-        Raises:
-            InvalidArgumentError (a ValueError): a bad argument, weight or point.
-            NumericalError: a component collapsed, as happens with reg_covar = 0.
-        """
+        """Fit the tree to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
         found = grow(points, weight, self._rule(), on_iteration)
         tree = found.tree._replace(means=found.tree.means + center)
         leaves = tree.leaves()
         mixture = Parameters(*(value[leaves] for value in found.tree[1:]))
         extra = dict(zip(self._extra_names, tree, strict=True))
-        self._keep(mixture, center, found.lower_bounds, found.converged, extra)
+        self._store_fit(mixture, center, found.lower_bounds, found.converged, extra)
         self._warn_unless_converged("EM", " in every node")
         return self
 
@@ -140,9 +128,9 @@ class HierarchicalGaussianMixture(MixtureEstimator):
     # -- the tree ---------------------------------------------------------------------------------
 
     def level(self, level: int) -> GaussianMixture:
-        """The nodes of a level, from 1 to `n_levels_`, and the leaves above it, as a mixture of the cloud.
+        """The mixture of the nodes of a level (1 to `n_levels_`) and the leaves of earlier levels.
 
-        Raises `InvalidArgumentError` for a level that there is not.
+        Raises `InvalidArgumentError` for a level that does not exist.
         """
         tree, deepest = self._tree(), self.n_levels_
         if check_whole("level", level, 1) > deepest:
@@ -160,7 +148,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         return mixture
 
     def _tree(self) -> Tree:
-        """The tree; for a mixture of given parameters, one level of leaves."""
+        """The tree. A mixture of given parameters is a tree with one level of leaves."""
         self._fitted()
         if "node_parents" in self._buffers:
             return Tree(self.node_parents, self.node_weights, self.node_means, self.node_covariances)
@@ -173,43 +161,43 @@ class HierarchicalGaussianMixture(MixtureEstimator):
 
     @property
     def n_levels_(self) -> int:
-        """How many levels there are."""
+        """Number of levels."""
         return int(self._tree().levels().max())
 
     @property
     def node_parents_(self) -> Array:
         """The parent (M,) of each node, −1 on the first level."""
-        return self._as_fitted(self._tree().parents)
+        return self._as_fit_kind(self._tree().parents)
 
     @property
     def node_levels_(self) -> Array:
         """The level (M,) of each node, from 1."""
-        return self._as_fitted(self._tree().levels())
+        return self._as_fit_kind(self._tree().levels())
 
     @property
     def node_weights_(self) -> Array:
         """The share (M,) of the cloud in each node."""
-        return self._as_fitted(self._tree().weights)
+        return self._as_fit_kind(self._tree().weights)
 
     @property
     def node_means_(self) -> Array:
         """Means (M, D) of the nodes."""
-        return self._as_fitted(self._tree().means)
+        return self._as_fit_kind(self._tree().means)
 
     @property
     def node_covariances_(self) -> Array:
         """Covariances (M, D, D) of the nodes."""
-        return self._as_fitted(self._tree().covariances)
+        return self._as_fit_kind(self._tree().covariances)
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         if tensors:
             missing = [name for name in self._extra_names if name not in tensors]
             if missing:
-                raise InvalidArgumentError(f"The tree lacks {missing[0]}; give all of it or nothing.")
+                raise InvalidArgumentError(f"The tree lacks {missing[0]}; pass all of its tensors, or none.")
             check_tree(Tree(*(tensors[name] for name in self._extra_names)), self.weights)
         super()._set_extra(tensors)
 
-    def _moved_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
+    def _transformed_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
         extra = self._extra_tensors()
         if extra:
             extra["node_means"] = extra["node_means"] @ rotation.T + translation
@@ -219,13 +207,33 @@ class HierarchicalGaussianMixture(MixtureEstimator):
     # -- arguments --------------------------------------------------------------------------------
 
     def check_parameters(self, n_points: int | None = None) -> None:
-        """Raise `InvalidArgumentError` for a parameter that cannot be."""
-        if self.n_components is not None:
-            check_whole("n_components", self.n_components, 1)
-        for name, least in (("branching", 2), ("max_levels", 1), ("max_iter", 1)):
-            check_whole(name, getattr(self, name), least)
-        for name in ("tol", "reg_covar", "planarity_threshold", "thickness", "min_support", "min_gain"):
+        super().check_parameters(n_points)
+        check_whole("branching", self.branching, 2)
+        check_whole("max_levels", self.max_levels, 1)
+        for name in ("planarity_threshold", "thickness", "min_support", "min_gain"):
             check_number(name, getattr(self, name))
-        check_number("soft_threshold", self.soft_threshold, most=1.0)
-        check_choice("dtype", self.dtype, em.SOFTMAX_DTYPES)
-        as_generator(self.random_state)
+        check_number("soft_threshold", self.soft_threshold, largest=1.0)
+
+
+def check_tree(tree: Tree, leaf_weights: Tensor) -> None:
+    """Raise `InvalidArgumentError` unless `tree` is a tree whose leaves have these weights (K,)."""
+    parents, *values = tree
+    n, dim = parents.numel(), tree.means.shape[-1] if tree.means.ndim else 0
+    if parents.shape != (n,) or parents.dtype != torch.int64:
+        raise InvalidArgumentError(
+            f"parents is {parents.dtype} {tuple(parents.shape)}; expected (M,) whole numbers, int64."
+        )
+    for name, value, shape in zip(tree._fields[1:], values, ((n,), (n, dim), (n, dim, dim)), strict=True):
+        if tuple(value.shape) != shape or value.dtype != torch.float64:
+            raise InvalidArgumentError(
+                f"{name} is {value.dtype} {tuple(value.shape)}; expected float64 {shape}."
+            )
+    if bool(((parents < -1) | (parents >= torch.arange(n, device=parents.device))).any()):
+        raise InvalidArgumentError(
+            f"parents={parents.tolist()} must be −1 or the index of an earlier node; order nodes by level."
+        )
+    leaves = tree.leaves()
+    if leaves.shape != leaf_weights.shape or not torch.allclose(tree.weights[leaves], leaf_weights):
+        raise InvalidArgumentError(
+            f"The tree's {leaves.numel()} leaves are not the mixture's {len(leaf_weights)} components."
+        )

@@ -1,8 +1,8 @@
-"""EM in every node of a level at once: a mixture of m children each, about the node's own centre.
+"""EM in every node of a level as one batch: each node has a mixture of m children about its own centre.
 
-The points of a node are its members; a point may be a member of several nodes, with a share of its
-weight in each. Members are packed in blocks of one node, so that all nodes together are one batch of
-small matrix products, whatever number of members each has. Working about the node's centre keeps
+The points of a node are its members. A point may be a member of several nodes, with a share of its
+weight in each. Members are packed in blocks of one node, so that all nodes are one batch of small
+matrix products, whatever their numbers of members. Coordinates relative to the node's centre keep
 enough digits in float32.
 """
 
@@ -19,19 +19,19 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import CHUNK_ELEMENTS, Parameters, feature_dimension, natural_parameters
 from gmmtorch.mixture.em.grouping import Rows, group_rows
 
-_LEAST_SHARE = 1e-30  # of the likeliest child's responsibility; less is nothing
-_ROUNDINGS = 10.0  # variances below so many roundings of the members' squared distances are noise
+_LEAST_SHARE = 1e-30  # smaller shares of the largest responsibility are treated as zero
+_ROUNDINGS = 10.0  # variances below this number of roundings of squared distances are noise
 
 
 class Members(NamedTuple):
-    """Which points belong to which nodes, in no order: point (R,), node (R,), weight (R,) float64."""
+    """Assignment of points to nodes, in no order: point (R,), node (R,), weight (R,) float64."""
 
     point: Tensor
     node: Tensor
     weight: Tensor
 
-    def of(self, nodes: Tensor, n_nodes: int) -> Members:
-        """Those of some `nodes` (G,) of `n_nodes`, which are numbered anew from 0."""
+    def select(self, nodes: Tensor, n_nodes: int) -> Members:
+        """The members of some `nodes` (G,) of `n_nodes`, which are renumbered from 0."""
         number = torch.full((n_nodes,), -1, dtype=torch.int64, device=nodes.device)
         number[nodes] = torch.arange(nodes.shape[0], device=nodes.device)
         new = number.index_select(0, self.node)
@@ -44,10 +44,10 @@ class Members(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Members in blocks of B of one node, filled up with members of weight 0.
+    """Members in blocks of B of one node. Members of weight 0 fill incomplete blocks.
 
-    features (b, F, B) about the node's centre, weight (b, B), node (b,) of each block, member (b, B):
-    which one is in each place, −1 where none is.
+    features: (b, F, B) relative to the node's centre. weight: (b, B). node: (b,) of each block. member:
+    (b, B) index of the member in each place, −1 if the place is empty.
     """
 
     features: Tensor
@@ -55,14 +55,14 @@ class Packed(NamedTuple):
     node: Tensor
     member: Tensor
 
-    def of(self, kept: Tensor) -> Packed:
-        """The blocks of the nodes that are `kept` (G,), which are numbered anew from 0."""
+    def select(self, kept: Tensor) -> Packed:
+        """The blocks of the nodes in the mask `kept` (G,), which are renumbered from 0."""
         blocks = kept[self.node].nonzero().squeeze(1)
         features, weight, node, member = (value.index_select(0, blocks) for value in self)
         return Packed(features, weight, (torch.cumsum(kept.long(), 0) - 1)[node], member)
 
     def chunks(self, n_children: int) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
-        """Blocks, and their features, weight and node, so few that work on all pairs stays in cache."""
+        """Slices of blocks, and their features, weight and node, small enough for the cache."""
         step = max(1, CHUNK_ELEMENTS // (self.weight.shape[1] * n_children))
         for begin in range(0, self.node.shape[0], step):
             part = slice(begin, begin + step)
@@ -70,29 +70,32 @@ class Packed(NamedTuple):
 
 
 def pack(points: Tensor, members: Members, centers: Tensor, dtype: torch.dtype) -> Packed:
-    """Members of points (N, D) about the centres (G, D) of their nodes, in `dtype`."""
+    """Pack members of points (N, D) relative to the centres (G, D) of their nodes, in `dtype`."""
     rows = Rows(points.index_select(0, members.point), members.weight, are_points=True)
     groups = group_rows(rows, members.node, centers, dtype)
     member = torch.full((groups.weight.numel(),), -1, dtype=torch.int64, device=points.device)
     member[groups.slot] = groups.row
-    # Members along the rows: the products run twice as fast.
+    # With members along the rows, the products run twice as fast.
     features = groups.features.transpose(1, 2).contiguous()
     return Packed(features, groups.weight, groups.owner, member.view_as(groups.weight))
 
 
 class Children(NamedTuple):
-    """Mixtures of m in each of G nodes: weights (G, m), means (G, m, D) about the node's centre, and
-    covariances (G, m, D, D). Weights add up to one in each node; a child of weight 0 is not there."""
+    """Mixtures of m children in each of G nodes; weights add up to one in each node.
+
+    weights: (G, m), 0 for an absent child. means: (G, m, D) relative to the node's centre. covariances:
+    (G, m, D, D).
+    """
 
     weights: Tensor
     means: Tensor
     covariances: Tensor
 
     def flat(self) -> Parameters:
-        """All children in a row, (G·m, …)."""
+        """All children as one list, (G·m, …)."""
         return Parameters(self.weights.flatten(), self.means.flatten(0, 1), self.covariances.flatten(0, 1))
 
-    def of(self, nodes: Tensor) -> Children:
+    def select(self, nodes: Tensor) -> Children:
         return Children(*(value[nodes] for value in self))
 
     def natural(self, dtype: torch.dtype) -> Tensor:
@@ -100,16 +103,11 @@ class Children(NamedTuple):
         return natural_parameters(self.flat()).view(*self.weights.shape, -1).to(dtype)
 
 
-def _floor(dtype: torch.dtype) -> float:
-    """Exponents below it would give denormal numbers: nothing, but slow."""
-    return -80.0 if dtype == torch.float32 else -700.0
-
-
 def expectation(packed: Packed, children: Children) -> tuple[Tensor, Tensor]:
     """The E-step in all nodes: statistics (G, m, F) and Σ p log Σ_children (G,), float64."""
     n_nodes, m = children.weights.shape
     dtype, n_features = packed.features.dtype, packed.features.shape[1]
-    natural, floor = children.natural(dtype), _floor(dtype)
+    natural, floor = children.natural(dtype), em.exponent_floor(dtype)
     sums = natural.new_zeros(n_nodes, m * n_features, dtype=torch.float64)
     value = natural.new_zeros(n_nodes, dtype=torch.float64)
     for _, features, weight, node in packed.chunks(m):
@@ -118,7 +116,7 @@ def expectation(packed: Packed, children: Children) -> tuple[Tensor, Tensor]:
         norm = gamma.sub_(peak).clamp_(min=floor).exp_().sum(1)
         value.index_add_(0, node, (weight * (peak[:, 0] + norm.log())).sum(1).double())
         gamma.mul_((weight / norm)[:, None])
-        # Summed in float64, so that roundings average out over the blocks of a large node.
+        # Summed in float64, so that rounding errors average out over the blocks of a large node.
         sums.index_add_(0, node, torch.bmm(gamma, features.transpose(1, 2)).flatten(1).double())
     return sums.view(n_nodes, m, n_features), value
 
@@ -128,8 +126,8 @@ def maximization(
 ) -> tuple[Children, float]:
     """The M-step in all nodes, from statistics (G, m, F) of features in `dtype`.
 
-    Also how far that dtype errs in the next E-step, in nats a point on the average: ε/2 E[‖x‖²]/λ_min.
-    Variances that are less than rounding could make are raised to that.
+    Also returns the mean error of that dtype in the next E-step, nats a point: ε/2 E[‖x‖²]/λ_min.
+    Variances below the rounding error are raised to it.
     """
     n_nodes, m, n_features = statistics.shape
     dim = feature_dimension(n_features)
@@ -152,15 +150,15 @@ def maximization(
     return children, float(error)
 
 
-# -- where EM starts ------------------------------------------------------------------------------
+# -- start of EM ----------------------------------------------------------------------------------
 
 
 def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_covar: float) -> Children:
-    """Each node's members cut in at most m pieces, and a component for each piece.
+    """Start of EM: each node's members are cut into at most m pieces, with one component per piece.
 
-    Pieces are halved at their mean across their longest direction, those of the largest scatter
-    first, as long as they are longer than reg_covar (m²) can tell. Nothing is drawn at random, and the
-    frame does not matter. A node of fewer places than m has children of weight 0.
+    Pieces are halved at their mean across their longest direction, those with the largest scatter first,
+    while they are longer than `reg_covar` (m²) resolves. The result is deterministic and does not depend
+    on the frame. A node with fewer distinct places than m gets children of weight 0.
     """
     label = torch.zeros_like(packed.member)
     n_pieces = 1
@@ -191,7 +189,7 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
 
 
 def _pool(packed: Packed, label: Tensor, n_nodes: int, n_pieces: int) -> Tensor:
-    """Statistics (G, n, F) of the pieces that the labels (b, B) of members make of each node."""
+    """Statistics (G, n, F) of the pieces that the labels (b, B) of members define in each node."""
     n_features = packed.features.shape[1]
     sums = packed.weight.new_zeros(n_nodes, n_pieces * n_features, dtype=torch.float64)
     piece = torch.arange(n_pieces, device=label.device)[:, None]
@@ -205,8 +203,11 @@ def _pool(packed: Packed, label: Tensor, n_nodes: int, n_pieces: int) -> Tensor:
 
 
 class Fitted(NamedTuple):
-    """children of each node; converged: whether EM settled in all; n_iter: EM iterations; is_coarse:
-    whether EM was given up, since its dtype is too coarse."""
+    """Result of EM in nodes.
+
+    children: of each node. converged: whether EM converged in all nodes. n_iter: EM iterations.
+    is_coarse: whether EM stopped because its dtype is too coarse.
+    """
 
     children: Children
     converged: bool
@@ -225,15 +226,15 @@ def run_em(
     worst_error: float,
     on_values: Callable[[Tensor], None],
 ) -> Fitted:
-    """EM in each node until its mean log-likelihood rises by less than `tol` nats, each by itself.
+    """EM in each node until its own mean log-likelihood increases by less than `tol` nats.
 
     Args:
         packed: the members of G nodes.
-        start: where EM begins.
+        start: where EM starts.
         mass: (G,) weight of each node.
         reg_covar: added to each variance (m²).
-        tol, max_iter: when EM ends.
-        worst_error: EM is given up when its dtype errs by more (nats a point).
+        tol, max_iter: when EM stops.
+        worst_error: EM stops if the error of its dtype is larger (nats a point).
         on_values: called with Σ p log Σ_children (G,) before each M-step.
     """
     children = Children(*(value.clone() for value in start))
@@ -241,7 +242,7 @@ def run_em(
     active = torch.arange(mass.shape[0], device=mass.device)
     dtype = packed.features.dtype
     for iteration in range(1, max_iter + 1):
-        part = children.of(active)
+        part = children.select(active)
         statistics, found = expectation(packed, part)
         part, error = maximization(statistics, reg_covar, dtype, part)
         for whole, new in zip(children, part, strict=True):
@@ -249,18 +250,18 @@ def run_em(
         going_on = found - value[active] >= tol * mass[active]
         value[active] = found
         on_values(value)
-        settled = not bool(going_on.any())
-        if settled or error > worst_error:
-            return Fitted(children, settled, iteration, not settled)
+        converged = not bool(going_on.any())
+        if converged or error > worst_error:
+            return Fitted(children, converged, iteration, not converged)
         if not bool(going_on.all()):
-            packed, active = packed.of(going_on), active[going_on]
+            packed, active = packed.select(going_on), active[going_on]
     return Fitted(children, False, max_iter, False)
 
 
-def without_weak(children: Children, mass: Tensor, min_support: float) -> Children:
-    """Children of less support than `min_support` get weight 0, for their siblings to take over.
+def drop_weak_children(children: Children, mass: Tensor, min_support: float) -> Children:
+    """Set children with less support than `min_support` to weight 0, in favour of their siblings.
 
-    mass (G,): of the nodes. The largest of each node stays.
+    mass (G,): of the nodes. The largest child of each node stays.
     """
     weights = children.weights
     largest = weights == weights.amax(1, keepdim=True)
@@ -268,26 +269,30 @@ def without_weak(children: Children, mass: Tensor, min_support: float) -> Childr
     return children._replace(weights=kept / kept.sum(1, keepdim=True))
 
 
-# -- handing the members down ---------------------------------------------------------------------
+# -- assignment of members to children ------------------------------------------------------------
 
 
-class Partition(NamedTuple):
-    """Members of the children, numbered node · m + child; log_density (R,) of each member at its child,
-    nats; value (G,): Σ p log Σ_children of the nodes."""
+class Assignment(NamedTuple):
+    """Members of the children, which are numbered node · m + child.
+
+    log_density: (R,) of each member at its child, nats. value: (G,) Σ p log Σ_children of the nodes.
+    """
 
     members: Members
     log_density: Tensor
     value: Tensor
 
 
-def partition(packed: Packed, children: Children, members: Members, soft_threshold: float) -> Partition:
-    """Members of each node handed down to its children (2.7): to child j if γ_j > λ max γ, and to the
-    likeliest. They share the member's weight in proportion to γ (2.8), all of it.
+def assign_members(packed: Packed, children: Children, members: Members, soft_threshold: float) -> Assignment:
+    """Assign the members of each node to its children (2.7): to each child j with γ_j > λ max γ.
+
+    The most likely child is always included. The children share the member's whole weight in proportion
+    to γ (2.8).
     """
     m = children.weights.shape[1]
     natural = children.natural(packed.features.dtype)
     log_weight = children.weights.log().flatten()
-    floor = _floor(natural.dtype)
+    floor = em.exponent_floor(natural.dtype)
     value = torch.zeros_like(children.weights[:, 0])
     least = max(soft_threshold, _LEAST_SHARE)
     found: list[tuple[Tensor, ...]] = []
@@ -303,7 +308,7 @@ def partition(packed: Packed, children: Children, members: Members, soft_thresho
         where = (block, child, place)
         found.append((packed.member[part][block, place], node[block] * m + child, gamma[where], joint[where]))
     member, child, share, log_joint = (torch.cat(values) for values in zip(*found, strict=True))
-    return Partition(
+    return Assignment(
         Members(members.point[member], child, members.weight[member] * share),
         log_joint.double() - log_weight[child],
         value,
