@@ -180,7 +180,7 @@ def _dense(
         method = source.method if method is None else method
         if method != "point":  # the others answer for cells, all at once
             on_event(f"evidence by {method}", 0, None)
-            return grid, source.evidence(grid, method).probability(source.answering.prior)
+            return grid, source.evidence(grid, method).probability(source.query_options.prior)
 
     def answer(points: Tensor) -> Tensor:
         if isinstance(source, GaussianMap):

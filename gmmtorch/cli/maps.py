@@ -13,8 +13,8 @@ from gmmtorch.cli import common
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.methods import MapFactory
-    from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
-    from gmmtorch.mapping.learning.rules import NoveltyRule
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mapping.learning.rules import LearningRule, NoveltyRule
 
 _ANSWERING = ("n_samples", "sampling", "prior", "cutoff", "hit_length", "codec")
 
@@ -73,7 +73,7 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
     return make
 
 
-def _rule(options: dict[str, Any], dtype: str) -> Learning:
+def _rule(options: dict[str, Any], dtype: str) -> LearningRule:
     """The learning rule of the options `map.*` that are left."""
     from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 

@@ -1,4 +1,4 @@
-"""Components that remember whence they were seen."""
+"""Components: Gaussians of a map, with the sensor origins that observed them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,22 @@ from gmmtorch.scan import ArrayLike
 _PER_COMPONENT = ("means", "covariances", "support", "max_range", "ids")
 
 UNNUMBERED = -1
-"""The sequence, in `ids`, of a component that is new, or not as it was: who owns the map numbers it."""
+"""Sequence number, in `ids`, of a component that is new or changed. The owner of the map numbers it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """K components in the world frame, metres; S origins; E sightings (component, origin, count).
+    """K components in the world frame (m), S sensor origins, and E viewpoints.
 
-    means (K, D), covariances (K, D, D), support (K,): points each stands for, max_range (K,) bool:
-    no surface, but where beams without return were cut off, ids (K, 2): (robot, sequence);
-    origins (S, D): sensor positions; seen_by (E,), seen_from (E,), seen_count (E,): component
-    seen_by[e] has seen_count[e] of its points measured from origins[seen_from[e]].
-    The counts of a component add up to its support.
+    A viewpoint is a component, an origin that observed it, and the number of points observed from there.
+
+    means (K, D), covariances (K, D, D).
+    support (K,): number of points of each component.
+    max_range (K,) bool: the component describes ends of no-return beams, not a surface.
+    ids (K, 2): robot, sequence number.
+    origins (S, D): sensor positions.
+    seen_by, seen_from, seen_count (E,): `seen_count[e]` points of component `seen_by[e]` were observed from
+        `origins[seen_from[e]]`. The counts of a component add up to its support.
     """
 
     means: Tensor
@@ -44,6 +48,8 @@ class Components:
 
     @classmethod
     def empty(cls, dim: int, device: torch.device | str | None = None) -> Components:
+        """No components in `dim` dimensions."""
+
         def zeros(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
             return torch.zeros(*shape, dtype=dtype, device=device)
 
@@ -69,18 +75,18 @@ class Components:
     @classmethod
     def concatenate(cls, parts: Sequence[Components]) -> Components:
         """All components and origins of the parts, in order."""
-        by, whence = [], []
+        seen_by, seen_from = [], []
         n_components = n_origins = 0
         for part in parts:
-            by.append(part.seen_by + n_components)
-            whence.append(part.seen_from + n_origins)
+            seen_by.append(part.seen_by + n_components)
+            seen_from.append(part.seen_from + n_origins)
             n_components += len(part)
             n_origins += part.origins.shape[0]
         joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)}
-        return cls(**{**joined, "seen_by": torch.cat(by), "seen_from": torch.cat(whence)})
+        return cls(**{**joined, "seen_by": torch.cat(seen_by), "seen_from": torch.cat(seen_from)})
 
     def cones(self) -> Cones:
-        """One row for each sighting: what the evidence functions take."""
+        """One cone for each viewpoint: the argument of the evidence functions."""
         return Cones(
             self.means[self.seen_by],
             self.covariances[self.seen_by],
@@ -97,7 +103,7 @@ class Components:
         return replace(self, **moved, seen_by=rank[self.seen_by])
 
     def selected(self, rows: Tensor) -> Components:
-        """The components of distinct rows (J,), in that order; every origin stays."""
+        """The components of distinct rows (J,), in that order, with all origins."""
         place = torch.full_like(self.max_range, -1, dtype=torch.int64)
         place[rows] = torch.arange(len(rows), device=rows.device)
         kept = (place[self.seen_by] >= 0).nonzero().squeeze(1)
@@ -111,12 +117,26 @@ class Components:
             seen_count=self.seen_count[kept],
         )
 
+    def has_id(self, ids: ArrayLike | None) -> Tensor:
+        """Which components (K,) have one of the ids (J, 2); None: all."""
+        if ids is None:
+            return torch.ones_like(self.max_range)
+        wanted = torch.as_tensor(ids).to(self.ids)
+        wanted = wanted if wanted.numel() else wanted.reshape(0, 2)
+        if wanted.ndim != 2 or wanted.shape[1] != 2:
+            raise InvalidArgumentError(
+                f"ids has shape {tuple(wanted.shape)}; expected (J, 2): robot, sequence."
+            )
+        # One number for each distinct id, so that pairs are compared in one sorted pass.
+        _, number = torch.unique(torch.cat([self.ids, wanted]), dim=0, return_inverse=True)
+        return torch.isin(number[: len(self)], number[len(self) :])
+
     def transformed(self, transform: Tensor, chosen: Tensor) -> Components:
-        """The components marked in `chosen` (K,) moved by a rigid motion (D+1, D+1), origins with them."""
+        """The components `chosen` (K,) and their origins moved by a rigid motion (D+1, D+1)."""
         rotation, translation = transform[:-1, :-1], transform[:-1, -1]
-        moved_sighting = chosen[self.seen_by]
+        moved_viewpoint = chosen[self.seen_by]
         origins = torch.cat([self.origins, self.origins @ rotation.T + translation])
-        seen_from = self.seen_from + moved_sighting.long() * self.origins.shape[0]
+        seen_from = self.seen_from + moved_viewpoint.long() * self.origins.shape[0]
         used, seen_from = torch.unique(seen_from, return_inverse=True)
         return replace(
             self,
@@ -129,18 +149,21 @@ class Components:
         )
 
     def checked(self) -> Components:
-        """Itself, if shapes, indices, signs and covariances are sound; else `InvalidArgumentError`."""
+        """These components, if shapes, indices, signs and covariances are valid.
+
+        Otherwise raises `InvalidArgumentError`, or `NumericalError` for an indefinite covariance.
+        """
         k, dim = self.means.shape
-        n_sightings = self.seen_by.shape[0]
+        n_viewpoints = self.seen_by.shape[0]
         expected = {
             "covariances": (k, dim, dim),
             "support": (k,),
             "max_range": (k,),
             "ids": (k, 2),
             "origins": (self.origins.shape[0], dim),
-            "seen_by": (n_sightings,),
-            "seen_from": (n_sightings,),
-            "seen_count": (n_sightings,),
+            "seen_by": (n_viewpoints,),
+            "seen_from": (n_viewpoints,),
+            "seen_count": (n_viewpoints,),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -162,8 +185,7 @@ class Components:
 
 
 def packed(batches: Sequence[Components]) -> dict[str, Tensor]:
-    """Many batches as few tensors: each field of all, one after the other, and their sizes (B, 3):
-    components, origins, sightings."""
+    """B batches as one tensor for each field, and `sizes` (B, 3): components, origins and viewpoints."""
     sizes = [[len(b), b.origins.shape[0], b.seen_by.shape[0]] for b in batches]
     names = [f.name for f in fields(Components)] if batches else []
     return {
@@ -173,9 +195,9 @@ def packed(batches: Sequence[Components]) -> dict[str, Tensor]:
 
 
 def unpacked(state: dict[str, Tensor]) -> list[Components]:
-    """The batches that `packed` packed."""
-    n_components, n_origins, n_sightings = (column.tolist() for column in state["sizes"].unbind(1))
-    sizes = {"origins": n_origins, **dict.fromkeys(("seen_by", "seen_from", "seen_count"), n_sightings)}
+    """The inverse of `packed`."""
+    n_components, n_origins, n_viewpoints = (column.tolist() for column in state["sizes"].unbind(1))
+    sizes = {"origins": n_origins, **dict.fromkeys(("seen_by", "seen_from", "seen_count"), n_viewpoints)}
     if not n_components:
         return []
     columns = {f.name: state[f.name].split(sizes.get(f.name, n_components)) for f in fields(Components)}
@@ -185,34 +207,30 @@ def unpacked(state: dict[str, Tensor]) -> list[Components]:
     ]
 
 
-def sightings_of(
+def viewpoints_of(
     origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Table of origins, and seen_by, seen_from, seen_count, of the `origins` of `from_components`."""
+    """The fields origins, seen_by, seen_from and seen_count for the `origins` of `from_components`."""
     k = support.shape[0]
     if len(origins) != k:
         raise InvalidArgumentError(
-            f"origins has {len(origins)} entries for {k} components; one each is needed."
+            f"origins has {len(origins)} entries for {k} components; give one for each."
         )
     if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
-        table = (
-            torch.as_tensor(origins, dtype=torch.float64).cpu()
-            if k
-            else torch.zeros(0, dim, dtype=torch.float64)
-        )
+        table = torch.as_tensor(origins, dtype=torch.float64).cpu() if k else support.new_zeros(0, dim)
         return table, torch.arange(k), torch.arange(k), support
     rows: list[Tensor] = []
-    by: list[int] = []
+    seen_by: list[int] = []
     counts: list[float] = []
-    for component, seen in enumerate(origins):
-        total = sum(float(count) for _, count in seen)
-        if not total > 0 or min(float(count) for _, count in seen) < 0:
+    for component, viewpoints in enumerate(origins):
+        total = sum(float(count) for _, count in viewpoints)
+        if not total > 0 or min(float(count) for _, count in viewpoints) < 0:
             raise InvalidArgumentError(
                 f"origins[{component}] needs counts of at least zero that add up to more than zero."
             )
-        for origin, count in seen:
+        for origin, count in viewpoints:
             rows.append(torch.as_tensor(origin, dtype=torch.float64).cpu())
-            by.append(component)
+            seen_by.append(component)
             counts.append(float(count) / total * float(support[component]))
             if rows[-1].shape != (dim,):
                 raise InvalidArgumentError(
@@ -220,11 +238,11 @@ def sightings_of(
                     f"expected ({dim},)."
                 )
     shares = torch.tensor(counts, dtype=torch.float64)
-    return torch.stack(rows), torch.tensor(by), torch.arange(len(by)), shares
+    return torch.stack(rows), torch.tensor(seen_by), torch.arange(len(seen_by)), shares
 
 
 def _is_position(entry: Any) -> bool:
-    """Whether an entry is one plain position (D,), rather than a list of (position, count)."""
+    """Whether an entry is a position (D,), and not a list of (position, count)."""
     try:
         return torch.as_tensor(entry).ndim == 1
     except (TypeError, ValueError, RuntimeError):

@@ -4,67 +4,66 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
-from gmmtorch.linalg import argsort, check_rigid
-from gmmtorch.mapping.codec import map_file as storage
-from gmmtorch.mapping.codec.component_batch import quantized, spatial_order
-from gmmtorch.mapping.components import Components, sightings_of
-from gmmtorch.mapping.learning.incremental import absorb, depth_scan
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
-from gmmtorch.mapping.query import Answers
-from gmmtorch.mapping.query_options import QueryOptions, check_method
+from gmmtorch.linalg import check_rigid
+from gmmtorch.mapping.codec import map_file
+from gmmtorch.mapping.codec.component_batch import quantized
+from gmmtorch.mapping.components import Components, viewpoints_of
+from gmmtorch.mapping.learning.incremental import depth_scan
+from gmmtorch.mapping.learning.learner import Learner
+from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, read_rule
+from gmmtorch.mapping.query import Query
+from gmmtorch.mapping.query_options import MapOptions, QueryOptions, Sampling, check_method
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
-Learning = WindowedRule | IncrementalRule
-_KINDS: dict[type[Learning], str] = {WindowedRule: "windowed", IncrementalRule: "incremental"}
-
-_ROOM_FOR_SETTINGS = 48  # bytes: they may change once the map is built, and within its budget
-_LONGEST_WINDOW = 40  # scans that wait for one that says how many are to
-_OF_THE_MACHINE = ("memory_limit", "compiled")  # options of answering that a file does not carry
 _BUFFERS = tuple(f.name for f in fields(Components))
+_STATE = "_extra_state"  # torch's name of it in a state dict
 
 
 class GaussianMap(nn.Module):
-    """A map that learns components from windows of neighbouring scans, and knows whence each was seen.
+    """A map that learns Gaussian components from windows of neighbouring scans.
 
-    The components are buffers (see `Components` for shapes): means, covariances, support,
-    max_range, ids, origins, seen_by, seen_from, seen_count. What a map answers from, and what it
-    writes, are these rounded as its file holds them (`components()`), so that a loaded map answers
-    as the saved one.
+    The components are buffers: means, covariances, support, max_range, ids, origins, seen_by, seen_from,
+    seen_count; see `Components` for shapes. Queries and files use these components as the codec rounds them
+    (`components()`), so a loaded map gives the same answers as the saved one.
 
     Args:
-        learning: how scans become components. `IncrementalRule` (the default) merges them as it
-            goes, under a budget if it is given one; `WindowedRule` adds a mixture of every window, and
-            with `window=1, max_origins=1` is the thesis's map.
-        window: scans learned from together, in place of the rule's own.
-        resolution: side (m) of the cells that queries without a resolution ask about.
-        method: form of evidence that queries without a method ask for: "point", in closed form at
-            the point itself; "flux" (exact), "cone" (the thesis's) or "monte_carlo" of the cell that
-            holds it.
-        random_state: seed; the same scans in the same order then give the same map and answers.
+        learning: how scans become components. `IncrementalRule` (the default) merges components, under a
+            budget if it has one. `WindowedRule` adds a mixture for every window; with `window=1,
+            max_origins=1` it gives the thesis's map.
+        window: number of scans that are learned together, instead of the rule's own.
+        resolution: side (m) of the cells of queries without a resolution.
+        method: form of evidence of queries without a method: "point" (closed form at the point), or of the
+            cell that contains the point: "flux" (exact), "cone" (the thesis's) or "monte_carlo" (rays).
+        random_state: seed. The same scans in the same order give the same map and the same answers.
         robot: first half of the components' ids.
-        codec: how components are written, and so what is answered from: "quantized", some 10 bytes
-            each, or "float", every number as it is.
-        answering: further options of `QueryOptions`: prior, cutoff, n_samples, …
+        codec: rounding of components in files and queries: "quantized", about 10 bytes a component, or
+            "float", every number as it is.
+        prior: N_p of (3.9), counts added to each outcome.
+        cutoff: Mahalanobis distance at which a component ends. None: by support, see `QueryOptions`.
+        hit_length: ℓ (m). Occupancy multiplies hits by ℓ/resolution, so that thin walls count as occupied.
+            None: the factor is 1.
+        n_samples: number of rays of method "monte_carlo", drawn from the whole map.
+        sampling: sequence of these rays, "sobol", "stratified" or "plain".
+        memory_limit: largest number of bytes of Monte Carlo evidence.
+        compiled: use torch.compile where a compiled form exists.
 
-    Asking a map does not change it: scans of a window that is not full yet are learned from for the
-    answer, and again when the window is. What an answer needs is prepared at the first question
-    after an insertion: an index of the components, or by `monte_carlo` rays of the whole map (about a
-    second for a million). To keep a map in a file use `save`; `state_dict` restores into a map that
-    has its components.
+    Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
+    again when the window is full. The first query after an insertion builds an index of the components;
+    method "monte_carlo" draws its rays (about a second for a million). `save` and `load` keep a map with its
+    settings. `state_dict` holds everything that learning continues from, and loads into any map.
     """
 
     means: Tensor
@@ -82,7 +81,7 @@ class GaussianMap(nn.Module):
 
     def __init__(
         self,
-        learning: Learning | None = None,
+        learning: LearningRule | None = None,
         *,
         window: int | None = None,
         resolution: float = 0.1,
@@ -90,25 +89,37 @@ class GaussianMap(nn.Module):
         random_state: int = 0,
         robot: int = 0,
         codec: str = "quantized",
-        **answering: Any,
+        prior: float = 1.0,
+        cutoff: float | None = 5.0,
+        hit_length: float | None = None,
+        n_samples: int = 1_000_000,
+        sampling: Sampling = "sobol",
+        memory_limit: int = 4 << 30,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         check_method(method)
-        learning = IncrementalRule() if learning is None else learning
-        self.learning: Learning = learning if window is None else replace(learning, window=window)
-        if codec not in storage.CODECS:
-            raise InvalidArgumentError(f"codec={codec!r} is not one of {', '.join(storage.CODECS)}.")
-        self.codec = codec
+        check_choice("codec", codec, map_file.CODECS)
+        rule = IncrementalRule() if learning is None else learning
+        rule = rule if window is None else replace(rule, window=window)
+        query = QueryOptions(
+            prior=prior,
+            cutoff=cutoff,
+            hit_length=hit_length,
+            n_samples=n_samples,
+            sampling=sampling,
+            random_state=random_state,
+            memory_limit=memory_limit,
+            compiled=compiled,
+        )
         self.resolution = check_resolution(resolution)
         self.method = method
-        self.answering = QueryOptions(random_state=random_state, **answering)
-        self.random_state = int(random_state)
+        self.codec = codec
         self.robot = check_whole("robot", robot, 0)
-        self._pending: list[Scan] = []
-        self._n_windows = 0
-        self._n_numbered = 0
+        self.query_options = query
+        self._learner = Learner(rule, random_state)
         self._rounded: Components | None = None
-        self._answers: Answers | None = None
+        self._query: Query | None = None
 
     @classmethod
     def from_components(
@@ -118,62 +129,50 @@ class GaussianMap(nn.Module):
         support: ArrayLike,
         origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]],
         max_range: ArrayLike | None = None,
-        **options: Any,
+        **options: Unpack[MapOptions],
     ) -> GaussianMap:
         """A map of given components.
 
         Args:
             means (K, D), covariances (K, D, D), support (K,): the components; metres, points.
-            origins: (K, D), one sensor position each; or for each component a list of
+            origins: (K, D), one sensor origin for each component; or for each component a list of
                 (origin (D,), count), whose counts are scaled to add up to its support.
-            max_range: (K,) True for components of beams without return; none if not given.
-            options: as for `GaussianMap`; `codec` is "float" unless it is given.
+            max_range: (K,) True for components of no-return beams. None: no component is.
+            options: as for `GaussianMap`; the default `codec` is "float".
         """
-        options = {"codec": "float", **options}
-        mean = _tensor(means)
+        mean, weight = _tensor(means), _tensor(support)
         if mean.ndim != 2 or mean.shape[1] not in (2, 3):
             raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
         k = mean.shape[0]
-        weight = _tensor(support)
         if weight.shape != (k,):
             raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
         flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
-        made = cls(**options)
-        ids = torch.stack([torch.full((k,), made.robot), torch.arange(k)], 1)
-        sightings = sightings_of(origins, weight.cpu(), mean.shape[1])
-        parts = (_tensor(covariances), weight, flags, ids, *sightings)
-        # Copies: arrays that are written to again do not change the map.
-        components = Components(mean.clone(), *(part.to(mean.device, copy=True) for part in parts)).checked()
-        made._set(components)
-        made._n_numbered = k
-        return made
+        robot = check_whole("robot", options.get("robot", 0), 0)
+        ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
+        viewpoints = viewpoints_of(origins, weight.cpu(), mean.shape[1])
+        parts = (_tensor(covariances), weight, flags, ids, *viewpoints)
+        # Copies: later writes to the given arrays do not change the map.
+        copies = (part.to(mean.device, copy=True) for part in parts)
+        return cls.of(Components(mean.clone(), *copies), **options)
 
     @classmethod
-    def of(cls, components: Components, **options: Any) -> GaussianMap:
-        """A map of components as they are, ids included; `options` as for `from_components`."""
-        made = cls(**{"codec": "float", **options})
+    def of(cls, components: Components, **options: Unpack[MapOptions]) -> GaussianMap:
+        """A map of components as they are, with their ids; `options` as for `from_components`."""
+        options.setdefault("codec", "float")
+        made = cls(**options)
         made._commit(components.checked())
         return made
 
-    # -- learning ---------------------------------------------------------------------------------
+    # -- learning -------------------------------------------------------------------------------------
 
     def insert(self, scan: Scan) -> None:
-        """Learn from a scan. It counts at once; the components of its window are final when it is full."""
+        """Learns from a scan. Queries use it at once; its components are final when their window is full."""
         check_scan(scan)
-        if self.dim is not None and scan.dim != self.dim:
-            raise InvalidArgumentError(
-                f"scan is {scan.dim}-dimensional, but the map is {self.dim}-dimensional."
-            )
-        if self.dim is None:
-            self._set(Components.empty(scan.dim, scan.points.device))
-        self._pending.append(scan.copied(self.means.device))
+        self._prepare(scan.dim, scan.points.device, "scan is")
         self._forget()
-        if len(self._pending) >= (self._rule().window or _LONGEST_WINDOW):
-            try:
-                self._commit(self._with_pending())
-            except GmmTorchError:
-                self._pending.pop()  # what cannot be learned from is as if it had not been given
-                raise
+        learned = self._learner.add(self._final(), scan.copied(self.means.device), self._settings())
+        if learned is not None:
+            self._set(learned)
 
     def insert_depth(
         self,
@@ -182,96 +181,78 @@ class GaussianMap(nn.Module):
         pixel_stride: int = 4,
         max_range: float = math.inf,
     ) -> None:
-        """Learn from depth images, for good: a quick way that only an `IncrementalRule` has.
+        """Learns from depth images at once, without an unfinished window. Needs an `IncrementalRule`.
 
         Args:
-            frames: depth (H, W), metres along the axis, and pose (4, 4), world ← camera, of each.
+            frames: for each image its depth (H, W), metres along the optical axis, and its pose (4, 4),
+                world ← camera.
             intrinsics: (3, 3).
-            pixel_stride: every so manieth pixel of every so manieth row stands for those left out.
-            max_range: what is at or beyond it is left out, as is what is zero or not finite.
+            pixel_stride: uses every `pixel_stride`-th pixel of every `pixel_stride`-th row; each counts for
+                `pixel_stride`² points.
+            max_range: pixels at or beyond it (m) are left out, as are pixels that are zero or not finite.
         """
-        if not isinstance(self.learning, IncrementalRule):
+        if not self.learning.takes_depth:
             raise InvalidArgumentError(
                 "insert_depth needs a map with an IncrementalRule; insert scans instead."
             )
-        if self.dim not in (None, 3):
-            raise InvalidArgumentError(
-                f"depth images are 3-dimensional, but the map is {self.dim}-dimensional."
-            )
         if not frames:
             return
-        if self.dim is None:
-            self._set(Components.empty(3, frames[0][0].device))
-        if self._pending:
+        self._prepare(3, frames[0][0].device, "depth images are")
+        if self.n_pending:
             self._commit(self._with_pending())
-        self.learning = self.learning.fitted([depth_scan(*frames[0], intrinsics, pixel_stride, max_range)])
+        first = depth_scan(*frames[0], intrinsics, pixel_stride, max_range)
+        self._learner.rule = self.learning.fitted([first])
         scans = (depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
-        learned = absorb(self._committed(), scans, self.learning, self._size, float(pixel_stride**2))
-        self._commit(self._numbered(learned))
+        self._set(self._learner.absorb(self._final(), scans, self._settings(), float(pixel_stride**2)))
 
-    def _rule(self) -> Learning:
-        """The rule, with what it takes from the first scans."""
-        rule = self.learning
-        return rule.fitted(self._pending) if isinstance(rule, IncrementalRule) else rule
-
-    def _commit(self, learned: Components) -> None:
-        """Keep what was learned, the scans that waited included, for good."""
-        self.learning = self._rule()
-        self._n_windows += bool(self._pending)
-        self._pending = []
-        self._set(learned)
-        self._n_numbered = self._next_number(learned)
-
-    def _next_number(self, components: Components) -> int:
-        """The sequence that the next new component gets after these: none is given twice."""
-        return max(self._n_numbered, int(components.ids[:, 1].max()) + 1 if len(components) else 0)
-
-    def _with_pending(self) -> Components:
-        """All components, learned from the scans that wait, too."""
-        known = self._committed()
-        if not self._pending:
-            return known
-        # A generator of its own for every window: what was asked meanwhile does not matter.
-        generator = torch.Generator().manual_seed(hash((self.random_state, self._n_windows)) % 2**63)
-        if isinstance(self.learning, IncrementalRule):
-            learned = absorb(known, self._pending, self.learning, self._size)
-        else:
-            learned = Components.concatenate([known, learn_window(self._pending, self.learning, generator)])
-        return self._numbered(learned)
-
-    def _numbered(self, learned: Components) -> Components:
-        # New ones are numbered, and kept, in an order that takes few bytes.
-        fresh = learned.ids[:, 1] < 0
-        rank = torch.zeros(len(learned), dtype=torch.int64, device=fresh.device)
-        rank[spatial_order(learned)] = torch.arange(len(learned), device=fresh.device)
-        learned = learned.rearranged(argsort(torch.where(fresh, len(learned) + rank, 0)))
-        numbers = self._n_numbered + torch.arange(int(fresh.sum()), device=fresh.device)
-        ids = learned.ids.clone()
-        ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, self.robot), numbers], 1)
-        return replace(learned, ids=ids)
-
-    def _size(self, components: Components) -> int:
-        """Bytes of the file of these components, once they are numbered."""
-        return len(self._serialized(self._numbered(components))) + _ROOM_FOR_SETTINGS
-
-    def _as_written(self, components: Components) -> Components:
-        return components if self.codec == "float" else quantized(components)
+    def _prepare(self, dim: int, device: torch.device, what: str) -> None:
+        """Gives an empty map its dimension. Raises if the map has another one."""
+        if self.dim is None:
+            self._set(Components.empty(dim, device))
+        elif dim != self.dim:
+            raise InvalidArgumentError(f"{what} {dim}-dimensional, but the map is {self.dim}-dimensional.")
 
     def finish(self) -> None:
-        """Learn now from the scans that wait, rather than at the first question. Changes no answer."""
+        """Learns from the scans of the unfinished window now instead of at the first query. Changes no
+        answer."""
         if self.dim is not None:
             self.components()
 
     def components(self) -> Components:
-        """All components as they are stored, those of the unfinished window included."""
+        """All components as the codec rounds them, with those of the unfinished window."""
         if self._rounded is None:
-            self._rounded = self._as_written(self._with_pending())
+            learned = self._with_pending()
+            self._rounded = learned if self.codec == "float" else quantized(learned)
         return self._rounded
 
-    def _committed(self) -> Components:
+    def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
+        """Moves components and their sensor origins by a rigid motion (D+1, D+1), as a pose correction does.
+
+        `ids` (J, 2): robot and sequence number of the components; None: all. Ids that the map does not
+        contain are ignored. Nothing is fitted again. An unfinished window is learned first.
+        """
+        components = self._with_pending()
+        matrix = _tensor(transform).to(components.means.device)
+        check_rigid(matrix, components.dim)
+        self._commit(components.transformed(matrix, components.has_id(ids)))
+
+    def _final(self) -> Components:
+        """The components without those of the unfinished window, not rounded."""
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
         return Components(**{name: getattr(self, name) for name in _BUFFERS})
+
+    def _with_pending(self) -> Components:
+        """All components, not rounded."""
+        return self._learner.preview(self._final(), self._settings())
+
+    def _settings(self) -> map_file.MapSettings:
+        return map_file.MapSettings(self.resolution, self.method, self.codec, self.robot, self.query_options)
+
+    def _commit(self, components: Components) -> None:
+        """Replaces all components, those of the unfinished window included."""
+        self._learner.commit(components)
+        self._set(components)
 
     def _set(self, components: Components) -> None:
         for name in _BUFFERS:
@@ -279,23 +260,21 @@ class GaussianMap(nn.Module):
         self._forget()
 
     def _forget(self) -> None:
-        """The components have changed."""
-        self._rounded, self._answers = None, None
+        """Drops what was computed from the components."""
+        self._rounded, self._query = None, None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
-        """Moves between devices, waiting scans too; positions stay float64 whatever dtype a network
-        around the map takes."""
+        """Moves the map and its pending scans between devices. Types stay: positions need float64."""
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
-        if "means" in self._buffers:
-            self._pending = [scan.to(self.means.device) for scan in self._pending]
+        if self.dim is not None:
+            self._learner.pending = [scan.to(self.means.device) for scan in self._learner.pending]
         self._forget()
         return self
 
-    def _load_from_state_dict(self, *args: Any) -> None:
-        super()._load_from_state_dict(*args)
-        if self.dim is not None:
-            self._pending = []
-            self._commit(self._committed())
+    @property
+    def learning(self) -> LearningRule:
+        """The learning rule, with the options that the first windows determined."""
+        return self._learner.rule
 
     @property
     def dim(self) -> int | None:
@@ -308,47 +287,19 @@ class GaussianMap(nn.Module):
 
     @property
     def n_pending(self) -> int:
-        """Scans of the unfinished window; 0: all components are final."""
-        return len(self._pending)
+        """Number of scans of the unfinished window. If it is 0, all components are final."""
+        return len(self._learner.pending)
 
-    def transform(self, transform: ArrayLike, ids: ArrayLike | None = None) -> None:
-        """Move components by a rigid motion (D+1, D+1), and with them the origins they were seen from.
-
-        `ids` (J, 2) names the components, as in the buffer of that name; all if not given. Ids that
-        no component has (of records not received, say) are passed over. A pose
-        correction is this; nothing is fitted again. Scans of an unfinished window are learned from first.
-        """
-        components = self._with_pending()
-        matrix = _tensor(transform).to(components.means.device)
-        check_rigid(matrix, components.dim)
-        self._commit(components.transformed(matrix, self._chosen(components, ids)))
-
-    @staticmethod
-    def _chosen(components: Components, ids: ArrayLike | None) -> Tensor:
-        """Which components (K,) have one of the ids (J, 2); all if none are given."""
-        if ids is None:
-            return torch.ones_like(components.max_range)
-        wanted = torch.as_tensor(ids).to(components.ids)
-        wanted = wanted if wanted.numel() else wanted.reshape(0, 2)
-        if wanted.ndim != 2 or wanted.shape[1] != 2:
-            raise InvalidArgumentError(
-                f"ids has shape {tuple(wanted.shape)}; expected (J, 2): robot, sequence."
-            )
-        # One number for each id that occurs, so that pairs are compared in one sorted pass.
-        known = len(components)
-        _, number = torch.unique(torch.cat([components.ids, wanted]), dim=0, return_inverse=True)
-        return torch.isin(number[:known], number[known:])
-
-    # -- answering --------------------------------------------------------------------------------
+    # -- queries --------------------------------------------------------------------------------------
 
     def occupancy(
         self, points: ArrayLike, resolution: float | None = None, method: str | None = None
     ) -> Tensor | np.ndarray:
         """Probability (M,) that a cube of side `resolution` (m) at each point (M, D) is occupied.
 
-        Of the cube centred at the point by method "point"; of the cell of the lattice that holds the
-        point by the others. Exactly ½ where no evidence is, and everywhere while the map is empty.
-        Arrays in, arrays out; gradients flow to points that ask for them, by "point".
+        Method "point" takes the cube centred at the point; the others take the cell of the lattice that
+        contains the point. Exactly ½ without evidence, and everywhere while the map is empty. Arrays give
+        arrays, tensors give tensors. Method "point" is differentiable in the points.
         """
         query = check_queries(points, self.dim)
         method = self.method if method is None else method
@@ -357,7 +308,7 @@ class GaussianMap(nn.Module):
         if self.dim is None:
             theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64, device=query.device)
         else:
-            theta = self._answering().occupancy(query.to(self.means.device), resolution, method)
+            theta = self._answers().occupancy(query.to(self.means.device), resolution, method)
         return theta.to(query.device) if isinstance(points, Tensor) else theta.cpu().numpy()
 
     def evidence(self, grid: VoxelGrid, method: str | None = None) -> Evidence:
@@ -370,94 +321,81 @@ class GaussianMap(nn.Module):
             raise InvalidArgumentError(
                 f"grid is {grid.dim}-dimensional, but the map is {self.dim}-dimensional."
             )
-        return self._answering().evidence(grid, method)
+        return self._answers().evidence(grid, method)
 
-    def _answering(self) -> Answers:
-        if self._answers is None:
-            self._answers = Answers(self.components().cones(), self.answering)
-        return self._answers
+    def _answers(self) -> Query:
+        if self._query is None:
+            self._query = Query(self.components().cones(), self.query_options)
+        return self._query
 
-    # -- keeping ----------------------------------------------------------------------------------
+    # -- files and state ------------------------------------------------------------------------------
 
-    def _serialized(self, components: Components) -> bytes:
-        facts = {
-            "learning": {"kind": _KINDS[type(self.learning)], **changed(self._rule())},
-            "resolution": self.resolution,
-            "method": self.method,
-            "codec": self.codec,
-            "robot": self.robot,
-            "n_numbered": self._next_number(components),
-            **changed(self.answering, leave_out=_OF_THE_MACHINE),
-        }
-        return storage.to_bytes(components, facts, self.codec)
+    def _file(self) -> bytes:
+        rule = self.learning.fitted(self._learner.pending)
+        return map_file.to_bytes(self.components(), rule, self._settings(), self._learner.next_number)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the file that `save` writes; 0 for an empty map."""
-        return len(self._serialized(self.components())) if self.dim is not None else 0
+        return len(self._file()) if self.dim is not None else 0
 
     def save(self, path: str | Path) -> None:
-        """Write the map, atomically. An unfinished window is written as it is fitted now."""
-        write_bytes(path, self._serialized(self.components()))
+        """Writes the map atomically. An unfinished window is written as it is learned now."""
+        write_bytes(path, self._file())
 
     @classmethod
     def load(cls, path: str | Path) -> GaussianMap:
-        """Read a map that `save` wrote; it gives the same answers. Raises `DataError` if it is not one."""
-        components, facts = storage.from_file(path)
+        """Reads a map that `save` wrote; it gives the same answers. Raises `DataError` for other files."""
+        components, facts = map_file.from_file(path)
         try:
-            n_numbered = check_whole("n_numbered", facts.pop("n_numbered"), 0)
-            made = cls(_read_rule(**facts.pop("learning")), **facts)
+            next_number = check_whole("n_numbered", facts.pop("n_numbered"), 0)
+            made = cls(read_rule(**facts.pop("learning")), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
-        made._set(components)
-        made._n_numbered = n_numbered
-        made._n_numbered = made._next_number(components)
+        made._learner.next_number = next_number
+        made._commit(components)
         return made
 
-    def state(self) -> dict[str, Any]:
-        """All that learning goes on from, unrounded, and the scans that wait."""
-        return {
-            "learning": {"kind": _KINDS[type(self.learning)], **changed(self.learning)},
-            "components": None if self.dim is None else dict(vars(self._committed())),
-            "pending": [dict(vars(scan)) for scan in self._pending],
-            "n_windows": self._n_windows,
-            "n_numbered": self._n_numbered,
-        }
+    def get_extra_state(self) -> dict[str, Any]:
+        """The learning rule, the pending scans and the counters, as part of `state_dict`."""
+        return self._learner.state()
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on as the map whose `state` is given, with this one's seed and answering.
-
-        Raises `DataError` for a state that is damaged; nothing has changed then.
-        """
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Takes components of any number, also into an empty map. A state without the extra state gives a
+        map whose components are all final. Raises `DataError` for a damaged state, and changes nothing."""
+        own = {key.removeprefix(prefix): v for key, v in state_dict.items() if key.startswith(prefix)}
+        state = own.pop(_STATE, None)
+        missing = [name for name in _BUFFERS if name not in own]
+        if strict:
+            unexpected_keys += [prefix + name for name in own if name not in _BUFFERS]
+        if missing and (state is None or len(missing) < len(_BUFFERS)):
+            missing_keys += [prefix + name for name in missing]
+            return
         try:
-            learning = _read_rule(**state["learning"])
-            components = None if state["components"] is None else Components(**state["components"]).checked()
-            pending = [Scan(**scan) for scan in state["pending"]]
-            n_windows = check_whole("n_windows", state["n_windows"], 0)
-            n_numbered = check_whole("n_numbered", state["n_numbered"], 0)
+            learner = self._learner if state is None else self._learner.restored(state)
+            components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
-        self.learning, self._pending, self._n_windows = learning, pending, n_windows
+        device = None if self.dim is None else self.means.device
         for name in _BUFFERS:
             self._buffers.pop(name, None)
+        self._learner = learner
+        if state is None:
+            learner.pending = []
         if components is not None:
-            self._set(components)
-        self._n_numbered = n_numbered
+            self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
+            learner.next_number = map_file.number_after(components.ids, learner.next_number)
         self._forget()
 
 
-def changed(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
-    """The options of a dataclass that are not its defaults."""
-    plain = asdict(type(options)())
-    return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
-
-
-def _read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> Learning:
-    """The rule that a file holds the kind and the changed options of."""
-    if novelty is not None:
-        options["novelty"] = NoveltyRule(**novelty)
-    return {name: rule for rule, name in _KINDS.items()}[kind](**options)
-
-
 def _tensor(value: ArrayLike) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)  # not by way of float32, as lists would go
+    return torch.as_tensor(value, dtype=torch.float64)  # at once: lists would become float32 first

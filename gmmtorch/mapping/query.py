@@ -1,4 +1,4 @@
-"""Answers: what fixed components say of space, by any form of evidence."""
+"""Query: the evidence and the occupancy of fixed components, by any form of evidence."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _RAYS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
 
 
-def fitting_cutoff(cones: Cones) -> float:
-    """The cutoff for these cones where none is given: by the points that half of them stand for, or more."""
+def cutoff_by_support(cones: Cones) -> float:
+    """The cutoff if none is given: 3 if the median count is at least 50 points, otherwise `CUTOFF`."""
     counts = cones.counts[cones.counts > 0]
     return _SHARP_CUTOFF if counts.numel() and float(counts.median()) >= _MANY_POINTS else CUTOFF
 
 
-class Answers:
-    """What these cones say of space. What is costly is made once, when it is first asked for."""
+class Query:
+    """Answers queries about fixed cones. Indices and Monte Carlo rays are made at the first query."""
 
     def __init__(self, cones: Cones, options: QueryOptions) -> None:
         self.cones = cones
         self.options = options
-        self.cutoff = fitting_cutoff(cones) if options.cutoff is None else options.cutoff
+        self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, BlockEvidence] = {}
         self._forms: dict[float, PointForm] = {}
         self._indices: dict[float, ConeIndex] = {}
@@ -40,8 +40,8 @@ class Answers:
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
         """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
 
-        `point` asks of the cube centred at the point; the others of the cell of the lattice
-        [i·resolution, (i+1)·resolution) that holds it. Points at infinity are unknown.
+        Method "point" takes the cube centred at the point; the others take the cell of the lattice
+        [i·resolution, (i+1)·resolution) that contains the point. Points at infinity are unknown (½).
         """
         check_method(method)
         if len(self.cones.counts) == 0:
@@ -66,7 +66,7 @@ class Answers:
         )
 
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
-        """Hits and misses of every cell of a grid: counts, whatever `hit_length` is."""
+        """Hits and misses of every cell of a grid: counts, which `hit_length` does not change."""
         check_method(method)
         evidence = Evidence.empty(grid, self.cones.means.device)
         if len(self.cones.counts) == 0:
@@ -86,9 +86,8 @@ class Answers:
 
     def _form(self, resolution: float) -> PointForm:
         if resolution not in self._forms:
-            options = self.options
             self._forms[resolution] = PointForm(
-                self.cones, resolution, self.cutoff, compiled=options.compiled
+                self.cones, resolution, self.cutoff, compiled=self.options.compiled
             )
         return self._forms[resolution]
 
@@ -111,7 +110,7 @@ class Answers:
         return self._lattices[resolution]
 
     def _cast(self, evidence: Evidence | BlockEvidence) -> None:
-        """Monte Carlo rays of the whole map, added to `evidence`."""
+        """Adds Monte Carlo rays of the whole map to `evidence`."""
         options = self.options
         generator = torch.Generator().manual_seed(options.random_state)
         rays = sample_rays(self.cones, options.n_samples, generator, options.sampling)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, get_args
 
 from gmmtorch.errors import InvalidArgumentError, check_prior, check_whole
+from gmmtorch.mapping.learning.rules import LearningRule
 
 Method = Literal["point", "flux", "cone", "monte_carlo"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -60,3 +61,22 @@ def check_method(method: str) -> None:
     """Raises `InvalidArgumentError` unless `method` is one of `METHODS`."""
     if method not in METHODS:
         raise InvalidArgumentError(f"method={method!r} is not one of {', '.join(METHODS)}.")
+
+
+class MapOptions(TypedDict, total=False):
+    """The arguments of `GaussianMap`; see there."""
+
+    learning: LearningRule | None
+    window: int | None
+    resolution: float
+    method: str
+    random_state: int
+    robot: int
+    codec: str
+    prior: float
+    cutoff: float | None
+    hit_length: float | None
+    n_samples: int
+    sampling: Sampling
+    memory_limit: int
+    compiled: bool

@@ -247,7 +247,7 @@ def test_the_map_is_made_with_the_options_of_its_group(name, more, expected, run
     made = GaussianMap.load(tmp_path / "maps" / "monte_carlo_1_0.1.safetensors")
     assert made.learning.noise == 0.02
     assert {option: getattr(made.learning, option) for option in expected} == expected
-    how = made.answering
+    how = made.query_options
     assert (how.n_samples, how.sampling, how.prior, how.random_state) == (20_000, "plain", 0.5, 7)
     assert (how.cutoff, how.hit_length, made.codec) == (4, None, "float")
 

@@ -290,10 +290,10 @@ def test_a_map_takes_what_the_options_offer_with_the_same_defaults(name):
     made = GaussianMap()
     assert options.pop("codec") == made.codec
     for option in ("n_samples", "sampling", "prior"):
-        assert options.pop(option) == getattr(made.answering, option), option
+        assert options.pop(option) == getattr(made.query_options, option), option
     # The commands ask for maps that are right at ½, the library for counts: see docs/commands.md.
     assert options == {"cutoff": None, "hit_length": 1}
-    assert (made.answering.cutoff, made.answering.hit_length) == (5, None)
+    assert (made.query_options.cutoff, made.query_options.hit_length) == (5, None)
     limits = {"random_state", "memory_limit", "compiled"}  # which are runtime.* and the seed
     assert {item.name for item in fields(QueryOptions)} == limits | {
         "prior",

@@ -11,8 +11,8 @@ from occupancy.protocol_contract import RESOLUTION, move, open_scan, wall_scan
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap, Learning
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.scan import Scan
 
 FINE = IncrementalRule(noise=0.01, length=0.1, cell=0.05, window=2)
@@ -33,7 +33,7 @@ def open_drive(n: int, dim: int = 2) -> list[Scan]:
     return [replace(scan, no_return=open_scan(dim).no_return[i::10]) for i, scan in enumerate(drive(n, dim))]
 
 
-def built(scans: list[Scan], learning: Learning | None = None, **options: Any) -> GaussianMap:
+def built(scans: list[Scan], learning: LearningRule | None = None, **options: Any) -> GaussianMap:
     """A map of these scans: windowed, exact and of few rays, unless options say otherwise."""
     options = {"resolution": RESOLUTION, "n_samples": 20_000, "codec": "float", **options}
     made = GaussianMap(WindowedRule() if learning is None else learning, **options)

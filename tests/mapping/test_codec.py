@@ -17,7 +17,7 @@ from mapping.random_components import random_components, rotations
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.mapping.codec import component_batch as codec
+from gmmtorch.mapping.codec import batch_stream
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
 from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
@@ -266,7 +266,7 @@ def test_cells_as_large_as_the_world_are_read(monkeypatch, exponent):
     corners = torch.tensor([[-lattice.FARTHEST] * 3, [lattice.FARTHEST] * 3], dtype=torch.float64)
     wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
     components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
-    monkeypatch.setattr(codec, "_cell_exponent", lambda places, in_order: exponent)
+    monkeypatch.setattr(batch_stream, "_cell_exponent", lambda places, in_order: exponent)
     assert_same(decode(encode(components)), components)
 
 

@@ -11,7 +11,7 @@ from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice,
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Answers, fitting_cutoff
+from gmmtorch.mapping.query import Query, cutoff_by_support
 from gmmtorch.mapping.query_options import METHODS, QueryOptions
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -187,9 +187,9 @@ def test_a_cutoff_that_is_not_given_follows_the_points_of_the_components():
         weight = torch.tensor(counts, dtype=torch.float64)
         return Cones(place, eye, place + 5, weight, torch.zeros(k, dtype=torch.bool))
 
-    assert fitting_cutoff(cones(1000.0, 60.0, 50.0)) == 3
-    assert fitting_cutoff(cones(1000.0, 40.0, 3.0)) == CUTOFF
-    assert fitting_cutoff(cones(0.0, 0.0, 70.0)) == 3
-    assert fitting_cutoff(cones()) == CUTOFF
-    fixed = Answers(cones(1000.0), QueryOptions(cutoff=4.0))
-    assert (fixed.cutoff, Answers(cones(1000.0), QueryOptions(cutoff=None)).cutoff) == (4, 3)
+    assert cutoff_by_support(cones(1000.0, 60.0, 50.0)) == 3
+    assert cutoff_by_support(cones(1000.0, 40.0, 3.0)) == CUTOFF
+    assert cutoff_by_support(cones(0.0, 0.0, 70.0)) == 3
+    assert cutoff_by_support(cones()) == CUTOFF
+    fixed = Query(cones(1000.0), QueryOptions(cutoff=4.0))
+    assert (fixed.cutoff, Query(cones(1000.0), QueryOptions(cutoff=None)).cutoff) == (4, 3)

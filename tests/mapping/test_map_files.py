@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.map_cases import FINE, assert_same_components, built, names, open_drive
+from mapping.random_components import random_components
 from occupancy.protocol_contract import dims, lattice, wall_scan
 from torch import Tensor
 
-from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.errors import DataError, GmmTorchError, MissingDataError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mapping.codec import map_file as storage
+from gmmtorch.mapping.codec.component_batch import numbered
+from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.query_options import QueryOptions
 
 codecs = pytest.mark.parametrize("codec", ["quantized", "float"])
 
@@ -44,7 +48,7 @@ def test_settings_and_components_come_back(dim, codec, learning, tmp_path):
     made = built(open_drive(5, dim), learning, codec=codec, robot=2, method="flux", **options)
     made.save(tmp_path / "m.safetensors")
     loaded = GaussianMap.load(tmp_path / "m.safetensors")
-    for name in ("learning", "resolution", "method", "codec", "answering", "random_state", "robot"):
+    for name in ("learning", "resolution", "method", "codec", "query_options", "robot"):
         assert getattr(loaded, name) == getattr(made, name), name
     assert_same_components(loaded.components(), made.components())
     assert loaded.nbytes == made.nbytes
@@ -64,7 +68,7 @@ def test_settings_are_written_where_they_are_not_the_defaults(tmp_path):
         "codec": "float",
         "robot": 0,
     }
-    assert asdict(GaussianMap.load(tmp_path / "m.safetensors").answering) == asdict(GaussianMap().answering)
+    assert GaussianMap.load(tmp_path / "m.safetensors").query_options == GaussianMap().query_options
 
 
 @codecs
@@ -74,6 +78,23 @@ def test_ids_stay_unique_when_a_loaded_map_goes_on(codec, tmp_path):
     before = names(loaded.ids)
     loaded.insert(wall_scan(2))
     assert names(loaded.components().ids) > before
+
+
+@settings(max_examples=30)
+@given(
+    dim=st.sampled_from([2, 3]),
+    k=st.integers(0, 30),
+    n_known=st.integers(0, 30),
+    seed=st.integers(0, 1000),
+    codec=st.sampled_from(["quantized", "float"]),
+)
+def test_file_size_is_the_length_of_the_file_of_the_numbered_components(dim, k, n_known, seed, codec):
+    components = random_components(dim, k=k, seed=seed)
+    components.ids[n_known:, 1] = UNNUMBERED
+    rule, map_settings = IncrementalRule(), storage.MapSettings(0.1, "point", codec, 3, QueryOptions())
+    size = storage.FileSize(rule, map_settings, next_number=40)(components)
+    written = storage.to_bytes(numbered(components, 3, 40), rule, map_settings, 40)
+    assert size == len(written) + 48  # room for settings that change
 
 
 # -- hostile files ---------------------------------------------------------------------------------------
@@ -187,13 +208,36 @@ def test_a_file_that_lacks_a_tensor_is_refused(tmp_path, exact, packed, name):
         load_parts(tmp_path, {k: v for k, v in tensors.items() if k != name}, facts)
 
 
-def test_a_file_of_another_kind_or_version_is_refused(tmp_path, packed):
+@pytest.mark.parametrize(
+    ("kind", "version"),
+    [
+        ("gmmtorch.occupancy_grid", 2),
+        (storage.FILE_KIND, 1),
+        (storage.FILE_KIND, 3),
+        (storage.FILE_KIND, "2"),
+    ],
+)
+def test_load_refuses_other_kinds_and_versions(tmp_path, packed, kind, version):
     tensors, facts = packed
     path = tmp_path / "m.safetensors"
-    for kind, version in (("gmmtorch.occupancy_grid", 2), (storage.FILE_KIND, 3), (storage.FILE_KIND, "2")):
-        path.write_bytes(pack_tensors(tensors, kind, version, **facts))
-        with pytest.raises(DataError, match=r"m\.safetensors"):
-            GaussianMap.load(path)
+    path.write_bytes(pack_tensors(tensors, kind, version, **facts))
+    with pytest.raises(DataError, match=r"m\.safetensors"):
+        GaussianMap.load(path)
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [torch.zeros(5), torch.zeros(5, 5).byte(), torch.zeros(0).byte(), torch.zeros(50).byte()],
+    ids=["floats", "matrix", "no bytes", "zeros"],
+)
+def test_load_refuses_files_without_a_batch(tmp_path, packed, batch):
+    with pytest.raises(DataError, match=r"m\.safetensors"):
+        load_parts(tmp_path, {"components": batch}, packed[1])
+
+
+def test_load_names_a_missing_file(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere"):
+        GaussianMap.load(tmp_path / "nowhere.safetensors")
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def _sound(dim: int, k: int) -> Quantized:
 
 def _many(values: Quantized, k: int) -> Quantized:
     """The first component k times, each seen from the same place or places: a few bits each."""
-    n = max(int(values.sightings[0]), 1)
+    n = max(int(values.n_viewpoints[0]), 1)
     rows = torch.zeros(k, dtype=torch.int64)
     numbered = values.ids[rows] + torch.stack([rows, torch.arange(k)], 1)
     return replace(

@@ -73,7 +73,7 @@ class ReplayNode:
         self._publication = MapPublisher(replica)
         self._keep_every = check_whole("keep_every", keep_every, 1)
         about = {"robot": replica.robot, "keep_every": keep_every, "n_scans": self.n_scans}
-        about |= {"learning": self.map.state()["learning"], **(facts or {})}
+        about |= {"learning": self.map.get_extra_state()["learning"], **(facts or {})}
         self._progress = None if folder is None else Progress(folder, **about)
         self.position = self._saved_at = self._resume()
         """Scans of the log that have been read."""
@@ -124,7 +124,7 @@ class ReplayNode:
         if found is None:
             self._save(0)
             return 0
-        self.map.restore(found[1])
+        self.map.load_state_dict(found[1])
         return found[0]
 
     def _take_scan(self) -> bool:
@@ -168,7 +168,7 @@ class ReplayNode:
         if self._progress is None:
             return
         try:
-            self._progress.save(position, self.map.state())
+            self._progress.save(position, dict(self.map.state_dict()))
             self._saved_at = position
         except OutputError as error:
             self.n_unsaved += 1

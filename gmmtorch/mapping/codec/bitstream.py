@@ -1,7 +1,7 @@
-"""Whole numbers as a stream of bits, each column in the shortest of a few codes; see docs/formats.md.
+"""Bit streams of whole numbers: each column is written in the shortest of a few codes; see docs/formats.md.
 
-NumPy rather than torch: bits end as bytes, which live on the CPU, and every code here is a handful of
-vector operations, without a loop over numbers.
+NumPy instead of torch: the bytes live on the CPU, and every code is a handful of vector operations without a
+loop over numbers.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 Ints = NDArray[np.int64]
 
 MAX_WIDTH = 62
-"""Widest number in bits: int64 less the sign, less the bit that zigzag takes."""
+"""Largest width of a number in bits: int64 without the sign and without the bit that zigzag adds."""
 MAX_BYTES = 1 << 28
-"""Longest stream, some 25 million components: bits are spread to bytes while it is read."""
-_BLOCK = 1 << 16  # numbers taken apart at once: their bits take 24 bytes each meanwhile
-_AROUND = np.array([-1, 0, 1])  # low bits that are tried
+"""Largest length of a stream, about 25 million components. A reader expands every bit to a byte."""
+_BLOCK = 1 << 16  # numbers processed at a time; their bits take up to 24 bytes each
+_CANDIDATES = np.array([-1, 0, 1])  # offsets of the low bits that a Rice code tries
 _GROUP = 7  # bits in a group of a single number
 
 
 class Code(IntEnum):
-    """How a column is written."""
+    """The code of a column."""
 
-    FIXED = 0  # each number less the least, in as many bits as the greatest takes
-    RICE = 1  # each number less the least, in a Rice code
+    FIXED = 0  # each number minus the smallest, in the width of the largest difference
+    RICE = 1  # each number minus the smallest, in a Rice code
     DIFFERENCES = 2  # the first number, then differences, zigzag, in a Rice code
 
 
 def zigzag(values: Ints) -> Ints:
-    """0, −1, 1, −2, 2, … as 0, 1, 2, 3, 4, …"""
+    """Maps 0, −1, 1, −2, 2, … to 0, 1, 2, 3, 4, …"""
     return (values << 1) ^ (values >> 63)
 
 
@@ -44,7 +44,7 @@ def unzigzag(codes: Ints) -> Ints:
 
 
 class Coding(NamedTuple):
-    """The code of a column, its parameter (width, or low bits), its base, and the bits it takes."""
+    """The code of a column, its parameter (width, or number of low bits), its base, and its size in bits."""
 
     code: Code
     parameter: int
@@ -53,7 +53,7 @@ class Coding(NamedTuple):
 
 
 def best_code(values: Ints) -> Coding:
-    """The code in which these whole numbers are shortest."""
+    """The shortest code of these whole numbers."""
     if not len(values):
         return Coding(Code.FIXED, 0, 0, 0.0)
     base, largest = int(values.min()), int(values.max())
@@ -67,23 +67,23 @@ def best_code(values: Ints) -> Coding:
             code, int(parameter[0]), int(values[0]) if code is Code.DIFFERENCES else base, float(n_bits[0])
         )
         for code, (parameter, n_bits) in _codings(values[None]).items()
-        if code is not Code.DIFFERENCES or _way(values) < 2.0**MAX_WIDTH
+        if code is not Code.DIFFERENCES or _path_length(values) < 2.0**MAX_WIDTH
     ]
     return min(codings, key=lambda coding: coding.n_bits)
 
 
-def _way(values: Ints) -> float:
-    """How far it is from zero to the first number, and on from each to the next: a reader adds them up."""
+def _path_length(values: Ints) -> float:
+    """|first number| plus all absolute differences: the reader limits this sum."""
     return float(np.abs(np.diff(values, prepend=0).astype(np.float64)).sum())
 
 
 def fewest_bits(rows: Ints) -> NDArray[np.float64]:
-    """The bits (T,) that each row of (T, N) takes in its shortest code."""
+    """The size in bits (T,) of each row of (T, N) in its shortest code."""
     return np.minimum.reduce([n_bits for _, n_bits in _codings(rows).values()])
 
 
 def _codings(rows: Ints) -> dict[Code, tuple[Ints, NDArray[np.float64]]]:
-    """Parameters (T,) of each code for rows (T, N), N > 0, and the bits (T,) that they take."""
+    """Parameters (T,) of each code for rows (T, N), N > 0, and the sizes in bits (T,)."""
     base = rows.min(1)
     width = np.array([extent.bit_length() for extent in (rows.max(1) - base).tolist()])
     return {
@@ -94,13 +94,13 @@ def _codings(rows: Ints) -> dict[Code, tuple[Ints, NDArray[np.float64]]]:
 
 
 class BitWriter:
-    """Bits, most significant first, in the order written."""
+    """Writes bits, most significant first."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.uint8]] = []
 
     def to_bytes(self) -> bytes:
-        """All bits, the last byte filled up with zeros."""
+        """All bits; the last byte is filled with zeros."""
         data = np.packbits(np.concatenate(self._parts)).tobytes() if self._parts else b""
         if len(data) > MAX_BYTES:
             raise InvalidArgumentError(
@@ -109,23 +109,32 @@ class BitWriter:
         return data
 
     def fixed(self, values: Ints, widths: Ints | int) -> None:
-        """Each number ≥ 0 in its width of bits."""
+        """Writes each number ≥ 0 in its width of bits."""
         for begin in range(0, len(values), _BLOCK):
             block = values[begin : begin + _BLOCK]
             if isinstance(widths, int):
                 bits = block[:, None] >> _shifts(widths)
             else:
-                which, shift = _spread(widths[begin : begin + _BLOCK])
+                which, shift = _bit_places(widths[begin : begin + _BLOCK])
                 bits = block[which] >> shift
             self._parts.append((bits & 1).astype(np.uint8).reshape(-1))
 
     def one(self, value: int, width: int) -> None:
-        """One number ≥ 0 in that many bits: what `fixed` writes, without its arrays."""
+        """Writes one number ≥ 0 in `width` bits: the bits of `fixed`, without arrays."""
         bits = [(value >> shift) & 1 for shift in range(width - 1, -1, -1)]
         self._parts.append(np.array(bits, np.uint8))
 
+    def rice(self, values: Ints, low: Ints | int) -> None:
+        """Writes each number ≥ 0: the part above its `low` bits in unary (zeros, then a one); then all low
+        bits."""
+        ends = np.cumsum((values >> low) + 1)
+        bits = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
+        bits[ends - 1] = 1
+        self._parts.append(bits)
+        self.fixed(values & ((np.int64(1) << low) - 1), low)
+
     def number(self, value: int) -> None:
-        """One whole number of either sign: zigzag, groups of 7 bits, lowest first, a bit for "more"."""
+        """Writes one whole number: zigzag, groups of 7 bits, lowest first, each after a bit for "more"."""
         code = 2 * value if value >= 0 else -2 * value - 1
         if code.bit_length() > MAX_WIDTH + 1:
             raise InvalidArgumentError(f"{value} does not fit into {MAX_WIDTH} bits.")
@@ -136,16 +145,8 @@ class BitWriter:
                 return
             code = more
 
-    def rice(self, values: Ints, low: Ints | int) -> None:
-        """Each number ≥ 0: what is above its `low` bits as so many zeros and a one; then all low bits."""
-        ends = np.cumsum((values >> low) + 1)
-        bits = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
-        bits[ends - 1] = 1
-        self._parts.append(bits)
-        self.fixed(values & ((np.int64(1) << low) - 1), low)
-
     def column(self, values: Ints) -> None:
-        """Any whole numbers, in the code of `Code` that is shortest: code, parameter, base, numbers."""
+        """Writes whole numbers in their shortest `Code`: code, parameter, base, numbers."""
         coding = best_code(values)
         self.one(coding.code, 2)
         self.one(coding.parameter, 6)
@@ -158,15 +159,15 @@ class BitWriter:
             self.rice(zigzag(np.diff(values)), coding.parameter)
 
     def rice_column(self, values: Ints) -> None:
-        """Numbers ≥ 0 in a Rice code, its low bits first: at least a bit for each number."""
+        """Writes numbers ≥ 0 in a Rice code, after its low bits: at least one bit for each number."""
         low = int(_rice_codes(values[None])[0][0])
         self.one(low, 6)
         self.rice(values, low)
 
     def scaled(self, values: Ints, scales: Ints) -> None:
-        """Numbers of either sign that are of the order of 2^scale, or a fraction of it that they share.
+        """Writes whole numbers of the order of 2^scale, or of a common fraction of it.
 
-        A Rice code whose low bits are each number's scale less t, t written first.
+        A Rice code whose low bits are each number's scale minus t; t is written first.
         """
         codes = zigzag(values)
         low = np.maximum(scales - np.arange(16)[:, None], 0)
@@ -175,10 +176,29 @@ class BitWriter:
         self.rice(codes, low[t])
 
 
-class BitReader:
-    """Reads what `BitWriter` wrote; `DataError` for anything it could not have written.
+class BitCounter(BitWriter):
+    """Counts the bits that a `BitWriter` would write."""
 
-    What it allocates is bounded by the length of the data: who reads a count calls `require`.
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_bits = 0
+
+    def fixed(self, values: Ints, widths: Ints | int) -> None:
+        self.n_bits += len(values) * widths if isinstance(widths, int) else int(widths.sum())
+
+    def one(self, value: int, width: int) -> None:
+        self.n_bits += width
+
+    def rice(self, values: Ints, low: Ints | int) -> None:
+        self.n_bits += int((values >> low).sum()) + len(values)
+        self.fixed(values, low)
+
+
+class BitReader:
+    """Reads what `BitWriter` wrote. Raises `DataError` for streams that it cannot have written.
+
+    The memory of a read is bounded by the length of the data; callers check the counts that they read with
+    `require`.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -189,21 +209,21 @@ class BitReader:
 
     @property
     def left(self) -> int:
-        """Bits not read yet."""
+        """Number of bits that are not read yet."""
         return len(self._bits) - self._at
 
     def require(self, n_bits: int) -> None:
-        """Raises unless so many bits are left."""
+        """Raises unless at least `n_bits` bits are left."""
         if n_bits > self.left:
             raise DataError(f"{n_bits:,} bits are announced, {self.left:,} are left: it is truncated.")
 
     def finish(self) -> None:
-        """Raises if anything but the last byte's filling is left."""
+        """Raises if anything but the zeros of the last byte is left."""
         if self.left > 7 or self._bits[self._at :].any():
             raise DataError(f"{self.left:,} bits are left over: it is damaged.")
 
     def fixed(self, n: int, widths: Ints | int) -> Ints:
-        """So many numbers of these widths."""
+        """Reads n numbers of these widths."""
         if n and not 0 <= np.min(widths) <= np.max(widths) <= MAX_WIDTH:
             raise DataError(f"Numbers of {np.max(widths)} bits; at most {MAX_WIDTH} are read.")
         self.require(n * widths if isinstance(widths, int) else int(widths.sum()))
@@ -215,7 +235,7 @@ class BitReader:
                 rows[:] = (bits << _shifts(widths)).sum(1)
                 continue
             block = widths[begin : begin + _BLOCK]
-            which, shift = _spread(block)
+            which, shift = _bit_places(block)
             bits = self._next(len(which)) << shift
             wide = np.flatnonzero(block)
             if len(wide):
@@ -223,7 +243,7 @@ class BitReader:
         return values
 
     def one(self, width: int) -> int:
-        """One number of that many bits."""
+        """Reads one number of `width` bits."""
         self.require(width)
         value = 0
         for bit in self._bits[self._at : self._at + width].tolist():
@@ -236,7 +256,7 @@ class BitReader:
         return self._bits[self._at - n : self._at].astype(np.int64)
 
     def number(self) -> int:
-        """One whole number of either sign."""
+        """Reads one whole number."""
         code = shift = 0
         while True:
             group = self.one(1 + _GROUP)
@@ -248,11 +268,11 @@ class BitReader:
                 return code >> 1 if code % 2 == 0 else -((code + 1) >> 1)
 
     def rice(self, n: int, low: Ints | int) -> Ints:
-        """So many numbers ≥ 0."""
+        """Reads n numbers ≥ 0."""
         self.require(n)
         ones = np.flatnonzero(self._bits[self._at :])[:n]
         if len(ones) < n:
-            raise DataError(f"{n:,} numbers are announced, {len(ones):,} are there: it is truncated.")
+            raise DataError(f"{n:,} numbers are announced, {len(ones):,} are present: it is truncated.")
         if n == 0:
             return np.zeros(0, np.int64)
         high = np.diff(ones, prepend=-1) - 1
@@ -263,60 +283,62 @@ class BitReader:
         return (high << low) | self.fixed(n, low)
 
     def column(self, n: int) -> Ints:
-        """So many numbers of either sign, |x| < 2⁶²."""
+        """Reads n whole numbers, |x| < 2⁶²."""
         code, parameter = self.one(2), self.one(6)
         base = self.number()
         if code == Code.FIXED:
-            return _bounded(self.fixed(n, parameter), base)
+            return _shifted_by(base, self.fixed(n, parameter))
         if code == Code.RICE:
-            return _bounded(self.rice(n, parameter), base)
+            return _shifted_by(base, self.rice(n, parameter))
         if code != Code.DIFFERENCES:
-            raise DataError(f"A column has code {code}, which is none: it is damaged.")
+            raise DataError(f"A column has the unknown code {code}: it is damaged.")
         steps = np.append(np.int64(base), unzigzag(self.rice(max(n - 1, 0), parameter)))
         if float(np.abs(steps.astype(np.float64)).sum()) >= 2.0**MAX_WIDTH:
-            raise DataError("A column's differences add up to too much: it is damaged.")
+            raise DataError("The sum of a column's differences is too large: it is damaged.")
         return steps.cumsum()[:n]
 
     def rice_column(self, n: int) -> Ints:
-        """So many numbers ≥ 0."""
+        """Reads n numbers ≥ 0."""
         return self.rice(n, self.one(6))
 
     def scaled(self, scales: Ints) -> Ints:
-        """A number of either sign for each scale."""
+        """Reads one whole number for each scale."""
         t = self.one(4)
         return unzigzag(self.rice(len(scales), np.maximum(scales - t, 0)))
 
 
-def _spread(width: Ints) -> tuple[Ints, Ints]:
-    """Of each bit of numbers of these widths, highest first: whose it is, and how far from the lowest."""
+def _bit_places(width: Ints) -> tuple[Ints, Ints]:
+    """For each bit of numbers of these widths, highest first: the number's row, and the bit's exponent."""
     which = np.repeat(np.arange(len(width)), width)
     return which, np.cumsum(width)[which] - 1 - np.arange(len(which))
 
 
 def _shifts(width: int) -> Ints:
-    """By how much each bit of a number of this width is above the lowest, highest first."""
+    """Exponents of the bits of a number of this width, highest first."""
     return np.arange(width - 1, -1, -1)
 
 
-def _bounded(above: Ints, base: int) -> Ints:
+def _shifted_by(base: int, above: Ints) -> Ints:
     if len(above) and int(above.max()) + abs(base) >= 1 << MAX_WIDTH:
         raise DataError("A column's numbers are too large: it is damaged.")
     return above + base
 
 
 def _rice_codes(rows: Ints) -> tuple[Ints, NDArray[np.float64]]:
-    """The numbers (T,) of low bits that make the Rice codes of rows (T, N) of numbers ≥ 0 shortest, and
-    their bits (T,); floats, which do not overflow."""
+    """Low bits (T,) of the shortest Rice codes of rows (T, N) of numbers ≥ 0, and sizes in bits (T,).
+
+    Sizes are floats, which do not overflow.
+    """
     t, n = rows.shape
     if not n:
         return np.zeros(t, np.int64), np.zeros(t)
     about = np.log2(_sums(rows) / n + 1).astype(np.int64)
-    low = np.minimum(np.maximum(about[:, None] + _AROUND, 0), MAX_WIDTH - 1)
+    low = np.minimum(np.maximum(about[:, None] + _CANDIDATES, 0), MAX_WIDTH - 1)
     size = _sums(rows[:, None] >> low[:, :, None]) + (low + 1.0) * n
     best = (np.arange(t), np.argmin(size, axis=1))
     return low[best], size[best]
 
 
 def _sums(values: Ints) -> NDArray[np.float64]:
-    """Along the last axis."""
+    """Sums over the last axis, float64."""
     return np.add.reduce(values, axis=-1, dtype=np.float64)

@@ -1,86 +1,56 @@
-"""Components as bytes: a batch that stands alone, of any number of components. See docs/formats.md.
+"""Batches: components as bytes, any number of them; see docs/formats.md.
 
-A component takes about 10 bytes in 3D and 7 in 2D, its error is bounded in its own deviations (see
-`lattice`), and its covariance stays positive definite. What a batch decodes to depends on none of the
-company in it: `decode(encode(c))` is `quantized(c)`, and quantised components can be encoded again, in any
-grouping, to the same values.
+A component takes about 10 bytes in 3D and 7 in 2D. Its rounding error is bounded in its own standard
+deviations (see `lattice`), and its covariance stays positive definite. A component decodes to the same values
+in every batch: `decode(encode(c))` is `quantized(c)`, and encoding decoded components again, in any grouping,
+changes nothing.
 """
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.linalg import argsort
 from gmmtorch.mapping.codec import lattice
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints, fewest_bits
-from gmmtorch.mapping.codec.lattice import (
-    AXIS_ORDERS,
-    FARTHEST,
-    LARGEST_DEVIATION,
-    LARGEST_RATIO,
-    LEAST_DEVIATION,
-    Lattice,
-)
-from gmmtorch.mapping.codec.quantization import (
-    LARGEST_COUNT,
-    LEAST_SHARE,
-    NO_COUNT,
-    ORIGIN_STEP,
-    Quantized,
-    quantize,
-)
+from gmmtorch.mapping.codec.batch_stream import order_of, read_values, write_values
+from gmmtorch.mapping.codec.bitstream import BitCounter, BitReader, BitWriter
+from gmmtorch.mapping.codec.quantization import Quantized, quantize
 from gmmtorch.mapping.components import Components
 
 BATCH_VERSION = 1
-_CHECKSUM_BYTES = 4
-_ORDER_BITS = {2: 1, 3: 3}
-RASTER_BITS = 60
-"""Cells of a batch are numbered in so many bits at most."""
-LARGEST_SIDE = 30
-"""log2 of a cell's side (m) at most: such cells hold the world."""
-_SIDES_TRIED = 10
-_WORSE_IN_A_ROW = 2
+_VERSION_BYTES, _CHECKSUM_BYTES = 1, 4
 
 
 def encode(components: Components) -> bytes:
-    """A batch of components. Raises `InvalidArgumentError` for what cannot be stored, and says why."""
+    """A batch of components. Raises `InvalidArgumentError` for values that are too large to be stored."""
     return encode_quantized(quantize(components))
 
 
 def encode_quantized(values: Quantized) -> bytes:
-    """A batch of components that are whole numbers already, as `quantize` made them: they are not checked."""
-    dim, k = values.places.dim, len(values)
+    """A batch of components that `quantize` has rounded. The values are not checked again."""
     writer = BitWriter()
-    writer.number(dim)
-    writer.number(k)
-    writer.number(len(values.origins))
-    writer.fixed(_ints(values.places.axis_order), _ORDER_BITS[dim])
-    writer.column(_ints(values.ids[:, 0]))
-    # Consecutive ids become equal numbers, which take no bits.
-    writer.column(_ints(values.ids[:, 1]) - np.arange(k))
-    _write_covariances(writer, values.places)
-    _write_means(writer, values.places)
-    writer.column(_ints(values.count))
-    writer.column(_ints(values.max_range))
-    _write_sightings(writer, _ints(values.sightings), _ints(values.seen_from), _ints(values.share))
-    for axis in range(dim):
-        writer.column(_ints(values.origins[:, axis]))
+    write_values(writer, values)
     body = bytes([BATCH_VERSION]) + writer.to_bytes()
     return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def batch_bytes(values: Quantized) -> int:
+    """The length of `encode_quantized(values)`, without writing it."""
+    counter = BitCounter()
+    write_values(counter, values)
+    return _VERSION_BYTES + -(-counter.n_bits // 8) + _CHECKSUM_BYTES
 
 
 def decode(data: bytes) -> Components:
     """The components of a batch, on the CPU.
 
-    Raises `DataError` that says what is wrong for anything that `encode` did not write. Takes memory in
-    proportion to the data, whatever they say.
+    Raises `DataError`, with the reason, for data that `encode` did not write. Memory is bounded in proportion
+    to the length of the data, whatever numbers they contain.
     """
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if len(data) <= _CHECKSUM_BYTES:
@@ -88,12 +58,12 @@ def decode(data: bytes) -> Components:
     if body[0] != BATCH_VERSION:
         raise DataError(
             f"The batch of components is version {body[0]}; this gmmtorch reads version {BATCH_VERSION}. "
-            "It is foreign or damaged, or gmmtorch is to be updated."
+            "It is foreign or damaged, or gmmtorch needs an update."
         )
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
     try:
-        return _read(BitReader(body[1:])).restored().checked()
+        return read_values(BitReader(body[1:])).restored().checked()
     except DataError:
         raise
     except GmmTorchError as error:
@@ -101,227 +71,47 @@ def decode(data: bytes) -> Components:
 
 
 def quantized(components: Components) -> Components:
-    """What `decode(encode(components))` gives, on the components' device, without writing bits."""
+    """The result of `decode(encode(components))`, on the components' device, without writing bits."""
     restored = quantize(components).restored()
     device = components.means.device
     return Components(**{name: value.to(device) for name, value in vars(restored).items()})
 
 
-def spatial_order(components: Components) -> Tensor:
-    """An order (K,) in which components take fewer bits: log2 K! in all, about a byte each.
+# -- order and numbers -----------------------------------------------------------------------------------
 
-    For those who number components afterwards: ids are cheap only where they are consecutive.
+
+def spatial_order(components: Components) -> Tensor:
+    """An order (K,) of components by place, which saves log₂ K! bits in all, about a byte a component.
+
+    Use it before components are numbered: ids take few bits only if they are consecutive.
     """
     places = lattice.nearest(components.means.double().cpu(), components.covariances.double().cpu())
     return order_of(places).to(components.means.device)
 
 
-def order_of(places: Lattice) -> Tensor:
-    """The `spatial_order` (K,) of components on the lattice."""
-    cells = _cells(places, np.array([_cell_exponent(places, in_order=False)]))[0]
-    return torch.from_numpy(np.lexsort(cells.T[::-1]))
+def numbered(components: Components, robot: int, first: int) -> Components:
+    """Components with ids for those that have none: (robot, first), (robot, first + 1), …
+
+    New components come last, in their spatial order.
+    """
+    ids, order = _numbering(components.ids, spatial_order(components), robot, first)
+    return replace(components.rearranged(order), ids=ids)
 
 
-# -- writing ---------------------------------------------------------------------------------------------
+def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
+    """The same as `quantize(numbered(components, robot, first))`, rounding every component once."""
+    values = quantize(components)
+    ids, order = _numbering(values.ids, order_of(values.places), robot, first)
+    return replace(values.reordered(order), ids=ids)
 
 
-def _write_covariances(writer: BitWriter, places: Lattice) -> None:
-    writer.column(_ints(places.deviation[:, 0]))
-    for axis in range(1, places.dim):
-        writer.column(_ints(places.deviation[:, axis - 1] - places.deviation[:, axis]))
-    exponents = _ints(lattice.shear_exponents(places.deviation))
-    for pair in range(exponents.shape[1]):
-        writer.scaled(_ints(places.shear[:, pair]), -exponents[:, pair])
-
-
-def _write_means(writer: BitWriter, places: Lattice) -> None:
-    """The cells of a common grid that the means lie in, then where in its cell each lies."""
-    exponent = _cell_exponent(places, in_order=True)
-    cells = _cells(places, np.array([exponent]))[0]
-    least, extent = _box(cells)
-    writer.number(exponent)
-    for axis in range(places.dim):
-        writer.number(int(least[axis]))
-        writer.number(int(extent[axis]))
-    writer.column(_raster(cells, least, extent))
-    width = np.maximum(exponent - _ints(_world_exponents(places)), 0)
-    within = _ints(_by_world_axis(places, places.mean)) & ((np.int64(1) << width) - 1)
-    for axis in range(places.dim):
-        writer.fixed(within[:, axis], width[:, axis])
-
-
-def _write_sightings(writer: BitWriter, sightings: Ints, seen_from: Ints, share: Ints) -> None:
-    """How many each component has; its first one's origin, and steps from one origin to the next; shares."""
-    writer.column(sightings)
-    is_first = _firsts(sightings)
-    writer.column(seen_from[is_first])
-    writer.column(np.diff(seen_from, prepend=0)[~is_first])
-    writer.rice_column(share[np.repeat(sightings, sightings) > 1])
-
-
-def _firsts(sightings: Ints) -> NDArray[np.bool_]:
-    """Which of all sightings (E,) are their component's first."""
-    first = np.zeros(int(sightings.sum()), np.bool_)
-    first[(np.cumsum(sightings) - sightings)[sightings > 0]] = True
-    return first
-
-
-def _cells(places: Lattice, exponents: Ints) -> Ints:
-    """Cells (T, K, D) of sides 2^exponent m, for exponents (T,), that the means lie in."""
-    mean, step = _ints(_by_world_axis(places, places.mean)), _ints(_world_exponents(places))
-    finer = exponents[:, None, None] - step
-    return np.where(finer >= 0, mean >> np.maximum(finer, 0), mean << np.maximum(-finer, 0))
-
-
-def _cell_exponent(places: Lattice, in_order: bool) -> int:
-    """The side of the cells with which means take the fewest bits, in the order given or sorted."""
-    exponents = _ints(_world_exponents(places))
-    if not len(exponents):
-        return 0
-    rising = np.sort(exponents, axis=None)
-    first = int((rising[(len(rising) - 1) // 2] + rising[len(rising) // 2]) / 2)
-    while True:
-        tried = np.arange(first, min(first + _SIDES_TRIED, LARGEST_SIDE + 1))
-        cells = _cells(places, tried)
-        least, extent = _box(cells)
-        if first == LARGEST_SIDE or not _too_many(extent[0]):
-            break
-        first += 1
-    rasters = _raster(cells, least, extent)
-    within = np.maximum(tried[:, None, None] - exponents, 0).sum((1, 2))
-    sizes = fewest_bits(rasters if in_order else np.sort(rasters, axis=1)) + within
-    best = 0
-    for row in range(len(tried)):
-        if sizes[row] < sizes[best]:
-            best = row
-        if row - best >= _WORSE_IN_A_ROW:
-            break
-    return int(tried[best])
-
-
-def _box(cells: Ints) -> tuple[Ints, Ints]:
-    """Least cell (…, D) of (…, K, D), and the number of cells on each axis."""
-    if not cells.shape[-2]:
-        shape = (*cells.shape[:-2], cells.shape[-1])
-        return np.zeros(shape, np.int64), np.ones(shape, np.int64)
-    least = cells.min(-2)
-    return least, cells.max(-2) - least + 1
-
-
-def _too_many(extent: Ints) -> bool:
-    """Whether a box (D,) has more cells than are numbered."""
-    return bool(math.prod(extent.tolist()) >> RASTER_BITS)
-
-
-def _raster(cells: Ints, least: Ints, extent: Ints) -> Ints:
-    """Row-major numbers (…, K) of cells in their box."""
-    number = cells[..., 0] - least[..., None, 0]
-    for axis in range(1, cells.shape[-1]):
-        number = number * extent[..., None, axis] + (cells[..., axis] - least[..., None, axis])
-    return number
-
-
-def _world_exponents(places: Lattice) -> Tensor:
-    return _by_world_axis(places, places.mean_exponents())
-
-
-def _by_world_axis(places: Lattice, values: Tensor) -> Tensor:
-    """Values (K, D) by falling deviation, in the order of the world's axes."""
-    return torch.empty_like(values).scatter_(1, places.axes(), values)
-
-
-def _ints(values: Tensor) -> Ints:
-    return values.long().numpy()
-
-
-# -- reading ---------------------------------------------------------------------------------------------
-
-
-def _read(reader: BitReader) -> Quantized:
-    dim, k, n_origins = reader.number(), reader.number(), reader.number()
-    if dim not in (2, 3):
-        raise DataError(f"The components are {dim}-dimensional; a map has 2 or 3 dimensions.")
-    if min(k, n_origins) < 0:
-        raise DataError(f"{k} components and {n_origins} origins are announced.")
-    reader.require(max(k * _ORDER_BITS[dim], n_origins))
-    axis_order = _within(reader.fixed(k, _ORDER_BITS[dim]), "axis orders", 0, len(AXIS_ORDERS[dim]) - 1)
-    ids = np.stack([reader.column(k), reader.column(k) + np.arange(k)], 1)
-    places = _read_means(reader, *_read_covariances(reader, axis_order, dim))
-    if not bool(places.is_valid().all()):
-        raise DataError("A mean or a covariance is out of range.")
-    count = _within(reader.column(k), "counts", NO_COUNT, LARGEST_COUNT)
-    max_range = _within(reader.column(k), "max_range flags", 0, 1)
-    sightings, seen_from, share = _read_sightings(reader, k, n_origins)
-    farthest = int(FARTHEST / ORIGIN_STEP)
-    origins = [_within(reader.column(n_origins), "origins", -farthest, farthest) for _ in range(dim)]
-    reader.finish()
-    return Quantized(
-        places=places,
-        count=torch.from_numpy(count),
-        max_range=torch.from_numpy(max_range).bool(),
-        ids=torch.from_numpy(ids),
-        origins=torch.from_numpy(np.stack(origins, 1)),
-        sightings=torch.from_numpy(sightings),
-        seen_from=torch.from_numpy(seen_from),
-        share=torch.from_numpy(share),
-    )
-
-
-def _read_covariances(reader: BitReader, axis_order: Ints, dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Axis orders, deviations and shears."""
-    k = len(axis_order)
-    deviation = [_within(reader.column(k), "deviations", LEAST_DEVIATION, LARGEST_DEVIATION)]
-    for _ in range(1, dim):
-        deviation.append(deviation[-1] - _within(reader.column(k), "deviations", 0, LARGEST_RATIO))
-    steps = torch.from_numpy(np.stack(deviation, 1))
-    exponents = _ints(lattice.shear_exponents(steps))
-    shear = [reader.scaled(-exponents[:, pair]) for pair in range(exponents.shape[1])]
-    return torch.from_numpy(axis_order), steps, torch.from_numpy(np.stack(shear, 1))
-
-
-def _read_means(reader: BitReader, axis_order: Tensor, deviation: Tensor, shear: Tensor) -> Lattice:
-    k, dim = deviation.shape
-    exponent = reader.number()
-    least, extent = zip(*((reader.number(), reader.number()) for _ in range(dim)), strict=True)
-    # A box of cells may stick out of the world by one on each side.
-    reach = 2 * FARTHEST / 2.0**exponent + 2 if abs(exponent) <= LARGEST_SIDE else 0.0
-    if max(map(abs, least + extent)) > reach or min(extent) < 1 or math.prod(extent) >> RASTER_BITS:
-        raise DataError(f"Cells of side 2^{exponent} m, {extent} of them from {least} on: out of range.")
-    number = _within(reader.column(k), "cells", 0, math.prod(extent) - 1)
-    cells = np.empty((k, dim), np.int64)
-    for axis in reversed(range(dim)):
-        number, cells[:, axis] = np.divmod(number, extent[axis])
-    blank = Lattice(axis_order, deviation, shear, torch.zeros_like(deviation))
-    finer = exponent - _ints(_world_exponents(blank))
-    width, coarser = np.maximum(finer, 0), np.maximum(-finer, 0)
-    mean = (cells + np.array(least)) << width
-    if (mean & ((np.int64(1) << coarser) - 1)).any():
-        raise DataError("A mean lies between the steps of its lattice.")
-    mean >>= coarser
-    for axis in range(dim):
-        mean[:, axis] |= reader.fixed(k, width[:, axis])
-    return replace(blank, mean=torch.from_numpy(mean).gather(1, blank.axes()))
-
-
-def _read_sightings(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, Ints, Ints]:
-    sightings = _within(reader.column(k), "sightings", 0, n_origins)
-    reader.require(int(sightings.sum(dtype=np.float64)) - k)  # shares take at least a bit each
-    is_first = _firsts(sightings)
-    first = reader.column(int(is_first.sum()))
-    step = np.zeros(len(is_first), np.int64)
-    step[~is_first] = _within(reader.column(int((~is_first).sum())), "steps", -n_origins, n_origins)
-    walked = np.cumsum(step)
-    start = first - walked[is_first]  # each component walks from its own first origin
-    seen_from = walked + np.repeat(start, sightings[sightings > 0])
-    _within(seen_from, "origins seen from", 0, n_origins - 1)
-    several = np.repeat(sightings, sightings) > 1
-    share = np.zeros(len(seen_from), np.int64)
-    share[several] = _within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
-    return sightings, seen_from, share
-
-
-def _within(values: Ints, name: str, least: int, largest: int) -> Ints:
-    """The numbers, if they are from `least` to `largest`; else `DataError`."""
-    if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
-        raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
-    return values
+def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
+    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones."""
+    is_new = ids[:, 1] < 0
+    rank = torch.zeros_like(ids[:, 0])
+    rank[by_place] = torch.arange(len(ids), device=ids.device)
+    order = argsort(torch.where(is_new, len(ids) + rank, 0))
+    ids = ids[order].clone()
+    numbers = first + torch.arange(int(is_new.sum()), device=ids.device)
+    ids[len(ids) - len(numbers) :] = torch.stack([torch.full_like(numbers, robot), numbers], 1)
+    return ids, order

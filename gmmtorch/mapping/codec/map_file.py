@@ -1,12 +1,12 @@
-"""A map's file: one batch of the codec in a safetensors container, with its settings. No pickle.
+"""Map files: one batch of the codec in a safetensors container, with the settings of the map. No pickle.
 
-The container costs some 200 bytes; settings are written only where they are not the defaults. See
+The container takes about 200 bytes. Settings are written only if they differ from the defaults. See
 docs/formats.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,34 +15,69 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors, require
-from gmmtorch.mapping.codec import storage_v1
-from gmmtorch.mapping.codec.component_batch import decode, encode, quantized
+from gmmtorch.mapping.codec.component_batch import batch_bytes, decode, encode, quantize_numbered
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
+from gmmtorch.mapping.query_options import QueryOptions
 
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
 CODECS = ("quantized", "float")
-"""Some 10 bytes a component, rounded within bounds; or every number as it is, some 150 bytes."""
+"""About 10 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
+
+_MACHINE_OPTIONS = ("memory_limit", "compiled")  # query options that a file does not contain
+_ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built; part of its byte budget
 
 
-def to_bytes(components: Components, facts: dict[str, Any], codec: str = "quantized") -> bytes:
-    """The file's bytes; `facts` are the map's settings, JSON. `codec`: one of `CODECS`."""
-    if codec == "float":
+@dataclass(frozen=True)
+class MapSettings:
+    """The settings of a map that its file contains, without the learning rule."""
+
+    resolution: float
+    method: str
+    codec: str
+    robot: int
+    query: QueryOptions
+
+
+def to_bytes(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> bytes:
+    """A map file. `next_number`: sequence number of the next new component."""
+    facts = _facts(rule, settings, number_after(components.ids, next_number))
+    if settings.codec == "float":
         return pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
-    batch = torch.frombuffer(bytearray(encode(components)), dtype=torch.uint8)
-    return pack_tensors({"components": batch}, FILE_KIND, FILE_VERSION, **facts)
+    return _container(torch.frombuffer(bytearray(encode(components)), dtype=torch.uint8), facts)
+
+
+@dataclass(frozen=True)
+class FileSize:
+    """Computes the file size of components before they are numbered, without writing the file."""
+
+    rule: LearningRule
+    settings: MapSettings
+    next_number: int
+
+    def __call__(self, components: Components) -> int:
+        """Bytes of the file, plus room for settings that change while the map is built."""
+        n_new = int((components.ids[:, 1] < 0).sum())
+        facts = _facts(self.rule, self.settings, number_after(components.ids, self.next_number + n_new))
+        if self.settings.codec == "float":
+            data = pack_tensors(vars(components), FILE_KIND, FILE_VERSION, **facts)
+        else:
+            values = quantize_numbered(components, self.settings.robot, self.next_number)
+            data = _container(torch.zeros(batch_bytes(values), dtype=torch.uint8), facts)
+        return len(data) + _ROOM_FOR_SETTINGS
+
+
+def number_after(ids: Tensor, next_number: int) -> int:
+    """The sequence number of the next new component, after components with these ids (K, 2) exist."""
+    return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
 
 
 def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:
-    """Components and settings of a map file. Raises `DataError` when it is not sound.
-
-    Files of version 1, whose components were less rounded, are rounded as they are read.
-    """
-    tensors, facts = read_tensors(path, FILE_KIND, FILE_VERSION, 1)
+    """Components and settings of a map file. Raises `DataError` for a damaged or foreign file."""
+    tensors, facts = read_tensors(path, FILE_KIND, FILE_VERSION)
     if tensors.keys() == {f.name for f in fields(Components)}:
         return _exact(tensors, path), facts
-    if "components" not in tensors:
-        return quantized(storage_v1.components(tensors, path)), storage_v1.settings(facts)
     batch = require(tensors, "components", (None,), torch.uint8, path)
     try:
         return decode(batch.numpy().tobytes()), facts
@@ -50,8 +85,24 @@ def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:
         raise DataError(f"{path}: {error}") from error
 
 
+def _facts(rule: LearningRule, settings: MapSettings, next_number: int) -> dict[str, Any]:
+    return {
+        "learning": rule_facts(rule),
+        "resolution": settings.resolution,
+        "method": settings.method,
+        "codec": settings.codec,
+        "robot": settings.robot,
+        "n_numbered": next_number,
+        **changed_options(settings.query, leave_out=_MACHINE_OPTIONS),
+    }
+
+
+def _container(batch: Tensor, facts: dict[str, Any]) -> bytes:
+    return pack_tensors({"components": batch}, FILE_KIND, FILE_VERSION, **facts)
+
+
 def _exact(tensors: dict[str, Tensor], path: str | Path) -> Components:
-    """Components whose every number was written as it is."""
+    """Components of a file with codec "float"."""
     whole = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
     for name, tensor in tensors.items():
         require(tensors, name, (None,) * tensor.ndim, whole.get(name, torch.float64), path)

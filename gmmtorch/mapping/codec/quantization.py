@@ -1,8 +1,8 @@
-"""Components as whole numbers, and back: what the codec writes.
+"""Components as whole numbers: the values that the codec writes.
 
-Means and covariances go to the `lattice`; a count is a power of 2^(1/4), to half a step, or none; the
-shares that sightings have of a component are powers of 2^(−1/2) of its largest; origins are multiples of
-2⁻⁸ m. Each number is rounded by itself, so that components may be regrouped without further loss.
+Means and covariances are rounded to the `lattice`. A count is rounded to a power of 2^(1/4), or is zero. The
+share of a viewpoint in its component's largest is rounded to a power of 2^(−1/2). Origins are rounded to
+multiples of 2⁻⁸ m. Every number is rounded by itself, so components can be regrouped without further loss.
 """
 
 from __future__ import annotations
@@ -18,27 +18,28 @@ from gmmtorch.mapping.codec.lattice import FARTHEST, PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
 
 ORIGIN_STEP = 2.0**-8
-"""Metres. An origin moves by half of it on each axis at most."""
+"""Metres. Rounding moves an origin by at most half a step on each axis."""
 SHARES_PER_OCTAVE = 2
 LEAST_SHARE = 15
-"""Steps: shares below 2^(−15/2) of the component's largest, 1/181, become that."""
+"""Steps: shares below 2^(−15/2) = 1/181 of the component's largest are raised to it."""
 LEAST_COUNT, LARGEST_COUNT = -10 * PER_OCTAVE, 40 * PER_OCTAVE
-"""Steps: 2⁻¹⁰ and 2⁴⁰ points. Less than half the least is none; more than the largest is refused."""
+"""Steps: 2⁻¹⁰ and 2⁴⁰ points. Counts below half the least become zero; larger ones are refused."""
 MOST_POINTS = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
 NO_COUNT = LEAST_COUNT - 1
-"""Stands for no points."""
+"""The number that stands for a count of zero."""
 COUNT_ERROR = lattice.DEVIATION_ERROR
 """Largest relative error of a count."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantized:
-    """K components, S origins and E sightings as whole numbers, int64 on the CPU.
+    """K components, S origins and E viewpoints as whole numbers, int64 on the CPU.
 
-    places: means and covariances; count (K,): log2 of the support in steps, or `NO_COUNT`;
-    max_range (K,) bool; ids (K, 2); origins (S, D) in steps, each once, all used;
-    sightings (K,): how many each component has; of each sighting, by component: seen_from (E,), its
-    origin; share (E,): −log2 of its share of the component's largest, in steps.
+    places: means and covariances.
+    count (K,): log2 of the support in steps, or `NO_COUNT`. max_range (K,) bool. ids (K, 2).
+    origins (S, D): in steps; distinct, all used.
+    n_viewpoints (K,): number of viewpoints of each component. For each viewpoint, sorted by component:
+    seen_from (E,), its origin; share (E,), −log2 of its share of the component's largest, in steps.
     """
 
     places: Lattice
@@ -46,7 +47,7 @@ class Quantized:
     max_range: Tensor
     ids: Tensor
     origins: Tensor
-    sightings: Tensor
+    n_viewpoints: Tensor
     seen_from: Tensor
     share: Tensor
 
@@ -54,20 +55,24 @@ class Quantized:
         return len(self.count)
 
     def arranged(self, rows: Tensor) -> Quantized:
-        """The components of distinct rows (J,) in that order, their origins rising by coordinates."""
-        n = self.sightings[rows]
-        begins = (self.sightings.cumsum(0) - self.sightings)[rows]
+        """The components of distinct rows (J,), in that order, with the origins that they use, sorted."""
+        chosen = self.reordered(rows)
+        origins, seen_from = torch.unique(self.origins[chosen.seen_from], dim=0, return_inverse=True)
+        return replace(chosen, origins=origins, seen_from=seen_from)
+
+    def reordered(self, rows: Tensor) -> Quantized:
+        """The components of distinct rows (J,), in that order; all origins stay as they are."""
+        n = self.n_viewpoints[rows]
+        begins = (self.n_viewpoints.cumsum(0) - self.n_viewpoints)[rows]
         kept = torch.repeat_interleave(begins - (n.cumsum(0) - n), n) + torch.arange(int(n.sum()))
-        origins, seen_from = torch.unique(self.origins[self.seen_from[kept]], dim=0, return_inverse=True)
         return replace(
             self,
             places=self.places.taken(rows),
             count=self.count[rows],
             max_range=self.max_range[rows],
             ids=self.ids[rows],
-            origins=origins,
-            sightings=n,
-            seen_from=seen_from,
+            n_viewpoints=n,
+            seen_from=self.seen_from[kept],
             share=self.share[kept],
         )
 
@@ -75,7 +80,7 @@ class Quantized:
         """The components, float64 on the CPU."""
         means, covariances = self.places.restored()
         support = torch.where(self.count == NO_COUNT, 0.0, lattice.power(self.count.clamp_min(LEAST_COUNT)))
-        seen_by = torch.repeat_interleave(self.sightings)
+        seen_by = torch.repeat_interleave(self.n_viewpoints)
         weight = lattice.power(-self.share * (PER_OCTAVE // SHARES_PER_OCTAVE))
         total = support.new_zeros(len(support)).index_add_(0, seen_by, weight)
         return Components(
@@ -92,26 +97,26 @@ class Quantized:
 
 
 def quantize(components: Components) -> Quantized:
-    """The nearest whole numbers.
+    """The components rounded to whole numbers.
 
-    Sightings are put in order of their components; of origins, those that round to the same
-    place become one, and those that nothing was seen from are left out. Raises
-    `InvalidArgumentError` for what is too large to be stored: see `lattice` and `LARGEST_COUNT`.
+    Viewpoints are sorted by component. Origins that round to the same place become one; origins without a
+    viewpoint are dropped. Raises `InvalidArgumentError` for values that are too large to be stored, see
+    `lattice` and `LARGEST_COUNT`.
     """
     c = components
     places = lattice.nearest(c.means.double().cpu(), c.covariances.double().cpu())
     count = _count_steps(c.support.double().cpu())
     seen_by, seen_from, seen_count = c.seen_by.cpu(), c.seen_from.cpu(), c.seen_count.double().cpu()
     largest = _largest(seen_count, seen_by, len(c))
-    told = ((seen_count > 0) | (largest[seen_by] == 0)).nonzero().squeeze(1)
-    told = told[torch.argsort(seen_by[told], stable=True)]
-    seen_by, seen_from, seen_count = seen_by[told], seen_from[told], seen_count[told]
+    kept = ((seen_count > 0) | (largest[seen_by] == 0)).nonzero().squeeze(1)
+    kept = kept[torch.argsort(seen_by[kept], stable=True)]
+    seen_by, seen_from, seen_count = seen_by[kept], seen_from[kept], seen_count[kept]
 
     steps = _origin_steps(c.origins.double().cpu())
     distinct, place = _first_uses(steps)
     used, seen_from = torch.unique(place[seen_from], return_inverse=True)
     origins = steps[distinct[used]]
-    # Two origins of a component that have become one are one sighting.
+    # Two origins of a component that round to the same place are one viewpoint.
     kept, pair = _first_uses(seen_by * len(origins) + seen_from)
     seen_count = seen_count.new_zeros(len(kept)).index_add_(0, pair, seen_count)
     seen_by, seen_from = seen_by[kept], seen_from[kept]
@@ -121,7 +126,7 @@ def quantize(components: Components) -> Quantized:
         max_range=c.max_range.cpu(),
         ids=c.ids.cpu(),
         origins=origins,
-        sightings=torch.bincount(seen_by, minlength=len(c)),
+        n_viewpoints=torch.bincount(seen_by, minlength=len(c)),
         seen_from=seen_from,
         share=_share_steps(seen_count, seen_by, count),
     )
@@ -151,7 +156,7 @@ def _origin_steps(origins: Tensor) -> Tensor:
 
 
 def _share_steps(count: Tensor, seen_by: Tensor, component_count: Tensor) -> Tensor:
-    """−log2 (E,) of each count's share of its component's largest, in steps; 0 where there is no count."""
+    """−log2 (E,) of each count's share of its component's largest, in steps; 0 if there is no count."""
     share = count / _largest(count, seen_by, len(component_count))[seen_by].clamp_min(1e-300)
     steps = (-torch.log2(share.clamp_min(1e-300)) * SHARES_PER_OCTAVE).round().long().clamp(0, LEAST_SHARE)
     nothing = (component_count == NO_COUNT)[seen_by] | (share == 0)
@@ -159,11 +164,12 @@ def _share_steps(count: Tensor, seen_by: Tensor, component_count: Tensor) -> Ten
 
 
 def _largest(values: Tensor, owner: Tensor, n: int) -> Tensor:
+    """The largest value (n,) of each owner."""
     return values.new_zeros(n).scatter_reduce_(0, owner, values, "amax")
 
 
 def _first_uses(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Where each distinct row of (N, …) stands first, in order; and which of those each row is."""
+    """The first row of each distinct value of (N, …), in order; and for each row, the number of its value."""
     distinct, which = torch.unique(rows, dim=0, return_inverse=True)
     places = torch.arange(len(rows))
     first = torch.full((len(distinct),), len(rows)).scatter_reduce_(0, which, places, "amin")

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError, check_prior, check_resolution, check_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import torch
+
+    from gmmtorch.mapping.components import Components
+    from gmmtorch.mapping.learning.merging import Size
     from gmmtorch.scan import Scan
 
 SOFTMAX_DTYPES = ("float32", "float64")
@@ -67,6 +73,9 @@ class WindowedRule:
     dtype: type of the exponentials in EM, "float32" or "float64".
     """
 
+    kind: ClassVar[str] = "windowed"
+    takes_depth: ClassVar[bool] = False
+
     noise: float = 0.01
     length: float = 0.3
     min_points: float | None = None
@@ -90,6 +99,19 @@ class WindowedRule:
         if self.dtype not in SOFTMAX_DTYPES:
             raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
 
+    def fitted(self, scans: Sequence[Scan]) -> WindowedRule:
+        """The rule itself: none of its options is derived from scans."""
+        return self
+
+    def absorb(
+        self, known: Components, scans: Iterable[Scan], generator: torch.Generator, size: Size, weight: float
+    ) -> Components:
+        """The components of a map with those of one window added. `size` and `weight` are not used."""
+        from gmmtorch.mapping.components import Components
+        from gmmtorch.mapping.learning.windowed import learn_window
+
+        return Components.concatenate([known, learn_window(list(scans), self, generator)])
+
 
 @dataclass(frozen=True)
 class IncrementalRule:
@@ -110,6 +132,9 @@ class IncrementalRule:
     novelty: learn from novel beams only, and count explained points to the components that explain them
         (thesis 4.1). None: learn from all beams.
     """
+
+    kind: ClassVar[str] = "incremental"
+    takes_depth: ClassVar[bool] = True
 
     noise: float | None = None
     length: float | None = None
@@ -164,6 +189,41 @@ class IncrementalRule:
             cell=_three_digits(r * scale.cell) if self.cell is None else self.cell,
             window=window if self.window is None else self.window,
         )
+
+    def absorb(
+        self, known: Components, scans: Iterable[Scan], generator: torch.Generator, size: Size, weight: float
+    ) -> Components:
+        """The components of a map with scans added and merged, see `incremental.absorb`."""
+        from gmmtorch.mapping.learning.incremental import absorb
+
+        return absorb(known, scans, self, size, weight)
+
+
+LearningRule = WindowedRule | IncrementalRule
+"""How scans become components.
+
+`kind` is the rule's name in files, `takes_depth` says whether `GaussianMap.insert_depth` accepts it.
+"""
+
+_RULES: dict[str, type[LearningRule]] = {rule.kind: rule for rule in (WindowedRule, IncrementalRule)}
+
+
+def rule_facts(rule: LearningRule) -> dict[str, Any]:
+    """The rule as plain values: its kind, and its options that differ from the defaults."""
+    return {"kind": rule.kind, **changed_options(rule)}
+
+
+def read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> LearningRule:
+    """The rule of given `rule_facts`. Raises `KeyError`, `TypeError` or `ValueError` for other facts."""
+    if novelty is not None:
+        options["novelty"] = NoveltyRule(**novelty)
+    return _RULES[kind](**options)
+
+
+def changed_options(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+    """The options of a dataclass that differ from its defaults."""
+    defaults = asdict(type(options)())
+    return {k: v for k, v in asdict(options).items() if v != defaults[k] and k not in leave_out}
 
 
 class _Scale(NamedTuple):

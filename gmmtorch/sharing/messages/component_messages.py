@@ -72,9 +72,9 @@ def fitted(values: Quantized, max_bytes: int = MAX_BYTES) -> Iterator[tuple[byte
     The number of components is estimated from the size of the datagram before, which takes fewer attempts
     than halving all of them.
     """
-    _check_viewpoints(values.sightings)
+    _check_viewpoints(values.n_viewpoints)
     _check_quantized(values)
-    so_far = values.sightings.cumsum(0)
+    so_far = values.n_viewpoints.cumsum(0)
     begin, n = 0, _FIRST_GUESS
     while begin < len(values):
         before = int(so_far[begin - 1]) if begin else 0
