@@ -25,7 +25,7 @@ from gmmtorch.sharing.journal_format import framed, log_header, pack_snapshot
 from gmmtorch.sharing.journal_restore import MOST_LOG_BYTES, MOST_SNAPSHOT_BYTES, restore
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, keys_in
 from gmmtorch.sharing.replica.replica import Replica
 
 SYNCS = ("snapshot", "always")
@@ -211,4 +211,4 @@ def _is_record(datagram: bytes) -> bool:
     if not isinstance(datagram, bytes) or not 0 < len(datagram) <= MAX_BYTES:
         what = f"{len(datagram)} bytes" if isinstance(datagram, bytes) else type(datagram).__name__
         raise InvalidArgumentError(f"A datagram is {what}; it must be bytes, from 1 to {MAX_BYTES}.")
-    return datagram[0] & 15 in RECORDS
+    return datagram[0] & 15 in RECORD_KINDS

@@ -14,8 +14,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import keys_of_author
-from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, keys_in, keys_of_author
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store_file import explained, open_file, transaction
 
@@ -154,7 +153,7 @@ class Store:
         rows, kept = [], self._kept
         for datagram in datagrams:
             _check_datagram(datagram)
-            if datagram[0] & 15 in RECORDS and not kept.covers(names := keys_in(datagram)):
+            if datagram[0] & 15 in RECORD_KINDS and not kept.covers(names := keys_in(datagram)):
                 kept |= names
                 rows.append((datagram,))
         if not rows or not self.is_writable:

@@ -114,7 +114,7 @@ def run_schedule(seed: int, n_robots: int = 3, n_steps: int = 40) -> Outcome:
 
     With odd seeds robots tidy up what they said as soon as they can, which else takes long missions.
     """
-    tidy = {"_MOST_SUPERSESSIONS": 1, "_SLACK": 1} if seed % 2 else {"_MOST_SUPERSESSIONS": 32}
+    tidy = {"_MOST_SUPERSESSIONS": 1, "_MOST_OUTDATED": 1} if seed % 2 else {"_MOST_SUPERSESSIONS": 32}
     with mock.patch.multiple(authorship, **tidy):
         return _run(random.Random(seed), n_robots, n_steps)
 

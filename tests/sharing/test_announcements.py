@@ -28,8 +28,7 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.anti_entropy import MOST_PEERS, Backlog
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of
-from gmmtorch.sharing.replica.record_names import keys_in
+from gmmtorch.sharing.replica.record_keys import END, first_key, keys_in, keys_of
 from gmmtorch.sharing.replica.replica import Replica
 
 robots = st.integers(0, 1023)
@@ -301,7 +300,7 @@ def test_who_made_a_record_sends_it_at_once_and_others_if_it_is_still_missing():
     backlog.sent(Intervals.empty())
     backlog.announced(says(3, within(1, 0, 1, 2) | within(2, 0)), held, NOTHING)
     assert backlog.due == within(2, 1)
-    backlog.heard(within(2, 1))  # another has sent it
+    backlog.received(within(2, 1))  # another has sent it
     assert not backlog.due
 
 
@@ -338,7 +337,7 @@ def test_what_is_superseded_is_not_due():
     held, dead = within(1, 0, 1, 2, 3), within(1, 1, 2)
     backlog.announced(says(3, NOTHING), held, dead)
     assert backlog.due == within(1, 0, 3)
-    backlog.buried(within(1, 3))
+    backlog.superseded(within(1, 3))
     assert backlog.due == within(1, 0)
 
 
@@ -407,4 +406,4 @@ def test_an_echo_is_no_twin():
     for datagram in [*one.announcements(), *one.datagrams()]:
         one.receive(datagram)
     assert one.refused == {"own": 1}
-    assert not one.conflicts
+    assert not one.duplicates

@@ -31,7 +31,7 @@ from gmmtorch.sharing.replica import anti_entropy, records
 from gmmtorch.sharing.replica.anti_entropy import PATIENCE
 from gmmtorch.sharing.replica.changes import ChangeLog
 from gmmtorch.sharing.replica.component_table import ComponentTable
-from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.counters import Counters
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, first_key, ids_of
 from gmmtorch.sharing.replica.replica import Replica
@@ -151,12 +151,12 @@ def test_what_is_taken_to_be_on_its_way_is_bounded():
     shape = random_components(3, k=1000, n_origins=1, max_sightings=1)
     (message, *_) = (decode(datagram) for datagram in encode_components(shape))
     n = len(message.components)
-    for number in range(anti_entropy.MOST_PASSING // n + 20):
+    for number in range(anti_entropy.MOST_IN_FLIGHT // n + 20):
         keys = BURIED + 2 * n * number + 2 * np.arange(n)
         components = replace(message.components, ids=ids_of(keys))
         assert replica.receive(b"\x11", replace(message, components=components))
     passing = replica.state()["backlog"]["passing"]
-    assert sum(len(edges) // 2 for edges in passing) <= anti_entropy.MOST_PASSING
+    assert sum(len(edges) // 2 for edges in passing) <= anti_entropy.MOST_IN_FLIGHT
 
 
 def test_totals_without_end(monkeypatch):
@@ -237,13 +237,13 @@ def test_components_of_others_leave_room_for_those_of_this_robot():
 def test_changes_that_nobody_asks_for_are_bounded():
     """Records without entries, too."""
     log = ChangeLog()
-    log.taken(ComponentTable(), Totals(), [])
+    log.read(ComponentTable(), Counters(), [])
     for _ in range(100):
         log.counted(np.zeros(0, np.int64))
-    assert len(log._named) == 100
+    assert len(log._touched) == 100
     for _ in range(1 << 16):
         log.counted(np.zeros(0, np.int64))
-    assert log._named is None
+    assert log._touched is None
 
 
 # -- views -------------------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ def growth(seed: int, n_acts: int = 14) -> list[bytes]:
 def test_what_is_added_and_gained_is_the_map(seed, order):
     """Whatever the order, the loss and the repetition, and however often one asks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(authorship, "_SLACK", 1)
+        patch.setattr(authorship, "_MOST_OUTDATED", 1)
         patch.setattr(authorship, "_MOST_SHORT", 2)
         said = growth(seed)
     heard = [datagram for datagram in said if order.random() < 0.9]
@@ -315,12 +315,12 @@ def test_a_damaged_position_is_refused(name, value):
 
 
 def test_who_does_not_ask_costs_no_memory(monkeypatch):
-    monkeypatch.setattr(changes, "_MOST_NAMED", 4)
+    monkeypatch.setattr(changes, "_MOST_KEYS", 4)
     one, follower = Replica(0), Follower()
     ids = [tuple(row) for row in one.add(random_components(3, k=6)).tolist()]
     follower.follow(one)
     for step in range(8):
         one.count({ids[step % 6]: 50.0})
-    assert one._records._log._named is None
+    assert one._records._log._touched is None
     follower.follow(one)
     assert follower.agrees(one)

@@ -13,8 +13,7 @@ from sharing.schedules import act
 from gmmtorch.errors import DataError
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import keys_of
-from gmmtorch.sharing.replica.record_names import RECORDS, keys_in
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, keys_in, keys_of
 from gmmtorch.sharing.replica.replica import Replica
 
 
@@ -36,14 +35,14 @@ def test_names_are_those_that_the_decoder_finds():
             made = random_components(dim, k=k, robot=1023)
             made.ids[:, 1] = torch.randperm(1 << 20)[:k] << 32
             datagrams += encode_components(made)
-    assert {datagram[0] & 15 for datagram in datagrams} == RECORDS
+    assert {datagram[0] & 15 for datagram in datagrams} == RECORD_KINDS
     for datagram in datagrams:
         assert keys_in(datagram) == decoded_names(datagram)
 
 
 def test_what_is_no_record_is_refused():
     components = encode_components(random_components(3, k=20))[0]
-    others = [datagram for datagram in examples() if datagram[0] & 15 not in RECORDS]
+    others = [datagram for datagram in examples() if datagram[0] & 15 not in RECORD_KINDS]
     assert len(others) >= 8
     for datagram in [b"", b"\x11", components[:9], b"\x1b" + components[1:], *others]:
         with pytest.raises(DataError):

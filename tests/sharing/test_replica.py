@@ -321,8 +321,8 @@ def test_a_robot_that_lost_its_disk_gets_back_what_it_had_said_and_gives_no_name
     reborn.add(random_components(3, k=0), supersedes=torch.tensor(sorted(before)))  # still its own
     exchange([reborn, other])
     assert other.n_components == 20
-    assert not reborn.conflicts
-    assert not other.conflicts
+    assert not reborn.duplicates
+    assert not other.duplicates
 
 
 def test_a_restored_replica_goes_on():
@@ -368,9 +368,9 @@ def test_two_robots_of_one_number_are_found_out():
     one.add(random_components(3, k=3, seed=1))
     twin.add(random_components(3, k=3, seed=2))
     exchange([one, twin, other])
-    assert one.conflicts[0] > 0
-    assert twin.conflicts[0] > 0
-    assert not other.conflicts
+    assert one.duplicates[0] > 0
+    assert twin.duplicates[0] > 0
+    assert not other.duplicates
 
 
 def test_one_name_with_two_contents_is_refused_by_all():
@@ -381,13 +381,13 @@ def test_one_name_with_two_contents_is_refused_by_all():
     other = told(one.datagrams())
     digest = other.digest()
     assert not any(other.receive(datagram) for datagram in twin.datagrams())
-    assert other.conflicts == {4: 1}
-    assert other.refused == {"conflict": 1}
+    assert other.duplicates == {4: 1}
+    assert other.refused == {"duplicate_id": 1}
     assert other.digest() == digest
     more = Replica(4, incarnation=7)
     more.add(random_components(3, k=9, seed=1))  # numbers that `one` has not given yet
     assert not any(one.receive(datagram) for datagram in more.datagrams())
-    assert one.conflicts[4] == 1
+    assert one.duplicates[4] == 1
 
 
 # -- limits and hostile input ------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.record_messages import CountersMessage
-from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.counters import Counters
 from gmmtorch.sharing.replica.record_keys import first_key
 
 entries = st.dictionaries(st.integers(0, 12), st.integers(-41, 160), max_size=8)
@@ -17,7 +17,7 @@ acts = st.lists(st.tuples(st.integers(0, 2), entries, st.booleans()), max_size=2
 
 @given(acts=acts, choice=st.randoms(use_true_random=False))
 def test_sums_are_those_of_what_is_here(acts, choice):
-    totals, here = Totals(), {}
+    totals, here = Counters(), {}
     for number, (robot, row, drops) in enumerate(acts):
         names = np.array(list(row), np.int64)
         record = CountersMessage(

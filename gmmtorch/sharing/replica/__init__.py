@@ -1,1 +1,1 @@
-"""Replica: a set of records that converges to the same content on every robot."""
+"""Replica: a set of records that converges to the same content at every robot."""

@@ -1,4 +1,4 @@
-"""Sets of whole numbers as intervals: what a robot holds of what others have numbered."""
+"""Sets of whole numbers, stored as intervals."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """A set of whole numbers of 64 bits; takes memory by its intervals, however long they are.
+    """A set of 64-bit whole numbers. Memory is proportional to the number of intervals, not to their length.
 
-    edges (2n,): strictly rising; the numbers from edges[0] to edges[1] − 1, from edges[2] to edges[3] − 1, …
-    So intervals are sorted, do not touch, and equal sets have equal edges.
+    edges (2n,): strictly rising; the set has the numbers from edges[0] to edges[1] − 1, from edges[2] to
+    edges[3] − 1, …. Intervals are sorted and do not touch, so equal sets have equal edges.
     """
 
     edges: Ints
@@ -37,7 +37,7 @@ class Intervals:
 
     @classmethod
     def span(cls, begin: int, end: int) -> Intervals:
-        """The numbers from `begin` to `end` − 1; none if `end` is not above `begin`."""
+        """The numbers from `begin` to `end` − 1; the empty set unless `begin < end`."""
         return cls(np.array([begin, end] if begin < end else [], np.int64))
 
     @classmethod
@@ -52,7 +52,7 @@ class Intervals:
 
     @classmethod
     def union(cls, sets: Iterable[Intervals]) -> Intervals:
-        """The numbers of any of these sets: what `|` makes of them one by one, in one go."""
+        """The union of any number of sets, faster than repeated `|`."""
         parts = [one for one in sets if one]
         if len(parts) < 2:
             return parts[0] if parts else cls.empty()
@@ -74,28 +74,28 @@ class Intervals:
         return cls(edges.numpy().astype(np.int64))
 
     def __len__(self) -> int:
-        """How many intervals there are."""
+        """The number of intervals."""
         return len(self.edges) // 2
 
     @property
     def size(self) -> int:
-        """How many numbers there are."""
-        return sum((self.edges[1::2] - self.edges[::2]).tolist())  # Python's ints do not overflow
+        """The number of numbers."""
+        return sum((self.edges[1::2] - self.edges[::2]).tolist())  # Python's integers do not overflow
 
     def up_to(self, most: int) -> Intervals:
-        """The set; the empty one where it has more intervals than that."""
+        """The set; the empty set if it has more than `most` intervals."""
         return self if len(self) <= most else Intervals.empty()
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Begin and end of each interval, the end not in it."""
+        """Begin and end (exclusive) of each interval."""
         return list(zip(self.edges[::2].tolist(), self.edges[1::2].tolist(), strict=True))
 
     def contains(self, numbers: Ints) -> NDArray[np.bool_]:
-        """Which of these numbers (N,) are in the set: those with an odd number of edges up to them."""
+        """Which of the numbers (N,) are in the set: those with an odd number of edges at or below them."""
         return np.searchsorted(self.edges, numbers, side="right") % 2 == 1
 
     def covers(self, other: Intervals) -> bool:
-        """Whether all of the other set is in this one."""
+        """Whether the other set is a subset of this one."""
         return not (other - self)
 
     def __contains__(self, number: int) -> bool:
@@ -106,29 +106,30 @@ class Intervals:
         begins, lengths = self.edges[::2], self.edges[1::2] - self.edges[::2]
         return np.arange(lengths.sum()) + np.repeat(begins + lengths - np.cumsum(lengths), lengths)
 
-    # Sets are often large here, and what changes them small: only what is close to it is compared.
+    # Often one set is large and the other small: only the part of the large one near the small one is
+    # compared.
 
     def __or__(self, other: Intervals) -> Intervals:
         large, small = (self, other) if len(self) >= len(other) else (other, self)
         if not small:
             return large
-        begin, end = large._reach(small)
-        places, here, there = large._part(begin, end)._against(small)
-        joined = _where(places, here | there).edges
+        begin, end = large._range_near(small)
+        places, in_large, in_small = large._part(begin, end)._membership(small)
+        joined = _where(places, in_large | in_small).edges
         return Intervals(np.concatenate([large.edges[:begin], joined, large.edges[end:]]))
 
     def __and__(self, other: Intervals) -> Intervals:
         if not (self and other):
             return Intervals.empty()
-        places, here, there = self._near(other)._against(other._near(self))
-        return _where(places, here & there)
+        places, in_self, in_other = self._near(other)._membership(other._near(self))
+        return _where(places, in_self & in_other)
 
     def __sub__(self, other: Intervals) -> Intervals:
         if not (self and other):
             return self
-        begin, end = self._reach(other)
-        places, here, there = self._part(begin, end)._against(other._near(self))
-        left = _where(places, here & ~there).edges
+        begin, end = self._range_near(other)
+        places, in_self, in_other = self._part(begin, end)._membership(other._near(self))
+        left = _where(places, in_self & ~in_other).edges
         return Intervals(np.concatenate([self.edges[:begin], left, self.edges[end:]]))
 
     def __eq__(self, other: object) -> bool:
@@ -139,8 +140,8 @@ class Intervals:
     def __repr__(self) -> str:
         return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
 
-    def _reach(self, other: Intervals) -> tuple[int, int]:
-        """From which edge to which the intervals lie that may meet or touch the other set, not empty."""
+    def _range_near(self, other: Intervals) -> tuple[int, int]:
+        """The range of edges of the intervals that may meet or touch the other set, which is not empty."""
         begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
         end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
         return begin - begin % 2, end + end % 2
@@ -150,25 +151,25 @@ class Intervals:
 
     def _near(self, other: Intervals) -> Intervals:
         """The intervals that may meet the other set."""
-        return self._part(*self._reach(other))
+        return self._part(*self._range_near(other))
 
-    def _against(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Where either set may change, and whether the numbers from there on are in each."""
+    def _membership(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+        """All edges of both sets, and whether the numbers from each edge to the next are in each set."""
         places = np.unique(np.concatenate([self.edges, other.edges]))
         return places, self.contains(places), other.contains(places)
 
 
 def evict(sets: Mapping[int, Intervals], most: int) -> list[int]:
-    """Whose sets to forget, the largest, so that the others have at most so many intervals together."""
-    gone: list[int] = []
+    """The names of the largest sets to remove, so that the others have at most `most` intervals together."""
+    removed: list[int] = []
     n_left = sum(map(len, sets.values()))
     by_size = sorted(sets, key=lambda name: len(sets[name])) if n_left > most else []
     while n_left > most:
-        gone.append(by_size.pop())
-        n_left -= len(sets[gone[-1]])
-    return gone
+        removed.append(by_size.pop())
+        n_left -= len(sets[removed[-1]])
+    return removed
 
 
 def _where(places: Ints, inside: NDArray[np.bool_]) -> Intervals:
-    """The set that the numbers from each place to the next are in, or not; after the last none is."""
+    """The set of the numbers from each place to the next where `inside`; none after the last place."""
     return Intervals(places[np.diff(inside, prepend=False)])

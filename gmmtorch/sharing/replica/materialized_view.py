@@ -1,4 +1,4 @@
-"""What records say of a map: components with the counts that others added, where corrections put them."""
+"""The components that follow from the records: with the points of all counters, moved by the corrections."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from gmmtorch.sharing.replica.record_keys import robot_of
 
 
 def gains(components: Components, gain: Tensor) -> Components:
-    """What components (K,) gain by so many points (K,): support and counts are the gain alone.
+    """Components (K,) whose support and counts are the points (K,) that they gain.
 
-    Sightings gain in proportion to what they have.
+    The points are distributed over a component's viewpoints in proportion to their counts.
     """
     ratio = torch.where(components.support > 0, gain / components.support, 0.0)
     several = torch.bincount(components.seen_by, minlength=len(components)).clamp_min(1)
-    alike = torch.where(components.support > 0, 0.0, gain / several)  # of what had no points
-    seen_count = components.seen_count * ratio[components.seen_by] + alike[components.seen_by]
+    equal = torch.where(components.support > 0, 0.0, gain / several)  # for components without support
+    seen_count = components.seen_count * ratio[components.seen_by] + equal[components.seen_by]
     return replace(components, support=gain, seen_count=seen_count)
 
 
 def with_gains(components: Components, gain: Tensor) -> Components:
-    """Components (K,) with so many points (K,) more."""
+    """Components (K,) with points (K,) added to their support and counts."""
     more = gains(components, gain)
     return replace(
         components,
@@ -37,27 +37,27 @@ def with_gains(components: Components, gain: Tensor) -> Components:
     )
 
 
-def current(records: Sequence[CorrectionMessage]) -> list[CorrectionMessage]:
-    """The correction of each scan that counts, by robot and scan."""
-    latest: dict[tuple[int, int], CorrectionMessage] = {}
+def latest(records: Sequence[CorrectionMessage]) -> list[CorrectionMessage]:
+    """The correction of each scan with the highest version, then key; sorted by robot and scan."""
+    found: dict[tuple[int, int], CorrectionMessage] = {}
     for record in sorted(records, key=lambda r: (r.version, r.key)):
-        latest[robot_of(record.key), record.scan] = record
-    return [latest[name] for name in sorted(latest)]
+        found[robot_of(record.key), record.scan] = record
+    return [found[scan] for scan in sorted(found)]
 
 
 def corrected(components: Components, keys: Ints, records: Sequence[CorrectionMessage]) -> Components:
-    """Components (K,) where the corrections of their scans put them, their origins with them.
+    """Components (K,) moved by the corrections of their scans, with their origins.
 
-    A component of two scans goes with the later one.
+    A component of two scans is moved by the correction of the scan with the higher number.
     """
-    motions = [record for record in current(records) if record.dim == components.dim]
+    motions = [record for record in latest(records) if record.dim == components.dim]
     which = np.full(len(keys), -1)
     for number, record in enumerate(motions):
         which[record.moved.contains(keys)] = number
     if not (which >= 0).any():
         return components
-    still = torch.eye(components.dim + 1, dtype=torch.float64)
-    motion = torch.stack([*(record.transform() for record in motions), still])[which]  # (K, D+1, D+1)
+    identity = torch.eye(components.dim + 1, dtype=torch.float64)
+    motion = torch.stack([*(record.transform() for record in motions), identity])[which]  # (K, D+1, D+1)
     means, seen_at = components.means, components.origins[components.seen_from]
     turn = motion[:, :-1, :-1]
     covariances = turn @ components.covariances @ turn.transpose(1, 2)
@@ -75,8 +75,10 @@ def corrected(components: Components, keys: Ints, records: Sequence[CorrectionMe
 
 
 def information(components: Components) -> Tensor:
-    """About how much space (K,) each component tells of, m³ or m²: its face times its distance from the
-    sensor. What is lost or late of a large one that was seen from afar leaves the largest hole."""
+    """The approximate space (K,), m³ or m², that each component shows: its face times its sensor distance.
+
+    Large components seen from afar leave the largest hole in a map that lacks them.
+    """
     deviation = torch.linalg.eigvalsh(components.covariances).clamp_min(0).sqrt()
     face = deviation[:, 1:].prod(1)
     apart = components.means[components.seen_by] - components.origins[components.seen_from]
@@ -85,5 +87,5 @@ def information(components: Components) -> Tensor:
 
 
 def _moved(motion: Tensor, points: Tensor) -> Tensor:
-    """Points (N, D) by motions (N, D+1, D+1)."""
+    """Points (N, D) transformed by motions (N, D+1, D+1)."""
     return (motion[:, :-1, :-1] @ points[:, :, None]).squeeze(2) + motion[:, :-1, -1]

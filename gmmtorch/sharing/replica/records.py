@@ -1,4 +1,4 @@
-"""The replicated set: records that are added, and forgotten when others supersede them."""
+"""Records: the replicated set, to which records are added, and in which some supersede others."""
 
 from __future__ import annotations
 
@@ -23,42 +23,55 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.changes import ChangeLog, Changes
 from gmmtorch.sharing.replica.component_table import ComponentTable, fingerprints, most_viewpoints
-from gmmtorch.sharing.replica.counters import Totals
+from gmmtorch.sharing.replica.counters import Counters
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.materialized_view import corrected, with_gains
 from gmmtorch.sharing.replica.record_keys import keys_of, robot_of
-from gmmtorch.sharing.replica.rejections import RefusedError
 
 MOST_VIEWPOINTS = 48
-"""Of a component: so one by itself fits into `RECORD_BYTES`, and can be passed on."""
+"""Viewpoints of a component. One component then fits into `RECORD_BYTES`, so that every robot can send it."""
 MOST_COMPONENTS = 1 << 20
 MOST_OTHERS = 1 << 12
-"""Records that are no components."""
+"""Records other than components."""
 MOST_ENTRIES = 1 << 19
-"""Of these records, all together: totals, and intervals; 16 bytes each, of totals twice. So 16 MiB: eight
-thousand totals of each of 64 robots."""
+"""Counters and intervals of these records: 16 bytes each, counters twice. 16 MiB: eight thousand counters
+of each of 64 robots."""
 MOST_INTERVALS = 1 << 14
-"""Of what is held, and of what supersessions that wait may add: more than a team leaves where datagrams are
-lost, and a bound on memory."""
+"""Intervals of held keys, with those that waiting supersessions may add. A team that loses datagrams has
+fewer."""
 _BATCH = 2048
 """Components of a stored batch."""
 _PIECE = 128
-"""Components of a batch that is restored: dropping one costs as much as its batch is large."""
+"""Components of a batch in the table after loading: to drop one takes time in proportion to its batch."""
 
 _Record = TypeVar("_Record", bound=RecordMessage)
 
 
+class RefusedError(DataError):
+    """A valid message is refused. reason: one of a few words; robot: the author of its records."""
+
+    def __init__(self, reason: str, robot: int, message: str) -> None:
+        super().__init__(message)
+        self.reason, self.robot = reason, robot
+
+
 class Records:
-    """All that a robot knows of a shared map: a set of records that only grows.
+    """The records of a shared map at one robot. The set of held keys only grows.
 
-    held: every key that is or was here, and every one that is superseded: what need not be sent here.
-    A supersession takes effect where all of its successors are held. Its old records are forgotten at
-    once then, as who lacks them needs only the supersession and the successors, which are here. So
-    what counts depends on what is held, and not on the order in which it came.
+    A supersession takes effect when all of its successors are held. Its old records are then dropped,
+    because a robot that lacks them needs only the supersession and the successors. So the records that
+    count depend on the set of held keys, and not on the order of arrival.
 
-    There is room for so much of what others say; what the robot itself says is never refused for want of it.
+    Limits on memory apply to other robots' records. The robot's own records are never refused.
 
-    dim: 2 or 3; None: that of the first components.
+    Args:
+        dim: 2 or 3; None: that of the first components.
+
+    Attributes:
+        held: keys that are or were here, and keys that are superseded: they need not be sent here.
+        dead: keys of `held` whose records no longer count.
+        others, datagrams: records other than components that count, decoded and encoded, by key.
+        version: rises with every change.
     """
 
     def __init__(self, dim: int | None = None, most_components: int = MOST_COMPONENTS) -> None:
@@ -67,26 +80,25 @@ class Records:
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
         self.table = ComponentTable(dim or 3)
-        self.totals = Totals()
+        self.counters = Counters()
         self.others: dict[int, RecordMessage] = {}
-        self.datagrams: dict[int, bytes] = {}  # of the others, as all robots write them
+        self.datagrams: dict[int, bytes] = {}  # all robots encode a record equally
         self.version = 0
-        """Rises with every change."""
-        self._kinds: dict[type, dict[int, RecordMessage]] = {}  # the others by kind
-        self._n_entries = 0  # of the others
-        self._waiting: dict[int, SupersessionMessage] = {}  # for successors
+        self._kinds: dict[type, dict[int, RecordMessage]] = {}  # `others` by type
+        self._n_entries = 0  # see `MOST_ENTRIES`
+        self._waiting: dict[int, SupersessionMessage] = {}  # some of their successors are not held
         self._log = ChangeLog()
         self._view: tuple[int, Components] | None = None
 
-    # -- growing ----------------------------------------------------------------------------------
+    # -- adding -----------------------------------------------------------------------------------
 
     def add_components(self, components: Components, bounded: bool = True) -> Intervals:
-        """Take in components that are on the codec's lattice; returns their keys. All or none.
+        """Add all of the components, which the codec has rounded, or none; returns their keys.
 
-        bounded: whether only as far as there is room.
+        bounded: whether the limits on memory apply.
 
-        Raises `RefusedError`: "conflict", where a key is held with other content; "full"; "unfit", where they
-        are of another dimension, or seen from more than `MOST_VIEWPOINTS` places.
+        Raises `RefusedError` with the reason "duplicate_id" (a key is held with another content), "full", or
+        "unfit" (another dimension, or more than `MOST_VIEWPOINTS` viewpoints).
         """
         keys = keys_of(components.ids)
         if not len(keys):
@@ -95,8 +107,9 @@ class Records:
             raise RefusedError(
                 "unfit",
                 robot_of(int(keys[0])),
-                f"Components in {components.dim}D, seen from up to {most_viewpoints(components)} places; "
-                f"this map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} places are the most.",
+                f"Components in {components.dim}D with up to {most_viewpoints(components)} viewpoints; "
+                f"this map is in {self.dim or components.dim}D, and {MOST_VIEWPOINTS} viewpoints are the "
+                "most.",
             )
         fresh = ~self.held.contains(keys)
         if not fresh.all():
@@ -112,17 +125,17 @@ class Records:
         return added if fresh.all() else Intervals.of(keys)
 
     def add_record(self, record: RecordMessage, bounded: bool = True) -> Intervals:
-        """Take in another record; returns its key. Raises `RefusedError`, as `add_components` does."""
+        """Add another record; returns its key. Raises `RefusedError`, as `add_components` does."""
         key, robot, datagram = record.key, robot_of(record.key), encode_record(record)
         span = Intervals.span(key, key + 1)
         if key in self.held:
             if key in self.table or self.datagrams.get(key, datagram) != datagram:
-                raise _conflict(key)
+                raise _duplicate_id(key)
             return span
         unfit = isinstance(record, CorrectionMessage) and record.dim != (self.dim or record.dim)
         if unfit or len(datagram) > RECORD_BYTES:
             raise RefusedError(
-                "unfit", robot, f"Record {key} is too long, or of another dimension than this map."
+                "unfit", robot, f"Record {key} is too long, or has another dimension than this map."
             )
         if bounded and not self._has_room(record):
             raise _full(key)
@@ -133,7 +146,7 @@ class Records:
         if isinstance(record, SupersessionMessage):
             self._waiting[key] = record
         elif isinstance(record, CountersMessage):
-            self.totals.add(record)
+            self.counters.add(record)
             self._log.counted(record.components)
         else:
             self._moved(record)
@@ -149,62 +162,62 @@ class Records:
         return len(self.held) + waiting + len(record.old) <= MOST_INTERVALS
 
     def _with(self, added: Intervals, bounded: bool) -> Intervals:
-        """What is held then, if there is room."""
+        """The held keys with those added. Raises `RefusedError` if they take too many intervals."""
         held = self.held | added
         if bounded and len(held) > max(len(self.held), MOST_INTERVALS):
             raise _full(added.pairs()[0][0])
         return held
 
     def _check_same(self, keys: Ints, again: Components) -> None:
-        """Components of keys (K,) that are held already have come again."""
+        """Raise `RefusedError` if components with held keys (K,) have another content than before."""
         for key, print_ in zip(keys.tolist(), fingerprints(again), strict=True):
-            if key in self.others or (key in self.table and self.table.print_of(key) != print_):
-                raise _conflict(key)
+            if key in self.others or (key in self.table and self.table.fingerprints([key]) != [print_]):
+                raise _duplicate_id(key)
 
     def _hold(self, held: Intervals) -> None:
-        """Hold what was held and more, and forget what is superseded by it."""
+        """Set the held keys to a larger set, and drop the records that are superseded by now."""
         if held == self.held:
             return
         self.version += 1
-        here, buried = held, Intervals.empty()
-        while ready := [s for s in self._waiting.values() if held.covers(s.new)]:
-            for supersession in ready:
+        here, superseded = held, Intervals.empty()
+        while effective := [s for s in self._waiting.values() if held.covers(s.new)]:
+            for supersession in effective:
                 del self._waiting[supersession.key]
-                buried |= supersession.old
-            held |= buried
-        if buried:
-            self._bury((here & buried) - self.dead)
-        self.held, self.dead = held, self.dead | buried
+                superseded |= supersession.old
+            held |= superseded
+        if superseded:
+            self._drop((here & superseded) - self.dead)
+        self.held, self.dead = held, self.dead | superseded
 
-    def _bury(self, gone: Intervals) -> None:
-        """Forget these records, which are here."""
-        keys = gone.numbers()
-        shapes = self.table.holds(keys)
-        if shapes.any():
-            self.table.drop(keys[shapes])
-            self._log.broken()
-        totals = []
-        for key in keys[~shapes].tolist():
+    def _drop(self, dropped: Intervals) -> None:
+        """Remove records that are here."""
+        keys = dropped.numbers()
+        is_component = self.table.contains(keys)
+        if is_component.any():
+            self.table.drop(keys[is_component])
+            self._log.invalidate()
+        counters = []
+        for key in keys[~is_component].tolist():
             record = self.others.pop(key)
             del self.datagrams[key], self._kinds[type(record)][key]
             self._n_entries -= _n_entries(record)
             self._waiting.pop(key, None)
             if isinstance(record, CountersMessage):
-                totals.append(record)
+                counters.append(record)
                 self._log.counted(record.components)
             elif isinstance(record, CorrectionMessage):
                 self._moved(record)
-        self.totals.drop(totals)
+        self.counters.drop(counters)
 
     def _moved(self, correction: CorrectionMessage) -> None:
-        """A correction has come, or has gone."""
+        """A correction was added or dropped."""
         if (correction.moved & self.held) - self.dead:
-            self._log.broken()
+            self._log.invalidate()
 
     # -- reading ----------------------------------------------------------------------------------
 
     def of(self, kind: type[_Record]) -> list[_Record]:
-        """The records of a kind that count, by key."""
+        """The records of a type that count, by key."""
         found = self._kinds.get(kind, {})
         return [cast(_Record, found[key]) for key in sorted(found)]
 
@@ -213,51 +226,54 @@ class Records:
         return [record for record in self.of(SupersessionMessage) if record.key not in self._waiting]
 
     def live(self) -> Intervals:
-        """Keys whose records are here."""
+        """Keys of the records that count."""
         return self.held - self.dead
 
     def components(self) -> Components:
-        """All components that count, by key, with all counts, where they belong."""
+        """All components that count, by key, with the points of all counters, moved by the corrections."""
         if self._view is None or self._view[0] != self.version:
             keys = self.table.keys()
             if not len(keys):
                 return Components.empty(self.dim or 3)
-            gain = torch.from_numpy(self.totals.sums(keys))
-            plain = with_gains(self.table.taken(keys), gain)
+            gain = torch.from_numpy(self.counters.sums(keys))
+            plain = with_gains(self.table.selected(keys), gain)
             self._view = self.version, corrected(plain, keys, self.of(CorrectionMessage))
         return self._view[1]
 
     def changes(self) -> Changes:
-        """What has come to be known since the last call."""
-        return self._log.taken(self.table, self.totals, self.of(CorrectionMessage))
+        """The changes since the last call."""
+        return self._log.read(self.table, self.counters, self.of(CorrectionMessage))
 
     def break_off(self) -> None:
-        """Whoever follows the changes has to start over."""
+        """Make the next `changes` say `rebuilt`."""
         self._log = ChangeLog(rebuilt=True)
 
     def digest(self) -> bytes:
-        """16 bytes: equal if all that is held, and all that counts, is equal to the bit."""
+        """16 bytes, equal if and only if the held keys and the records that count are equal to the bit."""
         digest = hashlib.blake2b(self.held.edges.astype("<i8").tobytes(), digest_size=16)
         keys = self.table.keys()
-        names = keys.astype("<i8").tobytes()
-        for row, print_ in enumerate(self.table.prints(keys.tolist())):
-            digest.update(names[8 * row : 8 * row + 8] + print_)
+        key_bytes = keys.astype("<i8").tobytes()
+        for row, print_ in enumerate(self.table.fingerprints(keys.tolist())):
+            digest.update(key_bytes[8 * row : 8 * row + 8] + print_)
         for key in sorted(self.others):
             digest.update(self.datagrams[key])
         return digest.digest()
 
-    # -- keeping ----------------------------------------------------------------------------------
+    # -- saving -----------------------------------------------------------------------------------
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
         """Codec batches of all components that count, and the datagrams of the other records that count."""
         keys = self.table.keys()
         parts = [keys[begin : begin + _BATCH] for begin in range(0, len(keys), _BATCH)]
-        batches = [encode(self.table.taken(part)) for part in parts]
+        batches = [encode(self.table.selected(part)) for part in parts]
         return batches, [self.datagrams[key] for key in sorted(self.others)]
 
     def load_batch(self, data: bytes, own: int) -> None:
-        """Add the components of a batch of `stored`. The limit on components does not apply to those of robot
-        `own`. Raises as `add_components` does, and `DataError` for a damaged batch."""
+        """Add the components of a batch of `stored`. The limits on memory do not apply to those of robot
+        `own`.
+
+        Raises as `add_components` does, and `DataError` for a damaged batch.
+        """
         components = read_batch(data)
         is_own = components.ids[:, 0] == own
         for rows in (is_own.nonzero().squeeze(1), (~is_own).nonzero().squeeze(1)):
@@ -267,7 +283,7 @@ class Records:
 
     def state(self) -> dict[str, Any]:
         keys = self.table.keys()
-        components = self.table.taken(keys) if len(keys) else Components.empty(self.dim or 3)
+        components = self.table.selected(keys) if len(keys) else Components.empty(self.dim or 3)
         datagrams = [self.datagrams[key] for key in sorted(self.others)]
         return {
             "dim": self.dim,
@@ -279,8 +295,8 @@ class Records:
         }
 
     def restore(self, state: dict[str, Any], robot: int) -> None:
-        """Hold what `state` says, of this robot and others. Raises `DataError` where it is damaged, of
-        another dimension, or has more components of others than there is room for; nothing has changed then.
+        """Replace all records by those of a `state`. Raises `DataError` if it is damaged, of another
+        dimension, or has too many components of others; nothing has changed then.
         """
         if None not in (asked := self._dim_asked, dim := state["dim"]) and asked != dim:
             raise DataError(f"The state is of a map in {dim}D, this is one with dim={asked}.")
@@ -315,7 +331,7 @@ class Records:
 
 
 def _n_entries(record: RecordMessage) -> int:
-    """How much of `MOST_ENTRIES` a record takes."""
+    """The entries of a record that count towards `MOST_ENTRIES`."""
     if isinstance(record, CountersMessage):
         return len(record.components)
     if isinstance(record, SupersessionMessage):
@@ -330,15 +346,15 @@ def _record(datagram: bytes) -> RecordMessage:
     return message
 
 
-def _conflict(key: int) -> RefusedError:
+def _duplicate_id(key: int) -> RefusedError:
     robot = robot_of(key)
     return RefusedError(
-        "conflict",
+        "duplicate_id",
         robot,
-        f"Record {key} of robot {robot} has come with two contents: two robots say that they are "
-        f"robot {robot}. Give each a number of its own.",
+        f"Record {key} of robot {robot} has two contents: two robots use the id {robot}. Give each robot an "
+        "id of its own.",
     )
 
 
 def _full(key: int) -> RefusedError:
-    return RefusedError("full", robot_of(key), f"Record {key} would take more memory than a map is allowed.")
+    return RefusedError("full", robot_of(key), f"Record {key} needs more memory than a map may take.")

@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from gmmtorch.errors import DataError, GmmTorchError
-
-
-class RefusedError(DataError):
-    """What came is sound, and not taken in; `reason` is one of few, `robot` whose it is."""
-
-    def __init__(self, reason: str, robot: int, message: str) -> None:
-        super().__init__(message)
-        self.reason, self.robot = reason, robot
+from gmmtorch.errors import GmmTorchError
+from gmmtorch.sharing.replica.records import RefusedError as RefusedError
 
 
 def merged(take: Callable[[], None], refused: Counter[str], conflicts: Counter[int]) -> bool:
@@ -22,7 +15,7 @@ def merged(take: Callable[[], None], refused: Counter[str], conflicts: Counter[i
         take()
     except RefusedError as refusal:
         refused[refusal.reason] += 1
-        if refusal.reason == "conflict":
+        if refusal.reason in ("conflict", "duplicate_id"):
             conflicts[refusal.robot] += 1
         return False
     except GmmTorchError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from gmmtorch.sharing.messages.record_messages import (
     check_size,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog
-from gmmtorch.sharing.replica.authorship import Author
+from gmmtorch.sharing.replica.authorship import Author, Published
 from gmmtorch.sharing.replica.changes import Changes
 from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.record_keys import (
@@ -36,28 +36,27 @@ from gmmtorch.sharing.replica.record_keys import (
     keys_of,
     robot_of,
 )
-from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records
-from gmmtorch.sharing.replica.rejections import RefusedError, merged
+from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records, RefusedError
 from gmmtorch.sharing.replica.send_queue import packets
 
 
 class Replica:
-    """A set of records that merges with others' in any order, any number of times: all end up the same.
+    """A set of records that merges with those of other robots in any order, until all are equal.
 
         replica.add(map)                                      # when the map has learned
         for datagram in replica.datagrams(): broadcast(datagram)        # often
         for datagram in replica.announcements(): broadcast(datagram)    # every second or so
-        for datagram in heard: replica.receive(datagram)
+        for datagram in received: replica.receive(datagram)
         replica.map()
 
-    What is lost is sent again once an announcement shows that it is missing, by whoever has it. See
-    docs/replica.md.
+    A lost record is sent again, by any robot that holds it, when an announcement shows that it is missing.
+    See docs/replica.md.
 
     Attributes:
-        refused: how many datagrams were not merged, by reason: "damaged", "other" (sound, but none
-            of a replica's), "conflict", "full", "unfit" (another dimension, or too large to be passed on),
-            "own" (of this robot's own announcements).
-        conflicts: by robot, how often it was found that two robots use its number.
+        refused: number of datagrams that were not merged, by reason: "damaged", "other" (valid, but of no
+            kind that a replica merges), "duplicate_id", "full", "unfit" (another dimension, or too large to
+            be sent again), "own" (an announcement of this robot).
+        duplicates: by robot id, how often a datagram showed that two robots use it.
     """
 
     def __init__(
@@ -69,61 +68,76 @@ class Replica:
         most_components: int = MOST_COMPONENTS,
     ) -> None:
         """Args:
-        robot: whose replica it is, up to 1023; no two robots of a team have the same.
+        robot: id of the robot, up to 1023; unique in the team.
         dim: 2 or 3; None: that of the first components.
-        incarnation: of this life of the robot, up to 2²⁴ − 1. None: drawn, which is safe whatever
-            was saved. Who gives it gives each only once, or goes on from the last state of it.
-        most_components: beyond so many none are taken from others; this robot's own always are.
+        incarnation: number of this start of the robot, up to 2²⁴ − 1, which must not be used twice. None:
+            drawn.
+        most_components: limit on the components; this robot's own are always added.
         """
         if check_whole("robot", robot, 0) > LARGEST_ROBOT:
             raise InvalidArgumentError(f"robot={robot} must be at most {LARGEST_ROBOT}.")
-        life = drawn_incarnation() if incarnation is None else incarnation
-        if check_whole("incarnation", life, 0) > LARGEST_INCARNATION:
-            raise InvalidArgumentError(f"incarnation={life} must be at most {LARGEST_INCARNATION}.")
+        number = drawn_incarnation() if incarnation is None else incarnation
+        if check_whole("incarnation", number, 0) > LARGEST_INCARNATION:
+            raise InvalidArgumentError(f"incarnation={number} must be at most {LARGEST_INCARNATION}.")
         if dim not in (None, 2, 3):
             raise InvalidArgumentError(f"dim={dim} must be 2 or 3, or None.")
-        self.robot, self.incarnation = int(robot), int(life)
+        self.robot, self.incarnation = int(robot), int(number)
         self._records = Records(dim, check_whole("most_components", most_components, 1))
         self._author = Author(self._records, self.robot, self.incarnation)
         self._backlog = Backlog(self.robot)
-        self._max_bytes = MAX_BYTES  # as last asked for
+        self._max_bytes = MAX_BYTES  # of the last call of `datagrams`
         self.refused: Counter[str] = Counter()
-        self.conflicts: Counter[int] = Counter()
+        self.duplicates: Counter[int] = Counter()
 
-    # -- what this robot says ---------------------------------------------------------------------
+    # -- writing ----------------------------------------------------------------------------------
 
     def add(self, new: GaussianMap | Components, supersedes: ArrayLike | None = None) -> Tensor:
-        """New records of this robot; returns their ids (K, 2).
+        """Write new records of this robot; returns their ids (K, 2).
 
-        Of a map: what it holds that was not said yet, or was said otherwise; what it no longer holds is
-        superseded. Of components: all of them, whatever their ids; they take the place of this
-        robot's components `supersedes` (J, 2), wherever all of them have come.
+        Of a map: the components that are new or have changed since the last call; components that it no
+        longer has are superseded. See `publish`. Of components: all of them, with new ids; they supersede
+        this robot's components `supersedes` (J, 2) at all robots that hold all of the new ones.
 
-        Raises `InvalidArgumentError` for what cannot be stored, and for others' records.
+        Raises `InvalidArgumentError` for components that cannot be stored, and for other robots' records.
         """
         if isinstance(new, GaussianMap):
             if supersedes is not None:
-                raise InvalidArgumentError("supersedes: a map itself says what it no longer holds.")
-            if new.dim is None:
-                return ids_of(np.zeros(0, np.int64))
-            published = self._author.publish_map(_on_cpu(self._of_dim(new.components())), self._max_bytes)
-            self._backlog.add(published.written, published.packets)
-            return ids_of(np.sort(published.keys))
+                raise InvalidArgumentError("supersedes is for components: a map shows what it no longer has.")
+            components = Components.empty(self._records.dim or 3) if new.dim is None else new.components()
+            if bool((components.ids[:, 0] != self.robot).any()):
+                robots = sorted({int(robot) for robot in components.ids[:, 0]})
+                raise InvalidArgumentError(
+                    f"The map has components of robots {robots}, this is robot={self.robot}: make the map "
+                    f"with robot={self.robot}, or give components."
+                )
+            return self.publish(components, whole=False)
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
-        published = self._author.publish(_on_cpu(self._of_dim(new)), old, self._max_bytes)
-        self._backlog.add(published.written, published.packets)
-        return ids_of(published.keys)
+        return self._due(self._author.publish(_on_cpu(self._checked(new)), old, self._max_bytes))
+
+    def publish(self, components: Components, *, whole: bool) -> Tensor:
+        """Make this robot's records equal to the components of its own map; returns the ids (K, 2) of new
+        ones.
+
+        Components are compared by content: those that are published already, also before a restart, are not
+        written again; those published by this replica and no longer in the map are superseded. whole: also
+        supersede what was published before a restart and is not in the map. Components given to `add`
+        directly are not affected.
+        """
+        if not len(components) and not self.n_components:
+            return ids_of(np.zeros(0, np.int64))
+        made = self._author.publish_map(_on_cpu(self._checked(components)), whole, self._max_bytes)
+        return self._due(made._replace(keys=np.sort(made.keys)))
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
-        """Points that components (robot, sequence), of whomever, have gained since the last call."""
+        """Add points that components (robot, sequence), of any robot, have gained since the last call."""
         keys = _keys("gains", torch.tensor(list(gains), dtype=torch.int64).reshape(-1, 2))
         self._backlog.add(self._author.count(dict(zip(keys.tolist(), gains.values(), strict=True))))
 
     def correct(self, scan: int, transform: ArrayLike, ids: ArrayLike) -> None:
-        """A correction of the pose of a scan of this robot: its components `ids` (J, 2) are moved.
+        """Correct the pose of a scan of this robot, which moves the scan's components `ids` (J, 2).
 
-        transform: (D+1, D+1), rigid, from where they were added to where they belong: the
-        last one of a scan counts, not the product of all.
+        transform: (D+1, D+1), rigid, from the positions that were added to the corrected ones. Of several
+        corrections of a scan the last one counts, not their product.
         """
         check_whole("scan", scan, 0)
         matrix = torch.as_tensor(transform, dtype=torch.float64)
@@ -133,52 +147,71 @@ class Replica:
             )
         self._backlog.add(self._author.correct(scan, matrix, Intervals.of(_keys("ids", ids))))
 
-    # -- what is sent and heard -------------------------------------------------------------------
+    def _due(self, made: Published) -> Tensor:
+        self._backlog.add(made.written, made.packets)
+        return ids_of(made.keys)
+
+    # -- sending and receiving --------------------------------------------------------------------
 
     def datagrams(self, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
-        """What is due: what is new, and what others lack.
+        """Datagrams of the records that are due: new ones, and those that other robots lack.
 
         Args:
-            max_bytes: of each datagram, from 1000 to 1200.
-            budget: bytes of all of them; what does not fit stays due. What supersedes or moves others goes
-                first, then components, the most informative first, then counts. None: no limit.
+            max_bytes: largest size of a datagram, from 1000 to 1200.
+            budget: largest size of all datagrams together; the other records stay due. Supersessions and
+                corrections are sent first, then components by their information, then counters. None: no
+                limit.
         """
         check_size(max_bytes)
         self._max_bytes = max_bytes
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
-        said = Intervals.empty()
-        self._backlog.buried(self._records.dead)
-        waiting = packets(
+        sent_keys = Intervals.empty()
+        self._backlog.superseded(self._records.dead)
+        queue = packets(
             self._records,
             self._backlog.due,
             self._backlog.ready,
             max_bytes,
             by_information=budget is not None,
         )
-        for datagram, keys in waiting:
+        for datagram, keys in queue:
             left -= len(datagram)
             if left < 0:
                 break
             sent.append(datagram)
-            said |= keys
-        self._backlog.sent(said)
+            sent_keys |= keys
+        self._backlog.sent(sent_keys)
         return sent
 
     def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
-        """What this robot holds: who hears it sends what is missing. Of each datagram so many bytes."""
+        """Datagrams that say which records this robot holds. Others answer with those that are missing."""
         check_size(max_bytes)
-        self._backlog.asks()
+        self._backlog.announcing()
         return encode_announcements(self.robot, self.incarnation, self._records.held, max_bytes)
 
     def receive(self, datagram: bytes, message: Message | None = None) -> bool:
-        """Merge what a datagram says; whether it was understood, and merged. Never raises.
+        """Merge a datagram; returns whether it was valid and merged. Never raises.
 
-        message: what `decode` makes of it, for those who have that already.
+        message: the result of `decode(datagram)`, if the caller has it.
         """
-        return merged(lambda: self._take(datagram, message), self.refused, self.conflicts)
+        return self._try(lambda: self._merge(datagram, message))
 
-    def _take(self, datagram: bytes, message: Message | None) -> None:
+    def _try(self, merge: Callable[[], None]) -> bool:
+        """Whether `merge` succeeds; if not, the reason is counted."""
+        try:
+            merge()
+        except RefusedError as refusal:
+            self.refused[refusal.reason] += 1
+            if refusal.reason == "duplicate_id":
+                self.duplicates[refusal.robot] += 1
+            return False
+        except GmmTorchError:
+            self.refused["damaged"] += 1
+            return False
+        return True
+
+    def _merge(self, datagram: bytes, message: Message | None) -> None:
         if not isinstance(datagram, bytes):
             raise RefusedError("damaged", -1, f"A datagram is {type(datagram).__name__}, not bytes.")
         message = decode(datagram) if message is None else message
@@ -186,97 +219,109 @@ class Replica:
             self._check_sender(message)
             self._backlog.announced(message, self._records.held, self._records.dead)
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
-            self._check_names(keys_of(message.components.ids))
-            self._backlog.heard(self._records.add_components(message.components))
+            self._check_keys(keys_of(message.components.ids))
+            self._backlog.received(self._records.add_components(message.components))
         elif isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
-            self._check_names(np.array([message.key]))
+            self._check_keys(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
-                self._check_untouched(message)
-            self._backlog.heard(self._records.add_record(message))
+                self._check_supersession(message)
+            self._backlog.received(self._records.add_record(message))
         else:
             raise RefusedError("other", -1, f"{type(message).__name__} is no record.")
 
     def _check_sender(self, message: AnnouncementMessage) -> None:
-        """Who announces as this robot is an echo, or late from its last life; or a second robot of this
-        number, if it has heard of this life."""
+        """Refuse an announcement with this robot's id.
+
+        It is an echo, or from an earlier incarnation; or from a second robot with this id, if another
+        incarnation holds records of this one.
+        """
         if message.sender != self.robot:
             return
         if message.incarnation != self.incarnation and message.held & self._author.written:
-            raise self._twin()
-        raise RefusedError("own", self.robot, "An announcement of this robot's own.")
+            raise self._duplicate_id()
+        raise RefusedError("own", self.robot, "An announcement of this robot.")
 
-    def _check_names(self, keys: Ints) -> None:
-        """Nobody but this robot numbers records in its life."""
-        if bool((self._author.life - self._author.written).contains(keys).any()):
-            raise self._twin()
+    def _check_keys(self, keys: Ints) -> None:
+        """Only this robot gives keys of its incarnation."""
+        if bool((self._author.keys - self._author.written).contains(keys).any()):
+            raise self._duplicate_id()
 
-    def _check_untouched(self, message: SupersessionMessage) -> None:
-        """No earlier life of this robot can know what this one writes."""
-        if (message.old | message.new) & self._author.life:
-            raise self._twin()
+    def _check_supersession(self, message: SupersessionMessage) -> None:
+        """An earlier incarnation cannot know the records of this one."""
+        if (message.old | message.new) & self._author.keys:
+            raise self._duplicate_id()
 
-    def _twin(self) -> RefusedError:
-        return RefusedError("conflict", self.robot, f"Another robot says that it is robot {self.robot}.")
+    def _duplicate_id(self) -> RefusedError:
+        return RefusedError("duplicate_id", self.robot, f"Another robot uses the id {self.robot}.")
 
-    # -- what is known ----------------------------------------------------------------------------
+    # -- reading ----------------------------------------------------------------------------------
 
     def digest(self) -> bytes:
-        """16 bytes: equal for equal contents, whatever the order in which they came."""
+        """16 bytes, equal for equal contents, whatever the order of arrival."""
         return self._records.digest()
 
     def components(self) -> Components:
-        """All components that count, by id, with what everybody counted, where corrections put them."""
+        """All components that count, by id, with the points of all counters, moved by the corrections."""
         return self._records.components()
 
     def changes(self) -> Changes:
-        """What has become known since the last call: by this robot's doing, or heard.
+        """What was added since the last call, by this robot or others.
 
-        All `added` and `gained` together are `components()`, unless `rebuilt` says that this is to be
-        looked at anew. The first call tells all that there is. Takes time by what has changed.
+        All `added` and `gained` together are `components()`, unless `rebuilt` demands to read these again.
+        The first call returns everything. The time is proportional to the changes.
         """
         return self._records.changes()
 
     def map(self, **options: Any) -> GaussianMap:
-        """The components as a map, of its own; `options` as for `GaussianMap`."""
+        """The components as a new map; `options` as for `GaussianMap`."""
         if not len(self._records.table):
             return GaussianMap(robot=self.robot, **options)
         return GaussianMap.of(self.components(), robot=self.robot, **options)
 
     @property
     def held(self) -> Intervals:
-        """Names of all records that are here, or were superseded: what is announced."""
+        """Keys of all records that are here, or were superseded: those that are announced."""
         return self._records.held
 
     @property
     def missing(self) -> Intervals:
-        """Names of the records that others have announced they hold, and that are not here; but not those of
-        robots that have not been heard for long, or never were there: see `anti_entropy.PATIENCE`."""
+        """Keys of records that other robots have announced, and that are not here.
+
+        Robots that have not announced for long are left out: see `anti_entropy.PATIENCE`.
+        """
         return self._backlog.missing(self._records.held)
 
     @property
     def version(self) -> int:
-        """Rises with what is held."""
+        """Rises with every change of `held`."""
         return self._records.version
 
     @property
     def n_components(self) -> int:
         return len(self._records.table)
 
-    # -- keeping ----------------------------------------------------------------------------------
+    @property
+    def conflicts(self) -> Counter[int]:
+        return self.duplicates
+
+    # -- storing ----------------------------------------------------------------------------------
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
-        """All that counts, for a `Store`: codec batches of components, and the datagrams of other records."""
+        """All records that count, for a `Store`: codec batches of components, and datagrams of the others."""
         return self._records.stored()
 
     def load(self, batches: Iterable[bytes], datagrams: Iterable[bytes]) -> int:
-        """Add what `stored` returned in an earlier life, and datagrams that were sent or merged since.
+        """Add records that `stored` returned before a restart, and datagrams that were sent or merged since.
 
-        Returns how many batches and datagrams were refused, as damaged or for want of room. Nothing becomes
-        due: teammates that lack something announce so. What is superseded counts as held again.
+        Returns the number of batches and datagrams that were refused: damaged ones, and those without room.
+        Loaded records are not due, but are sent to robots that lack them. Superseded keys are held again.
         """
-        takes = [partial(self._records.load_batch, data, self.robot) for data in batches]
-        takes += [partial(self._load_datagram, data) for data in datagrams]
-        return sum(not merged(take, Counter(), Counter()) for take in takes)
+        refused, duplicates = self.refused.copy(), self.duplicates.copy()
+        merges = [partial(self._records.load_batch, data, self.robot) for data in batches]
+        merges += [partial(self._load_datagram, data) for data in datagrams]
+        n_refused = sum(not self._try(merge) for merge in merges)
+        self.refused, self.duplicates = refused, duplicates  # which count received datagrams only
+        return n_refused
 
     def _load_datagram(self, datagram: bytes) -> None:
         if datagram[:1] == _QUANTIZED:
@@ -288,8 +333,7 @@ class Replica:
         self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
 
     def state(self) -> dict[str, Any]:
-        """Everything, for a file, and what `changes` has told of it. What was sent before it is saved
-        survives with those who heard it."""
+        """Everything, for a checkpoint of a mission."""
         return {
             "robot": self.robot,
             "records": self._records.state(),
@@ -298,9 +342,7 @@ class Replica:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Hold what was saved, in place of what is held. The incarnation stays that of this replica.
-
-        In that incarnation `changes` goes on from where it was; in another one it says `rebuilt`.
+        """Replace all contents by those of a `state`. The incarnation stays that of this replica.
 
         Raises `DataError` for a state that is damaged, or another robot's.
         """
@@ -318,7 +360,7 @@ class Replica:
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of robot {self.robot} is damaged ({error}).") from error
 
-    def _of_dim(self, components: Components) -> Components:
+    def _checked(self, components: Components) -> Components:
         components = components.checked()
         if self._records.dim not in (None, components.dim):
             raise InvalidArgumentError(
@@ -328,7 +370,7 @@ class Replica:
 
 
 _QUANTIZED = b"\x11"
-"""First byte of components that can be passed on without change."""
+"""First byte of a datagram of components that every robot encodes equally."""
 
 
 def _keys(name: str, ids: ArrayLike) -> Ints:
