@@ -1,4 +1,4 @@
-"""What the commands share: finding conf/, setting up the run, errors, results."""
+"""Functions that several commands use: configuration folder, set-up of a run, errors, data sets, results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     from gmmtorch.datasets import Dataset
-    from gmmtorch.evaluation.estimators import FitOptions
+    from gmmtorch.evaluation.events import Event, Row
+    from gmmtorch.evaluation.protocol_options import FitOptions
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
@@ -22,20 +23,21 @@ _ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
 
 
 def conf_dir() -> str:
-    """The folder of configuration files: in the package once installed, beside it in a checkout."""
+    """The folder of configuration files: in the package if it is installed, beside the package in a
+    checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "occupancy.yaml").is_file():
             return str(candidate)
     raise FileNotFoundError(
-        f"conf/ is neither in {package} nor beside it; install gmmtorch again, or run from a whole checkout."
+        f"conf/ is neither in {package} nor beside it; install gmmtorch again, or use a complete checkout."
     )
 
 
 def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any:
-    """Run a command; errors raised on purpose become one line and exit status 1, without a traceback.
+    """Run a command. A `GmmTorchError` becomes a one-line message and exit status 1, without a traceback.
 
-    As a job of a sweep in a process of its own, it ends with the sweep.
+    A job of a sweep that runs in its own process ends if the sweep's process ends.
     """
     from gmmtorch.errors import GmmTorchError
     from gmmtorch.evaluation.worker_pool import end_with_parent
@@ -46,16 +48,15 @@ def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any
     except GmmTorchError as error:
         sys.exit(f"gmmtorch: error: {error}")
     except KeyboardInterrupt:
-        print("gmmtorch: interrupted; nothing half-written is left.", file=sys.stderr)
+        print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
         sys.exit(130)
 
 
 @contextmanager
 def naming(options: Mapping[str, str]) -> Iterator[None]:
-    """Within it, errors call arguments what the user does: `noise=-1`, which may be many things, becomes
-    `sensor.noise=-1`.
+    """Renames arguments in errors to the options that the user gave: `noise=-1` becomes `sensor.noise=-1`.
 
-    options: the option that each argument was given as.
+    options: the option for each argument.
     """
     from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
@@ -71,28 +72,28 @@ def naming(options: Mapping[str, str]) -> Iterator[None]:
 
 
 def as_options(node: DictConfig) -> dict[str, Any]:
-    """A configuration node as keyword arguments."""
+    """The values of a configuration node by name."""
     plain: Any = OmegaConf.to_container(node, resolve=True)
     return {str(key): value for key, value in plain.items()}
 
 
 def fit_options(config: DictConfig) -> FitOptions:
-    """The options `mixture.*`, and those of `runtime.*` that a fit has."""
-    from gmmtorch.evaluation.estimators import FitOptions
+    """The options of a fit from `mixture.*` and `runtime.*`."""
+    from gmmtorch.evaluation.protocol_options import FitOptions
 
     runtime = config.runtime
     return FitOptions(**as_options(config.mixture), dtype=runtime.dtype, compiled=runtime.compile)
 
 
 def run_dir() -> Path:
-    """Where this run's files go: `hydra.run.dir`, or the sweep's folder for this job."""
+    """The folder of this run: `hydra.run.dir`, or the sweep's folder of this job."""
     from hydra.core.hydra_config import HydraConfig
 
     return Path(HydraConfig.get().runtime.output_dir)
 
 
 def set_up(config: DictConfig) -> str:
-    """Check the seed and apply the runtime options; returns the device."""
+    """Check the seed and apply `runtime.*`; returns the device."""
     from gmmtorch.errors import check_whole
 
     check_whole("seed", config.seed, 0)
@@ -100,7 +101,7 @@ def set_up(config: DictConfig) -> str:
 
 
 def use_runtime(runtime: DictConfig) -> str:
-    """Apply the runtime options; returns the device. Raises `InvalidArgumentError` on a bad one."""
+    """Apply `runtime.*`; returns the device. Raises `InvalidArgumentError` for an invalid option."""
     import torch
 
     from gmmtorch.errors import InvalidArgumentError
@@ -109,15 +110,15 @@ def use_runtime(runtime: DictConfig) -> str:
         if runtime.threads < 1:
             raise InvalidArgumentError(f"runtime.threads={runtime.threads} must be at least 1, or null.")
         torch.set_num_threads(runtime.threads)
-    if runtime.get("memory_limit", 1) < 1:  # not all commands have one
+    if runtime.get("memory_limit", 1) < 1:  # some commands have no memory limit
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
     try:
-        torch.zeros(1, device=runtime.device).item()  # "meta" can be named, but holds no numbers
+        torch.zeros(1, device=runtime.device).item()  # item() also refuses the device "meta"
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidArgumentError(
-            f"runtime.device={runtime.device} cannot be used here ({reason}); use cpu, or a torch "
-            "build for it."
+            f"runtime.device={runtime.device} is not available ({reason}); use cpu, or install a torch build "
+            "for this device."
         ) from error
     return str(runtime.device)
 
@@ -129,15 +130,19 @@ def open_dataset(config: DictConfig) -> Dataset:
     options = {
         str(key): config[key]
         for key in config
-        # A path that was not given is left to the reader, which says what it wants.
+        # If a path is missing, the reader raises an error that describes the files it needs.
         if not OmegaConf.is_missing(config, key) and config[key] is not None
     }
     return datasets.load(options.pop("name"), options.pop("path", None), **options)
 
 
-def read_scans(
-    dataset: Dataset, indices: Sequence[int], device: str, on_event: Callable[[str, int, int | None], None]
-) -> list[Scan]:
+def all_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
+    """The name and all scans of the data set `dataset.*`, on the device."""
+    dataset = open_dataset(config.dataset)
+    return dataset.name, read_scans(dataset, range(len(dataset)), device, on_event)
+
+
+def read_scans(dataset: Dataset, indices: Sequence[int], device: str, on_event: Event) -> list[Scan]:
     """The scans with these indices, on the device."""
     scans = []
     on_event("reading scans", 0, len(indices))
@@ -147,8 +152,8 @@ def read_scans(
     return scans
 
 
-def write_results(command: str, config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> Path:
-    """results.json of a run: command, version, seed, config and rows, written atomically."""
+def write_results(command: str, config: DictConfig, rows: list[Row], folder: Path) -> Path:
+    """Write results.json of a run atomically: command, version, seed, config and rows."""
     import gmmtorch
     from gmmtorch.files import write_json
 
@@ -162,19 +167,19 @@ def write_results(command: str, config: DictConfig, rows: list[dict[str, Any]], 
     return write_json(folder / "results.json", results)
 
 
-def headline(rows: Sequence[dict[str, Any]]) -> str:
-    """What a table of fits is about."""
+def headline(rows: Sequence[Row]) -> str:
+    """The title of a table of fits."""
     return f"{rows[0]['dataset']}: {rows[0]['n_points']:,} points"
 
 
-def log_likelihood(row: dict[str, Any]) -> float:
-    """Of a fit: on the points held out, or on its own if there are none."""
+def log_likelihood(row: Row) -> float:
+    """The log-likelihood of a fit's held-out points, or of its training points if none are held out."""
     held_out = row["held_out_log_likelihood"]
     return float(row["log_likelihood"] if held_out is None else held_out)
 
 
 def save_figures(config: DictConfig, figures: dict[str, Any], folder: Path) -> None:
-    """Every figure as NAME.png, if `report.figures` wants them."""
+    """Write every figure as NAME.png if `report.figures` is set."""
     if not config.report.figures:
         return
     from gmmtorch.report.save import save_figure
@@ -183,15 +188,15 @@ def save_figures(config: DictConfig, figures: dict[str, Any], folder: Path) -> N
         save_figure(figure, folder / f"{name}.png")
 
 
-def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str], title: str) -> None:
-    """The rows as a table on standard output."""
+def print_table(rows: Sequence[Row], columns: Sequence[str], title: str) -> None:
+    """Print the rows as a table on standard output."""
     from gmmtorch.report.table import format_table
 
     print(f"\n{title}\n{format_table(list(rows), columns)}")
 
 
 def print_files(folder: Path, results: Path) -> None:
-    """Where the run's files are, on standard output."""
+    """Print the places of the run's files on standard output."""
     pictures = sorted(path.name for path in folder.glob("*.png"))
     print(f"\nresults   {results}")
     if pictures:
@@ -201,7 +206,7 @@ def print_files(folder: Path, results: Path) -> None:
 
 
 def flat(config: DictConfig) -> dict[str, Any]:
-    """The configuration as one level of dotted names, for the hyperparameter table."""
+    """The configuration as values by dotted names, for TensorBoard's table of hyperparameters."""
 
     def walk(prefix: str, value: Any) -> dict[str, Any]:
         if isinstance(value, dict):

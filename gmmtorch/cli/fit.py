@@ -1,4 +1,4 @@
-"""gmmtorch-fit: learn a Gaussian mixture from the points of scans, score it, show it."""
+"""gmmtorch-fit: learns a Gaussian mixture from the points of scans, scores it and draws it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, fit_stream, material, schema, studies
+from gmmtorch.cli import common, fit_stream, fit_studies, schema, studies
+from gmmtorch.cli.fit_data import fit_data
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.studies.fitting import FitOutcome, Row
+    from gmmtorch.evaluation.events import Event, Row
+    from gmmtorch.evaluation.fit_comparison import FitOutcome
 
 _TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
@@ -25,7 +26,7 @@ _TABLE = (
 def main() -> None:
     """Entry point of the command."""
     schema.register()
-    with fit_stream.quiet_follower():
+    with fit_stream.quiet_worker():
         hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="fit")(_guarded)()
 
 
@@ -34,7 +35,7 @@ def _guarded(config: DictConfig) -> float | None:
 
 
 def run(config: DictConfig) -> float | None:
-    """One run; returns the held-out (else the training) log-likelihood of the last row."""
+    """Run the command; returns `common.log_likelihood` of the last row, which a sweep can optimize."""
     from gmmtorch.report.progress import ProgressBars
 
     if fit_stream.is_wanted(config):
@@ -42,18 +43,20 @@ def run(config: DictConfig) -> float | None:
     device = common.set_up(config)
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
-        work = _compare if config.study is None else studies.run
-        rows = work(config, device, folder, bars)
+        if config.study is None:
+            rows = _compare(config, device, folder, bars)
+        else:
+            rows = studies.run("fit", fit_studies.STUDIES, config, device, folder, bars)
     common.print_files(folder, folder / "results.json")
     return common.log_likelihood(rows[-1])
 
 
 def _run_streamed(config: DictConfig) -> float | None:
-    """The same of a fit that is streamed; None in all processes but the first."""
-    from gmmtorch.evaluation.studies.fitting import FitOutcome
+    """The same for a streamed fit; returns None in workers."""
+    from gmmtorch.evaluation.fit_comparison import FitOutcome
 
     folder = common.run_dir()
-    streamed = fit_stream.run(config, material.material, folder)
+    streamed = fit_stream.run(config, folder)
     if streamed is None:
         return None
     row, mixture, sample = streamed
@@ -64,12 +67,12 @@ def _run_streamed(config: DictConfig) -> float | None:
 
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
-    """A row for each method; every mixture is saved, and shown."""
-    from gmmtorch.evaluation.studies import fitting
+    """A row for each method; saves and draws every mixture."""
+    from gmmtorch.evaluation.fit_comparison import compare
 
-    given = material.material(config, device, on_event)
-    outcome = fitting.compare(
-        given,
+    data = fit_data(config, device, on_event)
+    outcome = compare(
+        data,
         list(config.method),
         common.fit_options(config),
         config.seed,
@@ -79,17 +82,17 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
     )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
-    _show(config, given.train, outcome, folder)
+    _show(config, data.train, outcome, folder)
     common.print_table(outcome.rows, _TABLE.split(), common.headline(outcome.rows))
     return outcome.rows
 
 
 def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path) -> None:
-    """Figures as PNG and, with the numbers, in TensorBoard."""
+    """Write the figures as PNG, and figures and numbers to TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
-    from gmmtorch.evaluation.studies.fitting import in_use
+    from gmmtorch.evaluation.fit_comparison import in_use
     from gmmtorch.report.curves import convergence_figure
     from gmmtorch.report.maps.comparison import comparison_figure
     from gmmtorch.report.maps.mixture_figures import mixture_figure
@@ -101,7 +104,7 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
     if len(outcome.rows) > 1:
         figures["comparison"] = comparison_figure(outcome.rows)
     for method, mixture in outcome.mixtures.items():
-        used = in_use(mixture, points)  # where the others are says nothing of the cloud
+        used = in_use(mixture, points)  # the positions of unused components are arbitrary
         figures[f"mixture_{method}"] = mixture_figure(
             points,
             mixture.means[used],

@@ -1,11 +1,11 @@
-"""gmmtorch-fit on a cloud that is streamed, shared by several processes, or kept in checkpoints."""
+"""gmmtorch-fit with a streamed cloud, with several processes, or with checkpoints."""
 
 from __future__ import annotations
 
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,25 +13,22 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
+from gmmtorch.cli.fit_data import fit_data
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.studies.fitting import Material
-    from gmmtorch.evaluation.studies.streamed_fit import Split, Streamed
+    from gmmtorch.evaluation.streamed_fit import Split, Streamed
     from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 
-MaterialOf = Callable[[DictConfig, str, Any], "Material"]
-"""(config, device, on_event) → the points of the data set."""
 
-
-def _is_follower() -> bool:
-    """Whether torchrun started this process beside a first one, which does all the writing."""
+def _is_worker() -> bool:
+    """Whether torchrun started this process with a rank above 0; only rank 0 writes files."""
     return int(os.environ.get("WORLD_SIZE", "1")) > 1 and os.environ.get("RANK", "0") != "0"
 
 
 @contextmanager
-def quiet_follower() -> Iterator[None]:
-    """Keeps what Hydra writes and says for a follower out of the run's folder and off the screen."""
-    if not _is_follower():
+def quiet_worker() -> Iterator[None]:
+    """Sends the files and messages that Hydra writes in a worker to a temporary folder."""
+    if not _is_worker():
         yield
         return
     with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
@@ -41,15 +38,15 @@ def quiet_follower() -> Iterator[None]:
 
 
 def is_wanted(config: DictConfig) -> bool:
-    """Whether the options, or torchrun, ask for a streamed fit."""
+    """Whether the options or torchrun request a streamed fit."""
     from gmmtorch.mixture.streaming.distributed import is_launched
 
     return config.points is not None or config.checkpoint is not None or config.resume or is_launched()
 
 
-def run(config: DictConfig, material_of: MaterialOf, folder: Path) -> Streamed | None:
-    """One streamed fit: its row is written, its mixture saved. None in a process other than the first."""
-    from gmmtorch.evaluation.studies.streamed_fit import fit_streamed
+def run(config: DictConfig, folder: Path) -> Streamed | None:
+    """Run a streamed fit, write its row and save its mixture. Returns None in workers."""
+    from gmmtorch.evaluation.streamed_fit import fit_streamed
     from gmmtorch.mixture.streaming.distributed import joined
     from gmmtorch.report.progress import ProgressBars
 
@@ -63,7 +60,7 @@ def run(config: DictConfig, material_of: MaterialOf, folder: Path) -> Streamed |
         joined(device, config.stream.timeout) as processes,
         ProgressBars(enabled=config.report.progress and processes.rank == 0) as bars,
     ):
-        split = _split(config, material_of, device, bars)
+        split = _split(config, device, bars)
         streamed = fit_streamed(
             split,
             options,
@@ -85,21 +82,24 @@ def _check(config: DictConfig) -> None:
 
     if list(config.method) != ["em"]:
         raise InvalidArgumentError(
-            f"method={list(config.method)}: a fit that is streamed, or shared by processes, is by [em] only."
+            f"method={list(config.method)}: a streamed fit, or a fit by several processes, needs method=[em]."
         )
     if config.method_options:
         raise InvalidArgumentError(
-            f"method_options={config.method_options} are not for a fit that is streamed."
+            f"method_options={config.method_options}: a streamed fit has no method options; remove them."
         )
     if config.study is not None:
-        raise InvalidArgumentError("An experiment is run by one process, on a data set: leave out points.")
+        raise InvalidArgumentError(
+            f"study={config.study.name} runs in one process on a data set; remove points, checkpoint, resume "
+            "and torchrun."
+        )
     if config.points is not None and config.max_points is not None:
         raise InvalidArgumentError(
-            f"max_points={config.max_points} thins scans, but points={config.points} is read whole; leave it "
-            "null."
+            f"max_points={config.max_points} is for scans, but points={config.points} is read completely: "
+            "set max_points to null."
         )
     if config.resume and config.checkpoint is None:
-        raise InvalidArgumentError("resume=true goes on from a checkpoint; name it by checkpoint=FILE.")
+        raise InvalidArgumentError("resume=true needs a checkpoint; give checkpoint=FILE.")
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:
@@ -112,12 +112,12 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
     return Checkpoint(path, stream.checkpoint_every, stream.checkpoint_seconds, config.resume)
 
 
-def _split(config: DictConfig, material_of: MaterialOf, device: str, on_event: Any) -> Split:
+def _split(config: DictConfig, device: str, on_event: Any) -> Split:
     from gmmtorch.datasets.point_files.point_chunks import open_points
-    from gmmtorch.evaluation.studies.streamed_fit import split_material, split_source
+    from gmmtorch.evaluation.streamed_fit import split_data, split_source
 
     stream = config.stream
     if config.points is None:
-        return split_material(material_of(config, device, on_event), stream.chunk_points)
+        return split_data(fit_data(config, device, on_event), stream.chunk_points)
     source = open_points(config.points, chunk_points=stream.chunk_points, max_range=stream.max_range)
     return split_source(source, config.test_share, config.seed, stream.sample_points)

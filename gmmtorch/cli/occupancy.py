@@ -1,4 +1,4 @@
-"""gmmtorch-occupancy: learn maps from scans, score them on held-out ones, show them."""
+"""gmmtorch-occupancy: learns maps from scans, scores them on held-out scans and draws them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, maps, occupancy_studies, schema
+from gmmtorch.cli import common, maps, occupancy_studies, schema, studies
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Event
+    from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.evaluation.held_out import Built, Outcome
+    from gmmtorch.mapping.components import Components
     from gmmtorch.scan import Scan
 
 _TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
@@ -30,47 +31,48 @@ def _guarded(config: DictConfig) -> float | None:
 
 
 def run(config: DictConfig) -> float | None:
-    """One run; returns the AUC of the last row, which an optimiser may sweep over."""
+    """Run the command; returns the AUC of the last row, which a sweep can optimize."""
     from gmmtorch.report.progress import ProgressBars
 
     device = common.set_up(config)
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars:
-        work = _compare if config.study is None else occupancy_studies.run
-        rows = work(config, device, folder, bars)
+        if config.study is None:
+            rows = _compare(config, device, folder, bars)
+        else:
+            rows = studies.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
     common.print_files(folder, folder / "results.json")
     return rows[-1].get("auc")
 
 
-def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[dict[str, Any]]:
+def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
     """A row for each method, share kept and resolution."""
     from gmmtorch.errors import check_whole
-    from gmmtorch.evaluation import held_out as occupancy
-    from gmmtorch.evaluation import methods as contenders
+    from gmmtorch.evaluation import methods
+    from gmmtorch.evaluation.held_out import evaluate
 
     check_whole("report.magnify", config.report.magnify, 0)
-    factories = contenders.choose(list(config.method), maps.known_methods(config))
-    protocol = occupancy.Protocol(**common.as_options(config.evaluation))
+    factories = methods.choose(list(config.method), maps.known_methods(config))
+    protocol = occupancy_studies.protocol_of(config)
     maps.check_factories(factories, protocol.resolution[0])
-    dataset = common.open_dataset(config.dataset)
-    scans = common.read_scans(dataset, range(len(dataset)), device, on_event)
-    outcome = occupancy.evaluate(
-        dataset.name,
+    name, scans = common.all_scans(config, device, on_event)
+    outcome = evaluate(
+        name,
         scans,
         factories,
         protocol,
         config.seed,
         on_event,
-        # Each row is kept at once: hours of work must not hang on the last of them.
+        # Rows are written one by one, so that a run that fails late keeps them.
         lambda rows: common.write_results("occupancy", config, rows, folder),
     )
     _show(config, scans, outcome, folder)
-    common.print_table(outcome.rows, _TABLE.split(), f"{dataset.name}: {len(scans)} scans")
+    common.print_table(outcome.rows, _TABLE.split(), f"{name}: {len(scans)} scans")
     return outcome.rows
 
 
 def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
-    """Figures as PNG and, with the numbers, in TensorBoard."""
+    """Write the figures as PNG, and figures and numbers to TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
     figures = _figures(config, scans, outcome)
@@ -80,10 +82,9 @@ def _show(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: P
 
 
 def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
-    """Every figure of a run by file name."""
+    """The figures of a run by file name."""
     import torch
 
-    from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.report.curves import roc_figure
     from gmmtorch.report.maps.map_figures import map_figure
     from gmmtorch.report.maps.mixture_figures import mixture_figure
@@ -97,9 +98,9 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
         panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
-        # Cells that grazing beams cross are free more often than hit: half is too strict from above.
+        # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
         figures[f"map_{resolution:g}m"] = map_figure(
-            panels, trajectory, occupied_above=0.4, **_coarser(shown)
+            panels, trajectory, occupied_above=0.4, **_image_limits(shown)
         )
         regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
@@ -109,18 +110,11 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
         about = f"{shown[0].row['dataset']}, {resolution:g} m"
         figures[f"roc_{resolution:g}m"] = roc_figure(curves, about)
         figures[f"reliability_{resolution:g}m"] = _reliability(shown, about)
-    for built in outcome.shown:
-        if isinstance(built.map, GaussianMap):
-            components = built.map.components()
-            surface = ~components.max_range
-            figures["mixture"] = mixture_figure(
-                points,
-                components.means[surface],
-                components.covariances[surface],
-                components.support[surface],
-                title="The map's surfaces",
-            )
-            break
+    surfaces = _surfaces(outcome)
+    if surfaces is not None:
+        figures["mixture"] = mixture_figure(
+            points, surfaces.means, surfaces.covariances, surfaces.support, title="The map's surfaces"
+        )
     return figures
 
 
@@ -137,11 +131,22 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     return reliability_figure(curves, f"Reliability: {about}")
 
 
-def _coarser(shown: Sequence[Built]) -> dict[str, Any]:
-    """Integrals over cells, exact or the thesis's, are too dear in 3D to be drawn as finely as the rest."""
+def _image_limits(shown: Sequence[Built]) -> dict[str, Any]:
+    """Limits of the image size for forms that integrate over cells, which are slow in 3D."""
     if shown[0].asked.points.shape[1] == 3 and any(b.row["method"] in ("flux", "cone") for b in shown):
         return {"max_pixels": 250, "max_queries": 100_000}
     return {}
+
+
+def _surfaces(outcome: Outcome) -> Components | None:
+    """The surface components of the first `GaussianMap`; None if there is none."""
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    for built in outcome.shown:
+        if isinstance(built.map, GaussianMap):
+            components = built.map.components()
+            return components.selected((~components.max_range).nonzero().squeeze(1))
+    return None
 
 
 def _label(built: Built) -> str:
@@ -156,11 +161,10 @@ def _write_board(
     import torch
 
     from gmmtorch.evaluation.queries import OCCUPIED
-    from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.report.tensorboard_writer import Board
 
     with Board(folder) as board:
-        # Steps are per cent of the data kept; TensorBoard takes a step back for a restart.
+        # The step is the percentage of data kept. Steps must not decrease, which would mean a restart.
         for row in sorted(outcome.rows, key=lambda row: row["kept"]):
             tag = f"{row['method']}/{row['resolution']:g}m"
             board.scalars(row, tag, step=round(100 * row["kept"]))
@@ -172,12 +176,9 @@ def _write_board(
             board.figure(f"figures/{name}", figure)
         points = torch.cat([scan.points.double().cpu() for scan in scans])
         board.cloud("points", points)
-        for built in outcome.shown:
-            if isinstance(built.map, GaussianMap):
-                components = built.map.components()
-                surface = ~components.max_range
-                board.ellipsoids("mixture", components.means[surface], components.covariances[surface])
-                break
+        surfaces = _surfaces(outcome)
+        if surfaces is not None:
+            board.ellipsoids("mixture", surfaces.means, surfaces.covariances)
         scores = {
             f"hparam/auc_{built.row['method']}_{built.row['resolution']:g}m": built.row["auc"]
             for built in outcome.shown

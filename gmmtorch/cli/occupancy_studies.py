@@ -1,147 +1,89 @@
-"""Studies: experiments that ask more of gmmtorch-occupancy than a row for each method.
-
-To add one: a function here that makes its rows and figures, its options in `schema`, and a file in
-conf/experiment that says what it runs on.
-"""
+"""The studies of gmmtorch-occupancy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common, maps
+from gmmtorch.cli.structured import build
+from gmmtorch.cli.studies import Found, Study
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Event
-    from gmmtorch.scan import Scan
-
-Rows = list[dict[str, Any]]
-Keep = Callable[[Rows], object]
+    from gmmtorch.evaluation.events import Event, OnRows
+    from gmmtorch.evaluation.protocol_options import Protocol
 
 
-class Found(NamedTuple):
-    """Rows of results.json, figures by file name, columns of the table, and what it is about.
+def protocol_of(config: DictConfig) -> Protocol:
+    """The held-out test from `evaluation.*`."""
+    from gmmtorch.evaluation.protocol_options import Protocol
 
-    shown: the rows of the table; all of them if None.
-    """
-
-    rows: Rows
-    figures: dict[str, Any]
-    table: str
-    about: str
-    shown: Rows | None = None
+    return build(Protocol, common.as_options(config.evaluation), "evaluation")
 
 
-def run(config: DictConfig, device: str, folder: Path, on_event: Event) -> Rows:
-    """Make the rows of the study that `config.study` names, and show them.
-
-    results.json is written with each row; then the figures, as PNG and in TensorBoard, and the table.
-    """
-    from gmmtorch.errors import InvalidArgumentError
-
-    if config.study.name not in STUDIES:
-        raise InvalidArgumentError(
-            f"study.name={config.study.name!r} is not known; known are {', '.join(STUDIES)}."
-        )
-
-    def keep(rows: Rows) -> None:
-        common.write_results("occupancy", config, rows, folder)
-
-    found = STUDIES[config.study.name](config, device, on_event, keep)
-    keep(found.rows)
-    shown = found.rows if found.shown is None else found.shown
-    common.save_figures(config, found.figures, folder)
-    if config.report.tensorboard:
-        from gmmtorch.report.tensorboard_writer import Board
-
-        with Board(folder / "tensorboard") as board:
-            for step, row in enumerate(shown):
-                board.scalars(row, str(row["method"]), step=step)
-            for name, figure in found.figures.items():
-                board.figure(f"figures/{name}", figure)
-    common.print_table(shown, found.table.split(), found.about)
-    return found.rows
-
-
-def _options(config: DictConfig) -> dict[str, Any]:
-    """The options `study.*` but for the study's name."""
-    return {name: value for name, value in common.as_options(config.study).items() if name != "name"}
-
-
-def _scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
-    dataset = common.open_dataset(config.dataset)
-    return dataset.name, common.read_scans(dataset, range(len(dataset)), device, on_event)
-
-
-def _auc_memory(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
-    """Our map and BGK's at each of their sizes, and `study.others` at the one they have."""
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation import held_out as occupancy
-    from gmmtorch.evaluation import methods as contenders
+def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    """Our map and the BGK map at each of their sizes, and `study.others` at their only size."""
+    from gmmtorch.evaluation import methods
     from gmmtorch.evaluation.studies import auc_memory
     from gmmtorch.evaluation.studies.auc_memory import Sized
-    from gmmtorch.mapping.query_options import check_method
+    from gmmtorch.evaluation.studies.study_options import AucMemoryStudy
     from gmmtorch.report.studies import auc_memory_figures as report
 
-    protocol = occupancy.Protocol(**common.as_options(config.evaluation))
-    options = _options(config)
-    for form in options["forms"]:
-        check_method(form)
-    found = [
-        Sized(form, n, contenders.Form(maps.map_factory(config, n_components=n), form))
-        for form in options["forms"]
-        for n in options["n_components"]
+    protocol = protocol_of(config)
+    study = build(AucMemoryStudy, common.as_options(config.study), "study")
+    sized = [
+        Sized(form, n, methods.Form(maps.map_factory(config, n_components=n), form))
+        for form in study.forms
+        for n in study.n_components
     ]
     limits = maps.limits(config)
-    found += [
-        Sized("bgk_points", n, contenders.baseline("bgk_points", limits, max_points=n))
-        for n in options["bgk_points"]
+    sized += [
+        Sized("bgk_points", n, methods.baseline("bgk_points", limits, max_points=n)) for n in study.bgk_points
     ]
-    others = contenders.choose(options["others"], maps.known_methods(config)) if options["others"] else {}
-    found += [Sized(name, None, factory) for name, factory in others.items()]
-    if not found:
-        raise InvalidArgumentError(
-            "study.n_components, .bgk_points and .others leave no map; give one of them."
-        )
-    for sized in found:
-        maps.check_factories({sized.method: sized.factory}, protocol.resolution[0])
-    name, scans = _scans(config, device, on_event)
-    rows = auc_memory.run(name, scans, found, protocol, config.seed, on_event, keep)
+    if study.others:
+        others = methods.choose(study.others, maps.known_methods(config))
+        sized += [Sized(name, None, factory) for name, factory in others.items()]
+    for one in sized:
+        maps.check_factories({one.method: one.factory}, protocol.resolution[0])
+    name, scans = common.all_scans(config, device, on_event)
+    rows = auc_memory.run(name, scans, sized, protocol, config.seed, on_event, on_rows)
     table = "method size resolution auc auc_low auc_high brier nbytes build_seconds query_seconds"
-    return Found(rows, report.figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, lambda: report.figures(rows), table, f"{name}: {len(scans)} scans")
 
 
-def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
-    """Maps of several sizes under several thresholds."""
+def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    """Maps of several sizes with several thresholds."""
     import torch
 
     from gmmtorch.evaluation.studies import variance_threshold
-    from gmmtorch.mapping.query_options import check_method
+    from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
+    from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.report.studies import variance_threshold_figures as report
 
-    options = _options(config)
-    method = options.pop("method")
-    check_method(method)
-    study = variance_threshold.ThresholdStudy(**options)
-    name, scans = _scans(config, device, on_event)
+    study = build(VarianceThresholdStudy, common.as_options(config.study), "study")
+    name, scans = common.all_scans(config, device, on_event)
 
-    def new_map(n: int) -> Any:
+    def new_map(n: int) -> GaussianMap:
         return maps.map_factory(config, n_components=n)()
 
-    found = variance_threshold.run(name, scans, new_map, study, method, config.seed, on_event, keep)
-    figures = report.figures(found.rows)
-    if found.hits.shape[1] == 3:
-        low, high = report.closest_look(found.thin if len(found.thin) else found.hits, found.hits)
-        asked = {
-            n: lambda points, built=built: torch.as_tensor(built.occupancy(points, study.resolution, method))
-            for n, built in found.maps.items()
-        }
-        figures["variance_threshold_cells"] = report.cells_figure(
-            asked, study.variance_threshold, found.hits, low, high, study.resolution
-        )
+    found = variance_threshold.run(name, scans, new_map, study, config.seed, on_event, on_rows)
+
+    def figures() -> dict[str, object]:
+        drawn: dict[str, object] = dict(report.figures(found.rows))
+        if found.hits.shape[1] == 3:
+            low, high = report.closest_look(found.thin if len(found.thin) else found.hits, found.hits)
+            occupancies = {
+                n: lambda points, built=built: torch.as_tensor(
+                    built.occupancy(points, study.resolution, study.method)
+                )
+                for n, built in found.maps.items()
+            }
+            drawn["variance_threshold_cells"] = report.cells_figure(
+                occupancies, study.variance_threshold, found.hits, low, high, study.resolution
+            )
+        return drawn
+
     table = (
         "n_components variance_threshold occupied_recall thin_recall free_recall share_decided "
         "accuracy_decided auc auc_thin nbytes"
@@ -149,42 +91,39 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, keep: 
     return Found(found.rows, figures, table, f"{name}: {len(scans)} scans")
 
 
-def _approximation_error(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
+def _approximation_error(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     """Every form of evidence against the exact angular form; needs no data set."""
     from gmmtorch.evaluation.studies import approximation_error
+    from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
     from gmmtorch.report.studies import approximation_error_figures as report
 
-    options = approximation_error.Options(**_options(config))
-    rows = approximation_error.run(options, config.seed, on_event, keep)
+    study = build(ApproximationErrorStudy, common.as_options(config.study), "study")
+    rows = approximation_error.run(study, config.seed, on_event, on_rows)
     swept = [row for row in rows if row["study"] == "sweep"]
     table = "method dim hits_max hits_p99 hits_median misses_max misses_p99 misses_median probability_max"
-    return Found(rows, report.figures(rows), table, "errors a ray of one component, at random", swept)
+    return Found(
+        rows, lambda: report.figures(rows), table, "errors per ray of random single components", swept
+    )
 
 
-def _pose_correction(config: DictConfig, device: str, on_event: Event, keep: Keep) -> Found:
-    """Maps of perturbed poses, before and after the poses are put right."""
-    from gmmtorch.errors import InvalidArgumentError
-    from gmmtorch.evaluation import held_out as occupancy
+def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    """Maps from perturbed poses, before and after the correction of the poses."""
     from gmmtorch.evaluation.studies import pose_correction
-    from gmmtorch.mapping.query_options import METHODS, check_method
+    from gmmtorch.evaluation.studies.study_options import PoseCorrectionStudy
     from gmmtorch.report.studies import pose_correction_figures as report
 
-    protocol = occupancy.Protocol(**common.as_options(config.evaluation))
-    methods = _options(config)["methods"]
-    if not methods:
-        raise InvalidArgumentError(f"study.methods is empty; name at least one of {', '.join(METHODS)}.")
-    for method in methods:
-        check_method(method)
+    protocol = protocol_of(config)
+    study = build(PoseCorrectionStudy, common.as_options(config.study), "study")
     new_map = maps.map_factory(config)
-    name, scans = _scans(config, device, on_event)
+    name, scans = common.all_scans(config, device, on_event)
     rows = pose_correction.evaluate_correction(
-        name, scans, new_map, protocol, methods, config.seed, on_event, keep
+        name, scans, new_map, protocol, study.methods, config.seed, on_event, on_rows
     )
     table = "method resolution auc auc_corrected auc_clean n_components nbytes"
-    return Found(rows, report.figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, lambda: report.figures(rows), table, f"{name}: {len(scans)} scans")
 
 
-STUDIES = {
+STUDIES: dict[str, Study] = {
     "approximation_error": _approximation_error,
     "auc_memory": _auc_memory,
     "pose_correction": _pose_correction,

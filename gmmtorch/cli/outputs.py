@@ -1,4 +1,4 @@
-"""What a run writes on a disk that may fail: every file is tried, and what is missing is told once."""
+"""Writes a run's files to a disk that may fail, and reports the missing files once."""
 
 from __future__ import annotations
 
@@ -10,50 +10,52 @@ from pathlib import Path
 
 
 class Outputs:
-    """The files of a run's folder, written one after another, each whether or not those before could be."""
+    """Writes the files of a run's folder; a failed file does not prevent the next ones."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._unwritten: dict[str, list[str]] = {}
-        """What was not written, by why."""
+        self._missing: dict[str, list[str]] = {}
+        """Names of missing files by the reason."""
 
     def written(self, name: str, write: Callable[[Path], object]) -> Path | None:
-        """The file or folder `name` of the run's folder, which `write` fills; None where it cannot."""
+        """Call `write` with the path of the file or folder `name`; returns the path, or None if it fails."""
         path = self.folder / name
         try:
             write(path)
         except OSError as error:
             cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
-            self._unwritten.setdefault(cause.strerror or str(cause), []).append(name)
+            self._missing.setdefault(cause.strerror or str(cause), []).append(name)
             return None
         return path
 
     def check(self) -> None:
-        """Raises `OutputError`, which names all that was not written, and why."""
+        """Raises `OutputError` with the names of the missing files and the reasons."""
         from gmmtorch.errors import OutputError
 
-        if self._unwritten:
-            missing = "; ".join(f"{', '.join(names)} ({why})" for why, names in self._unwritten.items())
+        if self._missing:
+            missing = "; ".join(f"{', '.join(names)} ({why})" for why, names in self._missing.items())
             raise OutputError(
-                f"hydra.run.dir={self.folder} has not got all results: {missing}. Free space there, or give "
-                "another folder."
+                f"hydra.run.dir={self.folder} does not contain all results: {missing}. Free space there, or "
+                "give another folder."
             )
 
 
 @contextmanager
 def terse() -> Iterator[None]:
-    """Within it a disk that fails is told of by whoever has something to write, in a line. Python itself
-    would print a call stack for every record that the log's file does not take, and for the thread that
-    writes TensorBoard's events."""
+    """Suppresses Python's call stacks for a disk that fails; `Outputs` reports the failure in one line.
+
+    Python would print a call stack for each log record that cannot be written, and for TensorBoard's writer
+    thread.
+    """
     raising, hook = logging.raiseExceptions, threading.excepthook
 
-    def told(ended: threading.ExceptHookArgs) -> None:
+    def report(ended: threading.ExceptHookArgs) -> None:
         if not (
             type(ended.thread).__module__.startswith("tensorboard.") and issubclass(ended.exc_type, OSError)
         ):
             hook(ended)
 
-    logging.raiseExceptions, threading.excepthook = False, told
+    logging.raiseExceptions, threading.excepthook = False, report
     try:
         yield
     finally:

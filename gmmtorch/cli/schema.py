@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
+
+from gmmtorch.cli.structured import schema_of
+from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
+from gmmtorch.evaluation.studies.study_options import (
+    ApproximationErrorStudy,
+    AucMemoryStudy,
+    ComponentCountStudy,
+    InitializationStudy,
+    PoseCorrectionStudy,
+    SensorModelStudy,
+    VarianceThresholdStudy,
+)
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.query_options import QueryOptions
 
 
 @dataclass
@@ -53,160 +68,6 @@ class SyntheticBuildingDataset(SyntheticDataset):
 
 
 @dataclass
-class Map:
-    """What every map has: how it answers."""
-
-    name: str = MISSING
-    n_samples: int = 1000000  # Monte Carlo rays
-    sampling: str = "sobol"  # or stratified, plain
-    prior: float = 1.0  # N_p of (3.9)
-    cutoff: float | None = None  # standard deviations at which a component ends; null: 3, or 5 of few points
-    hit_length: float | None = 1.0  # metres; hits weigh as if cells were so deep; null: the side of a cell
-    codec: str = "quantized"  # or float: every number as it is
-
-
-@dataclass
-class WindowedMap(Map):
-    window: int = 20  # scans fitted together
-    n_components: int | None = None  # of a window at most; null: as many as its surfaces ask for
-    noise: float = 0.01  # standard deviation of the range sensor (m)
-    length: float = 0.3  # largest standard deviation (m) along a component
-    min_points: float | None = None  # fewest points a component is made of; null: 6 in 2D, 20 in 3D
-    max_origins: int = 8  # sensor positions kept for a component
-    iterations: int = 5  # of EM
-    max_cells: int = 20000  # more points than this are first summed into cells
-
-
-@dataclass
-class IncrementalMap(Map):
-    n_components: int | None = None  # of the whole map at most; null: no limit
-    max_bytes: int | None = None  # of its file at most; null: no limit
-    window: int | None = None  # scans learned together; null, here and below: from the first scans
-    window_components: int = 500  # of a window at most
-    noise: float | None = None  # standard deviation of the range sensor (m)
-    length: float | None = None  # largest standard deviation (m) along a component where it is learned
-    cell: float | None = None  # side (m) of the cells that points are summed into
-    max_origins: int = 8  # sensor positions kept for a component, at most
-    mean_origins: float | None = 2.0  # and on average; null: as many as there may be
-    iterations: int = 6  # of EM
-    max_cost: float | None = None  # Hellinger distance, squared, up to which components always merge
-    novelty: Any = None  # learn from novel beams only: {} or options of NoveltyRule; null: from all
-
-
-@dataclass
-class Evaluation:
-    test_every: int = 10
-    kept: list[float] = field(default_factory=lambda: [1.0])
-    removal: str = "beams"
-    resolution: list[float] = field(default_factory=lambda: [0.1])
-    free: str = "uniform"
-    unknown: bool = False
-    pose_noise: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    max_beams: int = 1_000_000
-    save_queries: str | None = None
-    save_map: str | None = None
-
-
-@dataclass
-class Mixture:
-    n_components: int | None = 100  # null: as many as the surfaces ask for
-    noise: float = 0.01  # standard deviation of the range sensor (m), for n_components=null
-    init_params: str = "auto"
-    algorithm: str = "auto"
-    max_cells: int | None = None
-    tol: float = 1e-3
-    reg_covar: float = 1e-6
-    max_iter: int = 100
-    n_init: int = 1
-
-
-@dataclass
-class InitializationStudy:
-    name: str = "initialization"
-    n_components: list[int] = field(default_factory=lambda: [4, 8, 32, 64, 128, 256, 512])
-    init_params: list[str] = field(
-        default_factory=lambda: ["random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces"]
-    )
-    n_seeds: int = 3
-
-
-@dataclass
-class ComponentCountStudy:
-    name: str = "component_count"
-    n_components: list[int] = field(default_factory=lambda: [16, 32, 64, 128, 256, 512, 1024])
-    noise: float = 0.01
-    multiples: list[float] = field(default_factory=lambda: [0.5, 1.0, 2.0, 4.0])
-    bandwidths: list[float] = field(default_factory=lambda: [0.4, 0.2, 0.1])
-    window: int = 20
-    window_components: list[int] = field(default_factory=lambda: [25, 50, 100, 200, 400, 800])
-    resolution: float = 0.1
-    test_every: int = 10
-    max_beams: int = 50_000
-    n_samples: int = 1_000_000
-
-
-@dataclass
-class SensorModelStudy:
-    name: str = "sensor_model"
-    sensor: str = "lidar"  # or depth_camera, laser_2d
-    sensor_options: dict[str, Any] = field(default_factory=dict)
-    n_components: list[int] = field(default_factory=lambda: [50, 200])
-    n_points: int = 20_000
-    resolution: float = 0.1
-    test_every: int = 10
-    max_beams: int = 20_000
-    max_iter: int = 50
-    tol: float = 1e-4
-    n_neighbors: int = 16
-    max_origins: int = 8
-    n_samples: int = 1_000_000
-
-
-@dataclass
-class ApproximationErrorStudy:
-    name: str = "approximation_error"
-    dims: list[int] = field(default_factory=lambda: [2, 3])
-    support: float = 100.0
-    prior: float = 1.0
-    n_pixels: int = 24
-    n_components: int = 64
-    n_cells: int = 8
-    n_samples: int = 1024
-    n_large_samples: int = 1 << 17
-    n_scans: int = 1
-    resolution: float = 0.25
-    n_rays: list[int] = field(default_factory=lambda: [1 << n for n in (10, 12, 14, 16, 18)])
-    tolerance: list[float] = field(default_factory=lambda: [0.1, 1e-2, 1e-3, 1e-4])
-
-
-@dataclass
-class PoseCorrectionStudy:
-    name: str = "pose_correction"
-    methods: list[str] = field(default_factory=lambda: ["point"])
-
-
-@dataclass
-class AucMemoryStudy:
-    name: str = "auc_memory"
-    forms: list[str] = field(default_factory=lambda: ["point"])  # of evidence, from our map
-    n_components: list[int] = field(default_factory=lambda: [100, 200, 300, 500, 1000])  # of our map
-    bgk_points: list[int] = field(default_factory=lambda: [500, 1000, 2000, 5000, 10000])  # stored
-    others: list[str] = field(default_factory=lambda: ["occupancy_grid"])  # methods of one size
-
-
-@dataclass
-class VarianceThresholdStudy:
-    name: str = "variance_threshold"
-    method: str = "point"
-    n_components: list[int] = field(default_factory=lambda: [200, 850])
-    variance_threshold: list[float] = field(default_factory=lambda: [0.06, 0.12, 0.18, 0.24])
-    resolution: float = 0.1
-    test_every: int = 5
-    max_beams: int = 40_000
-    thin_radius: float = 0.4
-
-
-@dataclass
 class Stream:
     chunk_points: int = 1 << 17
     sample_points: int = 100_000
@@ -245,7 +106,6 @@ class Occupancy:
     method_options: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
     study: Any = None
-    evaluation: Evaluation = field(default_factory=Evaluation)
     report: OccupancyReport = field(default_factory=OccupancyReport)
     runtime: Runtime = field(default_factory=Runtime)
 
@@ -258,7 +118,6 @@ class Fit:
     scans: list[int] | None = None
     max_points: int | None = None
     test_share: float = 0.1
-    mixture: Mixture = field(default_factory=Mixture)
     method_options: dict[str, Any] = field(default_factory=dict)
     study: Any = None
     points: str | None = None
@@ -545,11 +404,32 @@ class Robot:
     runtime: RobotRuntime = field(default_factory=RobotRuntime)
 
 
+STUDIES: dict[str, type] = {
+    "approximation_error": ApproximationErrorStudy,
+    "auc_memory": AucMemoryStudy,
+    "component_count": ComponentCountStudy,
+    "initialization": InitializationStudy,
+    "pose_correction": PoseCorrectionStudy,
+    "sensor_model": SensorModelStudy,
+    "variance_threshold": VarianceThresholdStudy,
+}
+"""The options of each study by the study's name."""
+
+
+def _map_schema(rule: type) -> type:
+    """Options of a map: of its learning rule, and of its queries."""
+    runtime = ("dtype", "random_state", "memory_limit", "compiled")
+    defaults = {"name": MISSING, "cutoff": None, "hit_length": 1.0, "codec": "quantized"}
+    return schema_of(rule, QueryOptions, without=runtime, **defaults)
+
+
+@functools.cache  # the tests call it often
 def register() -> None:
-    """Make the schemas known to Hydra, under the names that the files in conf/ use."""
+    """Store the schemas in Hydra's config store, under the names that the files in conf/ use."""
     store = ConfigStore.instance()
-    store.store(name="occupancy_schema", node=Occupancy)
-    store.store(name="fit_schema", node=Fit)
+    store.store(name="occupancy_schema", node=schema_of(Occupancy, evaluation=schema_of(Protocol)))
+    mixture = schema_of(FitOptions, without=("dtype", "compiled"))
+    store.store(name="fit_schema", node=schema_of(Fit, mixture=mixture))
     store.store(name="export_schema", node=Export)
     store.store(name="explore_schema", node=Explore)
     store.store(name="robot_schema", node=Robot)
@@ -559,15 +439,10 @@ def register() -> None:
     store.store(group="schema/planner", name="planner", node=PlannerOptions)
     store.store(group="schema/planner", name="tree", node=TreePlannerOptions)
     store.store(group="schema/study", name="trials", node=TrialsStudy)
-    store.store(group="schema/map", name="windowed", node=WindowedMap)
-    store.store(group="schema/map", name="incremental", node=IncrementalMap)
-    store.store(group="schema/study", name="approximation_error", node=ApproximationErrorStudy)
-    store.store(group="schema/study", name="auc_memory", node=AucMemoryStudy)
-    store.store(group="schema/study", name="pose_correction", node=PoseCorrectionStudy)
-    store.store(group="schema/study", name="variance_threshold", node=VarianceThresholdStudy)
-    store.store(group="schema/study", name="component_count", node=ComponentCountStudy)
-    store.store(group="schema/study", name="initialization", node=InitializationStudy)
-    store.store(group="schema/study", name="sensor_model", node=SensorModelStudy)
+    store.store(group="schema/map", name="windowed", node=_map_schema(WindowedRule))
+    store.store(group="schema/map", name="incremental", node=_map_schema(IncrementalRule))
+    for name, study in STUDIES.items():
+        store.store(group="schema/study", name=name, node=schema_of(study, name=name))
     store.store(group="schema/dataset", name="file", node=FileDataset)
     store.store(group="schema/dataset", name="depth_frames", node=DepthFramesDataset)
     store.store(group="schema/dataset", name="mesh", node=MeshDataset)

@@ -1,8 +1,8 @@
-"""Calibration: whether what is called 70 % occupied is occupied 70 times in a hundred.
+"""Calibration of occupancy probabilities: of the points with θ = 0.7, are 70 % occupied?
 
-All of it is relative to the test: one hit and one free point a beam, half of all points occupied,
-where most of space is free. A map that is calibrated here is calibrated for places as likely occupied
-as not; scores of two tests (`evaluation.free=uniform` and `near_surface`, say) are not comparable.
+All scores are relative to the test. The test has one hit and one free point for each beam, so half of its
+points are occupied, while most of real space is free. Scores of two tests with different free points
+(`evaluation.free=uniform` and `near_surface`) are not comparable.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from gmmtorch.occupancy.evidence import CellClass, classify
 
 Binning = Literal["width", "count"]
 N_BINS = 15
-"""Bins of the expected calibration error, of equal width, as in Guo et al. 2017."""
+"""Number of equal-width bins of the expected calibration error, as in Guo et al. 2017."""
 
 PRIORS = (0.1, 0.5, 1.0, 2.0, 5.0)
 VARIANCE_THRESHOLDS = (0.25, 0.2, 0.15, 0.1, 0.06, 0.03)
 
 
 class Reliability(NamedTuple):
-    """A reliability curve: of each bin that is not empty (B,), in order of θ,
+    """A reliability curve: one entry for each non-empty bin (B,), in order of θ.
 
-    predicted: mean θ of its points; observed: share of them that is occupied; n_points: how many they are.
+    predicted: mean θ of the bin's points; observed: share of them that is occupied; n_points: their number.
     """
 
     predicted: np.ndarray
@@ -55,8 +55,8 @@ def reliability(
 ) -> Reliability:
     """Reliability curve of probabilities (M,) of points with labels (M,), 1 occupied and 0 free.
 
-    Bins are of equal width, or hold equally many points ("count"; equal θ are never parted, so ties
-    make fewer bins). A bin holds its upper edge, and the first its lower one too.
+    Bins have equal widths ("width") or equal numbers of points ("count"). Equal θ are always in one bin, so
+    ties reduce the number of bins. A bin contains its upper edge; the first bin also contains its lower edge.
     """
     truth, p = _checked(theta, labels)
     member = _bins(p, n_bins, binning)
@@ -69,9 +69,10 @@ def reliability(
 class BrierParts(NamedTuple):
     """brier = reliability − resolution + uncertainty + within (Murphy 1973; Stephenson et al. 2008).
 
-    reliability: mean squared gap of observed and predicted, 0 is calibrated; resolution: how far the
-    bins' shares differ from the overall one, as large as can be is best; uncertainty: variance of the
-    labels, ¼ for a balanced test; within: what θ varies inside a bin, less what that explains.
+    reliability: mean squared difference of observed and predicted share; 0 is calibrated.
+    resolution: variance of the bins' observed shares about the overall share; larger is better.
+    uncertainty: variance of the labels; ¼ for a balanced test.
+    within: variance of θ inside the bins, minus twice its covariance with the labels there.
     """
 
     brier: float
@@ -84,10 +85,10 @@ class BrierParts(NamedTuple):
 def brier_parts(
     theta: Tensor, labels: Tensor, n_bins: int = N_BINS, binning: Binning = "width"
 ) -> BrierParts:
-    """The Brier score of probabilities (M,) of points with labels (M,), taken apart by bins."""
+    """Decomposition by bins of the Brier score of probabilities (M,) of points with labels (M,)."""
     truth, p = _checked(theta, labels)
     member = _bins(p, n_bins, binning)
-    count = np.maximum(np.bincount(member), 1)  # an empty bin has no member to ask for its mean
+    count = np.maximum(np.bincount(member), 1)  # avoids 0/0; the mean of an empty bin is never used
     predicted, observed = (np.bincount(member, values)[member] / count[member] for values in (p, truth))
     spread, explained = p - predicted, truth - observed
     return BrierParts(
@@ -100,9 +101,9 @@ def brier_parts(
 
 
 def log_loss_bits(theta: Tensor, labels: Tensor) -> float:
-    """Cross-entropy of labels (M,) under probabilities (M,), bits a point: 1 is knowing nothing.
+    """Cross-entropy (bits per point) of labels (M,) under probabilities (M,); θ = ½ everywhere scores 1.
 
-    Probabilities are kept 2⁻⁵² away from 0 and 1, so that one certain mistake costs 52 bits.
+    Probabilities are clipped to [2⁻⁵², 1 − 2⁻⁵²], so one certain mistake costs 52 bits.
     """
     truth, p = _checked(theta, labels)
     least = 2.0**-52
@@ -111,13 +112,13 @@ def log_loss_bits(theta: Tensor, labels: Tensor) -> float:
 
 
 def accuracy(theta: Tensor, labels: Tensor) -> float:
-    """Share of the points called rightly at ½; one of exactly ½ is half right, as if by tossing a coin."""
+    """Share of the points classified correctly with threshold ½; a point with θ = ½ counts one half."""
     truth, p = _checked(theta, labels)
     return float(np.where(p == 0.5, 0.5, (p > 0.5) == (truth == 1)).mean())
 
 
 def scores(theta: Tensor, labels: Tensor) -> dict[str, float]:
-    """`ece`, `log_loss_bits` and `accuracy`, of points that are occupied or free."""
+    """`ece`, `log_loss_bits` and `accuracy` of occupied and free points."""
     return {
         "ece": reliability(theta, labels).expected_error,
         "log_loss_bits": log_loss_bits(theta, labels),
@@ -131,24 +132,24 @@ def prior_and_dead_band(
     priors: Sequence[float] = PRIORS,
     variance_thresholds: Sequence[float] = VARIANCE_THRESHOLDS,
 ) -> list[dict[str, Any]]:
-    """What the prior count N_p and the dead band of (3.10) do, as a row for each pair of the two.
+    """Effect of the prior count N_p and of the dead band (3.10): one row for each pair of both.
 
     Args:
-        theta_of: probabilities (M,) under a prior count, of one test.
+        theta_of: returns the probabilities (M,) of one test for a prior count.
         labels: (M,), 1 occupied and 0 free.
         priors: counts N_p.
-        variance_thresholds: v of the dead band; 0.25 leaves none but exactly ½.
+        variance_thresholds: v of the dead band; with 0.25 only θ = ½ is unknown.
 
-    Rows have `prior, variance_threshold`; `ece, mce, brier, log_loss_bits, accuracy`, which the dead
-    band does not enter; `decided`, the share of the points called occupied or free, and
-    `accuracy_decided`, the share of those called rightly (None if there are none).
+    Rows have `prior, variance_threshold`; `ece, mce, brier, log_loss_bits, accuracy`, which do not depend on
+    the dead band; `decided`, the share of the points classified as occupied or free; and
+    `accuracy_decided`, the share of the decided points that are correct (None if no point is decided).
     """
     rows: list[dict[str, Any]] = []
     occupied = labels == OCCUPIED
     for prior in priors:
         theta = theta_of(prior).cpu()
         curve = reliability(theta, labels)
-        common = {
+        scores_of_prior = {
             "prior": float(prior),
             "ece": curve.expected_error,
             "mce": curve.maximum_error,
@@ -162,7 +163,7 @@ def prior_and_dead_band(
             right = (called == CellClass.OCCUPIED) == occupied.cpu()
             rows.append(
                 {
-                    **common,
+                    **scores_of_prior,
                     "variance_threshold": float(threshold),
                     "decided": float(decided.double().mean()),
                     "accuracy_decided": float(right[decided].double().mean())
@@ -174,22 +175,22 @@ def prior_and_dead_band(
 
 
 def _checked(theta: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and probabilities, float64; raises `InvalidArgumentError` for what is neither."""
+    """Labels and probabilities as float64; raises `InvalidArgumentError` for invalid ones."""
     p = torch.as_tensor(theta).detach().cpu().double().numpy()
     truth = torch.as_tensor(labels).detach().cpu().double().numpy()
     if p.ndim != 1 or p.shape != truth.shape or p.size == 0:
         raise InvalidArgumentError(
-            f"theta has shape {p.shape} and labels {truth.shape}; both must be (M,), of one point at least."
+            f"theta has shape {p.shape} and labels {truth.shape}; both must be (M,) with M ≥ 1."
         )
     if not np.isin(truth, (0, 1)).all():
         raise InvalidArgumentError("labels must be 0, free, or 1, occupied; leave out unknown points.")
     if not ((p >= 0) & (p <= 1)).all():
-        raise InvalidArgumentError("theta holds values outside [0, 1], or NaN; give probabilities.")
+        raise InvalidArgumentError("theta has values outside [0, 1], or NaN; give probabilities.")
     return truth, p
 
 
 def _bins(p: np.ndarray, n_bins: int, binning: Binning) -> np.ndarray:
-    """Bin (M,) of each probability: bins hold their upper edges."""
+    """Bin index (M,) of each probability; a bin contains its upper edge."""
     check_whole("n_bins", n_bins, 1)
     if binning not in get_args(Binning):
         raise InvalidArgumentError(f"binning={binning!r} is not one of {', '.join(get_args(Binning))}.")

@@ -1,4 +1,4 @@
-"""Maps built from training scans, and their scores on held-out ones."""
+"""Builds maps from training scans and scores them on held-out scans."""
 
 from __future__ import annotations
 
@@ -13,69 +13,32 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import calibration, metrics, queries, split
-from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.methods import Form, MapFactory
+from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, UNKNOWN, Queries
 from gmmtorch.files import check_writable
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.scan import Scan
 
-
-def _ignore_rows(rows: list[dict[str, Any]]) -> None:
-    """Nobody wants them before the end."""
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """The test, as the options `evaluation.*` describe it; see docs/commands.md.
-
-    max_beams: held-out beams asked about at most; more are thinned at random.
-    """
-
-    test_every: int = 10
-    kept: Sequence[float] = (1.0,)
-    removal: split.Removal = "beams"
-    resolution: Sequence[float] = (0.1,)
-    free: queries.FreePoints = "uniform"
-    unknown: bool = False
-    pose_noise: Sequence[float] = (0.0, 0.0)
-    max_beams: int = 1_000_000
-    save_queries: str | None = None
-    save_map: str | None = None
-
-    def __post_init__(self) -> None:
-        if not self.kept or not self.resolution:
-            raise InvalidArgumentError(
-                "evaluation.kept and evaluation.resolution need at least one value each."
-            )
-        # All at once and before any map is built, which may take hours.
-        for value in self.resolution:
-            check_resolution(value)
-        for share in self.kept:
-            split.check_share(share)
-        split.check_removal(self.removal)
-        split.check_test_every(self.test_every)
-        split.check_noise(self.pose_noise)
-        queries.check_free(self.free)
-        if self.max_beams < 1:
-            raise InvalidArgumentError(f"max_beams={self.max_beams} must be at least 1.")
-
-
 Answer = Callable[[Tensor], Tensor]
+"""Points (M, D), world metres → occupancy probabilities (M,)."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """One map, and what it answered: `theta` (M,) for `asked`, a row of results, the ROC curve.
+    """One map and its score.
 
-    answer: the method's occupancy (M,) of any points (M, D), at the row's resolution.
+    Attributes:
+        map: the map. answer: its occupancy by the row's method at the row's resolution.
+        row: of results.json.
+        asked: the test points. theta: their occupancy probabilities (M,). roc: their ROC curve.
     """
 
     map: OccupancyMap
     answer: Answer
-    row: dict[str, Any]
+    row: Row
     asked: Queries
     theta: Tensor
     roc: metrics.Roc
@@ -83,9 +46,9 @@ class Built:
 
 @dataclass
 class Outcome:
-    """rows: as in results.json; shown: the maps of the largest share kept, which figures show."""
+    """rows: of results.json; shown: the maps of the largest share kept, for the figures."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     shown: list[Built] = field(default_factory=list)
 
 
@@ -96,19 +59,18 @@ def evaluate(
     protocol: Protocol,
     seed: int = 0,
     on_event: Event = ignore,
-    on_row: Callable[[list[dict[str, Any]]], object] = _ignore_rows,
+    on_row: OnRows = lambda rows: None,
 ) -> Outcome:
     """Build every method's map for every share kept and resolution, and score each on the same test.
 
     Args:
         name: of the data set, for the rows.
-        scans: in the order they were taken, all in memory.
-        factories: the methods, see `choose`.
+        scans: in time order, all in memory.
+        factories: the methods; see `methods.choose`.
         protocol: the test.
-        seed: of the split's thinning, the free points and the bootstrap.
-        on_event: told of progress.
-        on_row: given all rows so far, whenever there is another: so that a run that fails late has
-            something to show.
+        seed: of the random choice of training data, the free points and the bootstrap.
+        on_event: progress callback.
+        on_row: called with all rows so far after each new row, so that a run that fails late keeps its rows.
     """
     if not 0 <= seed < 2**63:
         raise InvalidArgumentError(f"seed={seed} must be a whole number from 0 to 2⁶³ − 1.")
@@ -127,20 +89,20 @@ def evaluate(
     largest = max(protocol.kept)
     for kept in protocol.kept:
         shown = split.keep_share(train, kept, protocol.removal, seed)
-        # A map that answers at any resolution, and by any form, is built once and asked again.
-        at_hand: dict[Any, tuple[OccupancyMap, float]] = {}
+        # A map that serves several resolutions or forms of evidence is built once.
+        cache: dict[Any, tuple[OccupancyMap, float]] = {}
         for method, factory in factories.items():
             label = (
                 f"{'mixture' if isinstance(factory, Form) else method}, {kept:.0%} of the {protocol.removal}"
             )
             shared = factory.new_map if isinstance(factory, Form) else method
             for resolution in protocol.resolution:
-                if shared not in at_hand:
-                    at_hand[shared] = _build(factory(resolution), shown, label, on_event)
-                built, seconds = at_hand[shared]
+                if shared not in cache:
+                    cache[shared] = _build(factory(resolution), shown, label, on_event)
+                built, seconds = cache[shared]
                 if not built.any_resolution:
-                    del at_hand[shared]
-                _aim(built, factory, resolution)
+                    del cache[shared]
+                _set_defaults(built, factory, resolution)
                 answer = _answerer(built, factory, resolution)
                 made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
                 made.row.update(
@@ -161,14 +123,14 @@ def evaluate(
 
 
 def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:
-    """The method's occupancy at a resolution."""
+    """Occupancy by the factory's method at a resolution (m)."""
     if isinstance(factory, Form) and isinstance(built, GaussianMap):
         return lambda points: torch.as_tensor(built.occupancy(points, resolution, factory.form))
     return lambda points: torch.as_tensor(built.occupancy(points, resolution))
 
 
-def _aim(built: OccupancyMap, factory: MapFactory, resolution: float) -> None:
-    """Let the map, and its file, answer by this method and at this resolution unless told otherwise."""
+def _set_defaults(built: OccupancyMap, factory: MapFactory, resolution: float) -> None:
+    """Set the default method and resolution of the map, which its file stores."""
     if isinstance(built, GaussianMap):
         built.resolution = resolution
         built.method = factory.form if isinstance(factory, Form) else built.method
@@ -180,15 +142,15 @@ def _questions(
     asked = queries.hit_and_free(origins, ends, protocol.free, resolution, seed)
     if not protocol.unknown:
         return asked
-    # Of all training rays, at their true poses: what they did not see, no share of them saw.
-    extra = queries.unseen(origins, ends, queries.touched(train, resolution), seed)
+    # All training scans at their true poses: points that they do not observe are unknown for every share.
+    extra = queries.unseen(origins, ends, queries.ray_evidence(train, resolution), seed)
     return Queries(torch.cat([asked.points, extra.points]), torch.cat([asked.labels, extra.labels]))
 
 
 def _build(
     empty: OccupancyMap, scans: Sequence[Scan], label: str, on_event: Event
 ) -> tuple[OccupancyMap, float]:
-    """The map of the scans, and the seconds it took, an unfinished window's fit included."""
+    """The map of the scans, and its build time (s), which includes the fit of an incomplete window."""
     on_event(label, 0, len(scans))
     begin = time.perf_counter()
     for number, scan in enumerate(scans, 1):
@@ -208,7 +170,7 @@ def _score(
     known = asked.labels != UNKNOWN
     curve = metrics.roc(occupied, free)
     low, high = metrics.auc_interval(occupied, free, curve.auc, seed)
-    row: dict[str, Any] = {
+    row: Row = {
         "resolution": float(resolution),
         "auc": curve.auc,
         "auc_low": low,
@@ -248,5 +210,5 @@ _COLUMNS = [
 
 
 def _column(name: str) -> tuple[int, str]:
-    """Order of the fields of a row: those of the contract first."""
+    """Sort key of a row's fields: documented fields first, in their order."""
     return (_COLUMNS.index(name) if name in _COLUMNS else len(_COLUMNS), name)

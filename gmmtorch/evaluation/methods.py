@@ -1,4 +1,4 @@
-"""Every method by name: forms of evidence of our map, and the baselines."""
+"""The mapping methods by name: the forms of evidence of `GaussianMap`, and the baselines."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from gmmtorch.mapping.query_options import METHODS
 from gmmtorch.occupancy.protocol import OccupancyMap
 
 MapFactory = Callable[[float], OccupancyMap]
-"""Makes an empty map for a resolution (m)."""
+"""resolution (m) → an empty map."""
 
-_BASELINES: dict[str, Callable[..., OccupancyMap]] = {
+BASELINES: dict[str, Callable[..., OccupancyMap]] = {
     "occupancy_grid": OccupancyGrid,
     "occupancy_log_odds": partial(OccupancyGrid, log_odds=LogOdds()),
     "hilbert": HilbertMap,
@@ -39,9 +39,9 @@ _BASELINES: dict[str, Callable[..., OccupancyMap]] = {
 
 @dataclass(frozen=True)
 class Form:
-    """A factory of mixture maps that are asked for one form of evidence.
+    """A factory of `GaussianMap`s that are queried by one form of evidence.
 
-    Forms with the same `new_map` answer from the same map: it is built once.
+    Forms with the same `new_map` share one map, which is built once.
     """
 
     new_map: Callable[[], GaussianMap]
@@ -56,21 +56,22 @@ def methods(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     **limits: Any,
 ) -> dict[str, MapFactory]:
-    """Every method by name; `new_map` makes the mixture map that ours answer from.
+    """Every method by name.
 
     Args:
-        options: of one baseline alone, by its name; else its paper's, or those that did best on
-            training scans (see docs/baselines.md).
-        limits: `memory_limit`, `compiled`, `random_state`: for the baselines that take them.
+        new_map: makes the empty `GaussianMap` that the forms of evidence query.
+        options: options of each baseline, by its name. The defaults are those of the baseline's paper, or the
+            best on training scans (see docs/baselines.md).
+        limits: `memory_limit`, `compiled`, `random_state`: given to the baselines that take them.
 
-    Raises `InvalidArgumentError` for options of what is no baseline, or that it does not take.
+    Raises `InvalidArgumentError` for an unknown baseline, or an option that it does not take.
     """
     options = options or {}
     for name in options:
-        if name not in _BASELINES:
+        if name not in BASELINES:
             raise InvalidArgumentError(
-                f"method_options.{name} is not known; known are {', '.join(_BASELINES)}. Options of our own "
-                "map are map.*."
+                f"method_options.{name} is not known; known are {', '.join(BASELINES)}. The options of "
+                "GaussianMap are map.*."
             )
         if not isinstance(options[name], Mapping):
             raise InvalidArgumentError(
@@ -78,27 +79,28 @@ def methods(
             )
     return {
         **{form: Form(new_map, form) for form in METHODS},
-        **{name: baseline(name, limits, **options.get(name, {})) for name in _BASELINES},
+        **{name: baseline(name, limits, **options.get(name, {})) for name in BASELINES},
     }
 
 
 def baseline(name: str, limits: Mapping[str, Any], **options: Any) -> MapFactory:
-    """A factory of a baseline's maps with these options, and those of the limits that it takes."""
-    make = _BASELINES[name]
-    known = set(inspect.signature(make).parameters) - {"resolution"}
+    """A factory of a baseline's maps with these options, and with the limits that it takes."""
+    make = BASELINES[name]
+    parameters = set(inspect.signature(make).parameters)
+    known = parameters - {"resolution"}
     for option in options:
         if option not in known:
             raise InvalidArgumentError(
                 f"method_options.{name}.{option} is not known; {name} takes {', '.join(sorted(known))}."
             )
     chosen = {**{key: value for key, value in limits.items() if key in known}, **options}
-    if "resolution" in inspect.signature(make).parameters:
+    if "resolution" in parameters:
         return lambda resolution: make(resolution, **chosen)
     return lambda resolution: make(**chosen)
 
 
 def choose(names: Sequence[str], known: Mapping[str, MapFactory]) -> dict[str, MapFactory]:
-    """The factories asked for, in that order. An unknown name raises an error that lists the known."""
+    """The factories with these names, in their order. Raises for an unknown name and lists the known ones."""
     if not names:
         raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(known))}.")
     for name in names:

@@ -1,4 +1,4 @@
-"""Scores of probabilities, and of a mixture against its points."""
+"""Scores of occupancy probabilities, and of a mixture against a point cloud."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.errors import InvalidArgumentError
 
 _BINS = 4096
 CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
-"""θ below which a cell is called free, and above which occupied, in the scores of unknown space."""
+"""In `unknown_scores`, cells with θ below the first value are free, and above the second are occupied."""
 
 
 class Roc(NamedTuple):
@@ -26,7 +26,7 @@ class Roc(NamedTuple):
 
 
 def roc(occupied: Tensor, free: Tensor) -> Roc:
-    """ROC of the probabilities given to occupied (P,) and free (Q,) points; ties count one half."""
+    """ROC curve of the probabilities of occupied (P,) and free (Q,) points; ties count one half."""
     from sklearn.metrics import auc, roc_curve
 
     if occupied.numel() == 0 or free.numel() == 0:
@@ -42,8 +42,8 @@ def auc_interval(
 ) -> tuple[float, float]:
     """Bootstrap interval of an AUC: occupied and free points are resampled with replacement.
 
-    Done on the counts of 4096 quantile bins, whose resampling is multinomial; the replicates
-    spread about their own mean, and are centred on the exact AUC.
+    Resamples the counts of 4096 quantile bins, which are multinomial. The replicates are shifted so that
+    their mean is the exact AUC.
     """
     generator = np.random.default_rng(seed)
     scores = torch.cat([occupied, free]).cpu().numpy()
@@ -63,16 +63,16 @@ def auc_interval(
 
 
 def brier(occupied: Tensor, free: Tensor) -> float:
-    """Mean squared difference of probability and truth: 0 is perfect, ¼ is knowing nothing."""
+    """Mean squared difference of probability and label: 0 is perfect, θ = ½ everywhere scores ¼."""
     return float(torch.cat([(1 - occupied) ** 2, free**2]).mean())
 
 
 def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
-    """How well unknown space is told from free space, by the probabilities of either.
+    """Scores of unknown points (U,) against free points (Q,), given their probabilities.
 
-    unknown_auc: by how near θ is to ½. unknown_called_free, unknown_called_occupied: shares of the
-    unknown points; free_recall: share of the free points that are called free. None without
-    unknown points.
+    unknown_auc: AUC of classifying unknown points by |θ − ½|. unknown_called_free, unknown_called_occupied:
+    shares of the unknown points. These three are None without unknown points. free_recall: share of the free
+    points classified as free.
     """
     recall = float((free < CALLED_FREE).double().mean())
     if unknown.numel() == 0:
@@ -87,9 +87,10 @@ def unknown_scores(unknown: Tensor, free: Tensor) -> dict[str, float | None]:
 
 
 class Psnr(NamedTuple):
-    """The two terms of PSNR2, dB: from each point to the nearest drawn one, and the other way round.
+    """The two terms of PSNR2 (dB).
 
-    forward falls when the model misses part of the cloud, backward when it puts points where there are none.
+    forward: from each point to the nearest sample; low if the model misses part of the cloud.
+    backward: from each sample to the nearest point; low if the model has samples outside the cloud.
     """
 
     forward: float
@@ -97,10 +98,10 @@ class Psnr(NamedTuple):
 
 
 def psnr_terms(points: Tensor, sampled: Tensor) -> Psnr:
-    """20 log₁₀(B/RMSE(X, X̂)) and 20 log₁₀(B/RMSE(X̂, X)) in dB, of X (N, D) and X̂ (M, D).
+    """20 log₁₀(B/RMSE(X, X̂)) and 20 log₁₀(B/RMSE(X̂, X)) in dB, for points X (N, D) and samples X̂ (M, D).
 
-    B is the diagonal of the bounding box of X, RMSE is over nearest-neighbour distances. A term is
-    infinite where they are all zero.
+    B is the diagonal of the bounding box of X; RMSE is taken over nearest-neighbour distances. A term is
+    infinite if all these distances are zero.
     """
     x, y = points.cpu().numpy(), sampled.cpu().numpy()
     diagonal = float(np.linalg.norm(x.max(0) - x.min(0)))
@@ -115,9 +116,9 @@ def _psnr(distances: np.ndarray, diagonal: float) -> float:
 
 
 def psnr2(points: Tensor, sampled: Tensor) -> float:
-    """PSNR2 (2.10) in dB of a cloud (N, D) and as many points (N, D) drawn from its model.
+    """PSNR2 (2.10) in dB of a cloud (N, D) and as many samples (N, D) of its model.
 
-    The sum of both terms (see `psnr_terms`); infinite where either is.
+    It is the sum of the terms of `psnr_terms`, and infinite if one of them is.
     """
     terms = psnr_terms(points, sampled)
     return math.inf if math.inf in terms else sum(terms)

@@ -1,4 +1,4 @@
-"""Trials over seeds: their mean with its confidence band, and what one way gains on another."""
+"""Statistics over trials with several seeds: means with confidence bands, and paired differences."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gmmtorch.scan import ArrayLike
 
 
 class Band(NamedTuple):
-    """mean (T,) over trials, and low (T,), high (T,): where the expected value lies."""
+    """Mean (T,) over trials, and the confidence limits low (T,) and high (T,) of the expected value."""
 
     mean: np.ndarray
     low: np.ndarray
@@ -21,7 +21,7 @@ class Band(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A mean over trials, and low and high: where the expected value lies."""
+    """Mean over trials, and the confidence limits low and high of the expected value."""
 
     mean: float
     low: float
@@ -29,10 +29,10 @@ class Interval(NamedTuple):
 
 
 def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
-    """Mean of S curves (S, T) and Student's interval of it, at each of T times.
+    """Mean of S curves (S, T) and its Student's t interval at each of T times.
 
-    mean ± t_{S−1} s/√S, with s the standard deviation of the sample. One curve alone says nothing of
-    the spread: its band reaches from −∞ to ∞.
+    mean ± t_{S−1} s/√S, with s the sample standard deviation. For S = 1 the spread is unknown, and the band
+    is (−∞, ∞).
 
     Raises `InvalidArgumentError` for no curve, values that are not finite, or a confidence outside (0, 1).
     """
@@ -40,7 +40,7 @@ def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
 
     values = _finite("curves", curves, 2)
     if len(values) == 0:
-        raise InvalidArgumentError(f"curves has shape {values.shape}; give one trial at least.")
+        raise InvalidArgumentError(f"curves has shape {values.shape}; give at least one trial.")
     if not 0 < confidence < 1:
         raise InvalidArgumentError(f"confidence={confidence} must lie between 0 and 1; 0.95 is usual.")
     n, mean = len(values), values.mean(0)
@@ -51,14 +51,14 @@ def mean_band(curves: ArrayLike, confidence: float = 0.95) -> Band:
 
 
 def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Student's interval of the mean of a − b, over trials (S,) that share seed and start, in their order.
+    """Student's t interval of the mean of a − b, over pairs of trials (S,) with the same seed and start.
 
-    What the trials of one seed have in common cancels. A single pair gives −∞ … ∞, as `mean_band` does.
+    Pairing removes the variance that both trials of a seed share. A single pair gives (−∞, ∞).
     """
     first, second = _finite("a", a, 1), _finite("b", b, 1)
     if first.shape != second.shape:
         raise InvalidArgumentError(
-            f"a has shape {first.shape} and b {second.shape}; each trial of one needs its pair in the other."
+            f"a has shape {first.shape} and b {second.shape}; they must have one trial for each seed."
         )
     return Interval(*(float(value[0]) for value in mean_band((first - second)[:, None], confidence)))
 
@@ -66,16 +66,16 @@ def paired_interval(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> Int
 def time_to_share(times: ArrayLike, reduction: ArrayLike, reference: float, share: float) -> float | None:
     """First time (s) at which `reduction` (T,) reaches `share` of `reference`; None if it never does.
 
-    Linear between the times (T,), which do not fall. Where the reference is no reduction at all
-    (zero or less) there is nothing to reach: None.
+    The reduction is linear between the times (T,). A reference of zero or less also gives None.
 
-    Raises `InvalidArgumentError` for shapes that disagree, falling times, values that are not finite,
+    Raises `InvalidArgumentError` for shapes that disagree, decreasing times, values that are not finite,
     or a share outside (0, 1].
     """
     when, value = _finite("times", times, 1), _finite("reduction", reduction, 1)
     if when.shape != value.shape or (np.diff(when) < 0).any():
         raise InvalidArgumentError(
-            f"times has shape {when.shape} and reduction {value.shape}; give one value a time, in order."
+            f"times has shape {when.shape} and reduction {value.shape}; give one value for each time, with "
+            "increasing times."
         )
     if not 0 < share <= 1:
         raise InvalidArgumentError(f"share={share} must lie in (0, 1].")
@@ -93,21 +93,23 @@ def time_to_share(times: ArrayLike, reduction: ArrayLike, reference: float, shar
 
 
 def on_common_times(times: Sequence[ArrayLike], curves: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
-    """All times (T,) of several trials within the span that all of them cover, and the curves (S, T) there.
+    """Curves (S, T) of several trials, interpolated at common times (T,); returns the times and the curves.
 
-    Linear between a trial's own times. Raises `InvalidArgumentError` where there is no trial, where one
-    is empty, or where their spans do not meet.
+    The times are all times of all trials within the interval that every trial covers. Interpolation is
+    linear. Raises `InvalidArgumentError` without trials, for an empty trial, or if the trials have no
+    common interval.
     """
     if len(times) != len(curves) or len(times) == 0:
         raise InvalidArgumentError(
-            f"times has {len(times)} and curves {len(curves)} trials; give as many, and one at least."
+            f"times has {len(times)} and curves {len(curves)} trials; give equally many, at least one."
         )
     when = [_finite("times", t, 1) for t in times]
     values = [_finite("curves", c, 1) for c in curves]
     for t, c in zip(when, values, strict=True):
         if t.shape != c.shape or len(t) == 0 or (np.diff(t) < 0).any():
             raise InvalidArgumentError(
-                f"times has shape {t.shape} and its curve {c.shape}; give one value a time, in order."
+                f"times has shape {t.shape} and its curve {c.shape}; give one value for each time, with "
+                "increasing times."
             )
     start, stop = max(t[0] for t in when), min(t[-1] for t in when)
     if stop < start:
@@ -117,11 +119,11 @@ def on_common_times(times: Sequence[ArrayLike], curves: Sequence[ArrayLike]) -> 
 
 
 def _finite(name: str, values: ArrayLike, n_axes: int) -> np.ndarray:
-    # Not by way of a tensor: lists of numbers would become float32.
+    # Lists are not converted through a tensor, which would make them float32.
     plain = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
     array = np.asarray(plain, dtype=np.float64)
     if array.ndim != n_axes or not np.isfinite(array).all():
         raise InvalidArgumentError(
-            f"{name} has shape {array.shape}; expected {n_axes} axes and finite values alone."
+            f"{name} has shape {array.shape}; expected {n_axes} axes and only finite values."
         )
     return array

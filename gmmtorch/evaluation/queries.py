@@ -1,4 +1,4 @@
-"""Points whose truth is known from held-out beams."""
+"""Test points whose true state is known from held-out beams."""
 
 from __future__ import annotations
 
@@ -7,53 +7,47 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.evaluation.protocol_options import FreePoints
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 from gmmtorch.scan import Scan
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
-FreePoints = Literal["uniform", "near_surface", "clear"]
 
 
 @dataclass(frozen=True)
 class Queries:
-    """points (M, D), world metres; labels (M,) int64: 0 free, 1 occupied, 2 never seen in training."""
+    """Test points (M, D), world metres, and labels (M,) int64: 0 free, 1 occupied, 2 unknown."""
 
     points: Tensor
     labels: Tensor
 
     def of(self, label: int) -> Tensor:
-        """Which points (M,) have this label."""
+        """Mask (M,) of the points with this label."""
         return self.labels == label
 
 
-def check_free(free: str) -> None:
-    """Raises for a choice of free points that is not known."""
-    if free not in get_args(FreePoints):
-        raise InvalidArgumentError(f"free={free!r} is not one of {', '.join(get_args(FreePoints))}.")
-
-
 def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Origins and ends (B, D) of the beams of the test scans that hit something.
+    """Origins and ends (B, D) of the return beams of the test scans.
 
-    More than `max_beams` are thinned to that many at random.
+    Draws a random subset of `max_beams` if there are more.
     """
-    # On the CPU, where the random numbers are: so every device is asked about the same points.
+    # The random numbers are drawn on the CPU, so that the test points are the same on every device.
     ends = torch.cat([scan.points.double().cpu() for scan in scans])
     origins = torch.cat([scan.origin.double().cpu().expand(scan.points.shape[0], -1) for scan in scans])
     measured = (ends != origins).any(1)
     origins, ends = origins[measured], ends[measured]
     if ends.shape[0] == 0:
         raise InvalidArgumentError(
-            "The held-out scans have no beam that hit anything, so there is nothing to test on; "
-            "check dataset.max_range, or change evaluation.test_every."
+            "The held-out scans have no return beams, so there are no test points; check dataset.max_range, "
+            "or change evaluation.test_every."
         )
     if ends.shape[0] > max_beams:
         generator = torch.Generator().manual_seed(seed)
@@ -63,13 +57,13 @@ def test_beams(scans: Sequence[Scan], max_beams: int, seed: int) -> tuple[Tensor
 
 
 def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: float, seed: int) -> Queries:
-    """One hit and one free point a beam.
+    """One occupied point (the hit) and one free point for each beam.
 
-    The free point is uniform along the beam; or half to two cells before the hit ("near_surface",
-    which shows how thick a map's surfaces are), never before the sensor; or uniform, but left out
-    within one cell of the hit ("clear": a share of uniform points is too near to be told apart).
+    free: "uniform": uniform along the beam. "near_surface": 0.5 to 2 cells before the hit, but not behind the
+    sensor; this measures how thick a map's surfaces are. "clear": uniform, but points within one cell of the
+    hit are left out, because a cell can contain both.
     """
-    check_free(free)
+    check_choice("free", free, get_args(FreePoints))
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
     if free == "near_surface":
@@ -82,8 +76,8 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
     return Queries(torch.cat([ends, points]), labels)
 
 
-def touched(scans: Sequence[Scan], resolution: float) -> BlockEvidence:
-    """Evidence in every cell that a beam of the scans touched, the ends of empty beams included."""
+def ray_evidence(scans: Sequence[Scan], resolution: float) -> BlockEvidence:
+    """Evidence in every cell that a beam of the scans crosses, no-return beams included."""
     seen = BlockEvidence(resolution, scans[0].dim)
     for scan in scans:
         ends = torch.cat([scan.points, scan.no_return]).double().cpu()
@@ -92,31 +86,31 @@ def touched(scans: Sequence[Scan], resolution: float) -> BlockEvidence:
 
 
 def unseen(origins: Tensor, ends: Tensor, seen: BlockEvidence, seed: int) -> Queries:
-    """Points 2 to 12 cells behind test hits that no training ray came near.
+    """Points 2 to 12 cells behind test hits that no training beam observed.
 
-    `seen` is what `touched` makes of the training scans at the resolution in question; a point
-    stays only if its cell and all its neighbours (8 in 2D, 26 in 3D) have no evidence.
+    `seen` is the `ray_evidence` of the training scans. A point is kept only if its cell and all neighbouring
+    cells (8 in 2D, 26 in 3D) have no evidence.
     """
     generator = torch.Generator().manual_seed(seed + 1)
     behind = 2 + 10 * torch.rand(ends.shape[0], generator=generator, dtype=torch.float64)
     direction = (ends - origins) / (ends - origins).norm(dim=1, keepdim=True)
     points = ends + direction * (behind * seen.resolution)[:, None]
-    untouched = torch.ones(points.shape[0], dtype=torch.bool)
+    unobserved = torch.ones(points.shape[0], dtype=torch.bool)
     for offset in itertools.product((-1, 0, 1), repeat=points.shape[1]):
         shift = torch.tensor(offset, dtype=torch.float64) * seen.resolution
         hits, misses = seen.evidence_at(points + shift)
-        untouched &= hits + misses == 0
-    kept = points[untouched]
+        unobserved &= hits + misses == 0
+    kept = points[unobserved]
     return Queries(kept, torch.full((kept.shape[0],), UNKNOWN))
 
 
 def save_queries(
     path: str | Path, by_resolution: dict[float, Queries], train: Sequence[int], test: Sequence[int]
 ) -> None:
-    """Write the very test points as NPZ: points, labels, resolution, train_scans, test_scans.
+    """Write the test points as NPZ: points, labels, resolution, train_scans, test_scans.
 
-    `resolution` (M,) says at which resolution a point is asked about, and is 0 for points that are
-    the same at all of them.
+    `resolution` (M,) is the resolution at which a point is queried; 0 if the points are the same at all
+    resolutions.
     """
     each = list(by_resolution.items())
     first = each[0][1]

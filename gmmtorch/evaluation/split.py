@@ -1,17 +1,20 @@
-"""Which scans train and which test, and what is kept of those that train."""
+"""Split of scans into training and test scans, removal of training data, and perturbed poses."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.evaluation.protocol_options import (
+    Removal,
+    check_noise,
+    check_share,
+    check_test_every,
+)
 from gmmtorch.scan import Scan
-
-Removal = Literal["beams", "scans"]
 
 
 def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
@@ -19,47 +22,20 @@ def split_indices(n_scans: int, test_every: int) -> tuple[list[int], list[int]]:
     check_test_every(test_every)
     if n_scans < 2:
         raise InvalidArgumentError(
-            f"The data set has {n_scans} scans; at least 2 are needed, one to learn from and one to test on."
+            f"The data set has {n_scans} scans; at least 2 are needed: one for training and one for the test."
         )
     test = list(range(0, n_scans, test_every))
     held_out = set(test)
     return [i for i in range(n_scans) if i not in held_out], test
 
 
-def check_share(share: float) -> None:
-    """Raises unless the share kept lies in (0, 1]."""
-    if not 0 < share <= 1:
-        raise InvalidArgumentError(f"kept={share} must be a share in (0, 1].")
-
-
-def check_removal(removal: str) -> None:
-    """Raises for a removal that is not known."""
-    if removal not in get_args(Removal):
-        raise InvalidArgumentError(f"removal={removal!r} is not one of {', '.join(get_args(Removal))}.")
-
-
-def check_noise(noise: Sequence[float]) -> tuple[float, float]:
-    """Standard deviations (m, rad); raises unless they are two finite numbers ≥ 0."""
-    if len(noise) != 2 or not all(math.isfinite(x) and x >= 0 for x in noise):
-        raise InvalidArgumentError(f"pose_noise={list(noise)} must be two numbers ≥ 0: metres and radians.")
-    return float(noise[0]), float(noise[1])
-
-
-def check_test_every(test_every: int) -> None:
-    """Raises unless some scans are left to train on."""
-    if test_every < 2:
-        raise InvalidArgumentError(
-            f"test_every={test_every} must be at least 2: with 1 every scan is held out and none is left."
-        )
-
-
 def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int) -> list[Scan]:
-    """The scans with a random share of their beams, or a random share of the scans.
+    """Keeps a random share of the beams of each scan, or a random share of the scans.
 
-    Smaller shares are subsets of larger ones with the same seed.
+    With the same seed, a smaller share is a subset of a larger one.
     """
     check_share(share)
-    check_removal(removal)
+    check_choice("removal", removal, get_args(Removal))
     if share == 1:
         return list(scans)
     generator = torch.Generator().manual_seed(seed)
@@ -70,9 +46,9 @@ def keep_share(scans: Sequence[Scan], share: float, removal: Removal, seed: int)
 
 
 def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[torch.Tensor]:
-    """A random rigid motion (D+1, D+1) of each scan about its sensor, float64.
+    """A random rigid motion (D+1, D+1) of each scan about its sensor origin, float64.
 
-    `noise`: standard deviations of the shift along each axis (m) and of the rotation about each
+    `noise`: standard deviations of the translation along each axis (m) and of the rotation about each
     axis (rad).
     """
     shift, angle = check_noise(noise)
@@ -91,7 +67,7 @@ def pose_perturbations(scans: Sequence[Scan], noise: Sequence[float], seed: int)
 
 
 def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> list[Scan]:
-    """Each scan moved by its motion of `pose_perturbations`; as it is without noise."""
+    """Each scan moved by its motion of `pose_perturbations`; unchanged if both deviations are zero."""
     if check_noise(noise) == (0, 0):
         return list(scans)
     motions = pose_perturbations(scans, noise, seed)
@@ -99,7 +75,7 @@ def perturb_poses(scans: Sequence[Scan], noise: Sequence[float], seed: int) -> l
 
 
 def _rotation(turn: torch.Tensor) -> torch.Tensor:
-    """Rotation matrix of an angle (1,) or of a rotation vector (3,): exp of the skew matrix."""
+    """Rotation matrix of an angle (1,) or of a rotation vector (3,): exponential of the skew matrix."""
     skew = torch.zeros(2 if turn.shape[0] == 1 else 3, 2 if turn.shape[0] == 1 else 3, dtype=torch.float64)
     if turn.shape[0] == 1:
         skew[0, 1], skew[1, 0] = -turn[0], turn[0]

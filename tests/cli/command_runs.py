@@ -1,4 +1,4 @@
-"""Running a command inside the test's own process, and in one of its own."""
+"""Runs commands in the process of the test, and in a new process."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, fit, occupancy, schema
+from gmmtorch.cli import common, export, fit, occupancy, schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
-COMMANDS = {"occupancy": occupancy, "fit": fit}
+COMMANDS = {"occupancy": occupancy, "fit": fit, "export": export}
 QUIET = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
 TINY = {
     "occupancy": ["dataset.n_scans=10", "map.n_samples=20000"],
@@ -41,7 +41,7 @@ def composed(command: str, *overrides: str) -> DictConfig:
 
 @dataclass
 class Finished:
-    """How a command ended: exit status, what it printed, and its run directory."""
+    """The exit status of a command, its output, and its run directory."""
 
     status: int
     stdout: str
@@ -49,16 +49,16 @@ class Finished:
     folder: Path
 
     def results(self) -> dict[str, Any]:
-        """results.json; NaN and infinity, which JSON has not, are errors."""
+        """results.json; NaN and infinity, which JSON does not have, are errors."""
 
         def refuse(text: str) -> float:
-            raise ValueError(f"results.json holds {text}")
+            raise ValueError(f"results.json contains {text}")
 
         found: dict[str, Any] = json.loads((self.folder / "results.json").read_text(), parse_constant=refuse)
         return found
 
     def files(self) -> set[str]:
-        """Every file of the run directory, the hidden ones too."""
+        """Every file of the run directory, hidden files included."""
         return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
 
 
@@ -68,7 +68,7 @@ def succeeded(done: Finished) -> Finished:
 
 
 def refused(done: Finished) -> str:
-    """The one line that a command ends with when something is wrong."""
+    """The one-line error of a command that failed before it wrote results."""
     assert done.status == 1
     assert not (done.folder / "results.json").exists()
     lines = done.stderr.splitlines()
@@ -79,7 +79,7 @@ def refused(done: Finished) -> str:
 
 @contextlib.contextmanager
 def as_it_was() -> Iterator[None]:
-    """Hydra's own state and the loggers that it sets up are put back."""
+    """Restores Hydra's global state and the loggers on exit."""
     root = logging.getLogger()
     handlers, level = list(root.handlers), root.level
     GlobalHydra.instance().clear()
@@ -88,14 +88,14 @@ def as_it_was() -> Iterator[None]:
     finally:
         GlobalHydra.instance().clear()
         for handler in set(root.handlers) - set(handlers):
-            with contextlib.suppress(OSError):  # of a full disk: as logging itself does in the end
+            with contextlib.suppress(OSError):  # the disk may be full
                 handler.close()
         root.handlers, root.level = handlers, level
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch, command: str, folder: Path, *options: str) -> Finished:
-    """Run a command in this process: quick, as torch is loaded already."""
-    flags = [option for option in options if option.startswith("-")]  # which Hydra wants first
+    """Run a command in this process, which is fast because torch is loaded."""
+    flags = [option for option in options if option.startswith("-")]  # Hydra expects these first
     overrides = [option for option in options if option not in flags]
     monkeypatch.setattr(sys, "argv", [command, *flags, f"hydra.run.dir={folder}", *overrides])
     stdout, stderr = io.StringIO(), io.StringIO()
@@ -105,15 +105,14 @@ def run_here(monkeypatch: pytest.MonkeyPatch, command: str, folder: Path, *optio
             COMMANDS[command].main()
         except SystemExit as end:
             status = end.code
-            if isinstance(status, str):  # what the interpreter does with it
+            if isinstance(status, str):  # as the interpreter does
                 print(status, file=sys.stderr)
                 status = 1
     return Finished(status or 0, stdout.getvalue(), stderr.getvalue(), folder)
 
 
 class Disk:
-    """Of this process: as a full disk refuses to, so does the kernel to let a file grow. Within its context,
-    as pytest's own output may be a file."""
+    """Simulates a full disk for this process by a limit of the file size; removes the limit on exit."""
 
     def __init__(self) -> None:
         self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -132,25 +131,25 @@ class Disk:
 
 
 def environment() -> dict[str, str]:
-    """For subprocesses: no display, no paths that the checkout's scripts would not have themselves."""
+    """Environment of subprocesses: no display, and no PYTHONPATH, so scripts must find the checkout."""
     return {**os.environ, "MPLBACKEND": "agg", "OMP_NUM_THREADS": "1", "PYTHONPATH": ""}
 
 
 def run_script(command: str, folder: Path, *options: str) -> Finished:
-    """Run scripts/COMMAND.py of the checkout in a process of its own, from some other directory."""
+    """Run scripts/COMMAND.py of the checkout in a new process, from another directory."""
     arguments = [str(CHECKOUT / "scripts" / f"{command}.py"), f"hydra.run.dir={folder}", *options]
     done = run_python(arguments, cwd=folder.parent)
     return Finished(done.returncode, done.stdout, done.stderr, folder)
 
 
 def run_python(arguments: Sequence[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run Python with these arguments."""
+    """Run Python with these arguments in a new process."""
     return subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, env=environment(), capture_output=True, text=True, timeout=120
+        [sys.executable, *arguments], cwd=cwd, env=environment(), capture_output=True, text=True, timeout=180
     )
 
 
 def timeless(results: dict[str, Any]) -> dict[str, Any]:
-    """results.json without what a clock says."""
+    """results.json without times."""
     rows = [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in results["rows"]]
     return {**results, "rows": rows}

@@ -1,4 +1,4 @@
-"""gmmtorch-occupancy with every method: files that answer the same, their options, bytes, and close looks."""
+"""gmmtorch-occupancy with every method: saved maps, method options, byte budgets, and map regions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gmmtorch.baselines.hilbert_map import HilbertMap
 from gmmtorch.baselines.ndt_map import NDTMap
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap
-from gmmtorch.evaluation import methods as contenders
+from gmmtorch.evaluation import methods
 from gmmtorch.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -50,7 +50,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def all_methods(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """One run of every method, with its maps in maps/ and its test in queries.npz of the run's folder."""
+    """One run of every method, with its maps in maps/ and its test points in queries.npz."""
     pytest.importorskip("pyoctomap")
     folder = tmp_path_factory.mktemp("all") / "run"
     options = [f"evaluation.save_map={folder / 'maps'}", f"evaluation.save_queries={folder / 'queries.npz'}"]
@@ -59,13 +59,13 @@ def all_methods(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         return succeeded(run_here(patch, "occupancy", folder, *SMALL, f"method=[{names}]", *options))
 
 
-def test_these_are_all_the_methods():
-    assert set(contenders.methods(GaussianMap)) == {*OURS, *BASELINES}
+def test_all_methods_are_tested():
+    assert set(methods.methods(GaussianMap)) == {*OURS, *BASELINES}
 
 
 @pytest.mark.parametrize("method", [*OURS, *BASELINES])
-def test_a_saved_map_answers_the_test_as_the_map_did(method, all_methods):
-    """The file alone, asked at the run's test points, has the area, the score and the bytes of the row."""
+def test_a_saved_map_reproduces_its_row(method, all_methods):
+    """The loaded file has the AUC, the Brier score and the bytes of the row at the saved test points."""
     (row,) = (row for row in all_methods.results()["rows"] if row["method"] == method)
     kind = BASELINES.get(method, GaussianMap)
     path = all_methods.folder / "maps" / f"{method}_1_0.25{kind.suffix}"
@@ -85,7 +85,7 @@ def test_a_saved_map_answers_the_test_as_the_map_did(method, all_methods):
     assert (row["n_components"] is None) == (method in BASELINES)
 
 
-def test_nothing_else_is_saved_and_forms_share_one_map(all_methods):
+def test_forms_of_evidence_share_one_map(all_methods):
     maps = {path.name for path in (all_methods.folder / "maps").iterdir()}
     assert len(maps) == len(OURS) + len(BASELINES)
     rows = {row["method"]: row for row in all_methods.results()["rows"]}
@@ -95,7 +95,7 @@ def test_nothing_else_is_saved_and_forms_share_one_map(all_methods):
 # -- options of one method ------------------------------------------------------------------------
 
 
-def test_options_reach_the_baseline_they_are_for(run, tmp_path):
+def test_method_options_reach_their_baseline(run, tmp_path):
     options = "{bgk:{length:0.9,prior:0.01},ndt:{spread:3},hilbert:{features:nystroem,n_features:50}}"
     succeeded(
         run(
@@ -132,7 +132,7 @@ def test_options_reach_the_baseline_they_are_for(run, tmp_path):
         ("+method_options.bgk.length=-1 method=[point,bgk]", "length=-1"),
     ],
 )
-def test_a_bad_option_of_a_method_is_named_in_one_line_before_anything_is_built(options, words, run):
+def test_an_invalid_method_option_gives_a_one_line_error(options, words, run):
     line = refused(run(*options.split()))
     assert all(word in line for word in words.split()), line
 
@@ -140,7 +140,7 @@ def test_a_bad_option_of_a_method_is_named_in_one_line_before_anything_is_built(
 # -- bytes ----------------------------------------------------------------------------------------
 
 
-def test_a_budget_is_kept_by_the_saved_file(run, tmp_path):
+def test_saved_maps_keep_their_byte_budget(run, tmp_path):
     found = {}
     for limit in ("900", "1400", "null"):
         maps = tmp_path / f"maps_{limit}"
@@ -153,15 +153,15 @@ def test_a_budget_is_kept_by_the_saved_file(run, tmp_path):
         assert (maps / "point_1_0.25.safetensors").stat().st_size == row["nbytes"]
         assert GaussianMap.load(maps / "point_1_0.25.safetensors").n_components == row["n_components"]
         found[limit] = row
-    assert 450 < found["900"]["nbytes"] <= 900  # and what there is, is used
+    assert 450 < found["900"]["nbytes"] <= 900  # most of the budget is used
     assert 900 < found["1400"]["nbytes"] <= 1400 < found["null"]["nbytes"]
     assert found["900"]["n_components"] < found["1400"]["n_components"] < found["null"]["n_components"]
 
 
-# -- close looks ----------------------------------------------------------------------------------
+# -- magnified regions ---------------------------------------------------------------------------
 
 
-def test_regions_of_a_2d_map_are_shown_close_up(run):
+def test_regions_of_a_2d_map_are_magnified(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     shown = ["method=[point]", "report.figures=true", "report.tensorboard=true", "report.magnify=2"]

@@ -1,4 +1,4 @@
-"""docs/commands.md: each command's section has all of its options, at the defaults that they have."""
+"""docs/commands.md documents every option of each command with its default."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ CHOICES = [
     *(["explore", f"planner={name}"] for name in ("mcts", "frontier", "random")),
 ]
 SILENT = {"study"}
-"""What only `experiment=` sets; and of each group its name, which is the choice itself."""
+"""Options that only `experiment=` sets."""
 WORDS = {"dataset.max_range", "dataset.no_return_range"}
-"""Options whose defaults depend on others: they are said in words, and not compared."""
+"""Options whose defaults depend on other options; they are described in words and not compared."""
 FREE = {"method_options", "sensor_options"}
-"""Groups of whatever somebody else takes."""
+"""Groups with free names."""
 STUDIES = {
     "occupancy": [
         "fig3_3_approximation_error",
@@ -51,7 +51,7 @@ def configuration(command: str, *overrides: str) -> DictConfig:
 
 
 def options(config: DictConfig, prefix: str = "") -> Iterator[str]:
-    """Dotted names of all that can be set, without the names of choices."""
+    """Dotted names of all options, without the names of choices."""
     for name in config:
         value = None if OmegaConf.is_missing(config, name) else config[name]
         if isinstance(value, DictConfig) and name not in FREE:
@@ -60,7 +60,7 @@ def options(config: DictConfig, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{name}"
 
 
-# -- what is there ----------------------------------------------------------------------------------
+# -- documented options ----------------------------------------------------------------------------
 
 
 def section(command: str) -> list[str]:
@@ -80,8 +80,8 @@ def experiment_section(experiment: str) -> list[str]:
     return LINES[first : following[0] if following else None]
 
 
-def speaks_of(name: str, line: str) -> bool:
-    """Whether a line names an option, in full or as `.last` after another of its group."""
+def names_option(name: str, line: str) -> bool:
+    """Whether a line names an option, in full or as `.last` after another option of its group."""
     group, _, last = name.rpartition(".")
     return (
         f"`{name}`" in line
@@ -91,8 +91,8 @@ def speaks_of(name: str, line: str) -> bool:
 
 
 def is_documented(name: str, command: str) -> bool:
-    """Whether a table of the command's section has the option, or of the section that is referred to."""
-    if any(line.startswith("|") and speaks_of(name, line) for line in section(command)):
+    """Whether a table of the command's section, or of a section that it refers to, has the option."""
+    if any(line.startswith("|") and names_option(name, line) for line in section(command)):
         return True
     if name.startswith("log.map."):  # "as `map` above"
         return is_documented("log.map", command) and is_documented(name.removeprefix("log."), "occupancy")
@@ -108,26 +108,26 @@ def is_documented(name: str, command: str) -> bool:
 
 
 @pytest.mark.parametrize("chosen", CHOICES, ids=" ".join)
-def test_every_option_is_in_the_section_of_its_command(chosen):
+def test_every_option_is_documented_in_the_section_of_its_command(chosen):
     names = set(options(configuration(*chosen))) - SILENT
     assert len(names) > 5
     assert not {name for name in names if not is_documented(name, chosen[0])}
 
 
 @pytest.mark.parametrize(("command", "name"), [(c, name) for c, names in STUDIES.items() for name in names])
-def test_every_option_of_a_study_is_where_the_study_is(command, name):
+def test_every_option_of_a_study_is_documented_with_the_study(command, name):
     config = configuration(command, f"experiment={name}")
     lines = experiment_section(name)
     found = [option for option in options(config) if option.startswith("study.")]
     assert found
-    assert not [option for option in found if not any(speaks_of(option, line) for line in lines)]
+    assert not [option for option in found if not any(names_option(option, line) for line in lines)]
 
 
-# -- at which defaults --------------------------------------------------------------------------------
+# -- documented defaults -----------------------------------------------------------------------------
 
 
 class Row(NamedTuple):
-    """A row of a table of options: names, what it says of their defaults, and what must be chosen first."""
+    """A row of a table of options: its option names, its cell of defaults, and the overrides they need."""
 
     command: str
     chosen: tuple[str, ...]
@@ -136,7 +136,7 @@ class Row(NamedTuple):
 
 
 def rows() -> Iterator[Row]:
-    """Of all tables of options."""
+    """The rows of all tables of options."""
     command, chosen, is_table = "", (), False
     for line in LINES:
         if heading := re.match(r"## gmmtorch-(\w+)", line):
@@ -150,14 +150,14 @@ def rows() -> Iterator[Row]:
         if group := re.match(r"\*\*`(map=\w+)`\*\*", cells[0]):
             chosen = (group[1],)
             continue
-        if cells[0].startswith("`evaluation."):  # the maps are behind us
+        if cells[0].startswith("`evaluation."):  # the rows of maps end here
             chosen = ()
         dataset = re.match(r"`(depth_frames|mesh|mesh_scans)`:", cells[2])
         yield Row(command, (f"dataset={dataset[1]}",) if dataset else chosen, full_names(cells[0]), cells[1])
 
 
 def full_names(cell: str) -> list[str]:
-    """`a.b`, `.c` are a.b and a.c."""
+    """Expands `a.b`, `.c` to a.b and a.c."""
     names: list[str] = []
     for name in re.findall(r"`([^`]+)`", cell):
         names.append(f"{names[-1].rpartition('.')[0]}{name}" if name.startswith(".") else name)
@@ -165,7 +165,7 @@ def full_names(cell: str) -> list[str]:
 
 
 def values(cell: str) -> list[Any]:
-    """What a cell says, separated by commas outside of brackets."""
+    """The values of a cell, which are separated by commas outside of brackets."""
     return [value_of(text) for text in re.findall(r"(?:\[[^]]*\]|\{[^}]*\}|[^,[{])+", cell)]
 
 
@@ -180,7 +180,7 @@ def value_of(text: str) -> Any:
 
 
 def is_value(config: DictConfig, name: str, said: Any) -> bool:
-    """Whether an option has this value; a group, this choice. Numbers may be rounded to a thousandth."""
+    """Whether an option has this value, or a group this choice. Numbers may be rounded to 0.1 %."""
     value = OmegaConf.select(config, name, throw_on_missing=False)
     if isinstance(value, DictConfig) and "name" in value:
         return bool(value.name == said)
@@ -191,7 +191,7 @@ def is_value(config: DictConfig, name: str, said: Any) -> bool:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_defaults_are_those_that_are_said(command):
+def test_documented_defaults_match_the_configuration(command):
     compared, wrong = 0, []
     for row in rows():
         in_words = not row.defaults or set(row.names) <= WORDS or row.names == ["experiment"]

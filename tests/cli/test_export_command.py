@@ -1,22 +1,19 @@
-"""gmmtorch-export: from files to files, and how it fails."""
+"""gmmtorch-export: formats and errors."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from command_runs import CHECKOUT, COMMANDS, Finished, as_it_was, run_here, run_python, run_script
+from command_runs import Finished, as_it_was, run_here, run_script
 from export.map_examples import read_map_image
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
-from gmmtorch.cli import common, export, schema
+from gmmtorch.cli import common
 from gmmtorch.datasets import load
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -35,8 +32,7 @@ def hydra_as_it_was():
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Runs the command in this process, from an empty folder."""
-    monkeypatch.setitem(COMMANDS, "export", export)
+    """Runs the command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
     def run_command(*options: str) -> Finished:
@@ -75,14 +71,14 @@ def succeeded(done: Finished) -> Finished:
 # -- space ----------------------------------------------------------------------------------------
 
 
-def test_a_flat_map_becomes_an_image_of_its_own_answers(run, files, tmp_path):
+def test_image_of_a_2d_map_has_its_occupancy(run, files, tmp_path):
     done = succeeded(run(f"path={files / 'map_2.safetensors'}", "output=floor.yaml", "resolution=0.2"))
     found = read_map_image(tmp_path / "floor.yaml")
     built = GaussianMap.load(files / "map_2.safetensors")
     theta = torch.as_tensor(built.occupancy(found.grid.centers(), 0.2)).view(found.grid.shape)
     assert float((found.probability - theta).abs().max()) <= 1 / 255
     assert found.grid.resolution == 0.2
-    assert {"floor.yaml", "floor.pgm"} == {path.name for path in tmp_path.iterdir()}  # and nothing else
+    assert {"floor.yaml", "floor.pgm"} == {path.name for path in tmp_path.iterdir()}
     assert re.search(r"floor\.pgm  [\d,]+ bytes: \d+ × \d+ cells of 0\.2 m", done.stdout)
     inside = (
         (built.components().origins / 0.2).floor() * 0.2 >= torch.tensor(found.grid.origin) - 1e-9
@@ -90,7 +86,7 @@ def test_a_flat_map_becomes_an_image_of_its_own_answers(run, files, tmp_path):
     assert bool(inside)
 
 
-def test_other_forms_of_evidence_fill_the_same_cells(run, files, tmp_path):
+def test_image_by_another_form_of_evidence(run, files, tmp_path):
     source = f"path={files / 'map_2.safetensors'}"
     succeeded(run(source, "output=a.yaml", "method=monte_carlo", "resolution=0.2"))
     found = read_map_image(tmp_path / "a.yaml")
@@ -100,7 +96,7 @@ def test_other_forms_of_evidence_fill_the_same_cells(run, files, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["grid", "log_odds"])
-def test_a_grid_becomes_an_image_of_its_own_cells(kind, run, files, tmp_path):
+def test_image_of_a_grid_has_its_occupancy(kind, run, files, tmp_path):
     succeeded(run(f"path={files / f'{kind}_2.safetensors'}", "output=floor.yaml"))
     found = read_map_image(tmp_path / "floor.yaml")
     grid = OccupancyGrid.load(files / f"{kind}_2.safetensors")
@@ -110,7 +106,7 @@ def test_a_grid_becomes_an_image_of_its_own_cells(kind, run, files, tmp_path):
     assert 0 < int((theta != 0.5).sum()) <= n_cells
 
 
-def test_a_band_of_heights_becomes_an_image(run, files, tmp_path):
+def test_image_of_a_height_band_has_the_highest_occupancy(run, files, tmp_path):
     options = ["output=band.yaml", "resolution=0.5", "z_min=0.3", "z_max=1.2"]
     succeeded(run(f"path={files / 'map_3.safetensors'}", *options))
     found = read_map_image(tmp_path / "band.yaml")
@@ -118,7 +114,7 @@ def test_a_band_of_heights_becomes_an_image(run, files, tmp_path):
     columns = torch.cat(
         [
             torch.cat([found.grid.centers(), torch.full((found.grid.n_cells, 1), z)], 1)
-            for z in (0.25, 0.75, 1.25)  # the cells that the band meets
+            for z in (0.25, 0.75, 1.25)  # the cells that the band intersects
         ]
     )
     theta = torch.as_tensor(built.occupancy(columns, 0.5)).view(3, *found.grid.shape).amax(0)
@@ -128,7 +124,7 @@ def test_a_band_of_heights_becomes_an_image(run, files, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "dim", "form"), [("map", 2, "ply"), ("map", 3, "pcd"), ("grid", 2, "pcd"), ("grid", 3, "ply")]
 )
-def test_occupied_cells_become_points(kind, dim, form, run, files, tmp_path):
+def test_point_cloud_of_occupied_cells(kind, dim, form, run, files, tmp_path):
     name = f"cells.{form}"
     open3d = pytest.importorskip("open3d")
     resolution = ["resolution=0.5"] if kind == "map" else []
@@ -151,7 +147,7 @@ def test_occupied_cells_become_points(kind, dim, form, run, files, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["map_3", "grid_3", "log_odds_2"])
-def test_maps_become_octrees(name, run, files, tmp_path):
+def test_octree_has_the_occupancy_of_the_map(name, run, files, tmp_path):
     pyoctomap = pytest.importorskip("pyoctomap")
     resolution = ["resolution=0.5"] if name == "map_3" else []
     options = ["format=octomap", "output=map.ot", *resolution]
@@ -168,7 +164,7 @@ def test_maps_become_octrees(name, run, files, tmp_path):
     np.testing.assert_allclose(found, answers, atol=1e-5)
 
 
-def test_bounds_cut_the_cells_out(run, files, tmp_path):
+def test_bounds_limit_the_cells(run, files, tmp_path):
     succeeded(
         run(f"path={files / 'map_2.safetensors'}", "output=cut.yaml", "bounds=[1,2,4,3]", "resolution=0.1")
     )
@@ -178,14 +174,14 @@ def test_bounds_cut_the_cells_out(run, files, tmp_path):
 # -- components -----------------------------------------------------------------------------------
 
 
-def test_components_go_round(run, files, tmp_path):
+def test_components_survive_all_formats(run, files, tmp_path):
     succeeded(run(f"path={files / 'map_3.safetensors'}", "format=npz", "output=a.npz"))
     succeeded(run("path=a.npz", "format=csv", "output=b.csv"))
     succeeded(run("path=b.csv", "format=mixture", "output=c.safetensors"))
     succeeded(run("path=c.safetensors", "format=npz", "output=d.npz", "n_points=1000"))
     built = GaussianMap.load(files / "map_3.safetensors").components()
     surface = ~built.max_range
-    assert bool(built.max_range.any())  # or nothing would be left out
+    assert bool(built.max_range.any())  # some components are left out
     first, last = read_npz(tmp_path / "a.npz"), read_npz(tmp_path / "d.npz")
     assert torch.equal(first.support, built.support[surface])
     for found in (first, read_gira_csv(tmp_path / "b.csv"), last):
@@ -195,14 +191,14 @@ def test_components_go_round(run, files, tmp_path):
     assert float(last.support.sum()) == pytest.approx(1000)
 
 
-def test_a_fitted_mixture_becomes_gira_s(run, files, tmp_path):
+def test_a_fitted_mixture_is_written_as_csv(run, files, tmp_path):
     done = succeeded(run(f"path={files / 'mixture.safetensors'}", "format=csv", "output=m.csv"))
     assert "3 components in 3D" in done.stdout
     fitted = GaussianMixture.load(files / "mixture.safetensors")
     np.testing.assert_allclose(read_gira_csv(tmp_path / "m.csv").means, fitted.means_, rtol=1e-15)
 
 
-# -- failing --------------------------------------------------------------------------------------
+# -- errors ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -226,7 +222,7 @@ def test_a_fitted_mixture_becomes_gira_s(run, files, tmp_path):
         (["path={map_2}", "output=a.yaml", "runtime.device=abacus"], "runtime.device=abacus"),
     ],
 )
-def test_errors_are_one_line_and_leave_nothing(options, says, run, files, tmp_path):
+def test_an_invalid_option_gives_a_one_line_error_and_no_file(options, says, run, files, tmp_path):
     names = {path.stem: str(path) for path in files.iterdir()}
     done = run(*(option.format(**names) for option in options))
     assert done.status == 1
@@ -249,48 +245,10 @@ def test_an_empty_map_needs_bounds(run, tmp_path):
 # -- the command itself ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_script_of_the_checkout_runs(files, tmp_path):
     done = succeeded(
         run_script("export", tmp_path, f"path={files / 'map_2.safetensors'}", "format=npz", "output=m.npz")
     )
     assert (tmp_path.parent / "m.npz").is_file()
     assert not done.files()
-
-
-def test_the_configuration_repeats_the_defaults_and_shows_every_option():
-    schema.register()
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        assert OmegaConf.to_container(compose("export")) == asdict(schema.Export())
-    text = (CONF / "export.yaml").read_text(encoding="utf-8")
-    documented = (
-        (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").split("## gmmtorch-export")[1]
-    )
-    for name in (*asdict(schema.Export()), "memory_limit"):
-        assert re.search(rf"^ *{name}:", text, re.MULTILINE), name
-        assert f"`{name}" in documented or f"`.{name}`" in documented, name
-
-
-def test_the_examples_of_the_help_compose():
-    schema.register()
-    text = (CONF / "export.yaml").read_text(encoding="utf-8")
-    examples = re.findall(r"^ +gmmtorch-export (path.*)$", text, re.MULTILINE)
-    assert len(examples) >= 5
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        for example in examples:
-            assert compose("export", overrides=example.split()).format in (
-                *export._OF_SPACE, *export._OF_COMPONENTS,
-            )  # fmt: skip
-
-
-def test_help_is_shown_without_loading_anything_heavy(tmp_path):
-    code = (
-        "import sys\nfrom gmmtorch.cli.export import main\nsys.argv = ['gmmtorch-export', '--help']\n"
-        "try:\n    main()\nfinally:\n    sys.stdout.flush()\n    print(*sys.modules, file=sys.stderr)\n"
-    )
-    done = run_python(["-c", code], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert not {"torch", "numpy", "open3d", "PIL", "pyoctomap"} & set(done.stderr.split())
-    assert "Examples:" in done.stdout
-    for name in (*export._OF_SPACE, *export._OF_COMPONENTS):
-        assert name in done.stdout
-    assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""gmmtorch-fit on points that are streamed, shared by processes, kept in checkpoints, or swept."""
+"""gmmtorch-fit with streamed points, several processes, checkpoints and sweeps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 
 def torchrun(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """scripts/fit.py in two processes; the folder is where the results go."""
+    """scripts/fit.py in two processes, with its results in `folder`."""
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     script = str(CHECKOUT / "scripts" / "fit.py")
     return run_python([*launcher, script, *SIX, *QUIET, *options, f"hydra.run.dir={folder}"], folder.parent)
@@ -52,7 +52,7 @@ def assert_same(one: Finished, two: Path) -> None:
     for key, value in row.items():
         if isinstance(value, str):
             assert other[key] == value
-        elif key not in ("seconds", "nbytes"):  # decimals of the bounds are part of the file
+        elif key not in ("seconds", "nbytes"):  # the file contains the decimals of the bounds
             assert other[key] == pytest.approx(value, rel=1e-6), key
     first, second = (GaussianMixture.load(folder / "em.safetensors") for folder in (one.folder, two))
     for name in ("weights", "means", "covariances"):
@@ -60,8 +60,8 @@ def assert_same(one: Finished, two: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_result_of_one_and_say_and_write_it_once(run, cloud, tmp_path):
-    """The start is found from a draw of 500 points, which must not depend on who holds them."""
+def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_path):
+    """The initialization uses a sample of 500 points, which must not depend on the number of processes."""
     options = [f"points={cloud}", "stream.sample_points=500", "mixture.tol=1e-6"]
     one = run(*options, name="one")
     assert one.status == 0, one.stderr
@@ -76,15 +76,15 @@ def test_two_processes_give_the_result_of_one_and_say_and_write_it_once(run, clo
 
 
 @pytest.mark.slow
-def test_two_processes_on_a_data_set_give_what_gmmtorch_fit_gives(run, tmp_path):
+def test_two_processes_on_a_data_set_give_the_result_of_one(run, tmp_path):
     options = TINY["fit"]
-    one = run(*options, name="one")  # not streamed at all
+    one = run(*options, name="one")  # not streamed
     two = torchrun(tmp_path / "two", *options)
     assert two.returncode == 0, two.stderr
     assert_same(one, tmp_path / "two")
 
 
-def test_a_streamed_row_is_of_the_whole_cloud(run, cloud):
+def test_a_streamed_row_covers_the_whole_cloud(run, cloud):
     done = run(f"points={cloud}", "stream.sample_points=300")
     assert done.status == 0, done.stderr
     (row,) = done.results()["rows"]
@@ -100,7 +100,7 @@ def test_a_streamed_row_is_of_the_whole_cloud(run, cloud):
     assert mixture.n_samples_seen_ == row["n_points"]
 
 
-def test_a_run_goes_on_from_its_checkpoint(run, cloud, tmp_path):
+def test_a_run_resumes_from_its_checkpoint(run, cloud, tmp_path):
     path = tmp_path / "state.safetensors"
     common = [f"points={cloud}", "mixture.tol=0", f"checkpoint={path}"]
     assert run(*common, "mixture.max_iter=4").status == 0
@@ -120,7 +120,7 @@ def test_a_run_goes_on_from_its_checkpoint(run, cloud, tmp_path):
     ("options", "said"),
     [
         (["points=none.npy"], "points=none.npy does not exist"),
-        (["points={cloud}", "method=[scikit_learn]"], "by [em] only"),
+        (["points={cloud}", "method=[scikit_learn]"], "needs method=[em]"),
         (["points={cloud}", "max_points=10"], "max_points=10"),
         (["points={cloud}", "test_share=1"], "test_share=1"),
         (["points={cloud}", "stream.chunk_points=0"], "chunk_points=0"),
@@ -129,7 +129,7 @@ def test_a_run_goes_on_from_its_checkpoint(run, cloud, tmp_path):
         (["resume=true"], "checkpoint=FILE"),
     ],
 )
-def test_what_cannot_be_is_one_line(run, cloud, options, said):
+def test_an_invalid_option_gives_a_one_line_error(run, cloud, options, said):
     done = run(*[option.format(cloud=cloud) for option in options])
     assert done.status == 1
     assert said in done.stderr
@@ -143,7 +143,7 @@ def test_what_cannot_be_is_one_line(run, cloud, options, said):
     or importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is None,
     reason="hydra-joblib-launcher is not installed",
 )
-def test_jobs_of_a_sweep_can_run_at_once(tmp_path):
+def test_jobs_of_a_sweep_can_run_in_parallel(tmp_path):
     options = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     arguments = ["-m", "gmmtorch.cli.fit", "-m", *options, *TINY["fit"], *QUIET, "mixture.n_components=2,3"]
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""A room with a round pillar, seen by a range sensor that circles it: known in closed form."""
+"""A room with a round pillar and a range sensor that circles it, in closed form."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from gmmtorch.scan import Scan
 
 SIDE = 6.0
-"""Metres; the room is [0, SIDE]^D, the pillar (a ball in 3D) stands in its middle."""
+"""Metres; the room is [0, SIDE]^D, and the pillar (a ball in 3D) is at its centre."""
 
 RADIUS = 0.8
 NO_RETURN_RANGE = 1.0
@@ -23,7 +23,7 @@ def directions(n_beams: int, dim: int, generator: torch.Generator) -> Tensor:
 
 
 def ranges(origin: Tensor, direction: Tensor) -> Tensor:
-    """Distance (N,) from the origin (D,) to what each beam (N, D) meets first."""
+    """Distance (N,) from the origin (D,) to the first surface along each beam (N, D)."""
     wall = torch.where(direction > 0, (SIDE - origin) / direction, -origin / direction)
     nearest = wall.nan_to_num(nan=math.inf).amin(1)
     offset = origin - SIDE / 2
@@ -34,7 +34,7 @@ def ranges(origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def room_scan(number: int, n_beams: int = 90, dim: int = 2, noise: float = 0.01, seed: int = 0) -> Scan:
-    """One scan from a place on the circle around the pillar; every tenth beam comes back empty."""
+    """One scan from a position on the circle around the pillar; every tenth beam has no return."""
     generator = torch.Generator().manual_seed(1000 * seed + number)
     angle = 0.37 * number
     origin = torch.full((dim,), SIDE / 2, dtype=torch.float64)
@@ -51,5 +51,5 @@ def room_scan(number: int, n_beams: int = 90, dim: int = 2, noise: float = 0.01,
 
 
 def room_scans(n_scans: int, n_beams: int = 90, dim: int = 2, seed: int = 0) -> list[Scan]:
-    """Scans from places along the circle."""
+    """Scans from positions along the circle."""
     return [room_scan(number, n_beams, dim, seed=seed) for number in range(n_scans)]

@@ -1,4 +1,4 @@
-"""The reference itself: against samples, nested quadrature, sums that must be one, and itself refined."""
+"""The angular reference against sampled rays, nested quadrature, closed forms and smaller tolerances."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def a_scene(dim: int, deviations: float, distance: float, low: list[list[float]]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_samples_agree_to_their_own_noise(dim, generator):
+def test_reference_matches_sampled_rays_within_their_noise(dim, generator):
     n, scores = 100_000, []
     for _ in range(10 if dim == 2 else 4):
         scene = random_scene(dim, 4, generator)
@@ -42,7 +42,7 @@ def test_samples_agree_to_their_own_noise(dim, generator):
     assert float(scores.square().mean()) < 2
 
 
-def test_it_is_nested_quadrature_of_the_density():
+def test_reference_matches_nested_scipy_quadrature():
     """Misses of a square in 2D: ∫ dθ ∫ r N dr, both by SciPy, in Cartesian coordinates of the sensor."""
     scene = a_scene(2, 0.7, 2.0, [[0.8, -0.4]], 0.6)
 
@@ -70,12 +70,12 @@ def density_xy(x: float, y: float) -> float:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("deviation", "distance"), [(0.3, 2.0), (1.0, 0.4), (0.02, 3.0)])
-def test_the_cell_of_the_sensor_is_left_by_every_ray_that_does_not_end_in_it(dim, deviation, distance):
+def test_hits_and_misses_in_the_sensor_cell_sum_to_one(dim, deviation, distance):
     hits, misses = exact(a_scene(dim, deviation, distance, [[-0.5] * dim], 1.0))
     assert float(hits + misses) == pytest.approx(1, abs=1e-6)
 
 
-def test_hits_of_an_aligned_component_are_products_of_intervals():
+def test_hits_of_an_aligned_component_match_the_error_function():
     scene = a_scene(3, 0.5, 2.0, [[1.5, -0.3, 0.1]], 0.8)
 
     def interval(low: float, high: float) -> float:
@@ -86,14 +86,14 @@ def test_hits_of_an_aligned_component_are_products_of_intervals():
 
 
 @pytest.mark.parametrize(("dim", "n_scenes"), [(2, 40), (3, 4)])
-def test_refining_it_changes_nothing(dim, n_scenes, generator):
+def test_a_smaller_tolerance_gives_the_same_evidence(dim, n_scenes, generator):
     for _ in range(n_scenes):
         scene = random_scene(dim, 4, generator)
         for once, twice in zip(exact(scene, 1e-8), exact(scene, 1e-10), strict=True):
             assert (once - twice).abs().max() < 1e-6
 
 
-def test_it_takes_a_box_for_each_cone():
+def test_different_numbers_of_boxes_and_cones_raise():
     scene = a_scene(2, 0.5, 2.0, [[1.0, 0.0], [2.0, 0.0]], 0.5)
-    with pytest.raises(InvalidArgumentError, match="low has 2 boxes"):
+    with pytest.raises(InvalidArgumentError, match="low has 2 and high 2 boxes for 1 cones"):
         angular_evidence(scene.cone, scene.low, scene.high)

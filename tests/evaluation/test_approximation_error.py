@@ -1,4 +1,4 @@
-"""The study of errors: its rows, its seeds, what it must find of each form, and its figures."""
+"""The study of approximation errors: rows, seed, the known errors of each form, and figures."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.approximation_error import Options, map_rows, run, sweep_rows
+from gmmtorch.evaluation.studies.approximation_error import map_rows, run, sweep_rows
 from gmmtorch.evaluation.studies.error_scenes import Scene, cast_rays, methods, random_scene
+from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
 from gmmtorch.report.studies.approximation_error_figures import figures
 
-SMALL = Options(
+SMALL = ApproximationErrorStudy(
     dims=(2,),
     n_pixels=6,
     n_components=12,
@@ -36,7 +37,7 @@ def of(rows: list[dict[str, Any]], study: str) -> Iterator[dict[str, Any]]:
     return (row for row in rows if row["study"] == study)
 
 
-def test_rows_are_plain_and_name_their_study(rows):
+def test_rows_are_serializable_and_name_their_study(rows):
     json.dumps(rows, allow_nan=False)
     assert {row["study"] for row in rows} == {"map", "sweep", "curve"}
     assert [row["method"] for row in of(rows, "sweep")] == [
@@ -47,7 +48,7 @@ def test_rows_are_plain_and_name_their_study(rows):
     assert len(first["error"][0]) == len(first["distances"]) == 6
 
 
-def test_flux_is_within_a_thousandth_and_the_approximations_are_not(rows):
+def test_flux_error_is_below_a_thousandth_unlike_the_approximations(rows):
     worst = {row["method"]: max(row["hits_max"], row["misses_max"]) for row in of(rows, "sweep")}
     median = {row["method"]: max(row["hits_median"], row["misses_median"]) for row in of(rows, "sweep")}
     for method in ("flux", "flux_float32"):
@@ -60,15 +61,15 @@ def test_flux_is_within_a_thousandth_and_the_approximations_are_not(rows):
     assert flux["probability_max"] < 1e-3
 
 
-def test_in_3d_flux_is_within_a_thousandth_too():
-    options = Options(n_components=6, n_cells=4, n_samples=64, n_large_samples=64)
+def test_flux_error_is_below_a_thousandth_in_3d():
+    options = ApproximationErrorStudy(n_components=4, n_cells=4, n_samples=64, n_large_samples=64)
     rows = {row["method"]: row for row in sweep_rows(3, options, torch.Generator().manual_seed(1))}
     assert max(rows["flux"]["hits_max"], rows["flux"]["misses_max"]) < 1e-3
     assert list(rows) == list(methods(1, 1))
 
 
-def test_the_cones_error_falls_with_distance_and_its_map_leaves_out_what_lies_behind():
-    options = Options(n_pixels=9)
+def test_cone_error_falls_with_distance_and_cells_at_the_sensor_are_none():
+    options = ApproximationErrorStudy(n_pixels=9)
     rows = {row["method"]: row for row in map_rows(2, options, torch.Generator().manual_seed(0))}
     error = rows["cone"]["error"]
     near, far = ([line[column] for line in error if line[column] is not None] for column in (2, 8))
@@ -80,7 +81,7 @@ def test_the_cones_error_falls_with_distance_and_its_map_leaves_out_what_lies_be
         assert rows["cone"]["depths"][i] + rows["cone"]["distances"][j] <= 1e-6
 
 
-def test_on_a_grid_monte_carlo_and_tighter_flux_come_nearer_the_truth(rows):
+def test_monte_carlo_and_flux_converge_on_a_grid(rows):
     curve = list(of(rows, "curve"))
     for method in ("monte_carlo_plain", "monte_carlo_stratified", "monte_carlo_sobol"):
         few, many = (row["error"] for row in curve if row["method"] == method)
@@ -93,7 +94,7 @@ def test_on_a_grid_monte_carlo_and_tighter_flux_come_nearer_the_truth(rows):
     assert 1e-3 < at_most["cone"] < 0.5
 
 
-def test_the_seed_decides_and_progress_ends_at_all(rows):
+def test_rows_depend_only_on_the_seed_and_progress_is_complete(rows):
     def timeless(given: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in given]
 
@@ -107,7 +108,7 @@ def test_the_seed_decides_and_progress_ends_at_all(rows):
     assert timeless(list(other)) != timeless([r for r in rows if r["study"] == "sweep"])
 
 
-def test_rays_that_start_or_end_in_a_box_or_pass_it_by_are_told_apart(generator):
+def test_cast_rays_distinguishes_hits_misses_and_no_crossing(generator):
     scene = random_scene(2, 1, generator)
     mean, origin = scene.cone.means, scene.cone.origins
     cone = scene.cone._replace(covariances=1e-18 * torch.eye(2).double()[None])
@@ -118,7 +119,7 @@ def test_rays_that_start_or_end_in_a_box_or_pass_it_by_are_told_apart(generator)
     assert misses.tolist() == pytest.approx([1, 1, 0, 0, 0])
 
 
-def test_every_study_has_its_figures(rows):
+def test_every_study_has_a_figure(rows):
     drawn = figures(rows)
     assert list(drawn) == [
         "approximation_error",
@@ -136,14 +137,14 @@ def test_every_study_has_its_figures(rows):
     ("options", "message"),
     [
         ({"dims": (4,)}, "dims=4"),
-        ({"dims": ()}, r"study\.dims is empty"),
+        ({"dims": ()}, r"dims=\[\] is empty"),
         ({"n_pixels": 0}, "n_pixels=0"),
-        ({"n_rays": ()}, r"study\.n_rays is empty"),
+        ({"n_rays": ()}, r"n_rays=\[\] is empty"),
         ({"support": float("nan")}, "support=nan"),
         ({"prior": -1.0}, "prior=-1"),
         ({"resolution": 0.0}, "resolution=0"),
     ],
 )
-def test_bad_options_are_named(options, message):
+def test_invalid_options_raise(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
-        Options(**options)
+        ApproximationErrorStudy(**options)

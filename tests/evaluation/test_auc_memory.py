@@ -1,4 +1,4 @@
-"""AUC against bytes: the rows are those of the plain evaluation, with sizes."""
+"""AUC against bytes: the rows match those of `evaluate`, with sizes."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ def sized_map(n: int) -> MapFactory:
     return Form(lambda: GaussianMap(window=5, learning=WindowedRule(n_components=n)), "point")
 
 
-def test_every_contender_has_a_row_with_its_method_and_size():
+def test_every_sized_method_has_a_row():
     scans = room_scans(12)
     grid = methods(GaussianMap)["occupancy_grid"]
-    contenders = [
+    sized = [
         Sized("point", 4, sized_map(4)),
         Sized("point", 12, sized_map(12)),
         Sized("grid", None, grid),
     ]
-    told: list[int] = []
-    rows = auc_memory.run("room", scans, contenders, PROTOCOL, on_rows=lambda rows: told.append(len(rows)))
+    counts: list[int] = []
+    rows = auc_memory.run("room", scans, sized, PROTOCOL, on_rows=lambda rows: counts.append(len(rows)))
     assert [(row["method"], row["size"]) for row in rows] == [("point", 4), ("point", 12), ("grid", None)]
-    assert told == [1, 2, 3]
+    assert counts == [1, 2, 3]
     assert rows[0]["nbytes"] < rows[1]["nbytes"]
     assert rows[0]["n_components"] < rows[1]["n_components"]
-    (alone,) = evaluate("room", scans, {"grid": grid}, PROTOCOL).rows
-    assert rows[2]["auc"] == alone["auc"]
-    assert rows[2]["nbytes"] == alone["nbytes"]
+    (expected,) = evaluate("room", scans, {"grid": grid}, PROTOCOL).rows
+    assert rows[2]["auc"] == expected["auc"]
+    assert rows[2]["nbytes"] == expected["nbytes"]

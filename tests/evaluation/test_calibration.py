@@ -1,4 +1,4 @@
-"""Calibration, against scikit-learn, brute force and what is known in closed form."""
+"""Calibration, against scikit-learn, brute force and closed forms."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gmmtorch.occupancy.evidence import occupancy_probability
 
 
 def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Probabilities, some of them exactly 0, ½ and 1, and labels that are true with θ^bend."""
+    """Probabilities, some of them exactly 0, ½ and 1, and labels that are 1 with probability θ^bend."""
     rng = np.random.default_rng(seed)
     theta = rng.beta(0.6, 0.8, n)
     theta[: n // 20] = 0.5
@@ -36,7 +36,7 @@ def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor
 
 @pytest.mark.parametrize("n_bins", [1, 2, 10, 15])
 @pytest.mark.parametrize(("binning", "strategy"), [("width", "uniform"), ("count", "quantile")])
-def test_the_curve_is_scikit_learns(n_bins, binning, strategy):
+def test_reliability_matches_scikit_learn(n_bins, binning, strategy):
     theta, labels = drawn()
     curve = reliability(theta, labels, n_bins, binning)
     observed, predicted = calibration_curve(labels, theta, n_bins=n_bins, strategy=strategy)
@@ -45,7 +45,7 @@ def test_the_curve_is_scikit_learns(n_bins, binning, strategy):
     assert curve.n_points.sum() == len(theta)
 
 
-def test_the_calibration_errors_are_those_of_a_loop_over_bins():
+def test_calibration_errors_match_a_loop_over_bins():
     theta, labels = drawn(700, bend=2.0)
     gaps, sizes = [], []
     for low, high in zip(np.linspace(0, 1, 11)[:-1], np.linspace(0, 1, 11)[1:], strict=True):
@@ -59,7 +59,7 @@ def test_the_calibration_errors_are_those_of_a_loop_over_bins():
     assert curve.n_points.tolist() == sizes
 
 
-def test_what_is_calibrated_has_little_error_and_what_is_bent_has_that_of_the_bend():
+def test_expected_error_matches_a_known_miscalibration():
     theta, labels = drawn(200_000)
     assert reliability(theta, labels).expected_error < 0.005
     theta, labels = drawn(200_000, bend=2.0)
@@ -67,14 +67,14 @@ def test_what_is_calibrated_has_little_error_and_what_is_bent_has_that_of_the_be
     assert reliability(theta, labels).expected_error == pytest.approx(expected, abs=0.005)
 
 
-def test_equal_counts_hold_equally_many_points():
+def test_count_bins_have_equally_many_points():
     theta = torch.rand(1000, generator=torch.Generator().manual_seed(0))
     assert set(reliability(theta, theta > 0.5, 10, "count").n_points.tolist()) == {100}
 
 
 @pytest.mark.parametrize("binning", ["width", "count"])
 @given(st.integers(1, 20), st.integers(1, 60), st.integers(0, 1000))
-def test_the_parts_of_the_brier_score_add_up(binning, n_bins, n, seed):
+def test_brier_parts_sum_to_the_brier_score(binning, n_bins, n, seed):
     rng = np.random.default_rng(seed)
     theta = torch.from_numpy(rng.choice([rng.random(n), rng.integers(0, 5, n) / 4], axis=0))
     labels = torch.from_numpy(rng.integers(2, size=n))
@@ -86,7 +86,7 @@ def test_the_parts_of_the_brier_score_add_up(binning, n_bins, n, seed):
     assert parts.resolution <= parts.uncertainty + 1e-12
 
 
-def test_with_one_value_a_bin_the_decomposition_is_murphys():
+def test_brier_parts_match_murphy_with_one_value_per_bin():
     theta = torch.tensor([0.1, 0.1, 0.1, 0.7, 0.7, 0.7, 0.7])
     labels = torch.tensor([0, 1, 0, 1, 1, 0, 1])
     parts = brier_parts(theta.double(), labels, 2)
@@ -98,26 +98,26 @@ def test_with_one_value_a_bin_the_decomposition_is_murphys():
     assert parts.uncertainty == pytest.approx(share * (1 - share))
 
 
-def test_brier_and_cross_entropy_are_scikit_learns():
+def test_brier_and_log_loss_match_scikit_learn():
     theta, labels = drawn()
     assert brier_parts(theta, labels).brier == pytest.approx(brier_score_loss(labels, theta), abs=1e-12)
     assert log_loss_bits(theta, labels) == pytest.approx(log_loss(labels, theta) / math.log(2), rel=1e-9)
 
 
-def test_knowing_nothing_costs_a_bit_and_a_certain_mistake_fifty_two():
+def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
     labels = torch.tensor([0, 1])
     assert log_loss_bits(torch.tensor([0.5, 0.5]), labels) == 1
     assert log_loss_bits(torch.tensor([0.0, 1.0]), labels) == pytest.approx(0, abs=1e-12)
     assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
 
 
-def test_exactly_one_half_is_half_right():
+def test_a_probability_of_one_half_counts_half():
     theta = torch.tensor([0.9, 0.1, 0.9, 0.5, 0.5])
     labels = torch.tensor([1, 0, 0, 1, 0])
     assert accuracy(theta, labels) == pytest.approx((2 + 2 * 0.5) / 5)
 
 
-def test_scores_of_a_row():
+def test_scores_contain_ece_log_loss_and_accuracy():
     theta, labels = drawn()
     found = scores(theta.float(), labels)
     assert list(found) == ["ece", "log_loss_bits", "accuracy"]
@@ -126,7 +126,7 @@ def test_scores_of_a_row():
     assert all(type(value) is float for value in found.values())
 
 
-def test_prior_and_dead_band_against_counting():
+def test_prior_and_dead_band_match_counting():
     generator = torch.Generator().manual_seed(0)
     labels = torch.randint(2, (400,), generator=generator)
     hits = labels * torch.randint(0, 9, (400,), generator=generator).double()
@@ -145,11 +145,11 @@ def test_prior_and_dead_band_against_counting():
         assert row["accuracy_decided"] == pytest.approx(len(right) / len(decided))
         assert row["brier"] == pytest.approx(float(((theta - labels) ** 2).mean()))
         assert row["ece"] == pytest.approx(reliability(theta, labels).expected_error)
-    # A stronger prior and a wider band both leave more undecided.
+    # A larger prior and a wider dead band both decide fewer points.
     assert rows[0]["decided"] > rows[1]["decided"] > rows[3]["decided"]
 
 
-def test_a_band_that_leaves_nothing_decided_has_no_accuracy():
+def test_accuracy_decided_is_none_if_nothing_is_decided():
     theta, labels = torch.full((4,), 0.5), torch.tensor([0, 1, 0, 1])
     (row,) = prior_and_dead_band(lambda prior: theta, labels, (1.0,), (0.25,))
     assert row["decided"] == 0
@@ -162,19 +162,19 @@ def test_a_band_that_leaves_nothing_decided_has_no_accuracy():
     [
         ([0.5], [2], "labels must be 0"),
         ([0.5, 0.5], [1], "labels \\(1,\\)"),
-        ([], [], "one point at least"),
+        ([], [], "M ≥ 1"),
         ([1.5], [1], "outside \\[0, 1\\]"),
         ([float("nan")], [1], "NaN"),
         ([[0.5]], [[1]], "must be \\(M,\\)"),
     ],
 )
 @pytest.mark.parametrize("score", [reliability, brier_parts, log_loss_bits, accuracy])
-def test_what_cannot_be_scored_is_refused(score, theta, labels, says):
+def test_invalid_probabilities_and_labels_raise(score, theta, labels, says):
     with pytest.raises(InvalidArgumentError, match=says):
         score(torch.tensor(theta), torch.tensor(labels))
 
 
-def test_bins_are_checked():
+def test_invalid_bins_raise():
     theta, labels = drawn(10)
     with pytest.raises(InvalidArgumentError, match="n_bins=0"):
         reliability(theta, labels, 0)

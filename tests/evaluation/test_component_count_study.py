@@ -1,4 +1,4 @@
-"""The study of how many components: rules on the curve, and maps."""
+"""The study of the number of components: rules, curve and maps."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.estimators import FitOptions
+from gmmtorch.evaluation.fit_comparison import FitData, Row, split
+from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies import component_count
 from gmmtorch.evaluation.studies.component_count import (
     RULES,
-    CountStudy,
     component_bytes,
     count_modes,
     middle,
     run,
 )
-from gmmtorch.evaluation.studies.fitting import Material, Row, split
+from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan
 
-STUDY = CountStudy(
+STUDY = ComponentCountStudy(
     n_components=(2, 6, 12, 24),
     noise=0.02,
     multiples=(1.0, 4.0),
@@ -47,13 +47,13 @@ def scans() -> list[Scan]:
 
 
 @pytest.fixture(scope="module")
-def material(scans) -> Material:
+def data(scans) -> FitData:
     return split("room", torch.cat([scan.points for scan in middle(scans, 8)]), 0.3, 0)
 
 
 @pytest.fixture(scope="module")
-def rows(material, scans) -> list[Row]:
-    return run(material, scans, STUDY, EM)
+def rows(data, scans) -> list[Row]:
+    return run(data, scans, STUDY, EM)
 
 
 def of(rows: list[Row], rule: str) -> list[Row]:
@@ -64,7 +64,7 @@ def timeless(rows: list[Row]) -> list[Row]:
     return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
-def test_every_rule_has_a_row_for_each_of_its_settings(rows):
+def test_every_rule_has_a_row_per_setting(rows):
     settings = {rule: [row["setting"] for row in of(rows, rule)] for rule in RULES}
     bic = settings.pop("bic")
     assert settings == {
@@ -77,29 +77,26 @@ def test_every_rule_has_a_row_for_each_of_its_settings(rows):
     }
     assert len(bic) == 1
     assert len(rows) == 14
-    assert len({frozenset(row) for row in rows}) == 1  # the same fields in all
+    assert [row["n_components"] for row in of(rows, "fixed")] == [2, 6, 12, 24]
+    assert len({frozenset(row) for row in rows}) == 1  # all rows have the same fields
     json.dumps(rows, allow_nan=False)
     for row in rows:
         assert row["component_bytes"] == 24 * row["n_components"]
         assert 0 <= (row["count_seconds"] or 0) <= row["seconds"] or row["rule"] == "flat_pieces"
 
 
-def test_the_curve_has_the_numbers_it_was_asked_for(rows):
-    assert [row["n_components"] for row in of(rows, "fixed")] == [2, 6, 12, 24]
-
-
-def test_pieces_are_those_of_the_estimator(rows, material):
+def test_flat_pieces_match_the_estimator(rows, data):
     for row in of(rows, "flat_pieces"):
-        mixture = GaussianMixture(None, noise=0.02 * row["setting"], max_iter=20).fit(material.train)
+        mixture = GaussianMixture(None, noise=0.02 * row["setting"], max_iter=20).fit(data.train)
         assert row["n_components"] == len(mixture.means_)
-        assert row["held_out_log_likelihood"] == pytest.approx(mixture.score(material.test), abs=1e-9)
-        assert row["bic"] == pytest.approx(mixture.bic(material.train))
+        assert row["held_out_log_likelihood"] == pytest.approx(mixture.score(data.test), abs=1e-9)
+        assert row["bic"] == pytest.approx(mixture.bic(data.train))
 
 
-def test_the_criterion_chooses_its_least_value_and_pays_for_the_whole_curve(rows, material):
+def test_bic_row_is_the_minimum_with_the_time_of_the_whole_curve(rows, data):
     curve, (chosen,) = of(rows, "fixed"), of(rows, "bic")
     best = min(curve, key=lambda row: row["bic"])
-    n = len(material.train)
+    n = len(data.train)
     free = 6 * best["n_components"] - 1  # weights, means and covariances in 2D
     assert best["bic"] == pytest.approx(-2 * n * best["log_likelihood"] + free * math.log(n))
     assert chosen["n_components"] == best["n_components"]
@@ -108,7 +105,7 @@ def test_the_criterion_chooses_its_least_value_and_pays_for_the_whole_curve(rows
     assert chosen["count_seconds"] == pytest.approx(chosen["seconds"] - best["seconds"])
 
 
-def test_modes_are_counted_at_a_share_of_the_size_of_the_cloud(generator):
+def test_modes_match_scikit_learn_mean_shift(generator):
     blobs = torch.randn(200, 3, generator=generator, dtype=torch.float64) * 0.05
     blobs += 4 * torch.eye(3, dtype=torch.float64)[torch.arange(200) % 3]
     assert count_modes(blobs, 0.3) == 3
@@ -119,7 +116,7 @@ def test_modes_are_counted_at_a_share_of_the_size_of_the_cloud(generator):
     assert count_modes(blobs, 0.02) == pytest.approx(len(peer.cluster_centers_), rel=0.25)
 
 
-def test_a_map_row_is_of_the_map_that_the_rule_learns(rows, scans):
+def test_map_row_matches_a_map_with_that_rule(rows, scans):
     first = of(rows, "map_flat_pieces")[0]
     built = GaussianMap(component_count.WindowedRule(noise=0.02, window=5), n_samples=20_000)
     for number, scan in enumerate(scans):
@@ -136,71 +133,69 @@ def test_a_map_row_is_of_the_map_that_the_rule_learns(rows, scans):
     assert first["held_out_log_likelihood"] == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_a_fixed_map_has_its_number_in_every_window(rows, scans):
-    """Of returns; what came back empty is fitted apart, with as many again at most."""
+def test_a_fixed_map_has_its_number_of_components_per_window(rows, scans):
+    """No-return beams are fitted separately, with at most as many components again."""
     for row in of(rows, "map_fixed"):
         n_windows = math.ceil(9 / 5)
         assert n_windows * row["setting"] <= row["n_components"] <= 2 * n_windows * row["setting"]
 
 
-def test_the_same_seed_gives_the_same_rows(rows, material, scans):
-    assert timeless(run(material, scans, STUDY, EM)) == timeless(rows)
+def test_rows_depend_only_on_the_seed(rows, data, scans):
+    assert timeless(run(data, scans, STUDY, EM)) == timeless(rows)
 
 
-def test_rows_are_handed_on_as_they_come(material, scans):
+def test_rows_are_reported_one_by_one(data, scans):
     seen: list[int] = []
     events: list[tuple[str, int, int | None]] = []
-    study = CountStudy((2,), multiples=(1.0,), bandwidths=(), window_components=())
-    found = run(
-        material, scans, study, EM, 0, lambda *event: events.append(event), lambda r: seen.append(len(r))
-    )
+    study = ComponentCountStudy((2,), multiples=(1.0,), bandwidths=(), window_components=())
+    found = run(data, scans, study, EM, 0, lambda *event: events.append(event), lambda r: seen.append(len(r)))
     assert [row["rule"] for row in found] == ["fixed", "flat_pieces", "hierarchical", "bic"]
     assert seen == [1, 2, 3, 4]
     assert events == [("components", done, 3) for done in range(4)]
 
 
-def test_one_scan_has_no_maps(material, scans):
-    study = CountStudy((2, 10**6), multiples=(), bandwidths=())
-    assert [row["rule"] for row in run(material, scans[:1], study, EM)] == ["fixed", "bic"]
+def test_no_maps_are_built_from_one_scan(data, scans):
+    study = ComponentCountStudy((2, 10**6), multiples=(), bandwidths=())
+    assert [row["rule"] for row in run(data, scans[:1], study, EM)] == ["fixed", "bic"]
 
 
-def test_the_window_is_in_the_middle():
+def test_middle_returns_the_central_scans():
     assert middle(range(9), 3) == range(3, 6)  # type: ignore[arg-type]
     assert middle(range(4), 20) == range(4)  # type: ignore[arg-type]
 
 
-def test_a_component_is_ten_numbers_in_space():
+def test_component_bytes_count_four_bytes_per_parameter():
     assert (component_bytes(7, 3), component_bytes(7, 2)) == (280, 168)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_components": ()}, r"study\.n_components is empty"),
-        ({"n_components": (0,)}, r"study\.n_components=0"),
-        ({"n_components": (10**6,)}, r"study\.n_components=\[1000000\]: all are above"),
-        ({"window_components": (1.5,)}, r"study\.window_components=1\.5"),
-        ({"window": 0}, r"study\.window=0"),
-        ({"noise": 0.0}, r"study\.noise=0"),
-        ({"multiples": (math.inf,)}, r"study\.multiples=inf"),
-        ({"bandwidths": (-1.0,)}, r"study\.bandwidths=-1"),
+        ({"n_components": ()}, r"n_components=\[\] is empty"),
+        ({"n_components": (0,)}, "n_components=0"),
+        ({"n_components": (10**6,)}, r"n_components=\[1000000\]: all exceed"),
+        ({"window_components": (1.5,)}, r"window_components=1\.5"),
+        ({"window": 0}, "window=0"),
+        ({"noise": 0.0}, "noise=0"),
+        ({"multiples": (math.inf,)}, "multiples=inf"),
+        ({"bandwidths": (-1.0,)}, "bandwidths=-1"),
         ({"resolution": 0.0}, "resolution"),
         ({"test_every": 1}, "test_every"),
     ],
 )
-def test_bad_options_are_named(options, message, material, scans):
+def test_invalid_options_raise(options, message, data, scans):
     with pytest.raises(InvalidArgumentError, match=message):
-        run(material, scans, CountStudy(**options), EM)
+        run(data, scans, ComponentCountStudy(**options), EM)
 
 
 @pytest.mark.real_data
 @pytest.mark.slow
-def test_on_a_depth_image_flat_pieces_are_as_good_as_numbers_of_their_size(real_data):
+def test_flat_pieces_match_the_curve_on_a_depth_image(real_data):
     path = real_data / "kinect"
     if not path.is_dir():
         pytest.skip(f"{path} is not there")
     scan = load("depth_frames", path, pixel_stride=4)[40]
-    study = CountStudy((64, 128, 256), multiples=(1.0,), bandwidths=(), window_components=())
+    study = ComponentCountStudy((64, 128, 256), multiples=(1.0,), bandwidths=(), window_components=())
     found = run(split("kinect", scan.points, 0.5, 0), [scan], study)
     pieces, (few, *_, many) = of(found, "flat_pieces")[0], of(found, "fixed")
     assert few["n_components"] < pieces["n_components"] < many["n_components"]

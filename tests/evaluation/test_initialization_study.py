@@ -1,4 +1,4 @@
-"""The study of where EM starts: its rows are those of GaussianMixture, with the time of the start apart."""
+"""The initialization study: its rows match GaussianMixture, with a separate time for the initialization."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.estimators import FitOptions
 from gmmtorch.evaluation.events import ignore
+from gmmtorch.evaluation.fit_comparison import FitData, Row, compare, split
+from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies import initialization_study as initialization
-from gmmtorch.evaluation.studies.fitting import Material, Row, compare, split
-from gmmtorch.evaluation.studies.initialization_study import Options, fit_timed, run
+from gmmtorch.evaluation.studies.initialization_study import fit_timed, run
+from gmmtorch.evaluation.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
 EM = FitOptions(max_iter=20, algorithm="exact")
-SMALL = Options(n_components=(2, 5), init_params=("random_points", "kmeans"), n_seeds=2)
+SMALL = InitializationStudy(n_components=(2, 5), init_params=("random_points", "kmeans"), n_seeds=2)
 
 
 @pytest.fixture
-def material(generator) -> Material:
+def data(generator) -> FitData:
     points = torch.randn(600, 3, generator=generator, dtype=torch.float64) * torch.tensor([3.0, 1.0, 0.1])
     return split("slab", points + 500.0, 0.5, 0)
 
 
-def rows_of(material: Material, options: Options = SMALL, seed: int = 0) -> list[Row]:
-    return run(material, options, EM, seed, ignore, lambda rows: None)
+def rows_of(data: FitData, study: InitializationStudy = SMALL, seed: int = 0) -> list[Row]:
+    return run(data, study, EM, seed, ignore, lambda rows: None)
 
 
 def timeless(rows: list[Row]) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
-def test_there_is_a_row_for_each_start_number_and_seed(material):
-    rows = rows_of(material, seed=7)
+def test_a_row_for_each_initialization_number_and_seed(data):
+    rows = rows_of(data, seed=7)
     cases = [(row["seed"], row["n_components"], row["init_params"]) for row in rows]
     assert cases == [(s, k, i) for s in (7, 8) for k in (2, 5) for i in ("random_points", "kmeans")]
     for row in rows:
@@ -47,26 +48,26 @@ def test_there_is_a_row_for_each_start_number_and_seed(material):
 
 
 @pytest.mark.parametrize("init_params", INITIALIZATIONS)
-def test_a_row_says_what_fitting_by_the_estimator_says(init_params, material):
+def test_a_timed_fit_matches_the_estimator(init_params, data):
     options = replace(EM, n_components=5, init_params=init_params)
-    ours = fit_timed(material, 5, options, seed=3)
-    theirs = compare(material, ["em"], options, 3, ignore).rows[0]
+    ours = fit_timed(data, 5, options, seed=3)
+    theirs = compare(data, ["em"], options, 3, ignore).rows[0]
     for name, value in theirs.items():
-        if name in ("nbytes", "seconds"):  # the estimator's file names its options, too
+        if name in ("nbytes", "seconds"):  # the estimator's file also contains its options
             continue
         expected = pytest.approx(value, rel=1e-9) if isinstance(value, float) else value
         assert ours[name] == expected, name
 
 
-def test_the_seed_decides(material):
-    assert timeless(rows_of(material)) == timeless(rows_of(material))
-    assert timeless(rows_of(material)) != timeless(rows_of(material, seed=1))
+def test_rows_depend_only_on_the_seed(data):
+    assert timeless(rows_of(data)) == timeless(rows_of(data))
+    assert timeless(rows_of(data)) != timeless(rows_of(data, seed=1))
 
 
-def test_rows_are_handed_on_as_they_come_and_progress_ends_at_all(material):
+def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
     seen: list[int] = []
     events: list[tuple[str, int, int | None]] = []
-    run(material, SMALL, EM, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))
+    run(data, SMALL, EM, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows)))
     assert seen == list(range(1, 9))
     assert events == [("starts", done, 8) for done in range(9)]
 
@@ -75,14 +76,14 @@ def test_rows_are_handed_on_as_they_come_and_progress_ends_at_all(material):
     ("options", "message"),
     [
         ({"n_seeds": 0}, "n_seeds=0"),
-        ({"n_components": ()}, r"study\.n_components is empty"),
-        ({"init_params": []}, r"study\.init_params is empty"),
+        ({"n_components": ()}, r"n_components=\[\] is empty"),
+        ({"init_params": []}, r"init_params=\[\] is empty"),
         ({"n_components": (2, 400)}, "n_components=400 is more than the n_samples=300"),
         ({"n_components": (0,)}, "n_components=0"),
         ({"init_params": ("kmeans", "sorted")}, "init_params='sorted'"),
     ],
 )
-def test_bad_options_are_named_before_anything_is_fitted(options, message, material, monkeypatch):
+def test_invalid_options_raise_before_the_first_fit(options, message, data, monkeypatch):
     monkeypatch.setattr(initialization, "fit_timed", lambda *_: pytest.fail("something was fitted"))
     with pytest.raises(InvalidArgumentError, match=message):
-        rows_of(material, replace(SMALL, **options))
+        rows_of(data, replace(SMALL, **options))

@@ -1,4 +1,4 @@
-"""Scores against scikit-learn, enumeration and formulas written out."""
+"""Scores against scikit-learn, enumeration and explicit formulas."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.metrics import auc_interval, brier, psnr2, psnr_terms, roc, unknown_scores
 
 eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)
-"""Few values, so that ties are common."""
+"""Few values, so that many scores tie."""
 
 
 def scores(n: int, shift: float, seed: int, levels: int | None = None) -> Tensor:
-    """Probabilities (n,), the higher the larger the shift; on a few levels, so that many tie, if asked."""
+    """Probabilities (n,) that grow with the shift; `levels` rounds them, so that many tie."""
     raw = np.random.default_rng(seed).normal(shift, 1.0, n)
     theta = torch.from_numpy(1 / (1 + np.exp(-raw)))
     return theta if levels is None else (theta * levels).round() / levels
@@ -37,19 +37,19 @@ def labelled(occupied: Tensor, free: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(eighths, eighths)
-def test_auc_is_the_share_of_pairs_in_the_right_order_and_ties_count_half(occupied, free):
+def test_auc_is_the_share_of_ordered_pairs_and_ties_count_half(occupied, free):
     pairs = [0.5 * ((p > q) + (p >= q)) for p, q in itertools.product(occupied, free)]
     found = roc(torch.tensor(occupied).double(), torch.tensor(free).double()).auc
     assert found == pytest.approx(sum(pairs) / len(pairs), abs=1e-12)
 
 
 @pytest.mark.parametrize("levels", [None, 10, 2])
-def test_auc_is_that_of_scikit_learn(levels):
+def test_auc_matches_scikit_learn(levels):
     occupied, free = scores(700, 0.8, 0, levels), scores(1300, -0.2, 1, levels)
     assert roc(occupied, free).auc == pytest.approx(roc_auc_score(*labelled(occupied, free)), abs=1e-12)
 
 
-def test_the_curve_climbs_from_corner_to_corner():
+def test_roc_curve_is_monotone_from_corner_to_corner():
     curve = roc(scores(50, 0.5, 0, 8), scores(80, 0.0, 1, 8))
     for rate in (curve.false_positive, curve.true_positive):
         assert rate[0] == 0
@@ -57,7 +57,7 @@ def test_the_curve_climbs_from_corner_to_corner():
         assert (np.diff(rate) >= 0).all()
 
 
-def test_auc_of_perfect_reversed_and_ignorant_maps():
+def test_auc_of_perfect_reversed_and_constant_maps():
     low, high, half = torch.full((4,), 0.1), torch.full((3,), 0.9), torch.full((4,), 0.5)
     assert roc(high, low).auc == 1
     assert roc(low, high).auc == 0
@@ -65,7 +65,7 @@ def test_auc_of_perfect_reversed_and_ignorant_maps():
 
 
 @pytest.mark.parametrize(("n_occupied", "n_free"), [(0, 3), (3, 0), (0, 0)])
-def test_a_curve_of_one_class_is_refused(n_occupied, n_free):
+def test_roc_of_one_class_raises(n_occupied, n_free):
     with pytest.raises(InvalidArgumentError, match="at least one occupied and one free point"):
         roc(torch.rand(n_occupied), torch.rand(n_free))
 
@@ -81,11 +81,11 @@ def interval(occupied: Tensor, free: Tensor, seed: int = 0, **options: float) ->
 
 
 @pytest.mark.parametrize("levels", [None, 6])
-def test_the_interval_is_that_of_resampling_points_one_by_one(levels):
+def test_interval_matches_resampling_of_single_points(levels):
     occupied, free = scores(150, 0.9, 2, levels), scores(250, 0.0, 3, levels)
     generator = np.random.default_rng(0)
     replicates = []
-    for _ in range(600):
+    for _ in range(400):
         drawn = [x[torch.from_numpy(generator.integers(0, len(x), len(x)))] for x in (occupied, free)]
         replicates.append(roc_auc_score(*labelled(*drawn)))
     low, _, high = interval(occupied, free)
@@ -95,7 +95,7 @@ def test_the_interval_is_that_of_resampling_points_one_by_one(levels):
     assert high - low == pytest.approx(expected[1] - expected[0], rel=0.12)
 
 
-def test_the_interval_of_many_points_has_the_width_of_delong():
+def test_interval_width_matches_delong():
     occupied, free = scores(20_000, 1.0, 4), scores(30_000, 0.0, 5)
     ranks = [np.searchsorted(np.sort(b.numpy()), a.numpy()) / len(b) for a, b in
              ((occupied, free), (free, occupied))]  # fmt: skip
@@ -105,7 +105,7 @@ def test_the_interval_of_many_points_has_the_width_of_delong():
     assert (low + high) / 2 == pytest.approx(auc, abs=0.2 * sigma)
 
 
-def test_the_interval_depends_on_the_seed_only_and_widens_with_its_level():
+def test_interval_depends_only_on_the_seed_and_widens_with_the_level():
     occupied, free = scores(200, 0.7, 0), scores(200, 0.0, 1)
     assert interval(occupied, free, seed=1) == interval(occupied, free, seed=1)
     assert interval(occupied, free, seed=1) != interval(occupied, free, seed=2)
@@ -113,12 +113,12 @@ def test_the_interval_depends_on_the_seed_only_and_widens_with_its_level():
     assert wide[0] < narrow[0] < narrow[1] < narrow[2] < wide[2]
 
 
-def test_the_interval_of_scores_that_all_tie_is_a_point():
+def test_interval_of_equal_scores_is_a_point():
     half = torch.full((30,), 0.5)
     assert interval(half, half) == (0.5, 0.5, 0.5)
 
 
-def test_the_interval_holds_its_auc_and_stays_among_the_areas_there_are():
+def test_interval_contains_the_auc_and_lies_in_zero_to_one():
     for seed in range(12):
         low, auc, high = interval(scores(8, 2.5, seed), scores(6, 0.0, 100 + seed), seed=seed)
         assert 0 <= low <= auc <= high <= 1
@@ -127,16 +127,16 @@ def test_the_interval_holds_its_auc_and_stays_among_the_areas_there_are():
 # -- the other scores -----------------------------------------------------------------------------
 
 
-def test_brier_is_the_mean_squared_error_of_the_probabilities():
+def test_brier_is_the_mean_squared_error():
     assert brier(torch.tensor([1.0, 0.5]), torch.tensor([0.0, 0.25])) == pytest.approx(0.3125 / 4)
     occupied, free = scores(60, 1.0, 0), scores(40, -1.0, 1)
     assert brier(occupied, free) == pytest.approx(brier_score_loss(*labelled(occupied, free)), abs=1e-12)
     assert brier(torch.full((3,), 0.5), torch.full((7,), 0.5)) == 0.25
 
 
-def test_scores_of_unknown_space_by_hand():
+def test_unknown_scores_match_a_hand_count():
     unknown, free = torch.tensor([0.5, 0.5, 0.125, 0.75]), torch.tensor([0.125, 0.25, 0.0625, 0.5])
-    # How far from ½: unknown 0, 0, 3/8, 1/4; free 3/8, 1/4, 7/16, 0. Pairs in the right order, ties ½:
+    # |θ − ½|: unknown 0, 0, 3/8, 1/4; free 3/8, 1/4, 7/16, 0. Ordered pairs, ties count ½:
     right = (3 + 0.5) + (3 + 0.5) + (1 + 0.5) + (2 + 0.5)
     assert unknown_scores(unknown, free) == {
         "unknown_auc": pytest.approx(right / 16),
@@ -146,13 +146,13 @@ def test_scores_of_unknown_space_by_hand():
     }
 
 
-def test_a_cell_on_the_threshold_is_called_neither_free_nor_occupied():
+def test_probabilities_on_a_threshold_are_neither_free_nor_occupied():
     found = unknown_scores(torch.tensor([0.2, 0.65]).double(), torch.tensor([0.2, 0.1]).double())
     assert (found["unknown_called_free"], found["unknown_called_occupied"]) == (0, 0)
     assert found["free_recall"] == 0.5
 
 
-def test_without_unknown_points_their_scores_are_none():
+def test_unknown_scores_are_none_without_unknown_points():
     found = unknown_scores(torch.empty(0), torch.tensor([0.1, 0.9]))
     assert found == {
         "unknown_auc": None,
@@ -174,7 +174,7 @@ def psnr2_by_all_pairs(x: np.ndarray, y: np.ndarray) -> float:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_psnr2_is_that_of_all_pairs_of_points(generator, dim, dtype):
+def test_psnr2_matches_all_pairs(generator, dim, dtype):
     points = torch.randn(80, dim, generator=generator, dtype=dtype) * 3 + 5
     sampled = torch.randn(80, dim, generator=generator, dtype=dtype) * 3 + 5
     expected = psnr2_by_all_pairs(points.double().numpy(), sampled.double().numpy())
@@ -182,29 +182,29 @@ def test_psnr2_is_that_of_all_pairs_of_points(generator, dim, dtype):
     assert sum(psnr_terms(points, sampled)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_psnr2_does_not_depend_on_place_and_scale(generator):
+def test_psnr2_is_invariant_to_translation_and_scale(generator):
     points, sampled = torch.rand(2, 50, 3, generator=generator, dtype=torch.float64)
     assert psnr2(7 * points - 3, 7 * sampled - 3) == pytest.approx(psnr2(points, sampled))
 
 
-def test_psnr2_of_the_same_cloud_is_infinite_in_any_order(generator):
+def test_psnr2_of_equal_clouds_is_infinite(generator):
     points = torch.rand(20, 3, generator=generator)
     assert psnr2(points, points) == math.inf
     assert psnr2(points, points.flip(0)) == math.inf
 
 
-def test_the_terms_of_psnr2_tell_what_is_missed_from_what_is_invented(generator):
+def test_psnr_terms_separate_missing_from_extra_points(generator):
     points = torch.rand(200, 2, generator=generator)
-    there, back = psnr_terms(points, points[:20])  # misses most of the cloud, invents nothing
-    assert back == math.inf
-    assert there < 40
-    there, back = psnr_terms(points, torch.cat([points, points[:50] + 3]))
-    assert there == math.inf
-    assert back < 0
+    forward, backward = psnr_terms(points, points[:20])  # most of the cloud is missing
+    assert backward == math.inf
+    assert forward < 40
+    forward, backward = psnr_terms(points, torch.cat([points, points[:50] + 3]))
+    assert forward == math.inf
+    assert backward < 0
     assert psnr2(points, points[:20]) == math.inf
 
 
-def test_psnr2_of_a_single_point_has_no_scale():
+def test_psnr2_of_a_single_point_is_infinite():
     point = torch.tensor([[1.0, 2.0, 3.0]])
     assert psnr2(point, point) == math.inf
     assert psnr2(point, point + 1) == -math.inf

@@ -1,4 +1,4 @@
-"""Maps whose poses are put right afterwards, against maps that were learned from right ones."""
+"""Maps with corrected poses, against maps that were learned from the true poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pillar_room import room_scans
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.held_out import Protocol
+from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.evaluation.split import perturb_poses, pose_perturbations
 from gmmtorch.evaluation.studies.pose_correction import build_by_scan, correct_poses, evaluate_correction
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -32,7 +32,7 @@ def building() -> list[Scan]:
 
 
 def corrected(scans: Sequence[Scan]) -> tuple[GaussianMap, GaussianMap, list[torch.Tensor]]:
-    """A map of perturbed poses put right, one of the right poses, and the ids of the latter by scan."""
+    """A corrected map of perturbed poses, a map of the true poses, and the latter's ids by scan."""
     motions = pose_perturbations(scans, NOISE, seed=3)
     wrong, right = per_scan(), per_scan()
     born = build_by_scan(wrong, [s.transformed(m) for s, m in zip(scans, motions, strict=True)])
@@ -43,14 +43,14 @@ def corrected(scans: Sequence[Scan]) -> tuple[GaussianMap, GaussianMap, list[tor
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_every_scan_s_components_are_those_of_a_map_learned_from_right_poses(dim, building):
+def test_corrected_components_match_a_map_from_true_poses(dim, building):
     scans = building[:6] if dim == 2 else room_scans(4, 300, dim=3)
     wrong, right, by_scan = corrected(scans)
     found, truth = wrong.components(), right.components()
     assert torch.equal(found.ids, truth.ids)
     for ids in by_scan:
         here = (found.ids[:, None] == ids[None]).all(2).any(1)
-        # Which of two pieces comes first depends on the sign of an axis: pairs are found by nearness.
+        # The order of two pieces depends on the sign of an axis, so the nearest components are compared.
         pair = torch.cdist(found.means[here], truth.means[here]).argmin(1)
         assert len(set(pair.tolist())) == len(ids)
         for name, tolerance in (("means", 1e-4), ("covariances", 1e-6), ("support", 1e-3)):
@@ -61,32 +61,32 @@ def test_every_scan_s_components_are_those_of_a_map_learned_from_right_poses(dim
         )
 
 
-def test_correction_restores_the_area(building):
+def test_correction_restores_the_auc(building):
     protocol = Protocol(test_every=4, resolution=(0.1, 0.2), kept=(1.0, 0.5), pose_noise=NOISE)
     rows = evaluate_correction("building", building, per_scan, protocol, ("point", "monte_carlo"))
     order = [(row["kept"], row["method"], row["resolution"]) for row in rows]
     assert order == [(k, m, r) for k in (1.0, 0.5) for m in ("point", "monte_carlo") for r in (0.1, 0.2)]
     for row in rows:
         assert row["auc"] < row["auc_clean"] - 0.02
-        exact = 1e-4 if row["method"] == "point" else 0.01  # rays are drawn in another order
+        exact = 1e-4 if row["method"] == "point" else 0.01  # Monte Carlo draws its rays in another order
         assert row["auc_corrected"] == pytest.approx(row["auc_clean"], abs=exact)
         assert (row["pose_noise_m"], row["pose_noise_rad"]) == NOISE
         assert row["dataset"] == "building"
         assert row["n_components"] > 0
 
 
-def test_without_noise_nothing_changes(building):
+def test_without_noise_all_aucs_are_equal(building):
     (row,) = evaluate_correction("building", building, per_scan, Protocol(test_every=4, resolution=(0.1,)))
     assert row["auc"] == row["auc_corrected"] == row["auc_clean"]
 
 
-def test_scans_may_be_taken_away(building):
+def test_correction_works_with_removed_scans(building):
     protocol = Protocol(test_every=4, removal="scans", kept=(0.5,), pose_noise=NOISE)
     (row,) = evaluate_correction("building", building, per_scan, protocol)
     assert row["auc_corrected"] == pytest.approx(row["auc_clean"], abs=1e-4)
 
 
-def test_perturbed_scans_are_those_moved_by_the_motions(building):
+def test_perturb_poses_applies_the_motions(building):
     motions = pose_perturbations(building, NOISE, seed=5)
     for scan, motion, moved in zip(building, motions, perturb_poses(building, NOISE, seed=5), strict=True):
         assert torch.equal(scan.transformed(motion).points, moved.points)
@@ -94,7 +94,7 @@ def test_perturbed_scans_are_those_moved_by_the_motions(building):
         assert (motion @ homogeneous)[:-1].sub(scan.origin).norm() < 5 * NOISE[0]
 
 
-def test_a_scan_without_points_has_no_components_to_move():
+def test_a_scan_without_points_has_no_components():
     empty = Scan(torch.empty(0, 2), torch.zeros(2))
     scans = [*room_scans(2), empty]
     wrong, right, by_scan = corrected(scans)
@@ -102,13 +102,13 @@ def test_a_scan_without_points_has_no_components_to_move():
     assert wrong.n_components == right.n_components
 
 
-def test_windows_of_several_scans_cannot_be_put_right():
+def test_windows_of_several_scans_raise():
     with pytest.raises(InvalidArgumentError, match=r"window=None.*map=per_scan"):
         build_by_scan(GaussianMap(), room_scans(2))
 
 
-def test_every_scan_needs_its_motion():
+def test_a_missing_motion_raises():
     built = per_scan()
     born = build_by_scan(built, room_scans(2))
-    with pytest.raises(InvalidArgumentError, match="1 motions for 2 scans"):
+    with pytest.raises(InvalidArgumentError, match="motions has 1 entries for 2 scans"):
         correct_poses(built, born, [torch.eye(3, dtype=torch.float64)])

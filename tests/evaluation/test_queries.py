@@ -1,4 +1,4 @@
-"""The points that a map is asked about, and that their truth is what it is said to be."""
+"""The test points and their labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import queries as asking  # `test_beams` by its own name would be taken for a test
+from gmmtorch.evaluation import queries as query_points  # pytest would collect the name `test_beams`
 from gmmtorch.evaluation.held_out import Protocol, evaluate
 from gmmtorch.evaluation.methods import choose, methods
 from gmmtorch.evaluation.queries import (
@@ -23,8 +23,8 @@ from gmmtorch.evaluation.queries import (
     UNKNOWN,
     Queries,
     hit_and_free,
+    ray_evidence,
     save_queries,
-    touched,
     unseen,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -35,7 +35,8 @@ MANY = 1_000_000
 
 
 def along(points: Tensor, origins: Tensor, ends: Tensor) -> Tensor:
-    """How far along its beam each point lies, 0 at the sensor, 1 at the hit; fails if it is beside it."""
+    """Position of each point along its beam, 0 at the sensor and 1 at the hit; fails if it is off the
+    beam."""
     beam = ends - origins
     share = ((points - origins) * beam).sum(1) / (beam**2).sum(1)
     torch.testing.assert_close(origins + share[:, None] * beam, points, atol=1e-9, rtol=0)
@@ -44,8 +45,8 @@ def along(points: Tensor, origins: Tensor, ends: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("free", ["uniform", "near_surface"])
-def test_every_beam_gives_one_hit_and_one_free_point(dim, free):
-    origins, ends = asking.test_beams(room_scans(4, dim=dim), MANY, seed=0)
+def test_every_beam_has_one_occupied_and_one_free_point(dim, free):
+    origins, ends = query_points.test_beams(room_scans(4, dim=dim), MANY, seed=0)
     asked = hit_and_free(origins, ends, free, 0.1, seed=0)
     assert asked.labels.dtype == torch.int64
     assert asked.points.dtype == torch.float64
@@ -55,9 +56,9 @@ def test_every_beam_gives_one_hit_and_one_free_point(dim, free):
     assert bool(((share >= 0) & (share <= 1)).all())
 
 
-def test_beams_without_return_are_not_asked_about():
+def test_no_return_beams_are_left_out_of_the_test():
     scans = room_scans(3)
-    origins, ends = asking.test_beams(scans, MANY, seed=0)
+    origins, ends = query_points.test_beams(scans, MANY, seed=0)
     torch.testing.assert_close(ends, torch.cat([scan.points for scan in scans]))
     torch.testing.assert_close(
         origins, torch.cat([scan.origin.expand(len(scan.points), -1) for scan in scans])
@@ -66,7 +67,7 @@ def test_beams_without_return_are_not_asked_about():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_free_points_are_uniform_along_the_beam(dim):
-    origins, ends = asking.test_beams(room_scans(5, n_beams=4000, dim=dim), MANY, seed=0)
+    origins, ends = query_points.test_beams(room_scans(5, n_beams=4000, dim=dim), MANY, seed=0)
     asked = hit_and_free(origins, ends, "uniform", 0.1, seed=0)
     share = along(asked.points[asked.of(FREE)], origins, ends)
     assert kstest(share.numpy(), "uniform").pvalue > 0.01
@@ -75,8 +76,8 @@ def test_free_points_are_uniform_along_the_beam(dim):
 
 
 @pytest.mark.parametrize("resolution", [0.02, 0.2])
-def test_near_surface_points_lie_half_to_two_cells_before_the_hit(resolution):
-    origins, ends = asking.test_beams(room_scans(5, n_beams=4000), MANY, seed=0)
+def test_near_surface_points_are_half_to_two_cells_before_the_hit(resolution):
+    origins, ends = query_points.test_beams(room_scans(5, n_beams=4000), MANY, seed=0)
     asked = hit_and_free(origins, ends, "near_surface", resolution, seed=0)
     points = asked.points[asked.of(FREE)]
     gap = (ends - points).norm(dim=1) / resolution
@@ -86,7 +87,7 @@ def test_near_surface_points_lie_half_to_two_cells_before_the_hit(resolution):
     assert bool((along(points, origins, ends) > 0).all())
 
 
-def test_near_surface_points_are_never_before_the_sensor():
+def test_near_surface_points_are_never_behind_the_sensor():
     length = torch.linspace(0.01, 0.5, 200, dtype=torch.float64)
     origins = torch.tensor([[3.0, -2.0]], dtype=torch.float64).expand(200, 2)
     ends = origins + length[:, None] * torch.tensor([0.6, 0.8], dtype=torch.float64)
@@ -96,52 +97,52 @@ def test_near_surface_points_are_never_before_the_sensor():
     assert bool((share[length < 0.1] == 0).all())  # shorter than half a cell: the sensor itself
 
 
-def test_an_unknown_choice_of_free_points_lists_the_known_ones():
+def test_an_unknown_choice_of_free_points_raises():
     with pytest.raises(InvalidArgumentError, match=r"free='behind' is not one of uniform, near_surface"):
         hit_and_free(torch.zeros(1, 2), torch.ones(1, 2), "behind", 0.1, seed=0)
 
 
-def test_points_depend_on_the_seed_only():
-    origins, ends = asking.test_beams(room_scans(2), MANY, seed=0)
+def test_free_points_depend_only_on_the_seed():
+    origins, ends = query_points.test_beams(room_scans(2), MANY, seed=0)
     first, again, other = (hit_and_free(origins, ends, "uniform", 0.1, seed) for seed in (0, 0, 1))
     assert torch.equal(first.points, again.points)
     assert not torch.equal(first.points, other.points)
 
 
-def test_more_beams_than_allowed_are_thinned_at_random():
+def test_max_beams_draws_a_random_subset():
     scans = room_scans(6)
-    _, every_end = asking.test_beams(scans, MANY, seed=0)
-    origins, ends = asking.test_beams(scans, 50, seed=0)
+    _, every_end = query_points.test_beams(scans, MANY, seed=0)
+    origins, ends = query_points.test_beams(scans, 50, seed=0)
     assert len(origins) == len(ends) == 50
     whole = {tuple(row): i for i, row in enumerate(every_end.tolist())}
     chosen = [whole[tuple(row)] for row in ends.tolist()]
     assert len(set(chosen)) == 50
-    assert max(chosen) > len(every_end) // 2  # from all scans, not from the first
-    for origin, end in zip(origins, ends, strict=True):  # each with its own sensor
+    assert max(chosen) > len(every_end) // 2  # from all scans
+    for origin, end in zip(origins, ends, strict=True):  # each with its own sensor origin
         scan = next(s for s in scans if bool((s.points == end).all(1).any()))
         assert torch.equal(scan.origin, origin)
-    assert torch.equal(asking.test_beams(scans, 50, seed=0)[1], ends)
-    assert not torch.equal(asking.test_beams(scans, 50, seed=1)[1], ends)
-    assert len(asking.test_beams(scans, len(every_end), seed=0)[1]) == len(every_end)
+    assert torch.equal(query_points.test_beams(scans, 50, seed=0)[1], ends)
+    assert not torch.equal(query_points.test_beams(scans, 50, seed=1)[1], ends)
+    assert len(query_points.test_beams(scans, len(every_end), seed=0)[1]) == len(every_end)
 
 
-def test_scans_without_any_return_cannot_be_tested_on():
+def test_test_scans_without_returns_raise():
     scan = Scan(torch.empty(0, 2), torch.zeros(2), torch.ones(5, 2))
-    with pytest.raises(InvalidArgumentError, match=r"no beam that hit anything.*evaluation\.test_every"):
-        asking.test_beams([scan, scan], MANY, seed=0)
+    with pytest.raises(InvalidArgumentError, match=r"no return beams.*evaluation\.test_every"):
+        query_points.test_beams([scan, scan], MANY, seed=0)
 
 
 # -- unseen space ---------------------------------------------------------------------------------
 
 
 def rays_of(scans: list[Scan]) -> tuple[Tensor, Tensor]:
-    """Origins and ends (R, D) of all beams, those without return too."""
+    """Origins and ends (R, D) of all beams, no-return beams included."""
     origins = torch.cat([scan.origin.expand(scan.n_beams, -1) for scan in scans])
     return origins, torch.cat([scan.ends()[0] for scan in scans])
 
 
 def enters(box_low: Tensor, box_high: Tensor, origins: Tensor, ends: Tensor) -> bool:
-    """Whether any of the segments (R, D) passes through the inside of a box: the slab test."""
+    """Whether one of the segments (R, D) crosses the interior of a box (slab test)."""
     beam = ends - origins
     near, far = (box_low - origins) / beam, (box_high - origins) / beam
     first = torch.minimum(near, far).amax(1).clamp_min(0)
@@ -150,16 +151,16 @@ def enters(box_low: Tensor, box_high: Tensor, origins: Tensor, ends: Tensor) -> 
 
 
 @pytest.mark.parametrize(("dim", "n_beams", "resolution"), [(2, 90, 0.1), (2, 90, 0.3), (3, 150, 0.3)])
-def test_unseen_points_are_those_behind_hits_that_no_training_ray_came_near(dim, n_beams, resolution):
+def test_unseen_points_match_brute_force_box_intersections(dim, n_beams, resolution):
     scans = room_scans(12, n_beams=n_beams, dim=dim)
     train, test = scans[:8], scans[8:]
-    origins, ends = asking.test_beams(test, 250, seed=0)
+    origins, ends = query_points.test_beams(test, 250, seed=0)
     grid = OccupancyGrid(resolution)
     for scan in train:
         grid.insert(scan)
     found = unseen(origins, ends, grid.evidence(), seed=0)
     assert bool((found.labels == UNKNOWN).all())
-    # Of a lattice without evidence all candidates are unseen, in the order of the beams.
+    # Without evidence all candidates are unseen, in the order of the beams.
     candidates = unseen(origins, ends, BlockEvidence(resolution, dim), seed=0).points
     assert len(candidates) == len(ends)
     behind = (candidates - ends).norm(dim=1) / resolution
@@ -167,18 +168,18 @@ def test_unseen_points_are_those_behind_hits_that_no_training_ray_came_near(dim,
     assert bool((along(candidates, origins, ends) > 1).all())
     starts, stops = rays_of(train)
     low = (candidates / resolution).floor() - 1
-    touched = torch.tensor([
+    observed = torch.tensor([
         enters(corner * resolution, (corner + 3) * resolution, starts, stops) for corner in low
     ])  # fmt: skip
-    assert 0.05 < float(touched.double().mean()) < 0.95  # or the test shows nothing
-    torch.testing.assert_close(found.points, candidates[~touched], atol=0, rtol=0)
+    assert 0.05 < float(observed.double().mean()) < 0.95  # both cases occur
+    torch.testing.assert_close(found.points, candidates[~observed], atol=0, rtol=0)
 
 
-def test_the_tip_of_a_beam_without_return_has_been_near():
-    """A beam without return ends in cell (10, 0); points of column 11 have it for a neighbour."""
+def test_the_end_cell_of_a_no_return_beam_is_observed():
+    """A no-return beam ends in cell (10, 0), a neighbour of the cells (11, -1) to (11, 1)."""
     beam = Scan(torch.empty(0, 2), torch.tensor([0.05, 0.05]), torch.tensor([[1.03, 0.05]]))
     ends = torch.tensor([[1.15, 0.65]], dtype=torch.float64).expand(200, 2)
-    found = unseen(ends + torch.tensor([0.0, 1.4]), ends, touched([beam], 0.1), seed=0)
+    found = unseen(ends + torch.tensor([0.0, 1.4]), ends, ray_evidence([beam], 0.1), seed=0)
     row = (found.points[:, 1] / 0.1).floor()
     assert set(row[(row >= 2) | (row <= -2)].tolist()) >= {3.0, 2.0, -2.0, -3.0}
     assert not bool(((row >= -1) & (row <= 1)).any())
@@ -191,7 +192,7 @@ def some_queries(shift: float = 0.0) -> Queries:
     return Queries(torch.tensor([[0.0, 1.0], [2.0 + shift, 3.0]]).double(), torch.tensor([OCCUPIED, FREE]))
 
 
-def test_points_that_every_resolution_shares_are_written_once(tmp_path):
+def test_points_shared_by_all_resolutions_are_saved_once(tmp_path):
     save_queries(tmp_path / "q.npz", {0.1: some_queries(), 0.02: some_queries()}, [1, 2], [0, 3])
     with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
         assert set(file) == {"points", "labels", "resolution", "train_scans", "test_scans"}
@@ -204,23 +205,23 @@ def test_points_that_every_resolution_shares_are_written_once(tmp_path):
         assert all(file[name].dtype == np.int64 for name in ("labels", "train_scans", "test_scans"))
 
 
-def test_points_that_differ_by_resolution_say_which_they_are_for(tmp_path):
+def test_saved_points_store_their_resolution(tmp_path):
     save_queries(tmp_path / "q.npz", {0.1: some_queries(), 0.02: some_queries(1.0)}, [1], [0])
     with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["resolution"], [0.1, 0.1, 0.02, 0.02])
         np.testing.assert_array_equal(file["points"][2:], some_queries(1.0).points.numpy())
 
 
-def test_the_file_gets_its_suffix_and_nothing_else_is_left(tmp_path):
+def test_saved_queries_get_the_npz_suffix(tmp_path):
     save_queries(tmp_path / "new" / "queries", {0.1: some_queries()}, [1], [0])
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["queries.npz"]
 
 
 @pytest.mark.parametrize("free", ["uniform", "near_surface"])
-def test_saved_maps_alone_answer_the_saved_queries_as_the_rows_say(tmp_path, free):
+def test_saved_maps_and_queries_reproduce_the_rows(tmp_path, free):
     protocol = Protocol(
         test_every=4,
-        kept=(1.0, 0.3),
+        kept=(1.0,) if free == "uniform" else (0.3,),
         resolution=(0.2, 0.1),
         free=free,
         unknown=True,
@@ -228,9 +229,9 @@ def test_saved_maps_alone_answer_the_saved_queries_as_the_rows_say(tmp_path, fre
         save_map=str(tmp_path / "maps"),
     )
     ours, grids = ("point", "monte_carlo"), ("occupancy_grid", "occupancy_log_odds")
-    known = choose([*ours, *grids], methods(lambda: GaussianMap(window=5, n_samples=20_000)))
+    known = choose([*ours, *grids], methods(lambda: GaussianMap(window=5, n_samples=5_000)))
     rows = evaluate("room", room_scans(16), known, protocol, seed=5).rows
-    assert len(rows) == len(known) * 4 == len(list((tmp_path / "maps").iterdir()))
+    assert len(rows) == len(known) * 2 == len(list((tmp_path / "maps").iterdir()))
     with np.load(tmp_path / "q.npz", allow_pickle=False) as file:
         saved = dict(file)
     np.testing.assert_array_equal(saved["test_scans"], [0, 4, 8, 12])

@@ -1,4 +1,4 @@
-"""Mixture and grid on real scans: the numbers that the project stands on."""
+"""AUC of mixture and grid on real scans."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def hall(real_data: Path) -> list[Scan]:
     return list(load("scan_folder", path))
 
 
-def test_on_intel_the_mixture_is_as_good_as_the_grid_and_better_on_a_tenth_of_the_beams(intel):
+def test_mixture_matches_the_grid_on_intel_and_beats_it_on_a_tenth_of_the_beams(intel):
     auc = scores(intel, Protocol(test_every=10, kept=(1.0, 0.1), resolution=(0.1,)))
     grid = auc["occupancy_grid", 1.0, 0.1]
     assert grid == pytest.approx(0.974, abs=0.003)
@@ -49,11 +49,11 @@ def test_on_intel_the_mixture_is_as_good_as_the_grid_and_better_on_a_tenth_of_th
     assert auc["monte_carlo", 0.1, 0.1] >= auc["occupancy_grid", 0.1, 0.1] + 0.003
 
 
-def test_on_a_tenth_of_intel_the_mixture_is_far_ahead_at_two_centimetres(intel):
+def test_mixture_beats_the_grid_at_two_centimetres_on_a_tenth_of_intel(intel):
     auc = scores(intel, Protocol(test_every=10, kept=(0.1,), resolution=(0.02,)))
     assert auc["monte_carlo", 0.1, 0.02] >= auc["occupancy_grid", 0.1, 0.02] + 0.05
 
 
-def test_in_the_hall_the_mixture_is_as_good_as_the_grid(hall):
+def test_mixture_matches_the_grid_in_the_hall(hall):
     auc = scores(hall, Protocol(test_every=5, resolution=(0.2,)))
     assert auc["monte_carlo", 1.0, 0.2] >= auc["occupancy_grid", 1.0, 0.2] - 0.001

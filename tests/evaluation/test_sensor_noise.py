@@ -1,8 +1,9 @@
-"""The sensor-noise study in a room that is known in closed form."""
+"""The sensor noise study in a room with a closed form."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +16,26 @@ from scipy.stats import multivariate_normal
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import queries
-from gmmtorch.evaluation.studies import sensor_noise
-from gmmtorch.evaluation.studies.sensor_noise import SENSORS, VARIANTS, NoiseStudy, run
+from gmmtorch.evaluation.studies.sensor_noise import SENSORS, VARIANTS, run, sensor_model
+from gmmtorch.evaluation.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.estimators.sensor_model import LaserModel, LidarModel
 from gmmtorch.scan import Scan
 
 NOISE = 0.04
 SENSOR = LaserModel(noise=NOISE, divergence=1e-4)
-STUDY = NoiseStudy((6, 20), 1500, 0.1, 5, 800, 40, 1e-6, n_samples=20_000)
+STUDY = SensorModelStudy(
+    "laser_2d",
+    {"noise": NOISE, "divergence": 1e-4},
+    (6, 20),
+    n_points=1500,
+    test_every=5,
+    max_beams=800,
+    max_iter=40,
+    tol=1e-6,
+    n_samples=20_000,
+)
+SMALL = replace(STUDY, n_components=(5,), n_points=300, resolution=0.2, max_beams=100, max_iter=5, tol=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +45,13 @@ def scans() -> list[Scan]:
 
 @pytest.fixture(scope="module")
 def rows(scans: list[Scan]) -> dict[tuple[int, str], dict]:
-    found = run("room", scans, SENSOR, STUDY)
+    found = run("room", scans, STUDY)
     order = [(k, variant) for k in STUDY.n_components for variant in VARIANTS]
     assert [row["variant"] for row in found] == [variant for _, variant in order]
     return dict(zip(order, found, strict=True))
 
 
-def test_every_row_is_plain_and_says_what_it_is_about(rows):
+def test_rows_are_serializable_and_consistent(rows):
     for (k, variant), row in rows.items():
         assert json.loads(json.dumps(row)) == row
         assert (row["dataset"], row["variant"], row["n_train_points"]) == ("room", variant, 1500)
@@ -57,8 +69,8 @@ def test_each_variant_is_scored_by_its_own_density(rows):
         assert row["held_out_log_likelihood"] == row[own]
 
 
-def test_the_scores_are_those_of_the_densities_and_the_map(scans, monkeypatch):
-    """One variant again, its likelihood by SciPy and its AUC by counting pairs."""
+def test_scores_match_scipy_densities_and_pair_counts(scans, monkeypatch):
+    """Recomputes one variant's likelihood by SciPy and its AUC by counting pairs."""
     kept: list[GaussianMap] = []
     make = GaussianMap.from_components
     monkeypatch.setattr(
@@ -66,8 +78,8 @@ def test_the_scores_are_those_of_the_densities_and_the_map(scans, monkeypatch):
         "from_components",
         lambda *args, **options: kept.append(make(*args, **options)) or kept[-1],
     )
-    study = NoiseStudy((6,), 800, 0.2, 5, 100, 10, n_neighbors=0, n_samples=5000)
-    row = run("room", scans, SENSOR, study)[2]
+    study = replace(SMALL, n_components=(6,), n_points=800, max_iter=10, n_neighbors=0, n_samples=5000)
+    row = run("room", scans, study)[2]
     built = kept[2]
     origins, ends = queries.test_beams(scans[::5], 100, 0)
     noise = SENSOR.noise_covariances(ends, origins).numpy()
@@ -81,7 +93,7 @@ def test_the_scores_are_those_of_the_densities_and_the_map(scans, monkeypatch):
             for x, r in zip(ends.numpy(), noise, strict=True)
         ]
     )
-    # The map is rounded as it is stored.
+    # The parameters of a map are quantized.
     assert row["held_out_log_likelihood"] == pytest.approx(logsumexp(logs, axis=1).mean(), abs=1e-3)
     asked = queries.hit_and_free(origins, ends, "uniform", 0.2, 0)
     theta = built.occupancy(asked.points, 0.2)
@@ -91,43 +103,38 @@ def test_the_scores_are_those_of_the_densities_and_the_map(scans, monkeypatch):
     assert row["nbytes"] == built.nbytes
 
 
-def test_the_noise_model_thins_the_walls_and_explains_the_measurements_better(rows):
+def test_the_noise_model_gives_thinner_walls_and_higher_likelihood(rows):
     plain, noise = rows[20, "plain"], rows[20, "noise"]
     assert noise["thickness"] < 0.7 * plain["thickness"]
     assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
-    # Counting the noise twice, or not at all, costs.
+    # Counting the noise twice, or not at all, lowers the likelihood.
     assert plain["log_likelihood_noise_added"] < plain["held_out_log_likelihood"]
     assert noise["log_likelihood_as_fitted"] < noise["held_out_log_likelihood"]
 
 
-def test_planar_components_are_no_thicker_than_the_noise(rows):
+def test_planar_components_are_at_most_as_thick_as_the_noise(rows):
     for (_, variant), row in rows.items():
         if variant.endswith("planar"):
             assert row["thickness"] <= row["sensor_deviation"] * (1 + 1e-6)
 
 
-def test_a_sensor_without_noise_changes_nothing(scans):
-    exact = LaserModel(noise=1e-9, divergence=1e-9)
-    study = NoiseStudy((10,), 600, 0.1, 5, 100, 10, n_samples=5000)
-    plain, _, noise, _ = run("room", scans, exact, study)
+def test_a_sensor_without_noise_gives_the_plain_mixture(scans):
+    exact = {"noise": 1e-9, "divergence": 1e-9}
+    study = replace(SMALL, sensor_options=exact, n_components=(10,), n_points=600, max_iter=10)
+    plain, _, noise, _ = run("room", scans, study)
     for name in ("held_out_log_likelihood", "auc", "thickness"):
         assert noise[name] == pytest.approx(plain[name], rel=1e-5)
 
 
-def test_the_same_seed_gives_the_same_rows(scans):
-    study = NoiseStudy((5,), 300, 0.2, 5, 100, 5, n_samples=5000)
-    first, again, other = (run("room", scans, SENSOR, study, seed) for seed in (3, 3, 4))
+def test_rows_depend_only_on_the_seed_and_progress_is_complete(scans):
+    events: list[tuple[str, int, int | None]] = []
+    first = run("room", scans, SMALL, 3, lambda *event: events.append(event))
+    again, other = (run("room", scans, SMALL, seed) for seed in (3, 4))
     for row in (*first, *again):
         row.pop("seconds")
     assert first == again
     assert first[0]["held_out_log_likelihood"] != other[0]["held_out_log_likelihood"]
-
-
-def test_progress_is_told(scans):
-    told: list[tuple[str, int, int | None]] = []
-    study = NoiseStudy((2, 3), 100, 0.5, 5, 50, 2, n_samples=5000)
-    run("room", scans, SENSOR, study, on_event=lambda *event: told.append(event))
-    assert told == [("sensor model", done, 8) for done in range(9)]
+    assert events == [("sensor model", done, 4) for done in range(5)]
 
 
 @pytest.mark.parametrize(
@@ -144,30 +151,36 @@ def test_progress_is_told(scans):
         ({"n_samples": 0}, "n_samples"),
     ],
 )
-def test_what_cannot_be_is_named(options, name):
+def test_invalid_options_raise(options, name):
     with pytest.raises(InvalidArgumentError, match=name):
-        NoiseStudy(**options)
+        SensorModelStudy(**options)
 
 
-def test_scans_without_points_are_refused(scans):
+def test_scans_without_points_raise(scans):
     empty = [Scan(np.empty((0, 2)), scan.origin) if i % 5 else scan for i, scan in enumerate(scans)]
     with pytest.raises(InvalidArgumentError, match="no points"):
-        run("room", empty, SENSOR, STUDY)
+        run("room", empty, STUDY)
 
 
-def test_the_sensors_have_names():
-    for name, model in SENSORS.items():
-        assert model().noise_covariances(torch.ones(1, 2), torch.zeros(2)).shape == (1, 2, 2), name
-    assert sensor_noise.SENSORS["lidar"] is LidarModel
+def test_sensor_models_are_found_by_name():
+    for name in SENSORS:
+        model = sensor_model(SensorModelStudy(name))
+        assert model.noise_covariances(torch.ones(1, 2), torch.zeros(2)).shape == (1, 2, 2), name
+    assert sensor_model(STUDY) == SENSOR
+    assert sensor_model(SensorModelStudy()) == LidarModel()
+    with pytest.raises(InvalidArgumentError, match="sensor='sonar' is not one of"):
+        sensor_model(SensorModelStudy("sonar"))
+    with pytest.raises(InvalidArgumentError, match="divergenz is not an option of lidar; known are"):
+        sensor_model(SensorModelStudy("lidar", {"divergenz": 1}))
 
 
 @pytest.mark.real_data
 @pytest.mark.slow
-def test_on_real_scans_the_noise_model_explains_held_out_measurements_better(real_data: Path):
+def test_the_noise_model_improves_likelihood_on_real_scans(real_data: Path):
     path = real_data / "laser2d" / "intel.log.gz"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
-    study = NoiseStudy((200,), 8000, 0.1, max_beams=5000, max_iter=30)
-    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=2)), LaserModel(), study)
+    study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=5000, max_iter=30)
+    plain, _, noise, _ = run("intel", list(load("carmen", path, stride=2)), study)
     assert noise["held_out_log_likelihood"] > plain["held_out_log_likelihood"]
     assert noise["thickness"] < plain["thickness"]

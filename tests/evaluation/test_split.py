@@ -1,4 +1,4 @@
-"""Which scans are held out, what is kept of the others, and poses made worse."""
+"""The split into training and test scans, removal of training data, and perturbed poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHARES = (0.8, 0.3, 0.1, 0.02)
 
 
 def beams(scans: list[Scan]) -> list[set[tuple[float, ...]]]:
-    """The beam ends of each scan, returns and others."""
+    """The beam ends of each scan, no-return beams included."""
     return [{tuple(row) for row in scan.ends()[0].tolist()} for scan in scans]
 
 
@@ -26,7 +26,7 @@ def sensors(scans: list[Scan]) -> list[tuple[float, ...]]:
 
 
 @pytest.mark.parametrize(("n_scans", "test_every"), [(2, 2), (10, 10), (11, 10), (45, 5), (7, 3), (5, 100)])
-def test_every_nth_scan_is_held_out_beginning_with_the_first(n_scans, test_every):
+def test_every_nth_scan_is_held_out_from_the_first(n_scans, test_every):
     train, test = split_indices(n_scans, test_every)
     assert test == [i for i in range(n_scans) if i % test_every == 0]
     assert train == [i for i in range(n_scans) if i % test_every]
@@ -34,18 +34,18 @@ def test_every_nth_scan_is_held_out_beginning_with_the_first(n_scans, test_every
 
 
 @pytest.mark.parametrize("test_every", [1, 0, -2])
-def test_holding_out_every_scan_is_refused(test_every):
+def test_holding_out_every_scan_raises(test_every):
     with pytest.raises(InvalidArgumentError, match=rf"test_every={test_every} must be at least 2"):
         split_indices(10, test_every)
 
 
 @pytest.mark.parametrize("n_scans", [0, 1])
-def test_too_few_scans_to_split_are_refused(n_scans):
+def test_fewer_than_two_scans_raise(n_scans):
     with pytest.raises(InvalidArgumentError, match=rf"has {n_scans} scans; at least 2 are needed"):
         split_indices(n_scans, 10)
 
 
-def test_a_smaller_share_of_the_beams_is_a_subset_of_a_larger_one():
+def test_a_smaller_share_of_beams_is_a_subset_of_a_larger_one():
     scans = room_scans(8)
     larger = beams(scans)
     for share in SHARES:
@@ -56,7 +56,7 @@ def test_a_smaller_share_of_the_beams_is_a_subset_of_a_larger_one():
 
 
 @pytest.mark.parametrize("share", SHARES)
-def test_the_share_of_beams_kept_is_as_asked(share):
+def test_the_kept_share_of_beams_matches_the_option(share):
     scans = room_scans(10, n_beams=2000)
     kept = keep_share(scans, share, "beams", seed=0)
     tolerance = 5 * math.sqrt(share * (1 - share))
@@ -66,25 +66,25 @@ def test_the_share_of_beams_kept_is_as_asked(share):
         assert after / before == pytest.approx(share, abs=tolerance / math.sqrt(before))
 
 
-def test_a_smaller_share_of_the_scans_is_a_subset_of_a_larger_one_in_the_same_order():
+def test_a_smaller_share_of_scans_is_a_subset_in_the_same_order():
     scans = room_scans(20)
     larger = sensors(scans)
     for share in SHARES:
         kept = keep_share(scans, share, "scans", seed=3)
         assert len(kept) == max(1, math.ceil(share * len(scans)))
         assert sensors(kept) == [origin for origin in larger if origin in set(sensors(kept))]
-        assert all(any(scan is whole for whole in scans) for scan in kept)  # whole scans, unchanged
+        assert all(any(scan is whole for whole in scans) for scan in kept)  # the same objects
         larger = sensors(kept)
 
 
 @pytest.mark.parametrize("removal", ["beams", "scans"])
-def test_keeping_everything_changes_nothing(removal):
+def test_a_share_of_one_keeps_the_scans(removal):
     scans = room_scans(3)
     assert all(a is b for a, b in zip(keep_share(scans, 1, removal, seed=0), scans, strict=True))
 
 
 @pytest.mark.parametrize("removal", ["beams", "scans"])
-def test_what_is_kept_depends_on_the_seed_only(removal):
+def test_kept_data_depends_only_on_the_seed(removal):
     scans = room_scans(20)
     first, again, other = (keep_share(scans, 0.3, removal, seed=seed) for seed in (1, 1, 2))
     assert beams(first) == beams(again)
@@ -92,12 +92,12 @@ def test_what_is_kept_depends_on_the_seed_only(removal):
 
 
 @pytest.mark.parametrize("share", [0, -0.5, 1.01, math.nan])
-def test_a_share_outside_zero_to_one_is_refused(share):
+def test_a_share_outside_zero_to_one_raises(share):
     with pytest.raises(InvalidArgumentError, match=r"kept=.* must be a share in \(0, 1\]"):
         keep_share(room_scans(2), share, "beams", seed=0)
 
 
-def test_an_unknown_removal_lists_the_known_ones():
+def test_an_unknown_removal_raises():
     with pytest.raises(InvalidArgumentError, match=r"removal='rays' is not one of beams, scans"):
         keep_share(room_scans(2), 0.5, "rays", seed=0)
 
@@ -106,7 +106,7 @@ def test_an_unknown_removal_lists_the_known_ones():
 
 
 def rotation_vector(rotation: Tensor) -> Tensor:
-    """Rotation vector (3,), or angle (1,), of a rotation by less than half a turn."""
+    """Rotation vector (3,), or angle (1,), of a rotation by less than π."""
     if rotation.shape[0] == 2:
         return torch.atan2(rotation[1, 0], rotation[0, 0])[None]
     axis = torch.stack([
@@ -124,33 +124,33 @@ def gaps(points: Tensor) -> Tensor:
 
 
 def unit_scans(n_scans: int, dim: int) -> list[Scan]:
-    """Scans far from the origin of the world, whose points are the sensor's axes."""
+    """Scans far from the world's origin, whose points are the unit vectors of the sensor frame."""
     origin = torch.arange(5.0, 5.0 + dim, dtype=torch.float64)
     return [Scan(origin + torch.eye(dim, dtype=torch.float64), origin)] * n_scans
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_no_noise_is_exactly_the_same_scans(dim):
+def test_zero_noise_keeps_the_scans(dim):
     scans = room_scans(3, dim=dim)
     moved = perturb_poses(scans, (0.0, 0.0), seed=0)
     assert all(a is b for a, b in zip(moved, scans, strict=True))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_scan_is_moved_as_a_rigid_body(dim):
+def test_perturbation_is_a_rigid_motion(dim):
     scans = room_scans(5, dim=dim)
     for before, after in zip(scans, perturb_poses(scans, (0.2, 0.3), seed=1), strict=True):
         ends, moved = before.ends()[0], after.ends()[0]
         assert not torch.allclose(ends, moved, atol=1e-3)
         torch.testing.assert_close(gaps(moved), gaps(ends))
-        # The sensor moves with its points, so that ranges stay what was measured.
+        # The sensor moves with its points, so the ranges do not change.
         torch.testing.assert_close((moved - after.origin).norm(dim=1), (ends - before.origin).norm(dim=1))
         frame = torch.linalg.lstsq(ends - before.origin, moved - after.origin).solution
         assert float(torch.linalg.det(frame)) == pytest.approx(1)  # not a mirror image
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_shift_alone_does_not_turn_and_rotation_alone_does_not_shift(dim):
+def test_translation_and_rotation_noise_are_independent(dim):
     scan = room_scans(1, dim=dim)[0]
     shifted, turned = (perturb_poses([scan], noise, seed=2)[0] for noise in ((0.1, 0.0), (0.0, 0.1)))
     torch.testing.assert_close(shifted.points - shifted.origin, scan.points - scan.origin)
@@ -160,7 +160,7 @@ def test_shift_alone_does_not_turn_and_rotation_alone_does_not_shift(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_noise_has_the_standard_deviations_asked_for(dim):
+def test_noise_has_the_given_standard_deviations(dim):
     n_scans, sigma_shift, sigma_angle = 1500, 0.3, 0.05
     scans = unit_scans(n_scans, dim)
     moved = perturb_poses(scans, (sigma_shift, sigma_angle), seed=4)
@@ -174,7 +174,7 @@ def test_noise_has_the_standard_deviations_asked_for(dim):
     assert float(correlation.abs().max()) < 0.12
 
 
-def test_noise_depends_on_the_seed_only():
+def test_noise_depends_only_on_the_seed():
     scans = room_scans(3)
     first, again, other = (perturb_poses(scans, (0.1, 0.1), seed) for seed in (0, 0, 1))
     assert beams(first) == beams(again)
@@ -184,6 +184,6 @@ def test_noise_depends_on_the_seed_only():
 @pytest.mark.parametrize(
     "noise", [(-0.1, 0.0), (0.0, -0.1), (math.nan, 0.0), (math.inf, 0.0), (0.1,), (), (0.1, 0.1, 0.1)]
 )
-def test_noise_that_is_not_two_numbers_above_zero_is_refused(noise):
+def test_invalid_pose_noise_raises(noise):
     with pytest.raises(InvalidArgumentError, match=r"pose_noise=.* must be two numbers"):
         perturb_poses(room_scans(2), noise, seed=0)

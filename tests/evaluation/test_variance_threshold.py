@@ -1,4 +1,4 @@
-"""Thresholds on thin structures: counted by hand, and a rail told from a wall."""
+"""Variance thresholds on thin structures: hand counts, and detection of thin structures."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import torch
 from evaluation.pillar_room import room_scans
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.variance_threshold import ThresholdStudy, decided, on_lines, run
+from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
+from gmmtorch.evaluation.studies.variance_threshold import decided, on_lines, run
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
 
 
-def test_shares_are_those_counted_by_hand():
+def test_decided_matches_a_hand_count():
     occupied = torch.tensor([0.99, 0.97, 0.6, 0.4, 0.01], dtype=torch.float64)
     free = torch.tensor([0.02, 0.3, 0.5, 0.98], dtype=torch.float64)
     thin = torch.tensor([True, False, True, False, False])
@@ -44,7 +45,7 @@ def test_rails_are_thin_and_walls_are_not(generator):
     assert not bool(thin[-1])
 
 
-def test_chunks_and_motions_do_not_matter(generator, monkeypatch):
+def test_on_lines_does_not_depend_on_chunks_order_or_translation(generator, monkeypatch):
     rail = torch.rand(150, 3, generator=generator, dtype=torch.float64) * torch.tensor([5.0, 0.08, 0.05])
     blob = 9 + torch.rand(50, 3, generator=generator, dtype=torch.float64)
     points = torch.cat([rail, blob])
@@ -57,13 +58,15 @@ def test_chunks_and_motions_do_not_matter(generator, monkeypatch):
     assert torch.equal(on_lines(points[order] + 1000, 0.4), whole[order])
 
 
-def test_a_larger_threshold_decides_more_and_every_case_has_a_row():
-    study = ThresholdStudy(n_components=(5, 20), variance_threshold=(0.06, 0.2), resolution=0.2, test_every=4)
+def test_a_larger_threshold_decides_more_points():
+    study = VarianceThresholdStudy(
+        n_components=(5, 20), variance_threshold=(0.06, 0.2), resolution=0.2, test_every=4
+    )
 
     def new_map(n: int) -> GaussianMap:
         return GaussianMap(window=20, learning=WindowedRule(n_components=n))
 
-    found = run("room", room_scans(12, dim=3, n_beams=400), new_map, study, "point")
+    found = run("room", room_scans(12, dim=3, n_beams=400), new_map, study)
     cases = [(row["n_components"], row["variance_threshold"]) for row in found.rows]
     assert [v for _, v in cases] == [0.06, 0.2, 0.06, 0.2]
     assert cases[0][0] < cases[2][0]
@@ -75,13 +78,14 @@ def test_a_larger_threshold_decides_more_and_every_case_has_a_row():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_components": ()}, r"study\.n_components is empty"),
+        ({"n_components": ()}, r"n_components=\[\] is empty"),
+        ({"method": "grid"}, "method='grid'"),
         ({"variance_threshold": (0.3,)}, "variance_threshold=0.3"),
-        ({"thin_radius": 0.0}, r"study\.thin_radius=0"),
+        ({"thin_radius": 0.0}, "thin_radius=0"),
         ({"resolution": -1.0}, "resolution=-1"),
         ({"test_every": 1}, "test_every=1"),
     ],
 )
-def test_bad_options_are_named_at_once(options, message):
+def test_invalid_options_raise(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
-        ThresholdStudy(**options)
+        VarianceThresholdStudy(**options)

@@ -1,4 +1,4 @@
-"""InformationDiscount, against a dictionary of blocks."""
+"""Fatigue, against a dictionary of blocks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from exploration.voxel_worlds import surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.information.information_discount import InformationDiscount
+from gmmtorch.exploration.information.information_discount import Fatigue
 
 SHAPE = (12, 9, 8)
 COUNTS = (3, 3, 2)
@@ -25,7 +25,7 @@ corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
 @given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
 def test_weights_are_those_of_a_dictionary_wherever_the_window_is(lows, seed):
     generator = torch.Generator().manual_seed(seed)
-    fatigue, kept = InformationDiscount(decay=0.3), {}
+    fatigue, kept = Fatigue(decay=0.3), {}
     for now, low in enumerate(lows):
         measured = torch.rand(18, generator=generator) * (torch.rand(18, generator=generator) < 0.5)
         fatigue.note(window(low), measured, float(now))
@@ -41,7 +41,7 @@ def test_weights_are_those_of_a_dictionary_wherever_the_window_is(lows, seed):
 
 
 def test_a_look_counts_once():
-    fatigue = InformationDiscount(decay=0.5)
+    fatigue = Fatigue(decay=0.5)
     assert fatigue.weights(window((0, 0, 0))).tolist() == [1.0] * 18
     for _ in range(3):
         fatigue.note(window((0, 0, 0)), torch.ones(18), 2.0)
@@ -51,7 +51,7 @@ def test_a_look_counts_once():
 
 
 def test_restored_it_answers_as_before():
-    fatigue, other = InformationDiscount(), InformationDiscount()
+    fatigue, other = Fatigue(), Fatigue()
     fatigue.note(window((0, 4, 8)), torch.linspace(0, 1, 18), 2.0)
     other.restore(fatigue.state())
     for one in (fatigue, other):

@@ -114,12 +114,12 @@ def test_a_start_chooses_the_part_of_the_world_that_is_flown_in():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"bounds": (20, 20, 0, 30, 30, 3)}, r"do not meet mesh, which extends from \(0.1"),
-        ({"bounds": (5, 0, 0, 1, 6, 3)}, "are empty"),
+        ({"bounds": (20, 20, 0, 30, 30, 3)}, r"miss mesh, which extends from \(0.1"),
+        ({"bounds": (5, 0, 0, 1, 6, 3)}, "hold nothing"),
         ({"bounds": (0, 0, 0, 5, 6, math.nan)}, "six finite numbers"),
         ({"bounds": (0, 0, 0, 5)}, "six finite numbers"),
         ({"bounds": (0, 0, 0, 5)}, r"bounds=\[0.0, 0.0, 0.0, 5.0\]"),
-        ({"bounds": (1, 1, 1, 2, 2, 2)}, r"bounds=\[1.0, .* 2.0\] contain no surface of mesh"),
+        ({"bounds": (1, 1, 1, 2, 2, 2)}, r"bounds=\[1.0, .* 2.0\] hold no surface of mesh"),
         ({"max_range": 0.7}, r"max_range=0.7 .*robot_radius=0.3 .*resolution=0.2"),
         ({"resolution": 3.0}, r"max_range=6.0 .*resolution=3.0"),
         ({"robot_radius": 3.0}, "robot_radius=3.0"),
@@ -141,7 +141,7 @@ def test_meshes_that_are_none_and_lattices_too_fine_are_refused():
         World.from_mesh(HALL[:0], cache=False)
     with pytest.raises(MemoryLimitError, match="coarser resolution"):
         World.from_mesh(HALL, 0.001, cache=False)
-    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not millimetres"):
+    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not in millimetres"):
         World.from_mesh(1000 * HALL, cache=False)
 
 
@@ -242,7 +242,7 @@ def test_a_damaged_or_foreign_cache_is_not_believed(hall, tmp_path, caplog, harm
     with caplog.at_level(logging.WARNING):
         world = World.from_mesh(HALL)
     assert same(world, hall)
-    assert "cannot be used and is computed again" in caplog.text
+    assert "Working the world out anew" in caplog.text
     assert same(World.from_mesh(HALL), hall)  # it was mended
 
 
@@ -251,7 +251,7 @@ def test_where_nothing_can_be_kept_a_warning_is_all(hall, tmp_path, monkeypatch,
     monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "file"))
     with caplog.at_level(logging.WARNING):
         assert same(World.from_mesh(HALL), hall)
-    assert "not cached" in caplog.text
+    assert "not kept" in caplog.text
 
 
 def test_worlds_by_name(tmp_path):

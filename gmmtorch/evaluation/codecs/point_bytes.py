@@ -1,4 +1,4 @@
-"""Cells and bytes that the codecs of points are made of."""
+"""Cell numbering and byte packing of the point codecs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
 
 MOST_BITS = 21
-"""Of a cell's number along an axis, so that three fit into 63."""
-_LARGEST_OUTPUT = 1 << 26  # bytes that zstd may unfold to
+"""Bits of a cell index along an axis; three axes fit into 63 bits."""
+_LARGEST_OUTPUT = 1 << 26  # bytes that zstd may decompress to
 
 
 # -- cells -------------------------------------------------------------------------------------------------
 
 
 def checked_points(points: Tensor) -> NDArray[np.float64]:
+    """Points (N, 3) as float64; raises `InvalidArgumentError` for another shape or values not finite."""
     rows = points.detach().double().cpu().numpy()
     if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
         raise InvalidArgumentError(f"points of shape {rows.shape} must be (N, 3), and finite.")
@@ -29,7 +30,7 @@ def checked_points(points: Tensor) -> NDArray[np.float64]:
 
 
 def morton_codes(points: Tensor, resolution: float) -> tuple[Ints, Ints, int]:
-    """Least cell (3,), Morton codes (N,) of the points' cells counted from it, and bits of an axis."""
+    """Lowest cell (3,) of the points (N, 3), Morton codes (N,) of their cells from it, and bits per axis."""
     rows = checked_points(points) / resolution
     if not len(rows):
         return np.zeros(3, np.int64), np.zeros(0, np.int64), 0
@@ -41,8 +42,8 @@ def morton_codes(points: Tensor, resolution: float) -> tuple[Ints, Ints, int]:
     depth = int(cells.max()).bit_length()
     if depth > MOST_BITS:
         raise InvalidArgumentError(
-            f"points reach over {int(cells.max()) + 1} cells of {resolution} m; at most {1 << MOST_BITS} "
-            "can be told apart. Take a coarser resolution, or fewer points at once."
+            f"points extend over {int(cells.max()) + 1} cells of {resolution} m; at most {1 << MOST_BITS} "
+            "can be encoded. Use a coarser resolution, or encode fewer points at once."
         )
     spread = [_spread(cells[:, axis]) for axis in range(3)]
     return corner, spread[0] << 2 | spread[1] << 1 | spread[2], depth
@@ -58,14 +59,14 @@ _MASKS = [
 
 
 def _spread(numbers: Ints) -> Ints:
-    """Numbers below 2²¹ with two zeros between their bits."""
+    """Numbers below 2²¹ with two zeros inserted between their bits."""
     for shift, mask in _MASKS:
         numbers = (numbers | numbers << shift) & mask
     return numbers
 
 
 def _gather(numbers: Ints) -> Ints:
-    """The inverse of `_spread`; bits between are ignored."""
+    """The inverse of `_spread`; ignores the bits between."""
     numbers = numbers & _MASKS[-1][1]
     masks = [mask for _, mask in _MASKS[-2::-1]] + [(1 << MOST_BITS) - 1]
     for (shift, _), mask in zip(_MASKS[::-1], masks, strict=True):
@@ -74,6 +75,7 @@ def _gather(numbers: Ints) -> Ints:
 
 
 def centers(corner: Ints, codes: Ints, resolution: float) -> Tensor:
+    """Centres (N, 3) of the cells with these Morton codes (N,), metres."""
     cells = corner + np.stack([_gather(codes >> 2), _gather(codes >> 1), _gather(codes)], 1)
     return torch.from_numpy((cells + 0.5) * resolution)
 
@@ -82,7 +84,7 @@ def centers(corner: Ints, codes: Ints, resolution: float) -> Tensor:
 
 
 def header(corner: Ints, n: int) -> bytes:
-    """Three whole numbers of either sign and one more, in a byte or a few each."""
+    """A corner (3,) and a number as variable-length signed integers."""
     writer = BitWriter()
     for value in [*corner.tolist(), n]:
         writer.number(value)
@@ -90,11 +92,11 @@ def header(corner: Ints, n: int) -> bytes:
 
 
 def read_header(data: bytes) -> tuple[Ints, int, bytes]:
-    """Corner, number, and the bytes after them."""
+    """Corner (3,), number, and the bytes after the header."""
     reader = BitReader(data)
     corner, n = np.array([reader.number() for _ in range(3)]), reader.number()
     if np.abs(corner.astype(np.float64)).max() > 2.0**53 or n < 0:
-        raise DataError(f"A corner of {corner.tolist()} cells and {n} points: out of range.")
+        raise DataError(f"corner={corner.tolist()} cells or n={n} points is out of range.")
     return corner, n, data[len(data) - reader.left // 8 :]
 
 
@@ -102,7 +104,7 @@ _GROUPS = 9  # of 7 bits in 63
 
 
 def grouped(numbers: Ints) -> bytes:
-    """Numbers ≥ 0 in groups of 7 bits, a bit for "more" above each; all lowest groups come first."""
+    """Numbers ≥ 0 in groups of 7 bits, each with a continuation bit; all lowest groups come first."""
     planes = []
     while len(numbers):
         more = numbers > 0x7F
@@ -112,10 +114,10 @@ def grouped(numbers: Ints) -> bytes:
 
 
 def ungrouped(data: bytes, n: int) -> Ints:
-    """The numbers (n,) of `_groups`."""
+    """The inverse of `grouped`: n numbers. Raises `DataError` for truncated or extra bytes."""
     left = np.frombuffer(data, np.uint8).astype(np.int64)
     if n > len(left):
-        raise DataError(f"{n} numbers are announced, {len(left)} bytes are there.")
+        raise DataError(f"The header states {n} numbers, but only {len(left)} bytes follow.")
     numbers, longer = np.zeros(n, np.int64), np.arange(n)
     for group in range(_GROUPS):
         here, left = left[: len(longer)], left[len(longer) :]
@@ -124,12 +126,12 @@ def ungrouped(data: bytes, n: int) -> Ints:
         numbers[longer] |= (here & 0x7F) << 7 * group
         longer = longer[here > 0x7F]
     if len(longer) or len(left):
-        raise DataError("Numbers are too long, or bytes are left over.")
+        raise DataError("A number is too long, or extra bytes follow.")
     return numbers
 
 
 def compressed(data: bytes, level: int) -> bytes:
-    """A zstd frame without magic number, length and checksum."""
+    """The bytes as a zstd frame without magic number, length and checksum."""
     zstd = library("zstandard")
     parameters = zstd.ZstdCompressionParameters.from_level(
         level,
@@ -138,29 +140,30 @@ def compressed(data: bytes, level: int) -> bytes:
         write_content_size=False,
         write_checksum=False,
     )
-    folded: bytes = zstd.ZstdCompressor(compression_params=parameters).compress(data)
-    return folded
+    frame: bytes = zstd.ZstdCompressor(compression_params=parameters).compress(data)
+    return frame
 
 
 def decompressed(data: bytes) -> bytes:
+    """The inverse of `compressed`; raises `DataError` for invalid bytes."""
     zstd = library("zstandard")
     try:
         frame = zstd.get_frame_parameters(data, format=zstd.FORMAT_ZSTD1_MAGICLESS)
-        if frame.content_size != zstd.CONTENTSIZE_UNKNOWN:  # would be believed, however large
-            raise DataError("The zstd frame says how long it is: it is foreign or damaged.")
+        if frame.content_size != zstd.CONTENTSIZE_UNKNOWN:  # zstd would allocate this size, however large
+            raise DataError("The zstd frame has a content size, which this codec never writes.")
         decompressor = zstd.ZstdDecompressor(format=zstd.FORMAT_ZSTD1_MAGICLESS)
-        unfolded: bytes = decompressor.decompress(data, max_output_size=_LARGEST_OUTPUT)
+        content: bytes = decompressor.decompress(data, max_output_size=_LARGEST_OUTPUT)
     except zstd.ZstdError as error:
-        raise DataError(f"zstd does not read these bytes: {error}.") from error
-    return unfolded
+        raise DataError(f"zstd cannot decompress these bytes: {error}.") from error
+    return content
 
 
 def library(name: str) -> Any:
-    """zstandard or DracoPy, which only these comparisons need."""
+    """The module zstandard or DracoPy, which only the point codecs need."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise GmmTorchError(
-            f"Points are compressed with {name}, which does not load ({error}); "
+            f"The point codecs need {name}, which cannot be imported ({error}); "
             "pip install 'gmmtorch[baselines]'."
         ) from error

@@ -1,9 +1,9 @@
-"""Other ways to send the novel points of a frame, as bytes really encoded: what mixtures are compared with.
+"""Point codecs: other ways to send the novel points of a frame, for comparison with mixtures.
 
-All are as favourable to the points as they can be made without loss: points are sets, so their order is
-free; coordinates count from the set's own corner; no container, checksum or header that a receiver could
-do without; the strongest level of compression. What every message has besides (robot, frame, sensor position,
-which beams came back empty) is left out.
+Each codec encodes the bytes and is as favourable to the points as possible: the order of the points is free,
+coordinates are relative to the lowest corner of the set, there is no container and no checksum, and the
+compression level is the strongest. Fields that every message has (robot, frame, sensor origin, no-return
+beams) are left out.
 """
 
 from __future__ import annotations
@@ -36,33 +36,33 @@ from gmmtorch.mapping.codec.bitstream import unzigzag, zigzag
 from gmmtorch.occupancy.grid import check_resolution
 
 FARTHEST = 2.0**14
-"""Metres from the origin: beyond, float32 takes steps of more than a millimetre."""
+"""Largest coordinate (m) of `RawPoints`; beyond it the spacing of float32 exceeds a millimetre."""
 POINT_CODECS = ("raw", "quantized", "octree", "draco")
-"""What `point_codec` knows."""
+"""Names that `point_codec` accepts."""
 BEST_LEVEL = 22
-"""Of zstd."""
+"""The strongest level of zstd."""
 _DRACO_BITS = 30
 _DRACO_LEVEL = 10
 _DEEPEST = (1 << 16) - 1
 
 
 class PointCodec(Protocol):
-    """A set of points as bytes, and back."""
+    """Encodes a set of points as bytes, and decodes it."""
 
     name: ClassVar[str]
 
     def encode(self, points: Tensor) -> bytes:
-        """Points (N, 3), metres. Raises `InvalidArgumentError` for what cannot be stored."""
+        """Encode points (N, 3), metres. Raises `InvalidArgumentError` for points that cannot be stored."""
         ...
 
     def decode(self, data: bytes) -> Tensor:
-        """Points (M, 3), float64, in any order. Raises `DataError` for bytes that are none."""
+        """Decode to points (M, 3), float64, in any order. Raises `DataError` for invalid bytes."""
         ...
 
 
 @dataclass(frozen=True)
 class RawPoints:
-    """12 bytes a point, float32, in order."""
+    """12 bytes for each point: three float32, in order."""
 
     name: ClassVar[str] = "raw"
 
@@ -70,25 +70,26 @@ class RawPoints:
         rows = checked_points(points)
         if len(rows) and not float(np.abs(rows).max()) < FARTHEST:
             raise InvalidArgumentError(
-                f"points reach {np.abs(rows).max():g} m from the origin, where float32 is coarser than a "
+                f"points lie up to {np.abs(rows).max():g} m from the origin, where float32 is coarser than a "
                 "millimetre; give them relative to the sensor."
             )
         return rows.astype("<f4").tobytes()
 
     def decode(self, data: bytes) -> Tensor:
         if len(data) % 12:
-            raise DataError(f"{len(data)} bytes are not whole points of 12 bytes.")
+            raise DataError(f"{len(data)} bytes are not a multiple of 12 bytes, the size of a point.")
         rows = np.frombuffer(data, "<f4").reshape(-1, 3)
         if not np.isfinite(rows).all():
-            raise DataError("Points are NaN or infinite.")
+            raise DataError("A decoded point is NaN or infinite.")
         return torch.from_numpy(rows.astype(np.float64))
 
 
 @dataclass(frozen=True)
 class QuantizedPoints:
-    """Every point to the centre of its cell of side `resolution` (m), sorted along a Morton curve, by zstd.
+    """Rounds each point to the centre of its cell of side `resolution` (m).
 
-    A curve's steps are numbers of 1 to 9 groups of 7 bits; bytes of the same weight stand together.
+    Sorts the cells along a Morton curve, writes the differences as 1 to 9 groups of 7 bits, grouped by their
+    significance, and compresses them with zstd.
     """
 
     resolution: float
@@ -108,16 +109,16 @@ class QuantizedPoints:
         corner, n, rest = read_header(data)
         steps = ungrouped(decompressed(rest), n)
         if float(steps.astype(np.float64).sum()) >= 2.0 ** (3 * MOST_BITS):
-            raise DataError("Cells are out of range.")
+            raise DataError("A cell index is out of range.")
         return centers(corner, np.cumsum(steps), self.resolution)
 
 
 @dataclass(frozen=True)
 class Octree:
-    """The cells of side `resolution` (m) that hold points, each once, as an octree.
+    """The occupied cells of side `resolution` (m) as an octree; each cell is stored once.
 
-    A byte for each node that has children, level by level from the root, bit i for child i = 4x + 2y + z;
-    then zstd. Points come back as the centres of their cells.
+    Writes a byte for each inner node, level by level from the root, where bit i stands for child
+    i = 4x + 2y + z, and compresses the bytes with zstd. Decodes to the centres of the cells.
     """
 
     resolution: float
@@ -141,7 +142,7 @@ class Octree:
     def decode(self, data: bytes) -> Tensor:
         corner, levels, rest = read_header(data)
         if levels > 1 + MOST_BITS:
-            raise DataError(f"The octree is {levels} levels deep; at most {1 + MOST_BITS} are read.")
+            raise DataError(f"The octree has {levels} levels; at most {1 + MOST_BITS} are supported.")
         occupancy = np.frombuffer(decompressed(rest), np.uint8)
         nodes = np.zeros(min(levels, 1), np.int64)
         for _ in range(levels - 1):
@@ -151,16 +152,16 @@ class Octree:
             parent, child = np.nonzero(np.unpackbits(here[:, None], axis=1, bitorder="little"))
             nodes = nodes[parent] << 3 | child
         if len(occupancy):
-            raise DataError("The octree has bytes left over.")
+            raise DataError("Extra bytes follow the octree.")
         return centers(corner, nodes, self.resolution)
 
 
 @dataclass(frozen=True)
 class Draco:
-    """Draco's k-d tree of points, on a lattice whose error is at most `error` (m, RMS).
+    """Draco's k-d tree of points on a lattice whose error is at most `error` (m, RMS).
 
-    The lattice's step is about 2 · error, which is that of evenly spread points. Left to itself, Draco
-    divides the extent by a power of two, and would be up to twice as fine as it need be.
+    The lattice step is about 2 · error, which is exact for uniformly distributed points. By default Draco
+    divides the extent by a power of two, and its lattice would be up to twice as fine as necessary.
     """
 
     error: float
@@ -179,7 +180,7 @@ class Draco:
             return start
         step, bits = _draco_step(rows - corner, self.error)
         encoded: bytes = library("DracoPy").encode(
-            (rows - corner).astype(np.float32),  # all that Draco takes
+            (rows - corner).astype(np.float32),  # the only type that Draco accepts
             quantization_bits=bits,
             compression_level=self.level,
             quantization_range=step * ((1 << bits) - 1),
@@ -194,18 +195,19 @@ class Draco:
         try:
             rows = np.asarray(library("DracoPy").decode(rest).points, np.float64).reshape(-1, 3)
         except (ValueError, RuntimeError, TypeError) as error:
-            raise DataError(f"Draco does not read these bytes: {error}.") from error
-        if not 0 < len(rows) <= n or not np.isfinite(rows).all():  # it makes equal points one
-            raise DataError(f"Draco's bytes hold {len(rows)} points, of {n} that were announced.")
+            raise DataError(f"Draco cannot decode these bytes: {error}.") from error
+        if not 0 < len(rows) <= n or not np.isfinite(rows).all():  # Draco merges equal points
+            raise DataError(f"Draco decoded {len(rows)} points, but the header states {n}.")
         return torch.from_numpy(rows + corner)
 
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Depths of an image (H, W) in whole steps of `step` (m), 0 where there is none, by zstd.
+    """A depth image (H, W), rounded to multiples of `step` (m); 0 means no depth.
 
-    A bit for each pixel, whether it has a depth; then each depth less that of the pixel with one before it,
-    row by row, zigzag, as 16 bits, the high bytes before the low ones. Depths below half a step are lost.
+    Writes a validity bit for each pixel, then the difference of each valid depth to the previous valid depth,
+    row by row, as 16-bit zigzag numbers with all high bytes before all low bytes; compresses them with zstd.
+    Depths below half a step are lost.
     """
 
     level: int = BEST_LEVEL
@@ -218,11 +220,11 @@ class DepthImage:
 
     @property
     def _per_metre(self) -> float:
-        """Steps: of a millimetre exactly 1000, so that depths are the decimals nearest to them."""
+        """Steps per metre; exactly 1000 for a millimetre, so that decoded depths are the nearest decimals."""
         return 1 / self.step
 
     def encode(self, depths: Tensor) -> bytes:
-        """Depths (H, W), metres; NaN is an error, 0 no depth."""
+        """Encode depths (H, W), metres; 0 means no depth, NaN raises `InvalidArgumentError`."""
         image = depths.detach().double().cpu().numpy()
         if image.ndim != 2 or not ((image >= 0) & (image * self._per_metre <= _DEEPEST)).all():
             raise InvalidArgumentError(
@@ -237,12 +239,12 @@ class DepthImage:
         return header(np.array([*image.shape, 0]), 0) + compressed(body, self.level)
 
     def decode(self, data: bytes) -> Tensor:
-        """Depths (H, W), metres, float64."""
+        """Decode to depths (H, W), metres, float64. Raises `DataError` for invalid bytes."""
         (height, width, _), _, rest = read_header(data)
         n = int(height) * int(width)
         body = np.frombuffer(decompressed(rest), np.uint8)
         if min(height, width) < 0 or (n + 7) // 8 > len(body):
-            raise DataError(f"{len(body)} bytes are no image of {height} by {width} pixels.")
+            raise DataError(f"{len(body)} bytes are not an image of {height} by {width} pixels.")
         present = np.unpackbits(body[: (n + 7) // 8])[:n].astype(bool)
         planes = body[(n + 7) // 8 :]
         if len(planes) != 2 * present.sum():
@@ -254,7 +256,7 @@ class DepthImage:
 
 
 def point_codec(name: str, resolution: float, target_error: float) -> PointCodec:
-    """The codec of that name; cells of side `resolution` (m), or points to `target_error` (m, RMS)."""
+    """The codec with this name; `resolution` (m) is the cell size, `target_error` (m, RMS) is for Draco."""
     makers: dict[str, Callable[[], PointCodec]] = {
         "raw": RawPoints,
         "quantized": lambda: QuantizedPoints(resolution),
@@ -262,7 +264,7 @@ def point_codec(name: str, resolution: float, target_error: float) -> PointCodec
         "draco": lambda: Draco(target_error),
     }
     if name not in makers:
-        raise InvalidArgumentError(f"{name!r} is no codec of points; there are {', '.join(makers)}.")
+        raise InvalidArgumentError(f"name={name!r} is not a point codec; known are {', '.join(makers)}.")
     return makers[name]()
 
 
@@ -273,13 +275,13 @@ def bytes_of_points(
     depths: Tensor | None = None,
     names: Sequence[str] = POINT_CODECS,
 ) -> dict[str, int]:
-    """Bytes of a frame's points (N, 3) in each codec, by name; none of no points.
+    """Bytes of a frame's points (N, 3) in each codec, by name; 0 bytes without points.
 
     Args:
-        resolution: side (m) of the cells of octree and lattice; points are half of it off, RMS.
-        target_error: RMS (m) of Draco's points.
-        depths: (H, W) image of the same points, metres, 0 elsewhere; without it, no depth image.
-        names: which of `POINT_CODECS`.
+        resolution: cell size (m) of octree and lattice; the RMS error of a point is half of it.
+        target_error: RMS error (m) of Draco's points.
+        depths: (H, W) image of the same points, metres, 0 elsewhere; None leaves the depth image out.
+        names: names from `POINT_CODECS`.
     """
     sizes = {}
     for name in names:
@@ -291,17 +293,18 @@ def bytes_of_points(
 
 
 def _draco_step(rows: NDArray[np.float64], error: float) -> tuple[float, int]:
-    """The step (m) of a lattice whose RMS error for rows (N, 3) ≥ 0 is at most `error`, and bits of an axis.
+    """Step (m) of a lattice whose RMS error for rows (N, 3) ≥ 0 is at most `error`, and bits per axis.
 
-    Evenly spread points miss their lattice by step / 2. Others may miss it by more: a finer one is tried.
+    The RMS error of uniformly distributed points is step / 2. For other points it may be larger; then the
+    step is reduced.
     """
     step = 2 * error
     while True:
         bits = max(1, math.ceil(math.log2(float(rows.max()) / step + 2)))
         if bits > _DRACO_BITS:
             raise InvalidArgumentError(
-                f"error={error:g} m over {rows.max():g} m is finer than Draco's {_DRACO_BITS} bits, or than "
-                "float32; allow more, or encode fewer points at once."
+                f"error={error:g} m over {rows.max():g} m needs more than Draco's {_DRACO_BITS} bits, or "
+                "than float32 has; allow a larger error, or encode fewer points at once."
             )
         rounded = np.round(rows.astype(np.float32) / step) * step
         found = math.sqrt(float(np.square(rows - rounded).sum(1).mean()))

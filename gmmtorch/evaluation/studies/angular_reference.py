@@ -1,9 +1,9 @@
-"""The exact evidence of one component in one box, by brute force: what every other form is measured by.
+"""Exact evidence of one component in one box: the reference for every form of evidence.
 
-The angular form of the thesis's appendix (5.1-5.3): along each direction from the sensor the component
-is a Gaussian of the distance, whose integrals inside and beyond the box have a closed form; over the
-directions, an angle in 2D and two in 3D, Gauss-Legendre rules are refined until two of them agree.
-Shares no code with the forms that it judges, and is far too slow to be one.
+Implements the angular form of the thesis's appendix (5.1-5.3). Along each direction from the sensor the
+component is a Gaussian of the distance, whose integrals inside and behind the box have a closed form. The
+integral over the directions (one angle in 2D, two in 3D) uses Gauss-Legendre rules that are refined until two
+of them agree. This file shares no code with the forms of evidence, and is much slower than they are.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.cones import Cones
 
 TOLERANCE = 1e-9
-"""What two rules may differ by on one interval of directions, in rays of one."""
+"""Largest difference of two rules on one interval of directions, in rays per ray of the cone."""
 
-_REACH = 8.5  # deviations off the mean where nothing is left in float64
-_STEPS = (0.0, 0.5, 1.0, 1.7, 2.5, 3.5, 4.5, 6.0, _REACH)  # where intervals begin, in deviations off the mean
+_REACH = 8.5  # standard deviations from the mean where the density is zero in float64
+_STEPS = (0.0, 0.5, 1.0, 1.7, 2.5, 3.5, 4.5, 6.0, _REACH)  # interval limits, in standard deviations
 _ORDERS = 7, 10
 _MAX_DEPTH = 40
-_CHUNK = 1 << 11  # directions in 3D whose inner integrals are taken at once
+_CHUNK = 1 << 11  # directions in 3D whose inner integrals are computed together
 
 
 class _Scenes(NamedTuple):
-    """Boxes seen from their sensors, in polar coordinates in which the component is round.
+    """P boxes seen from their sensors, in whitened coordinates, where the component is a unit normal.
 
-    A direction w has the world direction L F w (m), F a rotation that puts the mean at distance p (P,)
-    on the first axis. matrix = L F (P, D, D); low, high: corners from the sensor (m), (P, D); corners:
-    (P, 2^D, D) in the round frame; edges (P, E, 2, D), the same of the box's edges.
+    The world direction of a whitened direction w is L F w (m). F is a rotation that puts the mean at distance
+    p (P,) on the first axis. matrix: L F (P, D, D). low, high: corners relative to the sensor (m), (P, D).
+    corners: whitened corners (P, 2^D, D). edges: whitened end points of the box's edges (P, E, 2, D).
     """
 
     matrix: Tensor
@@ -55,20 +55,21 @@ def angular_evidence(
 ) -> tuple[Tensor, Tensor]:
     """Hits (P,) and misses (P,) of each cone in its own box, in rays per ray of the cone.
 
-    Nothing is cut off: a component has all of its tails. Neither `counts` nor `max_range` have a say.
+    There is no cutoff: components keep their tails. `counts` and `max_range` of the cones are ignored.
 
     Args:
-        cones: P of them, as many as boxes.
+        cones: P cones, one for each box.
         low, high: (P, D) corners, world metres.
-        tolerance: see `TOLERANCE`; an interval on which two rules agree by chance is missed, so that
-            the error is some 1e-7 in the worst of thousands of boxes.
+        tolerance: see `TOLERANCE`. Two rules can agree by chance, so the largest error over thousands of
+            boxes is about 1e-7.
 
     Raises:
-        InvalidArgumentError: as many cones as boxes are wanted.
+        InvalidArgumentError: the numbers of cones and boxes differ.
     """
     if not len(cones.means) == len(low) == len(high):
         raise InvalidArgumentError(
-            f"low has {len(low)} boxes, high {len(high)}, for {len(cones.means)} cones; give one box a cone."
+            f"low has {len(low)} and high {len(high)} boxes for {len(cones.means)} cones; give one box for "
+            "each cone."
         )
     scenes = _scenes(cones, low.double(), high.double())
     start, stop = _limit(scenes.distance, math.pi)
@@ -86,7 +87,7 @@ def _scenes(cones: Cones, low: Tensor, high: Tensor) -> _Scenes:
     dim = cones.dim
     frame = torch.linalg.qr(torch.cat([mean, torch.eye(dim).to(mean).expand(len(mean), dim, dim)], 2)).Q
     ahead = (frame[:, :, :1] * mean).sum(1, keepdim=True) < 0
-    frame = torch.where(ahead, -frame, frame)  # a reflection is as good as a rotation here
+    frame = torch.where(ahead, -frame, frame)  # the evidence is the same for a reflection
     matrix = factor @ frame
     low, high = low - origins, high - origins
     bits = torch.tensor(list(itertools.product((0, 1), repeat=dim)), device=low.device)
@@ -98,14 +99,14 @@ def _scenes(cones: Cones, low: Tensor, high: Tensor) -> _Scenes:
 
 
 def _limit(distance: Tensor, widest: float) -> tuple[Tensor, Tensor]:
-    """Angles off the mean between which the component can be seen, at most ±`widest`."""
+    """Angles from the mean between which the density is not zero, at most ±`widest`."""
     far = torch.asin((_REACH / distance.clamp_min(_REACH)).clamp_max(1.0))
     angle = torch.where(distance > _REACH, far, widest)
     return -angle, angle
 
 
 def _graded(distance: Tensor, widest: float) -> Tensor:
-    """Where a Gaussian seen from `distance` (P,) is to be cut: (P, B)."""
+    """Interval limits (P, B), in angles from the mean, for a unit normal at `distance` (P,)."""
     steps = distance.new_tensor(_STEPS)
     angles = torch.asin((steps / distance.clamp_min(1e-9)[:, None]).clamp_max(1.0))
     ends = torch.stack(_limit(distance, widest), 1)
@@ -117,13 +118,13 @@ def _azimuths(corners: Tensor) -> Tensor:
 
 
 def _circle(scenes: _Scenes, angle: Tensor, row: Tensor) -> Tensor:
-    """Hits and misses per radian in 2D: (Q, n) → (Q, n, 2)."""
+    """Hits and misses per radian in 2D, for angles (Q, n): (Q, n, 2)."""
     direction = torch.stack([angle.cos(), angle.sin()], 2)
     return _along(scenes, direction, angle.sin() ** 2, row)
 
 
 def _slices(scenes: _Scenes, azimuth: Tensor, row: Tensor, tolerance: float) -> Tensor:
-    """Hits and misses per radian of azimuth in 3D, each an integral over the elevation."""
+    """Hits and misses per radian of azimuth in 3D, (Q, n, 2): integrals over the elevation."""
     n_rows, n_nodes = azimuth.shape
     azimuth, row = azimuth.flatten(), row.repeat_interleave(n_nodes)
     parts = zip(azimuth.split(_CHUNK), row.split(_CHUNK), strict=True)
@@ -131,7 +132,7 @@ def _slices(scenes: _Scenes, azimuth: Tensor, row: Tensor, tolerance: float) -> 
 
 
 def _half_planes(scenes: _Scenes, azimuth: Tensor, row: Tensor, tolerance: float) -> Tensor:
-    """∫ … cos β dβ over half-planes (Q,) through the polar axis: (Q, 2)."""
+    """∫ … cos β dβ over the elevation β in half-planes (Q,) through the polar axis: (Q, 2)."""
     elevations, crossed = _elevations(scenes.edges[row], azimuth)
     value = azimuth.new_zeros(len(azimuth), 2)
     met = crossed.nonzero().squeeze(1)
@@ -151,7 +152,8 @@ def _half_planes(scenes: _Scenes, azimuth: Tensor, row: Tensor, tolerance: float
 
 
 def _elevations(edges: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
-    """Elevations (Q, E) at which edges (Q, E, 2, 3) cross half-planes; 0 where they do not. Which are met."""
+    """Elevations (Q, E) at which edges (Q, E, 2, 3) cross the half-planes at `azimuth` (Q,), 0 where they
+    do not; and a mask (Q,) of the half-planes that an edge crosses."""
     normal = torch.stack([-azimuth.sin(), azimuth.cos()], 1)
     toward = torch.stack([azimuth.cos(), azimuth.sin()], 1)
     side = (edges[..., :2] * normal[:, None, None]).sum(3)
@@ -166,8 +168,8 @@ def _elevations(edges: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
 def _along(scenes: _Scenes, direction: Tensor, off: Tensor, row: Tensor) -> Tensor:
     """Hits and misses per unit of directions (Q, n, D); off (Q, n): squared sine of the angle to the mean.
 
-    With b = p cos(angle): (2π)^{−D/2} e^{−½(p² − b²)} ∫ t^{D−1} e^{−½(t − b)²} dt, from where the ray
-    enters the box to where it leaves it, and from there on.
+    With b = p cos(angle), both are (2π)^{−D/2} e^{−½(p² − b²)} ∫ t^{D−1} e^{−½(t − b)²} dt: hits between
+    the points where the ray enters and leaves the box, misses behind the box.
     """
     dim = direction.shape[2]
     world = torch.einsum("qij,qnj->qni", scenes.matrix[row], direction)
@@ -203,12 +205,12 @@ def _rule(order: int) -> tuple[Tensor, Tensor]:
 
 
 def _integrate(function: Callable[[Tensor, Tensor], Tensor], breaks: Tensor, tolerance: Tensor) -> Tensor:
-    """∫ (R, 2) from the first to the last of the sorted breaks (R, B).
+    """Integral (R, 2) from the first to the last of the sorted breaks (R, B).
 
-    Intervals are halved on which two rules differ by more than the tolerance (R,).
+    Halves the intervals on which two rules differ by more than the tolerance (R,).
 
     Args:
-        function: x (Q, n) and the row (Q,) that each interval belongs to → (Q, n, 2).
+        function: x (Q, n) and the row index (Q,) of each interval → (Q, n, 2).
     """
     rules = [tuple(part.to(breaks) for part in _rule(order)) for order in _ORDERS]
     n = breaks.shape[1] - 1

@@ -1,12 +1,12 @@
-"""How far off each form of evidence is, and what its accuracy costs (thesis Fig 3.3).
+"""Error and run time of each form of evidence (thesis Fig 3.3).
 
-Three studies in rows of one table, told apart by the field `study`:
+The rows belong to three studies, named by the field `study`:
 
-    map    error against distance and depth, of cells before a round component (the thesis's figure)
-    sweep  error on components and cells at random, of any size, thickness, distance and incidence
-    curve  error against time on all cells around a small map
+    map    error against distance and depth, for cells around a round component (the thesis's figure)
+    sweep  error for random components and cells, of any size, thickness, distance and incidence
+    curve  error against time for all cells around a small map
 
-The first two are measured against `angular_reference`, which shares no code with any form.
+The reference of the first two is `angular_reference`, which shares no code with any form.
 """
 
 from __future__ import annotations
@@ -14,16 +14,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch import datasets
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.studies.error_scenes import (
     OFFSETS,
     Method,
@@ -32,79 +29,36 @@ from gmmtorch.evaluation.studies.error_scenes import (
     methods,
     random_scene,
 )
+from gmmtorch.evaluation.studies.study_options import ApproximationErrorStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.evidence import Evidence, check_prior, occupancy_probability
+from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.adaptive_quadrature import check_tolerance
 from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import Sampling, sample_rays
-from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-
-Row = dict[str, Any]
-OnRows = Callable[[list[Row]], object]
+from gmmtorch.occupancy.grid import VoxelGrid
 
 _DATASETS = {2: "synthetic_building_2d", 3: "synthetic_building"}
-_REFERENCE_TOLERANCE = 1e-6  # of the flux that the curve is measured against
-
-
-@dataclass(frozen=True)
-class Options:
-    """The options `study.*`.
-
-    dims: of the space. support: rays of a component, and prior: count, where θ (3.9) is asked for.
-    n_pixels: of the maps along either axis. n_components, n_cells: of the sweep, cells a component.
-    n_samples: of Monte Carlo for one component in map and sweep; n_large_samples: of the large one.
-    n_scans, resolution (m): of the map that the curve is drawn on. n_rays: of Monte Carlo on it.
-    tolerance: of flux on it.
-    """
-
-    dims: Sequence[int] = (2, 3)
-    support: float = 100.0
-    prior: float = 1.0
-    n_pixels: int = 24
-    n_components: int = 64
-    n_cells: int = 8
-    n_samples: int = 1024
-    n_large_samples: int = 1 << 17
-    n_scans: int = 1
-    resolution: float = 0.25
-    n_rays: Sequence[int] = (1 << 10, 1 << 12, 1 << 14, 1 << 16, 1 << 18)
-    tolerance: Sequence[float] = (0.1, 1e-2, 1e-3, 1e-4)
-
-    def __post_init__(self) -> None:
-        for name in ("n_pixels", "n_components", "n_cells", "n_samples", "n_large_samples", "n_scans"):
-            check_whole(f"study.{name}", getattr(self, name), 1)
-        for name in ("dims", "n_rays", "tolerance"):
-            if not getattr(self, name):
-                raise InvalidArgumentError(f"study.{name} is empty; give at least one.")
-        for dim in self.dims:
-            if dim not in _DATASETS:
-                raise InvalidArgumentError(f"study.dims={dim} must be 2 or 3.")
-        for n in self.n_rays:
-            check_whole("study.n_rays", n, 1)
-        for tolerance in self.tolerance:
-            check_tolerance(tolerance)
-        if not 0 < self.support < math.inf:
-            raise InvalidArgumentError(f"study.support={self.support} must be a number of rays above zero.")
-        check_prior(self.prior)
-        check_resolution(self.resolution)
+_REFERENCE_TOLERANCE = 1e-6  # of the flux that is the reference of the curve
 
 
 MAPPED = ("cone", "cone_exact", "point", "monte_carlo_sobol", "flux")
-"""The methods that have a map."""
+"""The methods of the study "map"."""
 
 
-def run(options: Options, seed: int, on_event: Event = ignore, on_rows: OnRows = lambda _: None) -> list[Row]:
-    """The rows of all three studies, for each dimension; `seconds` apart, the seed decides them.
+def run(
+    options: ApproximationErrorStudy, seed: int, on_event: Event = ignore, on_rows: OnRows = lambda _: None
+) -> list[Row]:
+    """The rows of all three studies for each dimension; the seed determines all fields but `seconds`.
 
-    Fields: `study`, `dim`, `method`; then, of each study,
-    map: `distances`, `depths` (the axes, in deviations), `error` of E = hits + misses per ray and
-    `probability_error` of θ, both lists of lists, [depth][distance], None where the sensor is in the
-    cell; `error_max`.
-    sweep: `hits_`, `misses_`, `probability_` times `max`, `p99`, `median`, of absolute errors per ray,
-    and of θ; `n_cases`, `seconds`.
-    curve: `setting` (rays, or tolerance), `seconds`, `error` (of hits and misses, all cells, as a share
+    Fields: `study`, `dim`, `method`; and for each study:
+
+    map: `distances`, `depths` (the axes, in standard deviations); `error` of E = hits + misses per ray and
+    `probability_error` of θ, both lists of lists [depth][distance], None if the sensor is in the cell;
+    `error_max`.
+    sweep: `max`, `p99` and `median` of the absolute errors per ray as `hits_…`, `misses_…`, and of θ as
+    `probability_…`; `n_cases`, `seconds`.
+    curve: `setting` (rays, or tolerance), `seconds`, `error` (of hits and misses in all cells, as a share
     of all evidence), `probability_error` (root mean square over the cells with evidence), `n_cells`,
     `n_components`.
     """
@@ -120,11 +74,12 @@ def run(options: Options, seed: int, on_event: Event = ignore, on_rows: OnRows =
     return rows
 
 
-def _offered(dim: int, options: Options, names: Sequence[str] | None = None) -> dict[str, Method]:
-    offered = methods(options.n_samples, options.n_large_samples)
+def _methods(
+    dim: int, options: ApproximationErrorStudy, names: Sequence[str] | None = None
+) -> dict[str, Method]:
     return {
         name: method
-        for name, method in offered.items()
+        for name, method in methods(options.n_samples, options.n_large_samples).items()
         if (dim == 3 or name != "cone_exact") and (names is None or name in names)
     }
 
@@ -132,17 +87,17 @@ def _offered(dim: int, options: Options, names: Sequence[str] | None = None) -> 
 # -- map ------------------------------------------------------------------------------------------
 
 
-def map_rows(dim: int, options: Options, generator: torch.Generator) -> Iterator[Row]:
-    """A row for each method: cells one deviation wide before and behind a round component.
+def map_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
+    """A row for each method: errors in cells of side σ before and behind a round component.
 
-    A pixel shows the largest error over cells that lie up to two deviations off the line of sight.
+    A pixel is the largest error over the `OFFSETS` from the line of sight.
     """
     distances = torch.logspace(math.log10(0.5), 2, options.n_pixels, dtype=torch.float64)
     depths = torch.linspace(-4, 4, options.n_pixels, dtype=torch.float64)
     scenes = [cells_before(float(p), depths, dim) for p in distances]
     clear = [scene.low[:, 0].view(len(OFFSETS), -1)[0] > 1e-6 for scene in scenes]
     truth = [exact(scene) for scene in scenes]
-    for name, method in _offered(dim, options, MAPPED).items():
+    for name, method in _methods(dim, options, MAPPED).items():
         error: list[list[float | None]] = []
         probability_error: list[list[float | None]] = []
         for scene, true, shown in zip(scenes, truth, clear, strict=True):
@@ -168,11 +123,11 @@ def map_rows(dim: int, options: Options, generator: torch.Generator) -> Iterator
 # -- sweep ----------------------------------------------------------------------------------------
 
 
-def sweep_rows(dim: int, options: Options, generator: torch.Generator) -> Iterator[Row]:
-    """A row for each method: quantiles of its errors over scenes at random."""
+def sweep_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
+    """A row for each method: quantiles of its errors over random scenes."""
     scenes = [random_scene(dim, options.n_cells, generator) for _ in range(options.n_components)]
     truth = [exact(scene) for scene in scenes]
-    for name, method in _offered(dim, options).items():
+    for name, method in _methods(dim, options).items():
         begin = time.perf_counter()
         found = [method(scene, generator) for scene in scenes]
         seconds = time.perf_counter() - begin
@@ -194,11 +149,11 @@ def sweep_rows(dim: int, options: Options, generator: torch.Generator) -> Iterat
 # -- curve ----------------------------------------------------------------------------------------
 
 
-def curve_rows(dim: int, options: Options, generator: torch.Generator) -> Iterator[Row]:
-    """A row for each method and setting, on a grid around a map of the embedded building.
+def curve_rows(dim: int, options: ApproximationErrorStudy, generator: torch.Generator) -> Iterator[Row]:
+    """A row for each method and setting, on a grid around a map of the synthetic building.
 
-    The truth is flux at a tolerance of 1e-6; that Monte Carlo goes on approaching it as its rays grow
-    in number shows it to be the truth, as far as that reaches.
+    The reference is flux with a tolerance of 1e-6. Monte Carlo, which is independent of flux, converges
+    to the reference as its rays grow in number.
     """
     built = GaussianMap(window=options.n_scans)
     for index in range(options.n_scans):
@@ -208,7 +163,7 @@ def curve_rows(dim: int, options: Options, generator: torch.Generator) -> Iterat
     places = torch.cat([cones.means, cones.origins]).double()
     grid = _grid_around(places, cones.origins[0].double(), options.resolution)
     truth = flux_evidence(cones, grid, tolerance=_REFERENCE_TOLERANCE)
-    for method, setting, work in _contenders(cones, grid, options, generator):
+    for method, setting, work in _settings(cones, grid, options, generator):
         begin = time.perf_counter()
         found = work()
         seconds = time.perf_counter() - begin
@@ -225,18 +180,20 @@ def curve_rows(dim: int, options: Options, generator: torch.Generator) -> Iterat
 
 
 def _grid_around(places: Tensor, sensor: Tensor, resolution: float) -> VoxelGrid:
-    """Cells over all places (P, D), with the sensor in the middle of one: of a sensor on a plane between
-    two cells it is a matter of rounding which of them its rays leave."""
+    """A grid over all places (P, D) with the sensor at the centre of a cell.
+
+    If the sensor lay on the plane between two cells, rounding would decide which cell contains it.
+    """
     before = ((sensor - places.amin(0) + 0.5) / resolution).ceil() + 0.5
     shape = ((places.amax(0) + 0.5 - sensor) / resolution + before).ceil()
     origin = (sensor - before * resolution).tolist()
     return VoxelGrid(tuple(origin), resolution, tuple(int(n) for n in shape))
 
 
-def _contenders(
-    cones: Cones, grid: VoxelGrid, options: Options, generator: torch.Generator
+def _settings(
+    cones: Cones, grid: VoxelGrid, options: ApproximationErrorStudy, generator: torch.Generator
 ) -> Iterator[tuple[str, float | None, Callable[[], Evidence]]]:
-    """Method, setting and the work that they stand for."""
+    """(method, setting, function that computes the evidence) for each case."""
     samplings: tuple[Sampling, ...] = ("plain", "stratified", "sobol")
     for sampling in samplings:
         for n in options.n_rays:
@@ -273,7 +230,9 @@ def _grid_errors(found: Evidence, truth: Evidence, prior: float) -> Row:
     }
 
 
-def _probability_error(found: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor], options: Options) -> Tensor:
+def _probability_error(
+    found: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor], options: ApproximationErrorStudy
+) -> Tensor:
     thetas = [
         occupancy_probability(options.support * hits, options.support * misses, options.prior)
         for hits, misses in (found, true)

@@ -1,19 +1,19 @@
-"""AUC against the bytes of the map (thesis Table 3.1): every method at several sizes, on one test."""
+"""AUC against map size in bytes (thesis Table 3.1): every method at several sizes, on one test."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from gmmtorch.evaluation import held_out as occupancy
-from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.evaluation.held_out import Protocol
+from gmmtorch.evaluation import held_out
+from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.methods import MapFactory
+from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.scan import Scan
 
 
 class Sized(NamedTuple):
-    """A method at one of its sizes: of components, or of stored points; None if it has but one."""
+    """A method with one size: its number of components or stored points; None if the method has one size."""
 
     method: str
     size: int | None
@@ -23,27 +23,27 @@ class Sized(NamedTuple):
 def run(
     name: str,
     scans: Sequence[Scan],
-    contenders: Sequence[Sized],
+    methods: Sequence[Sized],
     protocol: Protocol,
     seed: int = 0,
     on_event: Event = ignore,
-    on_rows: Callable[[list[dict[str, Any]]], object] = lambda rows: None,
-) -> list[dict[str, Any]]:
-    """A row of `occupancy.evaluate` for each contender, with its `size`; see there."""
-    by_label = {_label(contender): contender for contender in contenders}
+    on_rows: OnRows = lambda rows: None,
+) -> list[Row]:
+    """A row of `held_out.evaluate` for each sized method, with the field `size`."""
+    by_label = {_label(sized): sized for sized in methods}
 
-    def sized(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    def with_size(rows: Sequence[Row]) -> list[Row]:
         return [
             {**row, "method": by_label[row["method"]].method, "size": by_label[row["method"]].size}
             for row in rows
         ]
 
-    factories = {label: contender.factory for label, contender in by_label.items()}
-    outcome = occupancy.evaluate(
-        name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(sized(rows))
+    factories = {label: sized.factory for label, sized in by_label.items()}
+    outcome = held_out.evaluate(
+        name, scans, factories, protocol, seed, on_event, lambda rows: on_rows(with_size(rows))
     )
-    return sized(outcome.rows)
+    return with_size(outcome.rows)
 
 
-def _label(contender: Sized) -> str:
-    return contender.method if contender.size is None else f"{contender.method} {contender.size}"
+def _label(sized: Sized) -> str:
+    return sized.method if sized.size is None else f"{sized.method} {sized.size}"

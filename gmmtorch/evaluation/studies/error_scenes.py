@@ -1,4 +1,4 @@
-"""Scenes that forms of evidence are judged on: one component seen from one place, and boxes around it."""
+"""Test scenes for forms of evidence: one component seen from one sensor origin, and boxes around it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gmmtorch.occupancy.forms.monte_carlo import Sampling, sample_rays
 from gmmtorch.occupancy.forms.point import point_evidence
 
 OFFSETS = (0.0, 0.5, 1.0, 2.0)
-"""Deviations that cells of `cells_before` lie off the line of sight."""
+"""Offsets of the cells of `cells_before` from the line of sight, in standard deviations."""
 
 Found = tuple[Tensor, Tensor]
 """hits (M,), misses (M,) of a scene's boxes."""
 
 
 class Scene(NamedTuple):
-    """cone: one row of `Cones`, seen from the world's origin; boxes low, high (M, D), all cubes alike."""
+    """One cone with its sensor at the world's origin, and cubes of one size with corners low, high (M, D)."""
 
     cone: Cones
     low: Tensor
@@ -34,9 +34,9 @@ Method = Callable[[Scene, torch.Generator], Found]
 
 
 def methods(n_samples: int, n_large_samples: int) -> dict[str, Method]:
-    """Every form of evidence, by name: `cone` is the thesis's, `cone_exact` its exact polygon in 3D.
+    """Every form of evidence by name. `cone` is the thesis's form; `cone_exact` uses its exact polygon in 3D.
 
-    Of one component, stratified sampling is plain.
+    Stratified sampling is left out: for one component it equals plain sampling.
     """
     return {
         "cone": lambda scene, _: cone_evidence(*scene),
@@ -57,7 +57,7 @@ def _point(scene: Scene) -> Found:
 
 
 def exact(scene: Scene) -> Found:
-    """The reference."""
+    """Evidence by the angular reference."""
     n = len(scene.low)
     cones = Cones(*(part.expand(n, *part.shape[1:]) for part in scene.cone))
     return angular_evidence(cones, scene.low, scene.high)
@@ -66,7 +66,7 @@ def exact(scene: Scene) -> Found:
 def cast_rays(
     scene: Scene, n_samples: int, generator: torch.Generator, sampling: Sampling = "plain"
 ) -> Found:
-    """Evidence of a scene's boxes by sampled rays, each against every box."""
+    """Evidence of a scene's boxes by sampled rays; every ray is intersected with every box."""
     rays = sample_rays(scene.cone, n_samples, generator, sampling)
     step = rays.ends - rays.origins
     step = torch.where(step.abs() < 1e-300, 1e-300, step)
@@ -82,11 +82,12 @@ def cast_rays(
 
 
 def cells_before(distance: float, depths: Tensor, dim: int) -> Scene:
-    """A unit normal at `distance`, and unit cells that begin at `depths` (M,) from it, off the axis."""
+    """A unit normal at `distance`, and unit cells that begin at `depths` (M,) behind it, at each of
+    `OFFSETS`."""
     mean = torch.zeros(1, dim, dtype=torch.float64)
     mean[0, 0] = distance
     covariance = torch.eye(dim, dtype=torch.float64)[None].clone()
-    covariance[0, 0, 0] = 0.999  # the plane of the projection faces the sensor
+    covariance[0, 0, 0] = 0.999  # makes the projection plane face the sensor
     low = torch.full((len(OFFSETS), len(depths), dim), -0.5, dtype=torch.float64)
     low[..., 0] = distance + depths
     low[..., 1] += torch.tensor(OFFSETS, dtype=torch.float64)[:, None]
@@ -95,8 +96,12 @@ def cells_before(distance: float, depths: Tensor, dim: int) -> Scene:
 
 
 def random_scene(dim: int, n_cells: int, generator: torch.Generator) -> Scene:
-    """A component 0.1 to 20 m away, with deviations from 1 mm to 2 m, turned at random, and cells of one
-    size from 1 cm to 1 m, half of them on the way to a point of it, half around one."""
+    """A random component and random cells around it.
+
+    The component is 0.1 to 20 m away, has standard deviations from 1 mm to 2 m and a random rotation. The
+    cells have one size from 1 cm to 1 m. Half of them lie at a point of the component, the others between
+    the sensor and such a point.
+    """
 
     def uniform(*size: int) -> Tensor:
         return torch.rand(*size, generator=generator, dtype=torch.float64)

@@ -1,76 +1,59 @@
-"""What EM makes of different starts (thesis 2.1.3, Fig 2.1): time and quality against K."""
+"""Time and quality of EM from different initializations, against K (thesis 2.1.3, Fig 2.1)."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.evaluation.estimators import FitOptions
-from gmmtorch.evaluation.events import Event
-from gmmtorch.evaluation.studies.fitting import Material, OnRows, Row, row_of
+from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.evaluation.fit_comparison import FitData, row_of
+from gmmtorch.evaluation.protocol_options import FitOptions
+from gmmtorch.evaluation.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
+from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
 
-@dataclass(frozen=True)
-class Options:
-    """The options `study.*`: every start in `init_params`, with each number of components, from
-    `n_seeds` seeds, the first of which is that of the run."""
-
-    n_components: Sequence[int] = (4, 8, 32, 64, 128, 256, 512)
-    init_params: Sequence[str] = ("random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces")
-    n_seeds: int = 3
-
-    def __post_init__(self) -> None:
-        check_whole("study.n_seeds", self.n_seeds, 1)
-        for name in ("n_components", "init_params"):
-            if not getattr(self, name):
-                raise InvalidArgumentError(f"study.{name} is empty; name at least one.")
-        for name in self.init_params:
-            if name not in INITIALIZATIONS:
-                raise InvalidArgumentError(
-                    f"study.init_params={name!r} is not one of {', '.join(INITIALIZATIONS)}."
-                )
-
-
 def run(
-    material: Material, options: Options, mixture: FitOptions, seed: int, on_event: Event, on_rows: OnRows
+    data: FitData,
+    study: InitializationStudy,
+    options: FitOptions,
+    seed: int,
+    on_event: Event,
+    on_rows: OnRows,
 ) -> list[Row]:
-    """A row for each start, number of components and seed, of one run of exact EM on the points.
+    """A row for each initialization, number of components and seed: one run of exact EM on the points.
 
-    Of `mixture`, `tol`, `reg_covar`, `max_iter` and `dtype` have a say.
+    Of `options`, only `tol`, `reg_covar`, `max_iter` and `dtype` have an effect.
 
-    Beside the fields of every fit: `init_params`, `seed`, and `seconds` parted into `init_seconds`
-    and `em_seconds`. Raises `InvalidArgumentError` for a bad option before anything is fitted.
+    The rows have the fields of every fit and `init_params`, `seed`, `init_seconds` and `em_seconds`, whose
+    sum is `seconds`. Raises `InvalidArgumentError` for an invalid option before the first fit.
     """
-    exact = replace(mixture, algorithm="exact", max_cells=None, n_init=1)
+    exact = replace(options, algorithm="exact", max_cells=None, n_init=1)
     cases = [
         (k, replace(exact, n_components=k, init_params=init), seed + repeat)
-        for repeat in range(options.n_seeds)
-        for k in options.n_components
-        for init in options.init_params
+        for repeat in range(study.n_seeds)
+        for k in study.n_components
+        for init in study.init_params
     ]
-    for _, chosen, case_seed in cases:
-        chosen.check(len(material.train), case_seed)
+    for _, fit_options, case_seed in cases:
+        fit_options.check(len(data.train), case_seed)
     rows: list[Row] = []
     on_event("starts", 0, len(cases))
-    for case in cases[: len(options.init_params)]:
-        fit_timed(material, *case)  # the first of each kind pays for what is loaded but once
+    for case in cases[: len(study.init_params)]:
+        fit_timed(data, *case)  # warm-up: the first call of each initialization loads libraries
     for case in cases:
-        rows.append(fit_timed(material, *case))
+        rows.append(fit_timed(data, *case))
         on_rows(rows)
         on_event("starts", len(rows), len(cases))
     return rows
 
 
-def fit_timed(material: Material, n_components: int, options: FitOptions, seed: int) -> Row:
-    """What `GaussianMixture.fit` does of K components, with a clock between the start and EM."""
-    points = material.train.double()
+def fit_timed(data: FitData, n_components: int, options: FitOptions, seed: int) -> Row:
+    """The steps of `GaussianMixture.fit` with K components, with separate times for initialization and EM."""
+    points = data.train.double()
     center = points.mean(0)
     points, weight = points - center, points.new_ones(len(points))
     generator = torch.Generator().manual_seed(seed)
@@ -91,7 +74,7 @@ def fit_timed(material: Material, n_components: int, options: FitOptions, seed: 
         converged=found.converged,
     )
     return {
-        **row_of(material, "em", mixture, end - begin, seed),
+        **row_of(data, "em", mixture, end - begin, seed),
         "init_params": options.init_params,
         "seed": seed,
         "init_seconds": between - begin,

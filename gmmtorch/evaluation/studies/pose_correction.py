@@ -1,58 +1,59 @@
-"""Poses that were wrong when a map was built, and are put right afterwards: the components move.
+"""Accuracy of a map whose poses are corrected after it was built.
 
-A grid built from wrong poses must be built again. A mixture that was learned scan by scan
-(`map=per_scan`) moves with its poses: each scan's components are those with the ids it was given.
+A grid from wrong poses must be built again. In a map that is learned scan by scan (`map=per_scan`) each
+component belongs to one scan, so it moves with the corrected pose of that scan.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.evaluation.held_out import Protocol
+from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
+from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 
 
 def build_by_scan(empty: GaussianMap, scans: Sequence[Scan]) -> list[Tensor]:
-    """Insert the scans; returns the ids (J, 2) of the components that each became.
+    """Insert the scans; returns the ids (J, 2) of each scan's components.
 
-    Raises `InvalidArgumentError` for a map whose components are of several scans (window above 1).
+    Raises `InvalidArgumentError` for a map that learns several scans together (window above 1).
     """
     if empty.learning.window != 1:
         raise InvalidArgumentError(
-            f"window={empty.learning.window}: a scan's pose can be put right only where components are of "
-            "one scan; take map=per_scan."
+            f"window={empty.learning.window}: the pose of a scan can be corrected only if each component "
+            "belongs to one scan; take map=per_scan."
         )
-    born = []
+    ids = []
     for scan in scans:
-        known = empty.n_components
+        n_before = empty.n_components
         empty.insert(scan)
-        born.append(empty.components().ids[known:].clone())
-    return born
+        ids.append(empty.components().ids[n_before:].clone())
+    return ids
 
 
-def correct_poses(built: GaussianMap, born: Sequence[Tensor], motions: Sequence[Tensor]) -> None:
-    """Undo, in place, the motion (D+1, D+1) that each scan was moved by before it was inserted.
+def correct_poses(built: GaussianMap, ids: Sequence[Tensor], motions: Sequence[Tensor]) -> None:
+    """Undo, in place, the motion (D+1, D+1) that was applied to each scan before its insertion.
 
-    `born`: the ids (J, 2) of each scan's components, as `build_by_scan` returns them.
+    `ids`: the ids (J, 2) of each scan's components, from `build_by_scan`.
     """
-    if len(born) != len(motions):
-        raise InvalidArgumentError(f"{len(motions)} motions for {len(born)} scans; one each is needed.")
-    for ids, motion in zip(born, motions, strict=True):
-        if len(ids):
-            built.transform(_inverse(motion), ids)
+    if len(ids) != len(motions):
+        raise InvalidArgumentError(
+            f"motions has {len(motions)} entries for {len(ids)} scans; give one for each scan."
+        )
+    for ids_of_scan, motion in zip(ids, motions, strict=True):
+        if len(ids_of_scan):
+            built.transform(_inverse(motion), ids_of_scan)
 
 
 def _inverse(motion: Tensor) -> Tensor:
-    """Of a rigid motion, and rigid itself to the last digit."""
+    """Inverse of a rigid motion by its transpose, which keeps it exactly rigid."""
     inverse = torch.eye(len(motion), dtype=torch.float64, device=motion.device)
     inverse[:-1, :-1] = motion[:-1, :-1].T
     inverse[:-1, -1] = -motion[:-1, :-1].T @ motion[:-1, -1]
@@ -67,23 +68,23 @@ def evaluate_correction(
     methods: Sequence[str] = ("point",),
     seed: int = 0,
     on_event: Event = ignore,
-    on_rows: Callable[[list[dict[str, Any]]], object] = lambda rows: None,
-) -> list[dict[str, Any]]:
-    """The test of `evaluation.occupancy`, of maps learned from perturbed poses, before and after correction.
+    on_rows: OnRows = lambda rows: None,
+) -> list[Row]:
+    """The test of `held_out` for maps from perturbed poses, before and after the correction.
 
     Args:
         name: of the data set, for the rows.
-        scans: in the order they were taken.
+        scans: in time order.
         new_map: makes an empty map with window 1.
         protocol: the test; its `pose_noise` (m, rad) perturbs the training poses.
-        methods: forms of evidence that the maps are asked for.
-        seed: of the perturbations, the thinning and the free points.
-        on_event: told of progress.
-        on_rows: given all rows so far, whenever there are more.
+        methods: forms of evidence.
+        seed: of the perturbations, the random choice of training data, and the free points.
+        on_event: progress callback.
+        on_rows: called with all rows so far after new rows.
 
-    Returns a row for each share kept, method and resolution: `dataset, method, removal, kept,
-    resolution, pose_noise_m, pose_noise_rad, n_components, nbytes`, and the areas `auc` (of the map as it was
-    learned from the wrong poses), `auc_corrected` and `auc_clean` (of one learned from right ones).
+    Returns a row for each share kept, method and resolution: `dataset, method, removal, kept, resolution,
+    pose_noise_m, pose_noise_rad, n_components, nbytes`, and the AUCs `auc` (map from the perturbed poses),
+    `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
     """
     train_index, test_index = split.split_indices(len(scans), protocol.test_every)
     train = [scans[i] for i in train_index]
@@ -95,17 +96,18 @@ def evaluate_correction(
         shown = split.keep_share(train, kept, protocol.removal, seed)
         motions = split.pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
-        right, wrong = new_map(), new_map()
-        build_by_scan(right, shown)
+        true_map, perturbed_map = new_map(), new_map()
+        build_by_scan(true_map, shown)
         on_event("pose correction", 1, 3)
-        born = build_by_scan(wrong, moved)
-        n_components, nbytes = wrong.n_components, wrong.nbytes
+        ids = build_by_scan(perturbed_map, moved)
+        n_components, nbytes = perturbed_map.n_components, perturbed_map.nbytes
         cases = [(method, resolution) for method in methods for resolution in protocol.resolution]
         clean, before = (
-            {case: _auc(built, *case, asked[case[1]]) for case in cases} for built in (right, wrong)
+            {case: _auc(built, *case, asked[case[1]]) for case in cases}
+            for built in (true_map, perturbed_map)
         )
         on_event("pose correction", 2, 3)
-        correct_poses(wrong, born, motions)
+        correct_poses(perturbed_map, ids, motions)
         for method, resolution in cases:
             rows.append(
                 {
@@ -119,7 +121,7 @@ def evaluate_correction(
                     "n_components": n_components,
                     "nbytes": nbytes,
                     "auc": before[method, resolution],
-                    "auc_corrected": _auc(wrong, method, resolution, asked[resolution]),
+                    "auc_corrected": _auc(perturbed_map, method, resolution, asked[resolution]),
                     "auc_clean": clean[method, resolution],
                 }
             )

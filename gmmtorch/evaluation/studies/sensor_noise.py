@@ -1,17 +1,16 @@
-"""Does it pay to tell the learning how the sensor errs? Likelihood and occupancy against bytes.
+"""Effect of a sensor noise model in learning: likelihood and occupancy against bytes.
 
-Four variants learn from the same points, from the same start, with the same number of components:
+Four variants learn from the same points, from the same initialization, with the same number of components:
 
-    plain           EM: components are as thick as the noise makes the surfaces look
-    planar          EM whose components are no thicker than the sensor's typical noise
+    plain           EM; the noise makes the components thicker
+    planar          EM whose components are at most as thick as the sensor's typical noise
     noise           extreme deconvolution with a noise covariance for every point
     noise_planar    both
 
-What is held out are measurements: noisy points. Every variant is scored by the density that it gives
-to them, in nats a point: of the same points in the same space, so the numbers can be compared. A
-variant with the noise model holds that a measurement is a position plus noise of covariance R_n, so
-its density is Σ_k π_k N(x | μ_k, Σ_k + R_n); one without holds that noise is part of its components,
-Σ_k π_k N(x | μ_k, Σ_k). Both are in every row whatever the variant, since each is one side's view.
+Every variant is scored by the mean log density (nats per point) of the same held-out measurements. For a
+variant with the noise model a measurement is a position plus noise of covariance R_n, with density
+Σ_k π_k N(x | μ_k, Σ_k + R_n). For a variant without it the noise is part of the components, with density
+Σ_k π_k N(x | μ_k, Σ_k). Every row contains both densities.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
 
 import torch
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.evaluation.events import Event, Row, ignore
+from gmmtorch.evaluation.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.estimators.deconvolved import DeconvolvedGaussianMixture
 from gmmtorch.mixture.estimators.sensor_model import (
@@ -38,7 +37,6 @@ from gmmtorch.mixture.estimators.sensor_model import (
     SensorModel,
     estimate_normals,
 )
-from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.scan import Scan
 
 SENSORS: dict[str, type[DepthCameraModel] | type[LidarModel] | type[LaserModel]] = {
@@ -46,81 +44,59 @@ SENSORS: dict[str, type[DepthCameraModel] | type[LidarModel] | type[LaserModel]]
     "lidar": LidarModel,
     "laser_2d": LaserModel,
 }
-"""Sensor models by name: a configuration names one, and may change its fields."""
+"""Sensor models by name."""
 
 VARIANTS = ("plain", "planar", "noise", "noise_planar")
 
 
 @dataclass(frozen=True)
-class NoiseStudy:
-    """What is compared.
-
-    n_components: sizes K. n_points: training points learned from, drawn at random from all. resolution:
-    side (m) of the cells that occupancy is asked about. test_every: scans 0, n, 2n, … are held out.
-    max_beams: held-out beams at most. max_iter, tol: of EM. n_neighbors: of which a point's normal is
-    estimated, for the angle at which it was seen; 0: every surface is taken to be seen head-on.
-    max_origins: sensor positions kept for a component. n_samples: rays drawn from a map to answer.
-    """
-
-    n_components: Sequence[int] = (50, 200)
-    n_points: int = 20_000
-    resolution: float = 0.1
-    test_every: int = 10
-    max_beams: int = 20_000
-    max_iter: int = 50
-    tol: float = 1e-4
-    n_neighbors: int = 16
-    max_origins: int = 8
-    n_samples: int = 1_000_000
-
-    def __post_init__(self) -> None:
-        if not self.n_components:
-            raise InvalidArgumentError("n_components=() names no size; give at least one.")
-        for k in self.n_components:
-            check_whole("n_components", k, 1)
-        for name in ("n_points", "max_beams", "max_iter", "max_origins", "n_samples"):
-            check_whole(name, getattr(self, name), 1)
-        check_whole("n_neighbors", self.n_neighbors, 0)
-        split.check_test_every(self.test_every)
-        check_resolution(self.resolution)
-
-
-@dataclass(frozen=True)
 class _Cloud:
-    """Points (N, D), the noise covariance of each (N, D, D), and the scan (N,) that each is from."""
+    """Points (N, D), their noise covariances (N, D, D), and the index of each point's scan (N,)."""
 
     points: Tensor
     noise: Tensor
     scan: Tensor
 
 
+def sensor_model(study: SensorModelStudy) -> SensorModel:
+    """The sensor model that the study names. Raises `InvalidArgumentError` for an unknown name or field."""
+    if study.sensor not in SENSORS:
+        raise InvalidArgumentError(f"sensor={study.sensor!r} is not one of {', '.join(SENSORS)}.")
+    model = SENSORS[study.sensor]
+    known = {item.name for item in fields(model)}
+    if unknown := set(study.sensor_options) - known:
+        raise InvalidArgumentError(
+            f"sensor_options={study.sensor_options}: {min(unknown)} is not an option of {study.sensor}; "
+            f"known are {', '.join(sorted(known))}."
+        )
+    return model(**study.sensor_options)
+
+
 def run(
     name: str,
     scans: Sequence[Scan],
-    sensor: SensorModel,
-    study: NoiseStudy | None = None,
+    study: SensorModelStudy | None = None,
     seed: int = 0,
     on_event: Event = ignore,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Learn every variant at every size, and score it on the held-out scans.
 
     Args:
         name: of the data set, for the rows.
-        scans: in the order they were taken.
-        sensor: how their points err; see `SENSORS` and `gmmtorch.mixture.estimators.sensor_model`.
-        study: sizes and test.
-        seed: of the points drawn, the start of EM, the free points and the map's rays.
-        on_event: told of progress.
+        scans: in time order.
+        study: sensor model, sizes and test.
+        seed: of the points drawn, the initialization of EM, the free points and the map's rays.
+        on_event: progress callback.
 
-    Returns rows of: dataset, variant, n_components, nbytes (of the map, as stored), seconds,
-    n_iterations, converged, held_out_log_likelihood (the variant's own density of the held-out
-    measurements, nats a point), log_likelihood_noise_added and log_likelihood_as_fitted (either
-    density), auc, auc_low, auc_high (hits against free points anywhere on the beams),
-    auc_near_surface (against free points half to two cells before the hit), thickness (median
-    smallest standard deviation of the components, m), sensor_deviation (median along the beam of
-    the training points, m), resolution, n_train_points, n_test_beams.
+    Returns rows of: dataset, variant, n_components, nbytes (of the stored map), seconds, n_iterations,
+    converged, held_out_log_likelihood (by the variant's own density, nats per point),
+    log_likelihood_noise_added and log_likelihood_as_fitted (by each density), auc, auc_low, auc_high (hits
+    against free points anywhere on the beams), auc_near_surface (against free points 0.5 to 2 cells before
+    the hit), thickness (median of the components' smallest standard deviations, m), sensor_deviation (median
+    standard deviation of the training points along the beam, m), resolution, n_train_points, n_test_beams.
     """
-    study = study or NoiseStudy()
+    study = study or SensorModelStudy()
+    sensor = sensor_model(study)
     train_index, test_index = split.split_indices(len(scans), study.test_every)
     train = [scans[i] for i in train_index]
     cloud = _training_cloud(train, sensor, study, seed)
@@ -132,7 +108,7 @@ def run(
     }
     n_total = sum(scan.points.shape[0] for scan in train)
     typical = float(torch.linalg.eigvalsh(cloud.noise)[:, -1].median().sqrt())
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     stages = [(k, variant) for k in study.n_components for variant in VARIANTS]
     for done, (k, variant) in enumerate(stages):
         on_event("sensor model", done, len(stages))
@@ -142,7 +118,7 @@ def run(
         built = _as_map(mixture, cloud, train, n_total, study, seed)
         added = float(torch.as_tensor(mixture.score_samples(ends, test_noise)).mean())
         fitted = mixture.score(ends)
-        row: dict[str, Any] = {
+        row: Row = {
             "dataset": name,
             "variant": variant,
             "n_components": built.n_components,
@@ -177,13 +153,11 @@ def _normals(points: Tensor, n_neighbors: int) -> Tensor | None:
     return estimate_normals(points, n_neighbors) if n_neighbors else None
 
 
-def _training_cloud(train: Sequence[Scan], sensor: SensorModel, study: NoiseStudy, seed: int) -> _Cloud:
-    """Points drawn from all scans together, and their noise."""
+def _training_cloud(train: Sequence[Scan], sensor: SensorModel, study: SensorModelStudy, seed: int) -> _Cloud:
+    """A random sample of the points of all scans, with their noise."""
     sizes = torch.tensor([scan.points.shape[0] for scan in train])
     if int(sizes.sum()) == 0:
-        raise InvalidArgumentError(
-            "The training scans have no points to learn from; check dataset.max_range."
-        )
+        raise InvalidArgumentError("The training scans have no points; check dataset.max_range.")
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randperm(int(sizes.sum()), generator=generator)[: study.n_points].sort().values
     index = torch.repeat_interleave(sizes)[chosen]
@@ -194,7 +168,7 @@ def _training_cloud(train: Sequence[Scan], sensor: SensorModel, study: NoiseStud
 
 
 def _learn(
-    cloud: _Cloud, variant: str, n_components: int, typical: float, study: NoiseStudy, seed: int
+    cloud: _Cloud, variant: str, n_components: int, typical: float, study: SensorModelStudy, seed: int
 ) -> DeconvolvedGaussianMixture:
     mixture = DeconvolvedGaussianMixture(
         n_components,
@@ -204,7 +178,7 @@ def _learn(
         random_state=seed,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # whether it converged is in the row
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the row contains `converged`
         return mixture.fit(
             cloud.points, noise_covariances=cloud.noise if variant.startswith("noise") else None
         )
@@ -215,17 +189,17 @@ def _as_map(
     cloud: _Cloud,
     train: Sequence[Scan],
     n_total: int,
-    study: NoiseStudy,
+    study: SensorModelStudy,
     seed: int,
 ) -> GaussianMap:
-    """The mixture as a map: each component seen from the scans that most of its points are from."""
+    """The mixture as a map; the viewpoints of a component are the scans with most of its points."""
     owner = torch.as_tensor(mixture.predict(cloud.points))
     k, s = mixture.weights.shape[0], len(train)
     counts = torch.bincount(owner * s + cloud.scan, minlength=k * s).view(k, s)
     most = counts.topk(min(study.max_origins, s), dim=1)
-    alive = counts.sum(1) > 0  # what is no point's likeliest component was seen from nowhere
+    alive = counts.sum(1) > 0  # a component without points has no viewpoints
     origins = [scan.origin.double().cpu() for scan in train]
-    seen = [
+    viewpoints = [
         [(origins[i], float(n)) for i, n in zip(views, numbers, strict=True) if n > 0]
         for views, numbers in zip(most.indices[alive].tolist(), most.values[alive].tolist(), strict=True)
     ]
@@ -234,7 +208,7 @@ def _as_map(
         mixture.means[alive],
         mixture.covariances[alive],
         support[alive],
-        seen,
+        viewpoints,
         resolution=study.resolution,
         n_samples=study.n_samples,
         random_state=seed,

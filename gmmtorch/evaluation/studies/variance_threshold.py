@@ -1,4 +1,4 @@
-"""The dead band of (3.10) on thin structures (thesis Fig 3.8): what a variance threshold decides."""
+"""Effect of the dead band's variance threshold (3.10) on thin structures (thesis Fig 3.8)."""
 
 from __future__ import annotations
 
@@ -6,60 +6,26 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.evaluation import metrics, queries, split
-from gmmtorch.evaluation.events import Event, ignore
+from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED
+from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.evidence import CellClass, classify
-from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.scan import Scan
 
-Row = dict[str, Any]
-
-_CHUNK = 2048  # points whose neighbours are held at once
-
-
-@dataclass(frozen=True)
-class ThresholdStudy:
-    """n_components: of the map, one map each. variance_threshold: v of (3.10), each for every map.
-
-    resolution (m), test_every and max_beams: the test, as in `occupancy.Protocol`. thin_radius (m):
-    of the neighbourhoods in which points lie along a line where a structure is thin.
-    """
-
-    n_components: Sequence[int] = (200, 850)
-    variance_threshold: Sequence[float] = (0.06, 0.12, 0.18, 0.24)
-    resolution: float = 0.1
-    test_every: int = 5
-    max_beams: int = 40_000
-    thin_radius: float = 0.4
-
-    def __post_init__(self) -> None:
-        for name in ("n_components", "variance_threshold"):
-            if not getattr(self, name):
-                raise InvalidArgumentError(f"study.{name} is empty; give at least one.")
-        for n in self.n_components:
-            check_whole("study.n_components", n, 1)
-        for threshold in self.variance_threshold:
-            classify(torch.zeros(1), threshold)
-        check_resolution(self.resolution)
-        check_whole("study.max_beams", self.max_beams, 1)
-        split.check_test_every(self.test_every)
-        if not 0 < self.thin_radius < float("inf"):
-            raise InvalidArgumentError(f"study.thin_radius={self.thin_radius} must be above zero metres.")
+_CHUNK = 2048  # points whose neighbours are in memory together
 
 
 @dataclass
 class Thresholds:
-    """rows: of results.json. maps: by number of components. thin: (P, D) hits on thin structures.
-    hits: (H, D) all of them."""
+    """Rows of results.json, maps by number of components, and the test hits (H, D); `thin` (P, D) are the
+    hits on thin structures."""
 
     rows: list[Row] = field(default_factory=list)
     maps: dict[int, GaussianMap] = field(default_factory=dict)
@@ -71,17 +37,16 @@ def run(
     name: str,
     scans: Sequence[Scan],
     new_map: Callable[[int], GaussianMap],
-    study: ThresholdStudy,
-    method: str,
+    study: VarianceThresholdStudy,
     seed: int = 0,
     on_event: Event = ignore,
-    on_rows: Callable[[list[Row]], object] = lambda rows: None,
+    on_rows: OnRows = lambda rows: None,
 ) -> Thresholds:
-    """A map for each number of components, and of each a row for every threshold.
+    """A map for each number of components, and a row for each map and threshold.
 
-    Of the held-out points: `share_decided`, that are not left unknown; `accuracy_decided`, of those;
-    `occupied_recall` and `free_recall`, called what they are; `thin_recall`, of hits on thin structures
-    (`thin_share` of all hits).
+    Fields over the held-out points: `share_decided`, the share that is not unknown; `accuracy_decided`, the
+    accuracy on that share; `occupied_recall`, `free_recall`; `thin_recall`, the recall of hits on thin
+    structures, which are `thin_share` of all hits.
     """
     train_index, test_index = split.split_indices(len(scans), study.test_every)
     origins, ends = queries.test_beams([scans[i] for i in test_index], study.max_beams, seed)
@@ -97,11 +62,11 @@ def run(
         built.finish()
         seconds = time.perf_counter() - begin
         found.maps[n_components] = built
-        theta = torch.as_tensor(built.occupancy(asked.points, study.resolution, method)).cpu()
+        theta = torch.as_tensor(built.occupancy(asked.points, study.resolution, study.method)).cpu()
         occupied, free = theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]
-        common = {
+        shared = {
             "dataset": name,
-            "method": method,
+            "method": study.method,
             "resolution": study.resolution,
             "auc": metrics.roc(occupied, free).auc,
             "auc_thin": metrics.roc(occupied[thin], free).auc if bool(thin.any()) else None,
@@ -112,16 +77,16 @@ def run(
         }
         for threshold in study.variance_threshold:
             scores = decided(occupied, free, thin, threshold)
-            found.rows.append({**common, "variance_threshold": threshold, **scores})
+            found.rows.append({**shared, "variance_threshold": threshold, **scores})
         on_rows(found.rows)
         on_event("maps", len(found.maps), len(study.n_components))
     return found
 
 
 def decided(occupied: Tensor, free: Tensor, thin: Tensor, threshold: float) -> Row:
-    """What a threshold makes of the probabilities of occupied (P,) and free (Q,) points.
+    """Scores of the classification by a threshold, given probabilities of occupied (P,) and free (Q,) points.
 
-    `thin` (P,) marks occupied points on thin structures.
+    `thin` (P,) marks the occupied points on thin structures.
     """
     of_occupied, of_free = classify(occupied, threshold), classify(free, threshold)
     right = torch.cat([of_occupied == CellClass.OCCUPIED, of_free == CellClass.FREE]).double()
@@ -137,10 +102,10 @@ def decided(occupied: Tensor, free: Tensor, thin: Tensor, threshold: float) -> R
 
 
 def on_lines(points: Tensor, radius: float, linearity: float = 0.8, fewest: int = 8) -> Tensor:
-    """Which points (N, D) lie on thin structures: rails, poles, edges of narrow boards.
+    """Mask (N,) of the points (N, D) on thin structures: rails, poles, edges of narrow boards.
 
-    The neighbours within `radius` (m), at least `fewest`, spread along one line: of the deviations
-    σ₁ ≥ σ₂ of their covariance, (σ₁ − σ₂)/σ₁ is above `linearity` (Demantké et al. 2011).
+    Such a point has at least `fewest` neighbours within `radius` (m), and they form a line: (σ₁ − σ₂)/σ₁ is
+    above `linearity`, with σ₁ ≥ σ₂ the standard deviations of the neighbours (Demantké et al. 2011).
     """
     tree = cKDTree(points.cpu().numpy())
     parts = [_on_lines(tree, part, points, radius, linearity, fewest) for part in points.split(_CHUNK)]

@@ -1,4 +1,4 @@
-"""Journey: the way to a distant view, through the local map and beyond it."""
+"""Journey: the way to a far view, through the window and beyond it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from gmmtorch.exploration.planning.goal import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.roadmap import at_the_rim
 
-_REFRESHED = 10.0  # seconds after which the way over the roadmap is computed again
-_PATIENCE = 12.0  # seconds without progress after which a robot gives up
-_CLOSER = 0.5  # metres that count as progress
-_THERE = 1.2  # metres from the goal at which the robot has arrived
-_FACING = 0.7  # radians off the goal's heading at which the robot has arrived
+_REFRESHED = 10.0  # seconds that a way over the roadmap is relied on
+_PATIENCE = 12.0  # seconds without coming closer, after which a robot gives up
+_CLOSER = 0.5  # metres that count as closer
+_THERE = 1.2  # metres from the goal
+_FACING = 0.7  # radians off its heading
 
 
 def looks(state: Tensor, poses: Tensor) -> Tensor:
-    """Flag (...,) the poses (..., 4) that a robot in a state (7,) has reached, position and heading."""
+    """Whether (...,) a robot in a state (7,) is where poses (..., 4) are, as good as, and looks their way."""
     off = torch.remainder(state[3] - poses[..., 3] + math.pi, 2 * math.pi) - math.pi
     return ((state[:3] - poses[..., :3]).norm(dim=-1) < _THERE) & (off.abs() < _FACING)
 
 
 class Journey:
-    """A journey to a view `pose` (4,) with a `value`, `metres` away at the start.
+    """To a view `pose` (4,) worth `value`, `metres` away at the start; `since`: when it last came closer (s).
 
-    `since` is the time (s) of the last progress. The roadmap gives the distance from its nodes to the
-    goal. Inside the local map the distance is computed cell by cell, from the goal if it is inside, and
-    from the nodes near the border, each with its remaining distance.
+    Over the roadmap the distance to the goal is known at its nodes; in the window it is worked out cell by
+    cell, from the goal if it is inside, and from the nodes at the window's rim, each with what remains
+    beyond it.
     """
 
     def __init__(self, pose: Tensor, value: float, metres: float, now: float) -> None:
@@ -42,10 +42,9 @@ class Journey:
 
     @classmethod
     def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
-        """Start a journey to the view of the library with the largest value/(1 + metres), and remove that
-        view.
+        """To the view of the library with the largest value/(1 + metres), which is taken out of it.
 
-        Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored.
+        None if none worth `least` can be reached; views close to those of `given_up` (N, 4) do not count.
         """
         known = task.library.candidates()
         if not known.ids:
@@ -61,11 +60,11 @@ class Journey:
         return cls(known.poses[row], float(known.values[row]), float(metres[row]), task.now)
 
     def put_back(self, task: PlanningTask) -> None:
-        """Return the view to the library."""
+        """Leave the view to whoever comes by."""
         task.library.add(self.pose[None], torch.tensor([self.value]), task.now, 0.0)
 
     def goal(self, task: PlanningTask, weight: float) -> Goal | None:
-        """Return the goal of the next motion; None if the robot has arrived or makes no progress."""
+        """Where to go from here; None if the robot is there, or comes no closer."""
         if bool(looks(task.state, self.pose)):
             return None
         goal = Goal(self._field(task), weight, float(self.pose[3]))

@@ -1,4 +1,4 @@
-"""Navigable cells: connected cells above a floor at whose centre a robot does not touch the mesh."""
+"""Where a robot can be: cells at whose centre it does not touch the mesh, above a floor, all connected."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 ON_PLANE = 1e-6
-"""Tolerance, as a share of a cell, for a length to lie on a plane of the lattice; larger than rounding."""
+"""Of a cell, within which a length counts as lying on a plane of the lattice: more than rounding."""
 
 
 def occupied_and_clear(
@@ -26,11 +26,9 @@ def occupied_and_clear(
     radius: float,
     on_event: Event,
 ) -> tuple[Tensor, Tensor]:
-    """Return cells (nx, ny, nz) that the mesh meets, and grounded cells whose centre is beyond `radius`
-    of it.
-    """
-    # A cell m cells away on some axis is at least (m − ½) cells from a cell's centre. Distances are therefore
-    # computed only for cells that close to the mesh. The mesh just outside the box counts too.
+    """Cells (nx, ny, nz) that the mesh meets, and grounded ones from whose centre it is beyond `radius`."""
+    # The centre of a cell is at least (m − ½) cells from what lies m cells away on some axis. Only up to
+    # there need distances be asked for; what lies just outside the box matters too.
     reach = math.floor(radius / resolution + 0.5 + ON_PLANE)
     on_event("occupied cells", 0, None)
     wider = occupied_cells(triangles, resolution, Box(box.low - reach, box.high + reach))
@@ -48,7 +46,7 @@ def occupied_and_clear(
 
 
 def above_floor(mesh: MeshWorld, resolution: float, box: Box) -> Tensor:
-    """Return cells (nx, ny, nz), bool, that have a surface of the mesh below their centre."""
+    """Cells (nx, ny, nz), bool, whose centre has a surface of the mesh somewhere below it."""
     centers = [
         (torch.arange(low, high) + 0.5).double() * resolution
         for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True)
@@ -64,7 +62,7 @@ def above_floor(mesh: MeshWorld, resolution: float, box: Box) -> Tensor:
 
 
 def _dilated(mask: Tensor, reach: int) -> Tensor:
-    """Return cells (nx, ny, nz) within `reach` cells, on every axis, of a cell that is set."""
+    """Cells (nx, ny, nz) within `reach` cells of one that is set, on every axis."""
     for axis in range(3):
         n = mask.shape[axis]
         spread = mask.clone()
@@ -84,10 +82,7 @@ def connected(
     radius: float,
     name: str,
 ) -> Tensor:
-    """Return the connected part (nx, ny, nz), bool, of the clear cells that robots use.
-
-    It is the part that contains the start. Without a start it is the part with the most standing room.
-    """
+    """The part (nx, ny, nz), bool, of the clear cells that holds the start, or that is to be flown in."""
     from scipy.ndimage import label
 
     parts, n_parts = label(clear.numpy())
@@ -95,7 +90,7 @@ def connected(
     if n_parts == 0:
         raise InvalidArgumentError(
             f"{name}: no cell of {resolution} m is above a floor and farther than robot_radius={radius} m "
-            "from the mesh. Use a smaller radius or wider bounds; check that the mesh is in metres with z up."
+            "from the mesh; take a smaller radius, or wider bounds; is the mesh in metres, and z up?"
         )
     if start is not None:
         cell = (start / resolution).floor().long() - box.low
@@ -104,8 +99,8 @@ def connected(
         part = int(parts[tuple(cell.tolist())])
         if part == 0:
             raise InvalidArgumentError(
-                f"{name}: at start={start.tolist()} a robot of radius {radius} m touches the mesh or has no "
-                "floor below it; move the start."
+                f"{name}: at start={start.tolist()} a robot of radius {radius} m touches the mesh, or "
+                "has no floor below it; move it."
             )
         return parts == part
     places = (mesh.standing_places() / resolution).floor().long() - box.low

@@ -1,10 +1,11 @@
-"""The evaluation as a whole: what is built, what is asked, and what a row says."""
+"""The held-out test: maps, test points and rows."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,8 +15,9 @@ from pillar_room import room_scans
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.held_out import Outcome, Protocol, evaluate
+from gmmtorch.evaluation.held_out import Outcome, evaluate
 from gmmtorch.evaluation.methods import MapFactory, choose, methods
+from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
 
@@ -33,7 +35,7 @@ CONTRACT: dict[str, type] = {
     "query_seconds": float,
     "n_queries": int,
 }
-"""And n_components: int for mixtures, None for grids."""
+"""Documented fields; `n_components` is an int for mixtures and None for grids."""
 
 UNKNOWN_FIELDS = {"unknown_auc", "unknown_called_free", "unknown_called_occupied", "free_recall"}
 SMALL = Protocol(test_every=4, kept=(1.0, 0.3), resolution=(0.2, 0.1))
@@ -41,7 +43,7 @@ COARSE = replace(SMALL, resolution=(0.2,))
 
 
 def small_map() -> GaussianMap:
-    return GaussianMap(window=5, n_samples=20_000)
+    return GaussianMap(window=5, n_samples=5_000)
 
 
 def small_methods() -> dict[str, MapFactory]:
@@ -55,18 +57,23 @@ def run(protocol: Protocol = SMALL, seed: int = 0, **options: Any) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def plain_rows() -> list[dict[str, Any]]:
-    """Rows of the small protocol, as they come without further options."""
+def outcome() -> Outcome:
+    """The outcome of the small protocol."""
     torch.set_num_threads(1)
-    return run().rows
+    return run()
+
+
+@pytest.fixture(scope="module")
+def plain_rows(outcome) -> list[dict[str, Any]]:
+    return outcome.rows
 
 
 def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows without what a clock says."""
+    """The rows without times."""
     return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
 
 
-def test_rows_carry_every_field_of_the_contract_with_its_type(plain_rows):
+def test_rows_have_every_documented_field_with_its_type(plain_rows):
     rows = plain_rows
     order = [(row["kept"], row["method"], row["resolution"]) for row in rows]
     assert order == [(k, m, r) for k in (1.0, 0.3) for m in small_methods() for r in (0.2, 0.1)]
@@ -85,26 +92,29 @@ def test_rows_carry_every_field_of_the_contract_with_its_type(plain_rows):
     json.dumps(rows, allow_nan=False)
 
 
-def test_counts_of_points_and_queries_are_those_of_the_split(plain_rows):
+def test_point_and_query_counts_match_the_split(plain_rows):
     scans, rows = room_scans(12), plain_rows
     n_train = sum(len(scan.points) for i, scan in enumerate(scans) if i % 4)
     n_test = sum(len(scan.points) for i, scan in enumerate(scans) if i % 4 == 0)
     assert {row["n_train_points"] for row in rows if row["kept"] == 1} == {n_train}
-    (thinned,) = {row["n_train_points"] for row in rows if row["kept"] == 0.3}
-    assert thinned == pytest.approx(0.3 * n_train, rel=0.2)
+    (reduced,) = {row["n_train_points"] for row in rows if row["kept"] == 0.3}
+    assert reduced == pytest.approx(0.3 * n_train, rel=0.2)
     assert {row["n_queries"] for row in rows} == {2 * n_test}
-    assert {row["n_queries"] for row in run(replace(COARSE, max_beams=10)).rows} == {20}
+    grid = {"occupancy_grid": OccupancyGrid}
+    assert {row["n_queries"] for row in evaluate("room", scans, grid, replace(SMALL, max_beams=10)).rows} == {
+        20
+    }
 
 
-def test_the_same_seed_gives_the_same_rows_and_another_gives_others():
-    protocol = replace(COARSE, unknown=True, pose_noise=(0.05, 0.02))
+def test_rows_depend_only_on_the_seed():
+    protocol = replace(COARSE, kept=(0.3,), unknown=True, pose_noise=(0.05, 0.02))
     rows = timeless(run(protocol).rows)
     assert timeless(run(protocol).rows) == rows
     assert timeless(run(protocol, seed=1).rows) != rows
 
 
 class Counted:
-    """A map factory that counts the maps it made and the scans they were given."""
+    """A map factory that records the maps it makes and the scans that are inserted."""
 
     def __init__(self, make: MapFactory) -> None:
         self.make = make
@@ -124,7 +134,7 @@ class Counted:
         return made
 
 
-def test_a_mixture_is_built_once_for_a_share_and_a_grid_once_for_a_resolution_too():
+def test_a_mixture_is_built_once_per_share_and_a_grid_once_per_share_and_resolution():
     factories: dict[str, Any] = {name: Counted(make) for name, make in small_methods().items()}
     scans = room_scans(12)
     outcome = evaluate("room", scans, factories, SMALL)
@@ -135,12 +145,11 @@ def test_a_mixture_is_built_once_for_a_share_and_a_grid_once_for_a_resolution_to
     held_out = {tuple(scan.origin.tolist()) for scan in scans[::4]}
     for counted in factories.values():  # held-out scans are never inserted
         assert not held_out & {tuple(scan.origin.tolist()) for scan in counted.scans}
-    once = [row["build_seconds"] for row in outcome.rows if row["method"] == "monte_carlo"]
-    assert once[0] == once[1]
+    seconds = [row["build_seconds"] for row in outcome.rows if row["method"] == "monte_carlo"]
+    assert seconds[0] == seconds[1]
 
 
-def test_what_is_shown_are_the_maps_of_the_largest_share_with_their_answers():
-    outcome = run(replace(SMALL, kept=(0.3, 1.0)))
+def test_shown_maps_are_those_of_the_largest_share(outcome):
     assert [built.row for built in outcome.shown] == [row for row in outcome.rows if row["kept"] == 1]
     for built in outcome.shown:
         assert built.theta.shape == built.asked.labels.shape
@@ -148,31 +157,25 @@ def test_what_is_shown_are_the_maps_of_the_largest_share_with_their_answers():
         assert torch.equal(built.answer(built.asked.points), built.theta)
 
 
-def test_unknown_space_adds_its_points_and_its_four_fields(plain_rows):
-    rows = run(replace(SMALL, unknown=True)).rows
+def test_unknown_points_add_four_fields_and_keep_the_auc(plain_rows, tmp_path):
+    events: list[tuple[str, int, int | None]] = []
+    rows = run(
+        replace(SMALL, unknown=True, save_map=str(tmp_path / "maps")),
+        on_event=lambda *event: events.append(event),
+    ).rows
     for before, row in zip(plain_rows, rows, strict=True):
         assert row.keys() - before.keys() == UNKNOWN_FIELDS
         assert all(type(row[name]) is float and 0 <= row[name] <= 1 for name in UNKNOWN_FIELDS)
         assert row["n_queries"] > before["n_queries"]
         assert row["auc"] == before["auc"]  # hit and free points are the same
     grids = [row for row in rows if row["method"] == "occupancy_grid"]
-    # No training beam came near the unknown points, so that a grid of them answers exactly ½.
+    # No training beam observes the unknown points, so a grid answers exactly ½.
     assert all(row["unknown_called_free"] == row["unknown_called_occupied"] == 0 for row in grids)
+    check_saved_maps(tmp_path)
+    check_progress(events)
 
 
-def test_free_points_near_the_surface_are_harder(plain_rows):
-    for far, near in zip(plain_rows, run(replace(SMALL, free="near_surface")).rows, strict=True):
-        if far["method"] == "occupancy_grid":
-            assert near["auc"] < far["auc"]
-
-
-def test_wrong_poses_make_every_map_worse(plain_rows):
-    rows = run(replace(SMALL, pose_noise=(0.3, 0.2))).rows
-    assert all(bad["auc"] < good["auc"] for good, bad in zip(plain_rows, rows, strict=True))
-
-
-def test_maps_are_saved_under_method_share_and_resolution(tmp_path):
-    run(replace(SMALL, save_map=str(tmp_path / "maps")))
+def check_saved_maps(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "maps").iterdir()} == {
         f"{method}_{kept}_{resolution}.safetensors"
         for method in small_methods()
@@ -181,9 +184,7 @@ def test_maps_are_saved_under_method_share_and_resolution(tmp_path):
     }
 
 
-def test_progress_is_told_of_every_map_that_is_built():
-    events: list[tuple[str, int, int | None]] = []
-    run(COARSE, on_event=lambda *event: events.append(event))
+def check_progress(events: list[tuple[str, int, int | None]]) -> None:
     stages = {stage for stage, _, _ in events}
     assert any("mixture" in stage and "30%" in stage for stage in stages)
     for stage in stages:
@@ -192,10 +193,23 @@ def test_progress_is_told_of_every_map_that_is_built():
         assert steps[-1] == (9, 9)
 
 
-# -- what is refused ------------------------------------------------------------------------------
+def test_near_surface_points_lower_the_auc_of_a_grid(plain_rows):
+    grid = {"occupancy_grid": OccupancyGrid}
+    rows = evaluate("room", room_scans(12), grid, replace(SMALL, free="near_surface")).rows
+    uniform = [row for row in plain_rows if row["method"] == "occupancy_grid"]
+    assert all(near["auc"] < far["auc"] for near, far in zip(rows, uniform, strict=True))
 
 
-def test_methods_come_in_the_order_asked_for():
+def test_pose_noise_lowers_every_auc(plain_rows):
+    rows = run(replace(COARSE, kept=(1.0,), pose_noise=(0.3, 0.2))).rows
+    clean = [row for row in plain_rows if row["resolution"] == 0.2 and row["kept"] == 1]
+    assert all(bad["auc"] < good["auc"] for good, bad in zip(clean, rows, strict=True))
+
+
+# -- invalid input --------------------------------------------------------------------------------
+
+
+def test_choose_keeps_the_order_of_the_names():
     assert list(choose(["monte_carlo", "occupancy_grid"], methods(small_map))) == [
         "monte_carlo",
         "occupancy_grid",
@@ -203,28 +217,28 @@ def test_methods_come_in_the_order_asked_for():
 
 
 @pytest.mark.parametrize("names", [["octree"], ["monte_carlo", "octree"]])
-def test_an_unknown_method_lists_the_known_ones(names):
+def test_an_unknown_method_raises_and_lists_the_known_ones(names):
     known = methods(small_map)
     with pytest.raises(InvalidArgumentError, match="method='octree' is not known") as caught:
         choose(names, known)
     assert all(name in str(caught.value) for name in known)
 
 
-def test_no_method_at_all_is_refused():
+def test_an_empty_list_of_methods_raises():
     with pytest.raises(InvalidArgumentError, match=r"method is empty.*monte_carlo"):
         choose([], methods(small_map))
 
 
-def test_a_data_set_of_one_scan_is_refused():
+def test_a_data_set_with_one_scan_raises():
     with pytest.raises(InvalidArgumentError, match="1 scans; at least 2 are needed"):
         evaluate("room", room_scans(1), small_methods(), SMALL)
 
 
-def test_held_out_scans_without_returns_are_refused():
+def test_held_out_scans_without_returns_raise():
     scans = room_scans(8)
     for i in (0, 4):
         scans[i] = Scan(torch.empty(0, 2), scans[i].origin, scans[i].no_return)
-    with pytest.raises(InvalidArgumentError, match="no beam that hit anything"):
+    with pytest.raises(InvalidArgumentError, match="no return beams"):
         evaluate("room", scans, small_methods(), SMALL)
 
 
@@ -234,19 +248,9 @@ def test_held_out_scans_without_returns_are_refused():
         ({"resolution": (0.1, -0.1)}, "resolution=-0.1"),
         ({"resolution": (0.0,)}, "resolution=0"),
         ({"resolution": (float("nan"),)}, "resolution=nan"),
-        ({"resolution": ()}, "evaluation.resolution"),
-        ({"kept": ()}, "evaluation.kept"),
+        ({"resolution": ()}, r"resolution=\[\] is empty"),
+        ({"kept": ()}, r"kept=\[\] is empty"),
         ({"max_beams": 0}, "max_beams=0"),
-    ],
-)
-def test_a_protocol_that_cannot_be_followed_is_refused_at_once(options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        Protocol(**options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
         ({"kept": (2.0,)}, "kept=2"),
         ({"kept": (1.0, 2.0)}, "kept=2"),
         ({"kept": (0.0,)}, "kept=0"),
@@ -257,26 +261,19 @@ def test_a_protocol_that_cannot_be_followed_is_refused_at_once(options, message)
         ({"pose_noise": (-1.0, 0.0)}, "pose_noise="),
     ],
 )
-def test_bad_values_are_named_before_any_map_is_built(options, message):
-    built = []
-
-    def factory(resolution: float) -> OccupancyGrid:
-        built.append(resolution)
-        return OccupancyGrid(resolution)
-
+def test_an_invalid_protocol_raises_when_it_is_made(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
-        evaluate("room", room_scans(8), {"occupancy_grid": factory}, replace(SMALL, **options))
-    assert not built
+        Protocol(**options)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**70])
-def test_a_seed_that_cannot_be_used_is_named(seed):
+def test_an_invalid_seed_raises(seed):
     with pytest.raises(InvalidArgumentError, match=f"seed={seed}"):
         run(replace(SMALL, kept=(1.0,), resolution=(0.2,)), seed=seed)
 
 
-def test_training_scans_without_any_beam_give_maps_that_know_nothing():
-    """What is kept may be nothing at all, when the share is tiny."""
+def test_maps_without_training_beams_answer_one_half():
+    """A tiny share keeps no beam."""
     rows = run(replace(COARSE, kept=(1e-6,))).rows
     assert {row["n_train_points"] for row in rows} == {0}
     assert all(row["auc"] == 0.5 and row["brier"] == 0.25 for row in rows)
@@ -285,7 +282,7 @@ def test_training_scans_without_any_beam_give_maps_that_know_nothing():
 # -- the mixture against the grid -----------------------------------------------------------------
 
 
-def test_on_few_beams_the_mixture_answers_better_than_the_grid():
+def test_mixture_beats_the_grid_on_a_tenth_of_the_beams():
     scans = list(load("synthetic_building_2d"))
     known = methods(lambda: GaussianMap(n_samples=200_000))
     chosen = choose(["occupancy_grid", "monte_carlo"], known)
@@ -295,7 +292,7 @@ def test_on_few_beams_the_mixture_answers_better_than_the_grid():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_scans_on_a_gpu_give_the_rows_of_the_cpu():
+def test_rows_on_cuda_match_the_cpu():
     protocol = replace(COARSE, unknown=True, pose_noise=(0.01, 0.01))
     scans = [scan.to("cuda") for scan in room_scans(12)]
     rows = evaluate("room", scans, small_methods(), protocol).rows

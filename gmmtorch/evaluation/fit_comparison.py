@@ -1,11 +1,11 @@
-"""Mixtures fitted to a cloud, side by side: time, likelihood, PSNR2, bytes."""
+"""Fits mixtures to a point cloud and compares their time, likelihood, PSNR2 and bytes."""
 
 from __future__ import annotations
 
 import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -15,34 +15,31 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.estimators import METHODS, FitOptions
-from gmmtorch.evaluation.events import Event
+from gmmtorch.evaluation import estimators
+from gmmtorch.evaluation.events import Event, OnRows, Row
 from gmmtorch.evaluation.metrics import psnr2, psnr_terms
+from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimator import MixtureEstimator
-
-Row = dict[str, Any]
-OnRows = Callable[[list[Row]], object]
-"""Called with all rows so far whenever there is one more, so that hours of work need not hang on the last."""
 
 
 @dataclass
 class FitOutcome:
-    """rows: as in results.json; mixtures and lower bounds by method."""
+    """Rows of results.json, and the mixtures and lower bounds by method."""
 
     rows: list[Row] = field(default_factory=list)
     mixtures: dict[str, MixtureEstimator] = field(default_factory=dict)
     lower_bounds: dict[str, list[float]] = field(default_factory=dict)
 
 
-class Material(NamedTuple):
-    """What is learned from: points train (N, D) of a data set; and points test (M, D) held out, M ≥ 0."""
+class FitData(NamedTuple):
+    """Points of a data set: train (N, D) for the fit and test (M, D) held out, M ≥ 0; metres."""
 
     dataset: str
     train: Tensor
     test: Tensor
 
 
-def split(dataset: str, points: Tensor, test_share: float, seed: int) -> Material:
+def split(dataset: str, points: Tensor, test_share: float, seed: int) -> FitData:
     """Hold out a random share of points (N, D).
 
     Raises `InvalidArgumentError` for a share outside [0, 1) or a cloud without points.
@@ -50,15 +47,15 @@ def split(dataset: str, points: Tensor, test_share: float, seed: int) -> Materia
     if not 0 <= test_share < 1:
         raise InvalidArgumentError(f"test_share={test_share} must be a share in [0, 1).")
     if points.shape[0] == 0:
-        raise InvalidArgumentError("The chosen scans hold no points; choose others by `scans`.")
+        raise InvalidArgumentError("The chosen scans have no points; choose other scans by `scans`.")
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(points.shape[0], generator=generator).to(points.device)
     n_test = int(test_share * points.shape[0])
-    return Material(dataset, points[order[n_test:].sort().values], points[order[:n_test]])
+    return FitData(dataset, points[order[n_test:].sort().values], points[order[:n_test]])
 
 
 def compare(
-    material: Material,
+    data: FitData,
     methods: Sequence[str],
     options: FitOptions,
     seed: int,
@@ -66,43 +63,42 @@ def compare(
     on_rows: OnRows = lambda rows: None,
     own: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> FitOutcome:
-    """Fit the training points by each method, and score the mixtures on the same points held out.
+    """Fit the training points by each method, and score the mixtures on training and test points.
 
-    `own` has, by method, options that only its estimator takes. Raises `InvalidArgumentError` for an
-    unknown method, which lists the known, and for a bad option.
+    `own` contains, by method, options that only its estimator takes. Raises `InvalidArgumentError` for an
+    unknown method or an invalid option.
     """
     own = own or {}
+    known = ", ".join(sorted(estimators.ESTIMATORS))
     for method in (*methods, *own):
-        if method not in METHODS:
-            raise InvalidArgumentError(
-                f"method={method!r} is not known; known are {', '.join(sorted(METHODS))}."
-            )
+        if method not in estimators.ESTIMATORS:
+            raise InvalidArgumentError(f"method={method!r} is not known; known are {known}.")
     if not methods:
-        raise InvalidArgumentError(f"method is empty; name at least one of {', '.join(sorted(METHODS))}.")
-    options.check(material.train.shape[0], seed)
+        raise InvalidArgumentError(f"method is empty; name at least one of {known}.")
+    options.check(data.train.shape[0], seed)
     outcome = FitOutcome()
     for method in methods:
         begin = time.perf_counter()
-        mixture = METHODS[method](material.train, options, seed, on_event, **own.get(method, {}))
+        mixture = estimators.fit(method, data.train, options, seed, on_event, **own.get(method, {}))
         seconds = time.perf_counter() - begin
         outcome.mixtures[method] = mixture
         outcome.lower_bounds[method] = mixture.lower_bounds_
-        outcome.rows.append(row_of(material, method, mixture, seconds, seed))
+        outcome.rows.append(row_of(data, method, mixture, seconds, seed))
         on_rows(outcome.rows)
     return outcome
 
 
-def row_of(material: Material, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:
-    """How good a mixture is for what it was learned from, and for what was held out.
+def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:
+    """The row of results.json of a mixture: its scores on the training and the test points.
 
-    `n_components_used` counts those that a training point belongs to (weights would not do: a
-    prior may give weight to components that explain nothing). The points of PSNR2 are drawn with
-    the seed, as many as they are compared with.
+    `n_components_used` counts the components that are the likeliest of at least one training point. The
+    weights do not show this: a prior gives weight to components without points. PSNR2 compares the points
+    with equally many samples, drawn with the seed.
     """
-    _, train, test = material
+    _, train, test = data
     forward, backward = psnr_terms(train, _drawn(mixture, len(train), seed))
     return {
-        "dataset": material.dataset,
+        "dataset": data.dataset,
         "method": method,
         "n_points": len(train),
         "n_components": len(mixture.weights),
@@ -121,9 +117,9 @@ def row_of(material: Material, method: str, mixture: MixtureEstimator, seconds: 
 
 
 def means(rows: Sequence[Row], by: Sequence[str]) -> list[Row]:
-    """One row for each combination of the fields `by`: `n_seeds`, and means over the rows that share it.
+    """One row for each combination of the fields `by`: `n_seeds`, and the means over the rows of the group.
 
-    Of what is no number the value that all share, else None.
+    A field that is not a number keeps its value if all rows agree, else it is None.
     """
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -141,7 +137,7 @@ def _mean(values: Sequence[Any]) -> Any:
 
 
 def in_use(mixture: MixtureEstimator, points: Tensor) -> Tensor:
-    """Which components (K,) are the likeliest of one of the points (N, D) at least."""
+    """Mask (K,) of the components that are the likeliest of at least one of the points (N, D)."""
     return torch.bincount(torch.as_tensor(mixture.predict(points)), minlength=len(mixture.weights)) > 0
 
 

@@ -1,4 +1,4 @@
-"""What gmmtorch-fit works on: the scans that were chosen, and their points, split."""
+"""The points that gmmtorch-fit learns from: those of the selected scans, split into training and test."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.studies.fitting import Material
+    from gmmtorch.evaluation.fit_comparison import FitData
     from gmmtorch.scan import Scan
 
 
-def material(config: DictConfig, device: str, on_event: Event) -> Material:
-    """The points of the chosen scans, thinned to `max_points`, less those held out."""
-    return material_of(config, *chosen_scans(config, device, on_event))
+def fit_data(config: DictConfig, device: str, on_event: Event) -> FitData:
+    """The points of the selected scans: at most `max_points`, split by `test_share`."""
+    return fit_data_of(config, *selected_scans(config, device, on_event))
 
 
-def material_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> Material:
-    """The same of given scans."""
+def fit_data_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> FitData:
+    """The same for given scans of the data set with this name."""
     import torch
 
-    from gmmtorch.evaluation.studies.fitting import split
+    from gmmtorch.evaluation.fit_comparison import split
 
-    points = _thinned(torch.cat([scan.points for scan in scans]), config.max_points, config.seed)
+    points = _subset(torch.cat([scan.points for scan in scans]), config.max_points, config.seed)
     return split(name, points, config.test_share, config.seed)
 
 
-def chosen_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
-    """The data set's name, and its scans whose numbers are in `scans`; all of them for null."""
+def selected_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
+    """The data set's name, and its scans with the indices `scans`; all scans for null."""
     from gmmtorch.errors import InvalidArgumentError
 
     dataset = common.open_dataset(config.dataset)
@@ -42,12 +42,12 @@ def chosen_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str,
         if not -len(dataset) <= index < len(dataset):
             raise InvalidArgumentError(f"scans={indices}: {dataset.name} has scans 0 to {len(dataset) - 1}.")
     if not indices:
-        raise InvalidArgumentError("scans is empty; name at least one, or null for all.")
+        raise InvalidArgumentError("scans is empty; give at least one index, or null for all.")
     return dataset.name, common.read_scans(dataset, indices, device, on_event)
 
 
-def _thinned(points: Tensor, max_points: int | None, seed: int) -> Tensor:
-    """At most so many of the points (N, D), drawn at random, in their order."""
+def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor:
+    """A random subset of `max_points` of the points (N, D), in their order; all points if there are fewer."""
     import torch
 
     from gmmtorch.errors import InvalidArgumentError

@@ -1,4 +1,4 @@
-"""A mixture of a cloud larger than memory, or shared by several processes, and how good it is."""
+"""Fits a mixture to a cloud that is larger than memory or shared by several processes, and scores it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import NamedTuple
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.estimators import FitOptions
-from gmmtorch.evaluation.events import Event
-from gmmtorch.evaluation.studies.fitting import Material, Row, row_of
+from gmmtorch.evaluation.events import Event, Row
+from gmmtorch.evaluation.fit_comparison import FitData, row_of
+from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 from gmmtorch.mixture.streaming.distributed import ALONE, Processes
 from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream
 from gmmtorch.mixture.streaming.stream_start import survey_all
 
-_SPLIT_SALT = 0x5EED  # so that what is held out and what is drawn have nothing to do with each other
+_SPLIT_SALT = 0x5EED  # makes the split independent of the sample
 
 
 class Split(NamedTuple):
-    """Sources to learn from and to test on, and how many points are drawn of each (None: all)."""
+    """Training and test sources, and the number of points that are sampled from each (None: all)."""
 
     train: PointChunks
     test: PointChunks
@@ -29,11 +29,11 @@ class Split(NamedTuple):
 
 
 class Streamed(NamedTuple):
-    """The row for results.json, the mixture, and the points drawn of the sources."""
+    """The row of results.json, the mixture, and the points sampled from the sources."""
 
     row: Row
     mixture: GaussianMixture
-    sample: Material
+    sample: FitData
 
 
 def split_source(source: PointChunks, test_share: float, seed: int, sample_points: int | None) -> Split:
@@ -47,11 +47,10 @@ def split_source(source: PointChunks, test_share: float, seed: int, sample_point
     )
 
 
-def split_material(material: Material, chunk_points: int) -> Split:
-    """The points of a cloud in memory, split already. As they are there, all of them are drawn."""
+def split_data(data: FitData, chunk_points: int) -> Split:
+    """Sources for a cloud in memory that is already split; the samples are all its points."""
     train, test = (
-        in_memory(points, material.dataset, chunk_points=chunk_points)
-        for points in (material.train, material.test)
+        in_memory(points, data.dataset, chunk_points=chunk_points) for points in (data.train, data.test)
     )
     return Split(train, test, None)
 
@@ -66,9 +65,9 @@ def fit_streamed(
     checkpoint: Checkpoint | None = None,
     on_event: Event = lambda stage, done, total: None,
 ) -> Streamed:
-    """Fit the training source by EM, and score the mixture on both. The row is rank 0's alone to keep.
+    """Fit the training source by EM, and score the mixture on both sources. Only rank 0 returns a row.
 
-    Likelihoods are over all points; PSNR2 and components in use are of the points drawn.
+    Likelihoods are means over all points. PSNR2 and `n_components_used` are computed from the samples.
     """
     train, test = (part.shard(processes.rank, processes.size) for part in (split.train, split.test))
     wanted = None if split.sample_points is None else max(split.sample_points, options.n_components or 1)
@@ -77,7 +76,7 @@ def fit_streamed(
     on_event("reading points", 1, 2)
     held_out = survey_all(test, wanted, seed, processes)
     on_event("reading points", 2, 2)
-    sample = Material(split.train.name, found.points, held_out.points)
+    sample = FitData(split.train.name, found.points, held_out.points)
 
     def on_iteration(iteration: int, lower_bound: float) -> None:
         on_event("em", min(iteration, options.max_iter), options.max_iter)
@@ -86,7 +85,7 @@ def fit_streamed(
     mixture = GaussianMixture(**vars(options), random_state=seed)
     begin = time.perf_counter()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whether it converged is in the row
+        warnings.simplefilter("ignore")  # the row contains `converged`
         fit_stream(
             mixture,
             train,

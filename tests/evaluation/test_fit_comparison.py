@@ -1,4 +1,4 @@
-"""Mixtures side by side: what a row says, and that ours is as likely as scikit-learn's."""
+"""Comparison of mixtures: rows, and likelihoods against scikit-learn."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -15,10 +15,11 @@ from sklearn.mixture import GaussianMixture as ScikitLearnMixture
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.estimators import METHODS, FitOptions
+from gmmtorch.evaluation.estimators import ESTIMATORS
 from gmmtorch.evaluation.events import ignore
+from gmmtorch.evaluation.fit_comparison import FitOutcome, compare, means, split
 from gmmtorch.evaluation.metrics import psnr2
-from gmmtorch.evaluation.studies.fitting import FitOutcome, compare, means, split
+from gmmtorch.evaluation.protocol_options import FitOptions
 
 SMALL = FitOptions(n_components=6, max_iter=60)
 
@@ -36,13 +37,42 @@ def fit(
     *methods: str, points: Tensor | None = None, test_share: float = 0.2, seed: int = 0, **options: Any
 ) -> FitOutcome:
     cloud = blobs() if points is None else points
-    material = split("blobs", cloud, test_share, seed)
-    return compare(material, methods, replace(SMALL, **options), seed, ignore)
+    data = split("blobs", cloud, test_share, seed)
+    return compare(data, methods, replace(SMALL, **options), seed, ignore)
 
 
-def test_rows_carry_every_field_of_the_contract_with_its_type():
-    rows = fit(*METHODS).rows
-    assert [row["method"] for row in rows] == list(METHODS)
+class All(NamedTuple):
+    """The outcome of all methods, the events, and the numbers of rows that were reported."""
+
+    outcome: FitOutcome
+    events: list[tuple[str, int, int | None]]
+    counts: list[int]
+
+
+@pytest.fixture(scope="module")
+def everything() -> All:
+    torch.set_num_threads(1)
+    events: list[tuple[str, int, int | None]] = []
+    counts: list[int] = []
+    outcome = compare(
+        split("blobs", blobs(), 0.2, 0),
+        list(ESTIMATORS),
+        SMALL,
+        0,
+        lambda *event: events.append(event),
+        lambda rows: counts.append(len(rows)),
+    )
+    return All(outcome, events, counts)
+
+
+def timeless(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in rows]
+
+
+def test_rows_have_every_documented_field_with_its_type(everything):
+    rows = everything.outcome.rows
+    assert everything.counts == list(range(1, len(rows) + 1))
+    assert [row["method"] for row in rows] == list(ESTIMATORS)
     kinds: dict[str, type] = {
         "dataset": str,
         "method": str,
@@ -71,14 +101,14 @@ def test_rows_carry_every_field_of_the_contract_with_its_type():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_our_mixture_is_as_likely_as_that_of_scikit_learn(dim):
+def test_likelihood_of_em_matches_scikit_learn(dim):
     ours, theirs = fit("em", "scikit_learn", points=blobs(dim=dim)).rows
     for name in ("log_likelihood", "held_out_log_likelihood"):
         assert ours[name] == pytest.approx(theirs[name], abs=0.02)
     assert ours["nbytes"] == pytest.approx(theirs["nbytes"], rel=0.1)  # stored in the same way
 
 
-def test_the_mixture_of_scikit_learn_is_taken_over_as_it_is():
+def test_scikit_learn_mixture_is_converted_exactly():
     points = blobs()
     outcome = fit("scikit_learn", points=points, test_share=0.0, seed=3)
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(3)).sort().values
@@ -87,7 +117,7 @@ def test_the_mixture_of_scikit_learn_is_taken_over_as_it_is():
     np.testing.assert_allclose(outcome.mixtures["scikit_learn"].means_, peer.means_, atol=1e-8)
 
 
-def test_likelihoods_are_means_over_the_points_held_out_and_over_the_others(tmp_path):
+def test_likelihoods_are_means_over_train_and_test_points(tmp_path):
     points = blobs()
     outcome = fit("em", points=points)
     row, mixture = outcome.rows[0], outcome.mixtures["em"]
@@ -100,16 +130,16 @@ def test_likelihoods_are_means_over_the_points_held_out_and_over_the_others(tmp_
     assert row["log_likelihood"] != row["held_out_log_likelihood"]
 
 
-def test_psnr2_is_that_of_as_many_points_as_are_compared_with():
-    material = split("blobs", blobs(), 0.25, 0)
-    outcome = compare(material, ["em"], SMALL, 0, ignore)
+def test_psnr2_uses_as_many_samples_as_points():
+    data = split("blobs", blobs(), 0.25, 0)
+    outcome = compare(data, ["em"], SMALL, 0, ignore)
     row, mixture = outcome.rows[0], outcome.mixtures["em"]
-    for points, name in ((material.train, "psnr2_db"), (material.test, "held_out_psnr2_db")):
+    for points, name in ((data.train, "psnr2_db"), (data.test, "held_out_psnr2_db")):
         drawn, _ = mixture.sample(len(points), random_state=0)
         assert row[name] == pytest.approx(psnr2(points, drawn))
 
 
-def test_a_split_parts_the_points_at_random():
+def test_split_is_a_random_partition_of_the_points():
     points = blobs()
     _, train, test = split("blobs", points, 0.25, 0)
     assert (len(train), len(test)) == (900, 300)
@@ -117,7 +147,7 @@ def test_a_split_parts_the_points_at_random():
     assert not torch.equal(test, split("blobs", points, 0.25, 1).test)
 
 
-def test_components_that_no_point_belongs_to_are_not_in_use():
+def test_components_without_points_are_not_counted_as_used():
     points = torch.cat([torch.zeros(600, 2), torch.ones(600, 2)]).double()
     points = points + 1e-3 * torch.randn(1200, 2, generator=torch.Generator().manual_seed(0)).double()
     for method in ("variational", "scikit_learn_bayesian"):
@@ -125,66 +155,56 @@ def test_components_that_no_point_belongs_to_are_not_in_use():
         assert (row["n_components"], row["n_components_used"]) == (10, 2)
 
 
-def test_components_in_use_are_counted_by_enumeration():
+def test_used_components_match_enumeration():
     points = blobs()
     outcome = fit("em", points=points, n_components=40, test_share=0.0)
     likeliest = np.asarray(outcome.mixtures["em"].predict_proba(points)).argmax(1)
     assert outcome.rows[0]["n_components_used"] == len(set(likeliest.tolist()))
 
 
-def test_rows_are_handed_on_as_they_come():
-    seen: list[int] = []
-    material = split("blobs", blobs(), 0.2, 0)
-    compare(material, ["em", "scikit_learn"], SMALL, 0, ignore, lambda rows: seen.append(len(rows)))
-    assert seen == [1, 2]
-
-
-def test_nothing_held_out_has_no_held_out_likelihood():
+def test_held_out_scores_are_none_without_test_points():
     row = fit("em", test_share=0.0).rows[0]
     assert row["held_out_log_likelihood"] is None
     assert row["held_out_psnr2_db"] is None
     assert row["n_points"] == 1200
 
 
-def test_all_methods_see_the_same_points_and_the_same_seed_gives_the_same_rows():
-    def timeless(outcome: FitOutcome) -> list[dict[str, Any]]:
-        return [{k: v for k, v in row.items() if not k.endswith("seconds")} for row in outcome.rows]
+def test_rows_depend_only_on_the_seed(everything):
+    """The methods run in another order, so the rows do not depend on it either."""
+    first = timeless(everything.outcome.rows)
+    again = timeless(fit(*reversed(ESTIMATORS)).rows)
+    assert again[::-1] == first
+    for method in ("em", "scikit_learn"):
+        assert timeless(fit(method, seed=1).rows)[0] not in first
 
-    first = timeless(fit(*METHODS))
-    assert timeless(fit(*METHODS)) == first
-    assert timeless(fit(*METHODS, seed=1)) != first
-    assert timeless(fit("scikit_learn")) == [r for r in first if r["method"] == "scikit_learn"]
 
-
-@pytest.mark.parametrize("method", METHODS)
-def test_lower_bounds_rise_and_there_is_one_for_each_iteration(method):
-    outcome = fit(method)
-    bounds = outcome.lower_bounds[method]
-    assert len(bounds) == outcome.rows[0]["n_iterations"] > 1
+@pytest.mark.parametrize("method", ESTIMATORS)
+def test_lower_bounds_increase_with_one_per_iteration(method, everything):
+    bounds = everything.outcome.lower_bounds[method]
+    (row,) = (row for row in everything.outcome.rows if row["method"] == method)
+    assert len(bounds) == row["n_iterations"] > 1
     assert all(math.isfinite(bound) for bound in bounds)
-    if method in ("sliced_wasserstein", "hierarchical"):  # a stochastic descent; begins anew on each level
+    if method in ("sliced_wasserstein", "hierarchical"):  # stochastic; restarts at each level
         assert bounds[-1] > bounds[0]
     else:
         assert all(b >= a - 1e-5 for a, b in itertools.pairwise(bounds))
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_progress_begins_at_nothing_and_ends_at_all(method):
-    events: list[tuple[str, int, int | None]] = []
-    compare(split("blobs", blobs(), 0.1, 0), [method], SMALL, 0, lambda *event: events.append(event))
-    assert {stage for stage, _, _ in events} == {method}
-    assert events[0][1] == 0
-    assert events[-1][1] == events[-1][2]
-    assert [done for _, done, _ in events] == sorted(done for _, done, _ in events)
+@pytest.mark.parametrize("method", ESTIMATORS)
+def test_progress_goes_from_zero_to_the_total(method, everything):
+    events = [(done, total) for stage, done, total in everything.events if stage == method]
+    assert events[0][0] == 0
+    assert events[-1][0] == events[-1][1]
+    assert events == sorted(events)
 
 
-def test_a_fit_that_is_cut_short_says_so():
+def test_an_unconverged_fit_is_marked():
     row = fit("em", max_iter=1, tol=0.0).rows[0]
     assert row["converged"] is False
     assert row["n_iterations"] == 1
 
 
-def test_means_are_over_the_rows_that_share_the_fields():
+def test_means_group_rows_by_fields():
     rows = [
         {
             "start": start,
@@ -208,46 +228,46 @@ def test_means_are_over_the_rows_that_share_the_fields():
     }  # fmt: skip
 
 
-def test_a_methods_own_options_are_for_its_estimator_alone():
-    material = split("blobs", blobs(), 0.2, 0)
+def test_own_options_apply_only_to_their_estimator():
+    data = split("blobs", blobs(), 0.2, 0)
     own = {"hierarchical": {"max_levels": 1, "branching": 3}}
-    outcome = compare(material, ["em", "hierarchical"], SMALL, 0, ignore, own=own)
+    outcome = compare(data, ["em", "hierarchical"], SMALL, 0, ignore, own=own)
     assert [row["n_components"] for row in outcome.rows] == [6, 3]
 
 
-# -- what is refused ------------------------------------------------------------------------------
+# -- invalid input --------------------------------------------------------------------------------
 
 
-def test_an_unknown_method_lists_the_known_ones():
+def test_an_unknown_method_raises_and_lists_the_known_ones():
     with pytest.raises(
         InvalidArgumentError, match=r"method='kmeans' is not known; known are em, .*scikit_learn"
     ):
         fit("em", "kmeans")
 
 
-def test_no_method_at_all_is_refused():
+def test_an_empty_list_of_methods_raises():
     with pytest.raises(InvalidArgumentError, match="method is empty"):
         fit()
 
 
 @pytest.mark.parametrize("test_share", [1.0, -0.1, 2.0, math.nan])
-def test_a_share_that_leaves_nothing_to_learn_from_is_refused(test_share):
+def test_an_invalid_test_share_raises(test_share):
     with pytest.raises(InvalidArgumentError, match=r"test_share=.* must be a share in \[0, 1\)"):
         fit("em", test_share=test_share)
 
 
-def test_a_cloud_without_points_is_refused():
-    with pytest.raises(InvalidArgumentError, match="hold no points"):
+def test_a_cloud_without_points_raises():
+    with pytest.raises(InvalidArgumentError, match="have no points"):
         fit("em", points=torch.empty(0, 3))
 
 
 @pytest.mark.parametrize("method", ["scikit_learn", "scikit_learn_bayesian"])
-def test_scikit_learn_is_compared_from_kmeans_only(method):
-    with pytest.raises(InvalidArgumentError, match=r"init_params='random_points'.*kmeans only"):
+def test_scikit_learn_supports_only_the_kmeans_start(method):
+    with pytest.raises(InvalidArgumentError, match=r"init_params='random_points'.*only kmeans"):
         fit(method, init_params="random_points")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ESTIMATORS)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -259,14 +279,14 @@ def test_scikit_learn_is_compared_from_kmeans_only(method):
         ({"seed": -1}, "-1"),
     ],
 )
-def test_bad_options_are_named_whichever_method_is_asked_for(method, options, message):
+def test_invalid_options_raise_for_every_method(method, options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         fit(method, **options)
 
 
-def test_options_that_a_method_does_not_have_are_named():
-    material = split("blobs", blobs(), 0.2, 0)
+def test_unknown_own_options_raise():
+    data = split("blobs", blobs(), 0.2, 0)
     with pytest.raises(InvalidArgumentError, match=r"method_options\.em\.branching .*em takes .*warm_start"):
-        compare(material, ["em"], SMALL, 0, ignore, own={"em": {"branching": 3}})
+        compare(data, ["em"], SMALL, 0, ignore, own={"em": {"branching": 3}})
     with pytest.raises(InvalidArgumentError, match="method='trees' is not known"):
-        compare(material, ["em"], SMALL, 0, ignore, own={"trees": {"branching": 3}})
+        compare(data, ["em"], SMALL, 0, ignore, own={"trees": {"branching": 3}})

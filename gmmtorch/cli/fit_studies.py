@@ -1,0 +1,103 @@
+"""The studies of gmmtorch-fit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import common
+from gmmtorch.cli.fit_data import fit_data, fit_data_of, selected_scans
+from gmmtorch.cli.structured import build
+from gmmtorch.cli.studies import Found, Study
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from gmmtorch.evaluation.events import Event, OnRows, Row
+
+
+def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    from gmmtorch.evaluation.studies import initialization_study
+    from gmmtorch.evaluation.studies.study_options import InitializationStudy
+    from gmmtorch.report.studies import initialization_figures
+
+    study = build(InitializationStudy, common.as_options(config.study), "study")
+    data = fit_data(config, device, on_event)
+    rows = initialization_study.run(data, study, common.fit_options(config), config.seed, on_event, on_rows)
+    return _found(
+        rows,
+        initialization_figures,
+        "init_params",
+        "init_seconds n_iterations seconds psnr2_db held_out_psnr2_db log_likelihood held_out_log_likelihood",
+    )
+
+
+def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    """Fields of a fit that this study does not measure are None."""
+    from gmmtorch.evaluation.studies import sensor_noise
+    from gmmtorch.evaluation.studies.study_options import SensorModelStudy
+    from gmmtorch.report.studies import sensor_noise_figures
+
+    study = build(SensorModelStudy, common.as_options(config.study), "study")
+    with common.naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
+        sensor_noise.sensor_model(study)  # an invalid option fails before the scans are read
+    dataset, scans = selected_scans(config, device, on_event)
+    rows = [
+        {
+            "method": row["variant"],
+            "n_points": row["n_train_points"],
+            "log_likelihood": None,
+            "psnr2_db": None,
+            **row,
+        }
+        for row in sensor_noise.run(dataset, scans, study, config.seed, on_event)
+    ]
+    return _found(
+        rows,
+        sensor_noise_figures,
+        "variant",
+        "held_out_log_likelihood auc auc_near_surface thickness sensor_deviation seconds n_iterations nbytes",
+    )
+
+
+def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    from gmmtorch.evaluation.studies import component_count
+    from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
+    from gmmtorch.report.studies import component_count_figures
+
+    study = build(ComponentCountStudy, common.as_options(config.study), "study")
+    dataset, scans = selected_scans(config, device, on_event)
+    data = fit_data_of(config, dataset, component_count.middle(scans, study.window))
+    options = common.fit_options(config)
+    rows = component_count.run(data, scans, study, options, config.seed, on_event, on_rows)
+    return _found(
+        rows,
+        component_count_figures,
+        "rule",
+        "setting component_bytes held_out_psnr2_db held_out_log_likelihood auc count_seconds seconds",
+    )
+
+
+def _found(rows: list[Row], report: ModuleType, line: str, columns: str) -> Found:
+    """The table shows means over the seeds for each value of the field `line` and number of components."""
+    from gmmtorch.evaluation.fit_comparison import means
+
+    table = means(rows, (line, "n_components"))
+    return Found(
+        rows,
+        lambda: report.figures(rows),
+        f"{line} n_components n_seeds {columns}",
+        common.headline(rows),
+        shown=table,
+        line=line,
+        step="n_components",
+        scores={"hparam/best_log_likelihood": max(common.log_likelihood(row) for row in table)},
+    )
+
+
+STUDIES: dict[str, Study] = {
+    "component_count": _component_count,
+    "initialization": _initialization,
+    "sensor_model": _sensor_model,
+}
