@@ -30,8 +30,8 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 
 def noisy_room(n: int, seed: int) -> Tensor:
@@ -150,7 +150,7 @@ def ray_casting(n_rays: int = 1_000_000, repeats: int = 3) -> None:
             for _ in range(repeats):
                 cast.append(timed(lambda: sum(1 for _ in traverse(a, b, grid.shape))))  # noqa: B023
                 counted.append(timed(lambda: Evidence.empty(grid).add_rays(starts, ends)))  # noqa: B023
-                blocks.append(timed(lambda: BlockEvidence(resolution, dim).add_rays(starts, ends)))  # noqa: B023
+                blocks.append(timed(lambda: SparseEvidence(resolution, dim).add_rays(starts, ends)))  # noqa: B023
         rates = [f"{visits / statistics.median(times) / 1e6:.0f}" for times in (cast, counted, blocks)]
         rows.append(
             [f"{dim}D", f"{resolution} m", f"{visits / 1e6:.0f} M", *rates, f"{memory.mebibytes:.0f} MiB"]
@@ -186,11 +186,11 @@ def hall_by_stage(folder: Path, resolution: float = 0.2) -> None:
     stage("the same through GaussianMap.insert", lambda: [built.insert(s) for s in scans] and built.finish())  # type: ignore[attr-defined,func-returns-value]
     cones = built.components().cones()
     rays = stage("sample 10⁶ rays (Sobol)", lambda: sample_rays(cones, 1_000_000, generator))
-    evidence = BlockEvidence(resolution, 3)
+    evidence = SparseEvidence(resolution, 3)
     stage("cast them, block-sparse", lambda: evidence.add_rays(*rays))  # type: ignore[misc]
     centers = evidence.bounds()[0] + torch.rand(1_000_000, 3).double() * 20
     stage("ask 10⁶ points", lambda: evidence.lookup(centers))
-    raw = BlockEvidence(resolution, 3)
+    raw = SparseEvidence(resolution, 3)
     ends = torch.cat([s.points for s in scans])  # type: ignore[attr-defined]
     origins = torch.cat([s.origin.expand_as(s.points) for s in scans])  # type: ignore[attr-defined]
     stage("for comparison: cast every raw beam", lambda: raw.add_rays(origins, ends))

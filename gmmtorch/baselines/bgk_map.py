@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
-from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.samples import check_length, check_range, thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
+from gmmtorch.occupancy.voxels.cell_table import CellTable
 from gmmtorch.scan import Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.bgk_map", 1

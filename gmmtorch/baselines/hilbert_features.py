@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.bgk_map import kernel_offsets, sparse_kernel
-from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.samples import centroids
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import require
+from gmmtorch.occupancy.voxels.cell_table import CellTable
 
 RBF_CUTOFF = 1e-3
 """Kernels on a lattice are taken as zero below this, as the authors of Hilbert maps do."""

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap
-from gmmtorch.baselines.cell_table import CellTable
 from gmmtorch.baselines.samples import check_length, check_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import pack_tensors, require
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
+from gmmtorch.occupancy.voxels.cell_table import CellTable
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.scan import Scan
 

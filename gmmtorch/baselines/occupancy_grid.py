@@ -16,7 +16,7 @@ from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, requi
 from gmmtorch.occupancy.evidence import check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import ArrayLike, Scan
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1
@@ -68,14 +68,14 @@ class OccupancyGrid:
         self.prior = check_prior(prior)
         self.memory_limit = memory_limit
         self.compiled = compiled
-        self._blocks: BlockEvidence | None = None
+        self._blocks: SparseEvidence | None = None
         self._waiting: list[Scan] = []  # counts are additive, so scans are cast many at a time
 
     def insert(self, scan: Scan) -> None:
         """Count the beams of a scan."""
         check_scan(scan)
         if self._blocks is None:
-            self._blocks = BlockEvidence(
+            self._blocks = SparseEvidence(
                 self.resolution, scan.dim, scan.points.device, self.memory_limit, self.compiled
             )
         elif scan.dim != self._blocks.dim:
@@ -91,7 +91,7 @@ class OccupancyGrid:
         if self._blocks is not None:
             self.evidence()
 
-    def evidence(self) -> BlockEvidence:
+    def evidence(self) -> SparseEvidence:
         """Hits and misses counted so far."""
         if self._blocks is None:
             raise InvalidArgumentError("The grid is empty; insert a scan first.")
@@ -119,7 +119,7 @@ class OccupancyGrid:
         elif self.log_odds is None:
             theta = self.evidence().lookup(query, self.prior)
         else:
-            theta = torch.sigmoid(self._sum(*self.evidence().evidence_at(query), self.log_odds))
+            theta = torch.sigmoid(self._sum(*self.evidence().at_points(query), self.log_odds))
         return theta.to(device) if isinstance(points, Tensor) else theta.cpu().numpy()
 
     @staticmethod
@@ -165,7 +165,7 @@ class OccupancyGrid:
         try:
             rule = LogOdds(**facts["log_odds"]) if "log_odds" in facts else None
             grid = cls(facts["resolution"], log_odds=rule, prior=facts["prior"])
-            blocks = BlockEvidence(grid.resolution, {2: 2, 3: 3}[facts["dim"]])
+            blocks = SparseEvidence(grid.resolution, {2: 2, 3: 3}[facts["dim"]])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         anchor = require(tensors, "anchor", (blocks.dim,), torch.int64, path)

@@ -16,7 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice
 from gmmtorch.evaluation.protocol_options import FreePoints
 from gmmtorch.files import write_bytes
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
 
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
@@ -76,16 +76,16 @@ def hit_and_free(origins: Tensor, ends: Tensor, free: FreePoints, resolution: fl
     return Queries(torch.cat([ends, points]), labels)
 
 
-def ray_evidence(scans: Sequence[Scan], resolution: float) -> BlockEvidence:
+def ray_evidence(scans: Sequence[Scan], resolution: float) -> SparseEvidence:
     """Evidence in every cell that a beam of the scans crosses, no-return beams included."""
-    seen = BlockEvidence(resolution, scans[0].dim)
+    seen = SparseEvidence(resolution, scans[0].dim)
     for scan in scans:
         ends = torch.cat([scan.points, scan.no_return]).double().cpu()
         seen.add_rays(scan.origin.double().cpu().expand_as(ends), ends)
     return seen
 
 
-def unseen(origins: Tensor, ends: Tensor, seen: BlockEvidence, seed: int) -> Queries:
+def unseen(origins: Tensor, ends: Tensor, seen: SparseEvidence, seed: int) -> Queries:
     """Points 2 to 12 cells behind test hits that no training beam observed.
 
     `seen` is the `ray_evidence` of the training scans. A point is kept only if its cell and all neighbouring
@@ -98,7 +98,7 @@ def unseen(origins: Tensor, ends: Tensor, seen: BlockEvidence, seed: int) -> Que
     unobserved = torch.ones(points.shape[0], dtype=torch.bool)
     for offset in itertools.product((-1, 0, 1), repeat=points.shape[1]):
         shift = torch.tensor(offset, dtype=torch.float64) * seen.resolution
-        hits, misses = seen.evidence_at(points + shift)
+        hits, misses = seen.at_points(points + shift)
         unobserved &= hits + misses == 0
     kept = points[unobserved]
     return Queries(kept, torch.full((kept.shape[0],), UNKNOWN))

@@ -13,7 +13,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
@@ -56,22 +56,11 @@ class CellCloud:
         return cls(centers, probability[probability != 0.5].double(), grid.resolution)
 
     @classmethod
-    def of_blocks(cls, blocks: BlockEvidence, prior: float = 1.0) -> CellCloud:
+    def of_blocks(cls, blocks: SparseEvidence, prior: float = 1.0) -> CellCloud:
         """The cells of a lattice that have evidence, with the probability that follows from it."""
-        if blocks.anchor is None or blocks.n_blocks == 0:
-            nothing = torch.empty(0, blocks.dim, dtype=torch.float64, device=blocks.keys.device)
-            return cls(nothing, nothing[:, 0], blocks.resolution)
-        hits, misses = blocks.in_key_order()
-        block, local = ((hits != 0) | (misses != 0)).nonzero(as_tuple=True)
-        within = []
-        for _ in range(blocks.dim):  # row-major: the last axis runs fastest
-            within.append(local % blocks.block_side)
-            local = local // blocks.block_side
-        corner = (blocks.unpack(blocks.keys) + blocks.anchor)[block] * blocks.block_side
-        centers = (corner + torch.stack(within[::-1], 1) + 0.5) * blocks.resolution
-        observed = (hits != 0) | (misses != 0)
-        theta = occupancy_probability(hits[observed], misses[observed], prior)
-        return cls(centers, theta, blocks.resolution)
+        cells, hits, misses = blocks.cells()
+        theta = occupancy_probability(hits, misses, prior)
+        return cls((cells.double() + 0.5) * blocks.resolution, theta, blocks.resolution)
 
     def __len__(self) -> int:
         return self.centers.shape[0]

@@ -14,7 +14,7 @@ from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.index.cone_index import ConeIndex
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 _RAYS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
@@ -33,7 +33,7 @@ class Query:
         self.cones = cones
         self.options = options
         self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
-        self._lattices: dict[float, BlockEvidence] = {}
+        self._lattices: dict[float, SparseEvidence] = {}
         self._forms: dict[float, PointForm] = {}
         self._indices: dict[float, ConeIndex] = {}
 
@@ -49,7 +49,7 @@ class Query:
         if method == "point":
             return self._probability(self._form(resolution)(points), resolution)
         if method == "monte_carlo":
-            return self._probability(self._lattice(resolution).evidence_at(points), resolution)
+            return self._probability(self._lattice(resolution).at_points(points), resolution)
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
         evidence = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
@@ -98,18 +98,18 @@ class Query:
         form = box_flux if method == "flux" else cone_evidence
         return PointEvidence(*form(self.cones, low, high, pairs, cutoff=self.cutoff))
 
-    def _lattice(self, resolution: float) -> BlockEvidence:
+    def _lattice(self, resolution: float) -> SparseEvidence:
         """Monte Carlo evidence of the whole map on the world's lattice of this resolution."""
         if resolution not in self._lattices:
             options, device = self.options, self.cones.means.device
-            lattice = BlockEvidence(
+            lattice = SparseEvidence(
                 resolution, self.cones.dim, device, options.memory_limit, options.compiled
             )
             self._cast(lattice)
             self._lattices[resolution] = lattice
         return self._lattices[resolution]
 
-    def _cast(self, evidence: Evidence | BlockEvidence) -> None:
+    def _cast(self, evidence: Evidence | SparseEvidence) -> None:
         """Adds Monte Carlo rays of the whole map to `evidence`."""
         options = self.options
         generator = torch.Generator().manual_seed(options.random_state)

@@ -49,7 +49,7 @@ def test_one_scan_updates_each_cell_once_as_the_sensor_model_says(dim):
         counts.insert(given)
         ends = given.ends()[0]
         query = torch.cat([lattice(dim), ends, (ends + given.origin) / 2])
-        hits, misses = counts.evidence().evidence_at(query)
+        hits, misses = counts.evidence().at_points(query)
         made = OctoMapMap(RESOLUTION)
         made.insert(given)
         expected = by_hand(hits, misses).double()

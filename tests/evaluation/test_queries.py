@@ -28,7 +28,7 @@ from gmmtorch.evaluation.queries import (
     unseen,
 )
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.scan import Scan
 
 MANY = 1_000_000
@@ -161,7 +161,7 @@ def test_unseen_points_match_brute_force_box_intersections(dim, n_beams, resolut
     found = unseen(origins, ends, grid.evidence(), seed=0)
     assert bool((found.labels == UNKNOWN).all())
     # Without evidence all candidates are unseen, in the order of the beams.
-    candidates = unseen(origins, ends, BlockEvidence(resolution, dim), seed=0).points
+    candidates = unseen(origins, ends, SparseEvidence(resolution, dim), seed=0).points
     assert len(candidates) == len(ends)
     behind = (candidates - ends).norm(dim=1) / resolution
     assert 2 - 1e-9 <= float(behind.min()) < 3 < 11 < float(behind.max()) <= 12 + 1e-9

@@ -13,8 +13,8 @@ from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.replica.replica import Replica
@@ -40,7 +40,7 @@ def frame(place: tuple[float, ...], yaw: float, seed: int = 0, max_range: float 
 
 def mapper(robot: int = 0, codec: str = "replica", memo: Memo | None = None, **options: Any) -> GmmMapper:
     """One with a `Replica`, or with a `Broadcast` in a codec."""
-    local = SlidingVoxelMap(0.2, (64, 64, 32))
+    local = RollingWindow(0.2, (64, 64, 32))
     local.center_on(torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo

@@ -30,6 +30,7 @@ from gmmtorch.exploration.robot.grid_mapper import GridMapper
 from gmmtorch.exploration.robot.initial_free_space import InitialFreeSpace
 from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.sharing.messages.message_registry import (
     PlanMessage,
     decode,
@@ -286,7 +287,7 @@ def test_a_robot_at_rest_tells_its_plan_every_tenth_time() -> None:
 def test_a_robot_that_moves_tells_every_plan_and_where_it_comes_to_rest(tmp_path: Any) -> None:
     one, post = agent()
     local = one.robot.mapper.local  # where all is free, nothing keeps it from flying
-    local.add_dense(local.box, torch.zeros(local.shape), torch.full(local.shape, 50.0))
+    local.add(CellEvidence.from_dense(local.box.low, torch.zeros(local.shape), torch.full(local.shape, 50.0)))
     rests = [False] * 2 + [True] * 16 + [False] + [True] * 4
     told: list[int] = []
     for number, at_rest in enumerate(rests):

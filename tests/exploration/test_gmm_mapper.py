@@ -18,8 +18,8 @@ from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import intersection
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ComponentsMessage,
@@ -160,14 +160,14 @@ WAY = [(1.5, 3.0), (2.5, 3.2), (4.0, 3.5), (5.5, 3.0), (6.8, 2.0), (5.0, 2.5), (
 def test_a_window_that_wanders_is_filled_with_what_all_components_say() -> None:
     """Against the belief, which takes in all evidence of the whole room as it comes, and never moves."""
     one = mapper()
-    one.local = SlidingVoxelMap(0.2, (20, 20, 12), step=4)
+    one.local = RollingWindow(0.2, (20, 20, 12), step=4)
     one.center_on(torch.tensor([*WAY[0], 1.4], dtype=torch.float64))
     refilled = 0.0
     for turn, place in enumerate(WAY):
-        before = one.local.low
+        before = one.local.box.low
         one.center_on(torch.tensor([*place, 1.4], dtype=torch.float64))
         found = torch.stack(one.local.evidence())
-        moved = (before - one.local.low).tolist()
+        moved = (before - one.local.box.low).tolist()
         kept = torch.zeros(one.local.shape, dtype=torch.bool)
         spans = [slice(max(0, m), n + min(0, m)) for m, n in zip(moved, kept.shape, strict=True)]
         kept[tuple(spans)] = True
@@ -186,7 +186,7 @@ def assert_window_is_that_of_the_belief(one: GmmMapper) -> None:
     inside = tuple(
         slice(low, high)
         for low, high in zip(
-            (box.low - one.local.low).tolist(), (box.high - one.local.low).tolist(), strict=True
+            (box.low - one.local.box.low).tolist(), (box.high - one.local.box.low).tolist(), strict=True
         )
     )
     for found, expected in zip(one.local.evidence(), one.belief.grid.dense(box), strict=True):

@@ -14,9 +14,9 @@ from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_counts, encode_points
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
 from gmmtorch.sharing.replica.intervals import Intervals
@@ -29,7 +29,7 @@ NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)
 
 
 def mapper(robot: int = 0, shared: bool = True, shape: tuple[int, int, int] = (40, 40, 20)) -> GridMapper:
-    local = SlidingVoxelMap(0.2, shape, 4)
+    local = RollingWindow(0.2, shape, 4)
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     one = GridMapper(robot, local, belief, WIDTH, NOVELTY, Memo(64), shared, 31)
     one.center_on(MIDDLE)

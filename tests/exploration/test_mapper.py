@@ -7,24 +7,27 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.robot.mapper import Memo, novel_beams
+from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)
 WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))
 
 
-def known(seed: int) -> SlidingVoxelMap:
+def known(seed: int) -> RollingWindow:
     """A window with random evidence, of which some cells have none."""
     generator = torch.Generator().manual_seed(seed)
-    local = SlidingVoxelMap(0.2, (24, 24, 16))
+    local = RollingWindow(0.2, (24, 24, 16))
     local.center_on(torch.zeros(3, dtype=torch.float64))
     hits, misses = 40 * torch.rand(2, *local.shape, generator=generator)
     blank = torch.rand(local.shape, generator=generator) < 0.03
-    local.add_dense(local.box, hits.masked_fill(blank, 0), misses.masked_fill(blank, 0))
+    local.add(
+        CellEvidence.from_dense(local.box.low, hits.masked_fill(blank, 0), misses.masked_fill(blank, 0))
+    )
     return local
 
 
@@ -37,7 +40,7 @@ def frame(width: int, height: int, seed: int, missing: float) -> DepthFrame:
     return DepthFrame(origin, ends, is_hit, pixel)
 
 
-def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float) -> list[bool]:
+def by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: float) -> list[bool]:
     """Each beam answers as the beam of the lowest pixel of its three by three that there is."""
     speaker: dict[tuple[int, int], int] = {}
     for beam, pixel in enumerate(seen.pixel.tolist()):
@@ -45,8 +48,8 @@ def by_a_loop(local: SlidingVoxelMap, seen: DepthFrame, width: int, short: float
     answers = []
     for pixel in seen.pixel.tolist():
         beam = speaker[(pixel // width // 3, pixel % width // 3)]
-        bits, unobserved = local.beam_novelty(
-            seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short, within=WITHIN
+        bits, unobserved = beam_novelty(
+            local, seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short, within=WITHIN
         )
         answers.append(bool(unobserved[0]) or float(bits[0]) >= RULE.threshold)
     return answers
@@ -86,9 +89,9 @@ def test_the_map_is_left_as_it_was() -> None:
 
 
 def test_nothing_is_novel_where_everything_is_certain() -> None:
-    local = SlidingVoxelMap(0.2, (48, 48, 48))
+    local = RollingWindow(0.2, (48, 48, 48))
     local.center_on(torch.zeros(3, dtype=torch.float64))
-    sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.low.tolist()], indexing="ij")
+    sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.box.low.tolist()], indexing="ij")
     cells = torch.stack(sides, -1).reshape(-1, 3)
     assert bool(novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN).all())
     local.add(CellEvidence(cells, torch.full((len(cells),), 1e4), torch.full((len(cells),), 1e4)))

@@ -19,9 +19,9 @@ from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
@@ -48,7 +48,7 @@ class Idle:
 def robot(start_radius: float = 0.0) -> Robot:
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     mapper = GridMapper(
-        0, SlidingVoxelMap(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
+        0, RollingWindow(0.2, (32, 32, 16), 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
     )
     mapper.center_on(START[:3])
     launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
@@ -127,7 +127,9 @@ def test_its_state_is_its_own() -> None:
 
 def everywhere(one: Robot, hits: float, misses: float) -> None:
     local = one.mapper.local
-    local.add_dense(local.box, torch.full(local.shape, hits), torch.full(local.shape, misses))
+    local.add(
+        CellEvidence.from_dense(local.box.low, torch.full(local.shape, hits), torch.full(local.shape, misses))
+    )
 
 
 def test_the_trail_is_where_it_flew_and_standing_adds_nothing() -> None:

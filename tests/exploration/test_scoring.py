@@ -33,7 +33,7 @@ def observable(seed: int = 0) -> Tensor:
 def entropy_by_hand(belief: BeliefMap, seen: Tensor, rule: BeliefRule) -> float:
     total = 0.0
     cells = seen.nonzero() + BOX.low
-    for h, m in zip(*(x.tolist() for x in belief.grid.at(cells)), strict=True):
+    for h, m in zip(*(x.tolist() for x in belief.grid.at_cells(cells)), strict=True):
         p = min(max((h + rule.prior) / (h + m + 2 * rule.prior), rule.clamp), 1 - rule.clamp)
         total -= p * math.log2(p) + (1 - p) * math.log2(1 - p)
     return total
@@ -46,7 +46,7 @@ def test_entropy_kept_up_is_the_sum_over_the_observable_cells(seeds: list[int], 
     for seed in seeds:
         belief.add(evidence(seed))
     assert belief.entropy_bits == pytest.approx(entropy_by_hand(belief, seen, rule), abs=1e-3)
-    h, m = belief.grid.at(seen.nonzero() + BOX.low)
+    h, m = belief.grid.at_cells(seen.nonzero() + BOX.low)
     assert belief.n_observed == int(((h + m) > 0).sum())
 
 

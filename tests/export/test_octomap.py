@@ -14,7 +14,7 @@ from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.export.octomap import write_octomap
 from gmmtorch.export.point_cloud import CellCloud
 from gmmtorch.occupancy.evidence import CellClass, Thresholds
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 pyoctomap = pytest.importorskip("pyoctomap")
 
@@ -56,7 +56,7 @@ def test_full_octree_has_the_same_probabilities(tmp_path):
 
 
 def test_octree_of_a_2d_map_is_the_layer_above_zero(tmp_path, generator):
-    blocks = BlockEvidence(0.25, 2)
+    blocks = SparseEvidence(0.25, 2)
     blocks.add_rays(torch.zeros(50, 2), 3 * torch.randn(50, 2, generator=generator, dtype=torch.float64))
     cells = CellCloud.of_blocks(blocks)
     path = write_octomap(tmp_path / "flat.ot", cells)

@@ -11,7 +11,7 @@ from export.map_examples import example_grid, random_probabilities
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.point_cloud import CellCloud, write_pcd, write_ply
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 open3d = pytest.importorskip("open3d")
 
@@ -27,7 +27,7 @@ def test_cell_cloud_of_a_grid_has_all_cells_except_one_half(shape):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_cell_cloud_of_blocks_has_all_evidence_at_its_cells(dim, generator):
-    blocks = BlockEvidence(0.25, dim)
+    blocks = SparseEvidence(0.25, dim)
     origins = torch.randn(20, dim, generator=generator, dtype=torch.float64) - 40
     ends = origins + 3 * torch.randn(20, dim, generator=generator, dtype=torch.float64)
     blocks.add_rays(origins, ends)
@@ -37,13 +37,13 @@ def test_cell_cloud_of_blocks_has_all_evidence_at_its_cells(dim, generator):
     units = cells.centers / 0.25 - 0.5
     torch.testing.assert_close(units, units.round(), rtol=0, atol=1e-9)
     assert len(torch.unique(units.round(), dim=0)) == len(cells)
-    hits, misses = blocks.evidence_at(cells.centers)
-    assert float(hits.sum()) == float(blocks.hits.sum()) == 40
-    assert float(misses.sum()) == float(blocks.misses.sum())
+    hits, misses = blocks.at_points(cells.centers)
+    assert float(hits.sum()) == float(blocks.cells().hits.sum()) == 40
+    assert float(misses.sum()) == float(blocks.cells().misses.sum())
 
 
 def test_cell_cloud_without_evidence_is_empty():
-    assert len(CellCloud.of_blocks(BlockEvidence(0.1, 3))) == 0
+    assert len(CellCloud.of_blocks(SparseEvidence(0.1, 3))) == 0
 
 
 @pytest.mark.parametrize(

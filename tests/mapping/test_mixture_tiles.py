@@ -12,8 +12,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 
 RESOLUTION, SHAPE = 0.25, (24, 20, 12)
 
@@ -74,21 +74,21 @@ def test_all_in_the_order_in_which_they_came():
     assert len(MixtureTiles().all()) == 0
 
 
-def scratch(sliding: SlidingVoxelMap, batches: list[Components]) -> SlidingVoxelMap:
+def scratch(sliding: RollingWindow, batches: list[Components]) -> RollingWindow:
     """A new window at the same place, with all of the mixture."""
-    made = SlidingVoxelMap(RESOLUTION, SHAPE, sliding.step)
-    made.center_on((sliding.low + torch.tensor(SHAPE) // 2 + 0.5).double() * RESOLUTION)
-    assert torch.equal(made.low, sliding.low)
+    made = RollingWindow(RESOLUTION, SHAPE, sliding.step)
+    made.center_on((sliding.box.low + torch.tensor(SHAPE) // 2 + 0.5).double() * RESOLUTION)
+    assert torch.equal(made.box.low, sliding.box.low)
     if batches:
         whole = Components.concatenate(batches)
-        made.add(component_evidence(whole, RESOLUTION, Box(made.low - 400, made.low + 400)))
+        made.add(component_evidence(whole, RESOLUTION, Box(made.box.low - 400, made.box.low + 400)))
     return made
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_regenerated_window_equals_one_made_from_scratch(seed):
     generator = torch.Generator().manual_seed(seed)
-    sliding, tiles = SlidingVoxelMap(RESOLUTION, SHAPE, 4), MixtureTiles(4.0)
+    sliding, tiles = RollingWindow(RESOLUTION, SHAPE, 4), MixtureTiles(4.0)
     robot, batches = torch.zeros(3, dtype=torch.float64), []
     for number in range(12):
         robot = robot + torch.randn(3, generator=generator, dtype=torch.float64) * (
@@ -107,7 +107,7 @@ def test_a_regenerated_window_equals_one_made_from_scratch(seed):
 
 def test_any_form_of_evidence_can_refill():
     tiles, batches = many()
-    sliding = SlidingVoxelMap(RESOLUTION, SHAPE, 4)
+    sliding = RollingWindow(RESOLUTION, SHAPE, 4)
     asked = []
 
     def evidence(components: Components, resolution: float, box: Box):

@@ -94,7 +94,7 @@ class TestOccupancyGridByLogOdds(GridContract):
     def test_every_beam_adds_its_update_to_the_log_odds(self):
         made, counts = self.built(wall_scan(2)), OccupancyGrid(RESOLUTION)
         counts.insert(wall_scan(2))
-        hits, misses = counts.evidence().evidence_at(lattice(2))
+        hits, misses = counts.evidence().at_points(lattice(2))
         odds = (0.9 / 0.1) ** hits * (0.4 / 0.6) ** misses
         torch.testing.assert_close(self.ask(made, lattice(2)), odds / (1 + odds), rtol=1e-9, atol=1e-15)
 

@@ -9,14 +9,14 @@ import torch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.blocks import BlockEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.report.maps.map_figures import map_figure
 from gmmtorch.report.maps.raster import MapPanel, height_image, plan, robust_bounds, roof_above, slice_image
 
 
-def wall_map(dim: int) -> BlockEvidence:
+def wall_map(dim: int) -> SparseEvidence:
     """Rays from the origin to the plane x = 2, cells of 0.5 m."""
-    evidence = BlockEvidence(0.5, dim)
+    evidence = SparseEvidence(0.5, dim)
     side = torch.linspace(-1.9, 1.9, 21, dtype=torch.float64)
     others = torch.cartesian_prod(side, side) if dim == 3 else side[:, None]
     ends = torch.cat([torch.full((len(others), 1), 2.1, dtype=torch.float64), others], 1)

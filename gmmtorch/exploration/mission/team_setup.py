@@ -25,7 +25,7 @@ from gmmtorch.exploration.robot.mapper import Mapper, Memo
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.simulated_network import Network, Transport
@@ -144,7 +144,7 @@ def _mapper(
     number: int, world: World, options: TeamOptions, memo: Memo, evidence: Memo, incarnation: int
 ) -> Mapper:
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
-    local = SlidingVoxelMap(world.resolution, (x, y, z), _SLACK)
+    local = RollingWindow(world.resolution, (x, y, z), _SLACK)
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief)
     width = options.camera.width
     if options.framework != "gmm_shared":

@@ -28,9 +28,9 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.replica.intervals import Intervals
@@ -96,7 +96,7 @@ class GmmMapper(Mapper):
     def __init__(
         self,
         robot: int,
-        local: SlidingVoxelMap,
+        local: RollingWindow,
         belief: BeliefMap,
         width: int,
         novelty: NoveltyRule,

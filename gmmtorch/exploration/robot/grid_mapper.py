@@ -14,9 +14,9 @@ from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_b
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.envelope import loaded, stored, within
 from gmmtorch.sharing.messages.message_registry import Message, PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import MOST_PARTS
@@ -45,7 +45,7 @@ class GridMapper(Mapper):
     def __init__(
         self,
         robot: int,
-        local: SlidingVoxelMap,
+        local: RollingWindow,
         belief: BeliefMap,
         width: int,
         novelty: NoveltyRule,
@@ -63,7 +63,7 @@ class GridMapper(Mapper):
 
     def center_on(self, position: Tensor) -> None:
         for box in self.local.center_on(position):
-            self.local.add_dense(box, *self.belief.grid.dense(box))
+            self.local.add_from(self.belief.grid, box)
 
     def sense(self, frame: DepthFrame) -> FrameUpdate:
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box)

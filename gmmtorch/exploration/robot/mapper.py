@@ -14,10 +14,11 @@ from gmmtorch.errors import check_whole
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import Message, decode
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
@@ -78,7 +79,7 @@ class Mapper(ABC):
     def __init__(
         self,
         robot: int,
-        local: SlidingVoxelMap,
+        local: RollingWindow,
         belief: BeliefMap,
         width: int,
         novelty: NoveltyRule,
@@ -145,7 +146,7 @@ class Mapper(ABC):
 
 
 def novel_beams(
-    local: SlidingVoxelMap,
+    local: RollingWindow,
     frame: DepthFrame,
     width: int,
     rule: NoveltyRule,
@@ -156,7 +157,7 @@ def novel_beams(
 
     The first beam of every three by three pixels speaks for all nine: neighbouring pixels are much closer
     to one another than the cells are large. `within`, `short`: see
-    `SlidingVoxelMap.beam_novelty`.
+    `beam_novelty`.
     """
     n, across = len(frame.pixel), -(-width // _BLOCK)
     block = frame.pixel // (_BLOCK * width) * across + frame.pixel % width // _BLOCK
@@ -165,7 +166,7 @@ def novel_beams(
     present = first < n
     number = torch.cumsum(present, 0) - 1
     first = first[present]
-    bits, unobserved = local.beam_novelty(
-        frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short, within=within
+    bits, unobserved = beam_novelty(
+        local, frame.origin, frame.ends[first], frame.is_hit[first], rule, short=short, within=within
     )
     return (unobserved | (bits >= rule.threshold))[number[block]]

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
-from gmmtorch.occupancy.voxels.block_grid import BlockGrid
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ class BeliefMap:
 
     def __init__(self, resolution: float, box: Box, observable: Tensor, rule: BeliefRule) -> None:
         # Noise puts a wall that lies in the bounds on either side of them: that must not count as unseen.
-        self.grid = BlockGrid(resolution, Box(box.low - _MARGIN, box.high + _MARGIN))
+        bounds = Box(box.low - _MARGIN, box.high + _MARGIN)
+        self.grid = SparseEvidence(resolution, box=bounds, dtype=torch.float32)
         self.rule = rule
         self._low = box.low
         self._observable = observable.reshape(-1)
@@ -75,7 +76,7 @@ class BeliefMap:
 
     def clear(self) -> None:
         """Forget all evidence."""
-        self.grid = BlockGrid(self.grid.resolution, self.grid.box)
+        self.grid.clear()
         self.entropy_bits = self.observable_bits
         self.known_bits = 0.0  # off the entropy of all cells, observable or not, as a robot can tell
         self.n_observed = 0
@@ -96,7 +97,7 @@ class BeliefMap:
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3)."""
-        return self.rule.probability(*self.grid.at(cells))
+        return self.rule.probability(*self.grid.at_cells(cells))
 
     def state(self) -> dict[str, Any]:
         return {

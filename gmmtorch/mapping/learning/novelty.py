@@ -13,7 +13,10 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
+from gmmtorch.occupancy.voxels.ray_casting import rays_in_box
 from gmmtorch.occupancy.voxels.ray_traversal import traverse
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 
 _CHUNK_BEAMS = 1 << 14
@@ -88,3 +91,74 @@ def novel_beams(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor
         return torch.ones(scan.n_beams, dtype=torch.bool, device=scan.points.device)
     bits, unobserved = entropy_reduction(components, scan, rule)
     return unobserved | (bits >= rule.threshold)
+
+
+def beam_novelty(
+    window: RollingWindow,
+    origin: Tensor,
+    ends: Tensor,
+    is_hit: Tensor,
+    rule: NoveltyRule,
+    short: float = 0.0,
+    within: Box | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Bits (N,) float64 by which each beam reduces the entropy of a window of cells, and whether it is
+    unobserved.
+
+    The reduction is Σ h(p) − h(p′) over the cells that a beam passes through, and the cell that a hit ends
+    in: p is the occupancy of the cell, p′ the occupancy after this beam's miss or hit. Cells outside the
+    window do not count. It is negative for a beam that contradicts the map.
+
+    The flag (N,) bool is True if a beam passes through a cell with fewer than `rule.observed` rays, or if a
+    hit ends in a cell with fewer hits than that: a thin object in a cell that most rays pass is new to a
+    map that calls the cell free (thesis 4.1.2).
+
+    Args:
+        origin: (3,), world metres. ends: (N, 3), world metres. is_hit: (N,) bool, False for no-return beams.
+        rule: its `prior` and `observed` are used.
+        short: metres before the end of a beam that do not count as free space, because a map can leave them
+            out near surfaces.
+        within: cells that count, if the map stores no evidence of others; all if not given.
+    """
+    if not 0 <= short < math.inf:
+        raise InvalidArgumentError(f"short={short} must be finite metres, at least zero.")
+    stops = to_lattice(ends, window.resolution, "ends")
+    starts = to_lattice(origin, window.resolution, "origin").expand_as(stops)
+    bits = torch.zeros(len(stops), dtype=torch.float64, device=stops.device)
+    way = stops - starts
+    length = way.norm(dim=1, keepdim=True).clamp_min(torch.finfo(way.dtype).tiny)
+    until = stops - way * (short / window.resolution / length).clamp_max(1) if short else None
+    box = window.box if within is None else intersection(window.box, within)
+    rays = None if box is None else rays_in_box(starts, stops, box, until)
+    if rays is None:
+        return bits, torch.zeros_like(bits, dtype=torch.bool)
+    # A beam reduces the entropy by at most one bit for each cell that it crosses. So one sum can hold both
+    # the bits and the number of unobserved cells, as multiples of a mark that is more than twice that.
+    mark = 2.0 * (sum(window.shape) + 3)
+    hits, misses = (counts.double() for counts in window.evidence(rays.window))
+    table = _cell_reduction(hits, misses, 0, 1, rule, mark)
+    if rays.block is not rays.window:
+        table = torch.nn.functional.pad(table, (1,) * 6)
+    table = table.view(-1)
+    for visit in rays.visits:
+        bits.index_add_(0, visit.ray, table.index_select(0, visit.voxel))
+    flat, inside = flat_index(stops.floor().long() - rays.window.low, rays.window.shape)
+    ended = (is_hit & inside).nonzero().squeeze(1)
+    flat = flat[ended]
+    hits, misses = hits.view(-1)[flat], misses.view(-1)[flat]
+    bits[ended] += _cell_reduction(hits, misses, 1, 0, rule, mark)
+    bits[ended] += mark * ((hits < rule.observed) & (hits + misses >= rule.observed))
+    n_unobserved = (bits / mark).round()
+    return bits - n_unobserved * mark, n_unobserved > 0
+
+
+def _cell_reduction(
+    hits: Tensor, misses: Tensor, hit: int, miss: int, rule: NoveltyRule, mark: float
+) -> Tensor:
+    """Bits by which one more hit or miss reduces the entropy of cells, plus `mark` for unobserved cells."""
+
+    def entropy(h: Tensor, m: Tensor) -> Tensor:
+        return bernoulli_entropy(occupancy_probability(h, m, rule.prior))
+
+    bits = entropy(hits, misses) - entropy(hits + hit, misses + miss)
+    return bits + mark * (hits + misses < rule.observed)

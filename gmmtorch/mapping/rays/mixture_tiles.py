@@ -10,10 +10,10 @@ from typing import NamedTuple
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays.component_rays import component_evidence
-from gmmtorch.mapping.sliding_map import SlidingVoxelMap
 from gmmtorch.occupancy.cones import cone_bounds
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 
 _REACH = 3.0  # deviations around the means that count as near
 _MOST_TILES = 4096  # a batch that lies in more is looked at in every search
@@ -112,7 +112,7 @@ class MixtureTiles:
 
 
 def regenerate(
-    sliding: SlidingVoxelMap,
+    sliding: RollingWindow,
     boxes: Iterable[Box],
     tiles: MixtureTiles,
     evidence: Callable[[Components, float, Box], CellEvidence] = component_evidence,

@@ -13,7 +13,7 @@ _FARTHEST = 2.0**32  # cells from the world's origin; sums of the ray traversal 
 
 
 class Box(NamedTuple):
-    """Cells c with low ≤ c < high, along each axis; low and high are (3,) int64."""
+    """Cells c with low ≤ c < high along each axis; low and high are (D,) int64."""
 
     low: Tensor
     high: Tensor
@@ -44,6 +44,15 @@ def difference(box: Box, other: Box) -> list[Box]:
     return parts
 
 
+def contains(box: Box, cells: Tensor) -> Tensor:
+    """Whether each cell (C, D) is in the box, (C,) bool."""
+    inside = torch.ones_like(cells[:, 0], dtype=torch.bool)
+    # One comparison for each axis: reductions over a dimension of three are slow.
+    for axis, (low, high) in enumerate(zip(box.low.tolist(), box.high.tolist(), strict=True)):
+        inside &= (cells[:, axis] >= low) & (cells[:, axis] < high)
+    return inside
+
+
 def to_lattice(points: Tensor, resolution: float, name: str = "points") -> Tensor:
     """Points (…, 3), world metres, in units of cells, float64.
 
@@ -62,6 +71,5 @@ def flat_index(local: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """Row-major index (C,) of cells (C, 3) in a block of `shape`, 0 outside, and whether each is inside."""
     nx, ny, nz = shape
     x, y, z = local.unbind(1)
-    # One comparison for each axis: reductions over a dimension of three are slow.
     inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
     return torch.where(inside, (x * ny + y) * nz + z, 0), inside

@@ -1,0 +1,367 @@
+"""SparseEvidence: hits and misses in blocks of cells, stored only where there is evidence."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.grid import MEMORY_LIMIT
+from gmmtorch.occupancy.voxels.boxes import Box, contains, intersection
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.occupancy.voxels.ray_counting import count_misses
+from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS
+from gmmtorch.occupancy.voxels.sparse_lattice import SparseLattice
+
+_AXIS_BITS = {2: 31, 3: 21}
+
+
+class SparseEvidence(SparseLattice):
+    """Hits and misses of lattice cells. A block of cells is stored when evidence first falls into it.
+
+    Args:
+        resolution: side (m) of the cells.
+        dim: 2 or 3.
+        box: cells that can be stored; evidence outside is ignored. All cells if not given.
+        dtype: of the counts. float32 counts rays exactly up to 2²⁴ in a cell.
+        memory_limit: bytes that the blocks can take.
+        compiled: count rays by a compiled function, see `traverse`.
+
+    Raises:
+        InvalidArgumentError: a resolution that is not above zero, or a box without cells.
+        MemoryLimitError: a box with too many cells for one index.
+    """
+
+    def __init__(
+        self,
+        resolution: float,
+        dim: int = 3,
+        device: torch.device | str | None = None,
+        memory_limit: int = MEMORY_LIMIT,
+        compiled: bool = False,
+        *,
+        box: Box | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        device = box.low.device if device is None and box is not None else device
+        super().__init__(resolution, dim, _AXIS_BITS[dim], device, memory_limit)
+        self.compiled = compiled
+        self._box = box
+        if box is not None:
+            self._check_box(box)
+        self._slots = torch.empty(
+            0, dtype=torch.int64, device=device
+        )  # of the blocks, in the order of `keys`
+        self.counts = torch.zeros(2, 1, self.cells_per_block, dtype=dtype, device=device)
+        """Hits and misses (2, slots, cells). Slot 0 stays empty; cells that are not stored read it."""
+
+    def _check_box(self, box: Box) -> None:
+        shape = box.shape
+        if len(shape) != self.dim or min(shape) < 1:
+            raise InvalidArgumentError(
+                f"box from {box.low.tolist()} up to {box.high.tolist()} has no cells; high must exceed low."
+            )
+        if max(shape) >= (self._half - 2) * self.block_side:
+            raise MemoryLimitError(
+                f"box of {' × '.join(map(str, shape))} cells is too large for one index; use coarser cells "
+                f"than resolution={self.resolution} m."
+            )
+        if self.anchor is None:
+            self.anchor = (box.low >> self.local_bits).cpu()
+
+    @property
+    def box(self) -> Box:
+        """The cells that can be stored; raises `InvalidArgumentError` if they are not limited."""
+        if self._box is None:
+            raise InvalidArgumentError(
+                "No box is set: pass box=, or call center_on with the robot's position first."
+            )
+        return self._box
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of stored blocks."""
+        return self.keys.shape[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the stored blocks and their index."""
+        return self.n_blocks * (self._block_bytes + 16)
+
+    @property
+    def _block_bytes(self) -> int:
+        return 2 * self.counts.element_size() * self.cells_per_block
+
+    # -- adding -----------------------------------------------------------------------------------
+
+    def add_rays(
+        self,
+        origins: Tensor,
+        ends: Tensor,
+        weights: Tensor | None = None,
+        is_hit: Tensor | None = None,
+        chunk_visits: int = CHUNK_VISITS,
+    ) -> None:
+        """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
+
+        Arguments as in `Evidence.add_rays`. Requires a store without a `box`.
+
+        Raises `MemoryLimitError` if the blocks exceed `memory_limit` bytes. Then these rays are counted in
+        part, and no more can be added.
+        """
+        if self._box is not None:
+            raise InvalidArgumentError("add_rays needs evidence without a box; use cast_evidence and add.")
+        if ends.shape[0] == 0:
+            return
+        count_misses(self, origins, ends, weights, chunk_visits)
+        columns = self.columns(self.cells_of(ends).long())
+        index = self._first_of(self.block_keys(columns)) + self.places(columns)
+        source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+        if is_hit is not None:
+            index, source = index[is_hit], source[is_hit]
+        self.counts[0].view(-1).scatter_add_(0, index, source.to(self.counts.dtype))
+
+    def add(self, evidence: CellEvidence) -> tuple[Tensor, Tensor]:
+        """Add the evidence of distinct cells; return the hits (C,) and misses (C,) before the addition.
+
+        Cells outside the box are ignored, and have 0 before.
+        """
+        self._check_cells(evidence.cells)
+        columns = self.columns(evidence.cells)
+        inside = self._inside(columns)
+        keys = torch.where(inside, self.block_keys(columns), -1)
+        # Neighbouring cells often share a block: each run of equal keys is searched once.
+        runs, run = torch.unique_consecutive(keys, return_inverse=True)
+        first = self._first_of(runs)
+        missing = runs[(first == 0) & (runs >= 0)]
+        if missing.numel():
+            self._allocate(missing.unique())
+            first = self._first_of(runs)
+        index = torch.where(inside, first[run] + self.places(columns), 0)
+        before = [counts.view(-1).index_select(0, index) for counts in self.counts]
+        for counts, old, more in zip(self.counts, before, evidence[1:], strict=True):
+            # Ignored cells add 0 to cell 0 of the empty block.
+            counts.view(-1).index_copy_(0, index, old + torch.where(inside, more, 0.0).to(old.dtype))
+        return before[0], before[1]
+
+    def add_from(self, other: SparseEvidence, box: Box) -> None:
+        """Add the evidence that another store has in a box; cells outside the box of this store are ignored.
+
+        Raises `InvalidArgumentError` for a store of another resolution.
+        """
+        if other.resolution != self.resolution:
+            raise InvalidArgumentError(
+                f"other has cells of {other.resolution} m, but this store has {self.resolution} m; "
+                "they must be equal."
+            )
+        common = box if self._box is None else intersection(box, self._box)
+        if common is None:
+            return
+        corner = other._corners()
+        meets = _meets(corner, self.block_side, common)
+        counts = other._counts_in(corner[meets], other._slots[meets], common)
+        first = self.open_blocks(self.block_keys(self.columns(corner[meets])))
+        self.counts[:, first // self.cells_per_block] += counts
+
+    def _check_cells(self, cells: Tensor) -> None:
+        """Raise `InvalidArgumentError` if cells (C, D) have no keys and no box excludes them."""
+        if self._box is None:
+            self.check_reachable(cells)
+
+    def _inside(self, columns: list[Tensor]) -> Tensor:
+        """Whether each cell (M,) is in the box."""
+        if self._box is None:
+            return torch.ones_like(columns[0], dtype=torch.bool)
+        sides = zip(columns, *(self.columns(side[None]) for side in self._box), strict=True)
+        return functools.reduce(torch.logical_and, [(c >= low) & (c < high) for c, low, high in sides])
+
+    def _first_of(self, keys: Tensor) -> Tensor:
+        """Flat index (M,) of the first cell of each block; 0 for blocks that are not stored."""
+        if self.n_blocks == 0:
+            return torch.zeros_like(keys)
+        rank, known = self.find_keys(keys)
+        return torch.where(known, self._slots[rank] * self.cells_per_block, 0)
+
+    def open_blocks(self, keys: Tensor) -> Tensor:
+        """Store the blocks with these distinct keys (M,); return the flat index of the first cell of each
+        (M,).
+
+        Raises `MemoryLimitError` if the blocks exceed `memory_limit` bytes.
+        """
+        new = keys[~self.find_keys(keys)[1]]
+        if new.numel():
+            self._allocate(new)
+        return self._first_of(keys)
+
+    def _allocate(self, new: Tensor) -> None:
+        """Store blocks with distinct keys (M,), of which none is stored."""
+        n_blocks = self.n_blocks + new.numel()
+        n_bytes = n_blocks * self._block_bytes
+        if n_bytes > self.memory_limit:
+            raise MemoryLimitError(
+                f"resolution={self.resolution} m takes {n_bytes:,} bytes for the observed cells, above the "
+                f"limit of {self.memory_limit:,}; use coarser cells."
+            )
+        capacity = self.counts.shape[1] - 1
+        if n_blocks > capacity:
+            # Grow by half, so that many small additions stay cheap.
+            capacity = max(n_blocks, min(capacity * 3 // 2, self.memory_limit // self._block_bytes))
+            grown = self.counts.new_zeros(2, capacity + 1, self.cells_per_block)
+            grown[:, : self.n_blocks + 1] = self.counts[:, : self.n_blocks + 1]
+            self.counts = grown
+        slots = torch.arange(self.n_blocks + 1, n_blocks + 1, device=new.device)
+        self.keys, order = torch.sort(torch.cat([self.keys, new]))
+        self._slots = torch.cat([self._slots, slots])[order]
+
+    # -- removing ---------------------------------------------------------------------------------
+
+    def clear(self) -> None:
+        """Remove all evidence; the box stays."""
+        self.keys, self._slots = self.keys[:0], self._slots[:0]
+        self.counts = self.counts.new_zeros(2, 1, self.cells_per_block)
+
+    def crop(self, box: Box) -> None:
+        """Remove the evidence outside `box`, and store only cells in it from now on."""
+        self._check_box(box)
+        self.check_reachable(torch.stack([box.low, box.high]))
+        self._box = box
+        corner = self._corners()
+        kept = _meets(corner, self.block_side, box)
+        self.keys = self.keys[kept]
+        # The blocks are copied in the order of their keys, behind the empty one.
+        counts = self._counts_in(corner[kept], self._slots[kept], box)
+        self.counts = torch.cat([self.counts[:, :1], counts], 1)
+        self._slots = torch.arange(1, self.n_blocks + 1, device=self.device)
+
+    def _counts_in(self, corner: Tensor, slots: Tensor, box: Box) -> Tensor:
+        """A copy (2, b, cells) of the counts in blocks (b,), with 0 for cells outside a box.
+
+        The blocks are given by their lowest cells (b, D) and their slots (b,).
+        """
+        counts = self.counts[:, slots]
+        cut = ((corner < box.low) | (corner + self.block_side > box.high)).any(1).nonzero().squeeze(1)
+        if len(cut):
+            places = torch.arange(self.cells_per_block, device=self.device)
+            offsets = [
+                (places >> (self.local_bits * shift)) & (self.block_side - 1) for shift in range(self.dim)
+            ]
+            cells = corner[cut][:, None] + torch.stack(offsets[::-1], 1)
+            counts[:, cut] *= contains(box, cells.flatten(0, 1)).view(len(cut), -1)
+        return counts
+
+    def _corners(self) -> Tensor:
+        """Lowest cell (B, D) of each block, in the order of `keys`."""
+        return self.cells_at(self.keys, torch.zeros_like(self.keys))
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def at_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Hits (M,) and misses (M,) of the cells that contain points (M, D), world metres; 0 without
+        evidence.
+
+        Points can be NaN or infinite: they have no evidence.
+        """
+        return self.at_cells(self.cells_of(points))
+
+    def at_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Hits (C,) and misses (C,) of cells (C, D); 0 without evidence."""
+        columns = self.columns(cells)
+        reachable = self.reachable(columns)
+        columns = [torch.where(reachable, column, 0).long() for column in columns]
+        keys = torch.where(reachable, self.block_keys(columns), -1)
+        runs, run = torch.unique_consecutive(keys, return_inverse=True)
+        first = self._first_of(runs)[run]
+        index = torch.where(first > 0, first + self.places(columns), 0)
+        hits, misses = (counts.view(-1).index_select(0, index) for counts in self.counts)
+        return hits, misses
+
+    def lookup(self, points: Tensor, prior: float = 1.0) -> Tensor:
+        """Occupancy (M,) of the cells that contain points (M, D), world metres; ½ without evidence."""
+        return occupancy_probability(*self.at_points(points), prior)
+
+    def dense(self, box: Box) -> tuple[Tensor, Tensor]:
+        """Hits and misses of all cells of a box, in its shape; 0 without evidence."""
+        shape = [max(0, n) for n in box.shape]
+        if min(shape) == 0:
+            hits, misses = self.counts.new_zeros(2, *shape)
+            return hits, misses
+        side, dim = self.block_side, self.dim
+        first, last = box.low >> self.local_bits, box.high - 1 >> self.local_bits
+        axes = [
+            torch.arange(a, b + 1, device=self.device)
+            for a, b in zip(first.tolist(), last.tolist(), strict=True)
+        ]
+        corners = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, dim) << self.local_bits
+        columns = self.columns(corners)
+        keys = torch.where(self.reachable(columns), self.block_keys(columns), -1)
+        slots = self._first_of(keys) // self.cells_per_block
+        counts = self.counts.index_select(1, slots).view(2, *map(len, axes), *[side] * dim)
+        interleaved = [axis for a in range(1, dim + 1) for axis in (a, a + dim)]
+        counts = counts.permute(0, *interleaved).reshape(2, *(side * len(axis) for axis in axes))
+        offset = (box.low & (side - 1)).tolist()
+        part = tuple(slice(a, a + n) for a, n in zip(offset, shape, strict=True))
+        hits, misses = counts[(slice(None), *part)].contiguous()
+        return hits, misses
+
+    def cells(self) -> CellEvidence:
+        """All cells with evidence, in the order of `keys`; counts in the dtype of the store."""
+        hits, misses = (counts.index_select(0, self._slots).view(-1) for counts in self.counts)
+        flat = ((hits != 0) | (misses != 0)).nonzero().squeeze(1)
+        cells = self.cells_at(self.keys[flat >> (self.local_bits * self.dim)], flat)
+        return CellEvidence(cells, hits.index_select(0, flat), misses.index_select(0, flat))
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest corner (D,) of the stored blocks, world metres."""
+        corner = self._corners()
+        return corner.amin(0) * self.resolution, (corner.amax(0) + self.block_side) * self.resolution
+
+    # -- checkpoints ------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """A copy of the evidence and the box, for `restore`."""
+        return {
+            "resolution": self.resolution,
+            "box": None if self._box is None else tuple(side.clone() for side in self._box),
+            "anchor": self.anchor,
+            "keys": self.keys.clone(),
+            "counts": torch.stack(self.in_key_order()),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Replace the evidence and the box by a `state`; raise `DataError` if it does not fit this store."""
+        box = None if state["box"] is None else Box(*state["box"])
+        if state["resolution"] != self.resolution or (
+            self._box is not None and box is not None and box.shape != self._box.shape
+        ):
+            raise DataError(
+                f"The state has cells of {state['resolution']} m in a box of {box and box.shape} cells; this "
+                f"store has {self.resolution} m and {self._box and self._box.shape}. Use an equal store."
+            )
+        self._box, self.anchor = box, state["anchor"]
+        self.clear()
+        self.open_blocks(state["keys"].to(self.device))
+        self.counts[:, 1 : self.n_blocks + 1] = state["counts"]
+
+    # -- files ------------------------------------------------------------------------------------
+
+    def in_key_order(self) -> tuple[Tensor, Tensor]:
+        """Hits and misses (B, cells) of all blocks, in the order of `keys`."""
+        hits, misses = self.counts[:, self._slots]
+        return hits, misses
+
+    def fill(self, anchor: Tensor, keys: Tensor, observed: Tensor, hits: Tensor, misses: Tensor) -> None:
+        """Set the cells `observed` (B, cells) of an empty store; blocks in the order of `keys`."""
+        self.anchor = anchor.cpu()
+        self.open_blocks(keys)
+        slot, place = observed.nonzero(as_tuple=True)
+        self.counts[0, slot + 1, place] = hits
+        self.counts[1, slot + 1, place] = misses
+
+
+def _meets(corner: Tensor, side: int, box: Box) -> Tensor:
+    """Whether each block (B,) of `side` cells, with lowest cell `corner` (B, D), has cells in a box."""
+    return ((corner + side > box.low) & (corner < box.high)).all(1)
