@@ -74,7 +74,7 @@ def reliability_figure(
     lower.set_ylim(bottom=0)
     lower.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
     style.draw_grid(lower, "y")
-    style.legend_below(figure, max_columns=2)
+    style.legend_below(figure, max_columns=3)
     style.figure_title(figure, title)
     return figure
 

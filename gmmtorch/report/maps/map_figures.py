@@ -112,8 +112,10 @@ def map_figure(
             style.colour_bar(figure, heights, band[1].tolist(), "height z [m]", extend="both")
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
-    figure.supxlabel("x [m]", fontsize=style.LABEL_SIZE)
-    figure.supylabel("y [m]", fontsize=style.LABEL_SIZE)
+    for axes in np.concatenate([band[-1] for band in bands]):
+        axes.set_xlabel("x [m]", fontsize=style.LABEL_SIZE)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("y [m]", fontsize=style.LABEL_SIZE)
     style.legend_below(figure, _legend(path, dim))
     style.figure_title(figure, title)
     return figure

@@ -69,8 +69,9 @@ def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the standard deviations (K, D), in ascending order, and the directions (K, D, D) as the columns
     of rotation matrices, of covariances (K, D, D)."""
     variances, directions = torch.linalg.eigh((covariances + covariances.mT) / 2)
-    flip = torch.where(torch.linalg.det(directions) < 0, -1.0, 1.0)
-    return variances.clamp_min(0).sqrt(), directions * flip[:, None, None]
+    flip = torch.ones_like(variances)
+    flip[:, 0] = torch.linalg.det(directions).sign()
+    return variances.clamp_min(0).sqrt(), directions * flip[:, None, :]
 
 
 def ellipse_outlines(means: Tensor, covariances: Tensor, n_corners: int = 40) -> np.ndarray:

@@ -17,7 +17,8 @@ from gmmtorch.occupancy.evidence import CellClass, classify
 from gmmtorch.report import style
 from gmmtorch.report.maps.regions import Corners, busiest_regions
 from gmmtorch.report.scenes.ellipsoids import height_colour_map, height_colours
-from gmmtorch.report.scenes.scene import SOUTH_WEST, balls, canvas_around, draw_scene
+from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene
+from gmmtorch.report.scenes.scene_renderer import Camera
 
 _PANELS = {
     "occupied_recall": "occupied points found",
@@ -26,8 +27,9 @@ _PANELS = {
     "share_decided": "points not left unknown",
 }
 _MAX_CELLS = 400_000
-_SIDE = 3.3  # inches of a panel in space
-_POINT_RADIUS = 0.015  # metres
+_SIDE = 3.4  # inches of a panel in space
+_POINT_PIXELS = 2.5  # radius of a measured point
+_CAMERA = Camera(-60.0, 24.0)
 
 
 def figures(rows: style.Rows) -> dict[str, Figure]:
@@ -88,16 +90,16 @@ def cells_figure(
     scale = Normalize(low[2], high[2], clip=True)
     figure = style.new_figure(_SIDE * (1 + len(thresholds)) + 1.0, _SIDE * len(maps) + 0.6)
     grid = figure.subplots(len(maps), 1 + len(thresholds), squeeze=False)
-    canvas = canvas_around(low, high, SOUTH_WEST, int(_SIDE * style.SAVED_DPI))
+    canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
     for row, (n_components, occupancy) in zip(grid, maps.items(), strict=True):
         theta = occupancy(centres)
-        shown = [(inside, _POINT_RADIUS, f"{n_components:,} components:\nheld-out points")]
+        shown = [(inside, _POINT_PIXELS / canvas.scale, f"{n_components:,} components:\nheld-out points")]
         for threshold in thresholds:
             occupied = centres[classify(theta, threshold) == CellClass.OCCUPIED]
             shown.append((occupied, size / 2, f"v = {threshold:g}:\n{len(occupied):,} cells"))
         for axes, (places, radius, title) in zip(row, shown, strict=True):
             part = balls(places, radius, height_colours(places[:, 2], scale))
-            draw_scene(axes, [part], low, high, SOUTH_WEST, canvas, n_ticks=3)
+            draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
             axes.set_title(title, fontsize=style.TITLE_SIZE)
     colours = ScalarMappable(scale, height_colour_map())
     style.colour_bar(figure, colours, grid.ravel().tolist(), "height z [m]", shrink=0.6)
