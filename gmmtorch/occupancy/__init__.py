@@ -32,6 +32,12 @@ if TYPE_CHECKING:
     from gmmtorch.occupancy.ray_queries import RayHits as RayHits
     from gmmtorch.occupancy.ray_queries import expected_range as expected_range
     from gmmtorch.occupancy.ray_queries import hit_probability as hit_probability
+    from gmmtorch.occupancy.voxels.boxes import Box as Box
+    from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence as CellEvidence
+    from gmmtorch.occupancy.voxels.cell_evidence import sum_evidence as sum_evidence
+    from gmmtorch.occupancy.voxels.ray_casting import cast_evidence as cast_evidence
+    from gmmtorch.occupancy.voxels.rolling_window import RollingWindow as RollingWindow
+    from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence as SparseEvidence
 
 _NAMES = {
     "cones": ["Cones"],
@@ -45,6 +51,11 @@ _NAMES = {
     "index.cone_index": ["ConeIndex"],
     "protocol": ["OccupancyMap"],
     "ray_queries": ["ExpectedRange", "RayHits", "expected_range", "hit_probability"],
+    "voxels.boxes": ["Box"],
+    "voxels.cell_evidence": ["CellEvidence", "sum_evidence"],
+    "voxels.ray_casting": ["cast_evidence"],
+    "voxels.rolling_window": ["RollingWindow"],
+    "voxels.sparse_evidence": ["SparseEvidence"],
 }
 _HOMES = {name: f"gmmtorch.occupancy.{module}" for module, names in _NAMES.items() for name in names}
 

@@ -1,1 +1,1 @@
-"""Sparse voxels that store evidence, and the traversal of rays through them."""
+"""Lattices of voxels: sparse stores of evidence, the rolling window, and the traversal of rays."""

@@ -1,13 +1,13 @@
-"""Ray casting through a voxel grid by enumerating plane crossings: no stepping loop, no sort.
+"""Traversal of a voxel grid by rays: enumerates plane crossings, without a stepping loop and without a sort.
 
-A straight segment leaves one voxel at each grid plane that it crosses. For each axis the planes
-crossed are an arithmetic progression, so all crossings of all rays along one axis are one flat
-tensor; the voxel that is left follows from the plane on that axis and from `floor` on the others.
-Every voxel that a ray passes through, save the one it ends in, is left exactly once.
+A straight segment leaves one voxel at each grid plane that it crosses. The planes crossed along one axis
+are an arithmetic progression, so all crossings of all rays along that axis fit one flat tensor. The voxel
+that is left follows from the plane on this axis, and from `floor` on the others. Each voxel that a ray
+passes through, except the one that it ends in, is left exactly once.
 
-Coordinates here are *grid units*: voxel (i, j, k) is [i, i+1) × [j, j+1) × [k, k+1).
-Where a ray crosses two planes in the same point it crosses the lower axis first; points closer than
-rounding can tell count as the same, so that both axes decide alike.
+Coordinates are in grid units: voxel (i, j, k) is [i, i+1) × [j, j+1) × [k, k+1). If a ray crosses two
+planes at the same point, it crosses the plane of the lower axis first. Crossings closer than rounding can
+distinguish count as the same point, so that both axes take the same decision.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_TIE = 1e-13  # of the size of the terms: some hundred times their rounding
+_TIE = 1e-13  # relative to the terms: a few hundred times their rounding error
 
 CHUNK_VISITS = 1 << 18
-"""Voxel visits worked on at once: small enough to stay in a core's cache, whatever the ray count."""
+"""Voxel visits in one pass: they fit a core's cache."""
 
 
 class Visits(NamedTuple):
-    """Voxels left by rays: flat voxel index (V,) and the ray that left it (V,), both int64."""
+    """Voxels that rays leave: flat voxel index (V,) and ray index (V,), both int64."""
 
     voxel: Tensor
     ray: Tensor
 
 
 class _Rays(NamedTuple):
-    """Rays mirrored so that no direction component is negative, the grid at [0, size); (R, D) each."""
+    """Rays mirrored so that no direction component is negative; the grid is [0, size); (R, D) each."""
 
     start: Tensor
     delta: Tensor
@@ -46,9 +46,9 @@ class _Rays(NamedTuple):
 def _mirrored(starts: Tensor, ends: Tensor, low: Tensor, size: Tensor) -> _Rays:
     delta = ends - starts
     flipped = delta < 0
-    # Voxels are named before the grid's corner is taken off, so that rounding cannot rename them.
-    # Voxel i = [i, i+1) becomes (−i−1, −i] under x → −x: closed on the other side, which is what
-    # the tie rule wants, since a mirrored start on a plane has that plane still to cross.
+    # The floor is taken before the grid's corner is subtracted, so that rounding cannot change the voxel.
+    # Under x → −x voxel i = [i, i+1) becomes (−i−1, −i], closed on the other side. This matches the tie
+    # rule: a mirrored ray that starts on a plane still has to cross that plane.
     first, last = starts.floor() - low, ends.floor() - low
     start = starts - low
     return _Rays(
@@ -61,11 +61,11 @@ def _mirrored(starts: Tensor, ends: Tensor, low: Tensor, size: Tensor) -> _Rays:
 
 
 def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """First crossing and number of crossings on `axis` that can touch the grid, each (R,).
+    """First crossing and number of crossings on `axis` that can touch the grid, (R,) each.
 
-    Crossing k goes from mirrored voxel first+k to first+k+1. Those whose voxel lies outside the
-    grid on this axis are cut off; on the other axes an interval of crossings that certainly
-    contains every inside one is kept, so work is bounded by the grid however long the ray is.
+    Crossing k goes from mirrored voxel first+k to first+k+1. Crossings outside the grid on this axis are
+    left out. For the other axes, an interval is kept that contains all crossings inside the grid. So the
+    work is bounded by the size of the grid, however long the ray is.
     """
     first, last = rays.first[:, axis], rays.last[:, axis]
     begin = first.clamp_min(0)
@@ -77,7 +77,7 @@ def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor
         ratio = rays.delta[:, axis] / step
         enter = rays.start[:, axis] - rays.start[:, other] * ratio
         leave = rays.start[:, axis] + (size[other] - rays.start[:, other]) * ratio
-        slack = 2 + 1e-9 * (enter.abs() + leave.abs())  # only a bound: the mask decides
+        slack = 2 + 1e-9 * (enter.abs() + leave.abs())  # a loose bound; `_voxels_left` masks exactly
         moving = (step > 0) & torch.isfinite(enter) & torch.isfinite(leave)
         begin = torch.where(moving, torch.maximum(begin, (enter - slack).floor()), begin)
         stop = torch.where(moving, torch.minimum(stop, (leave + slack).ceil()), stop)
@@ -88,19 +88,19 @@ def _planes_inside(rays: _Rays, size: Tensor, axis: int) -> tuple[Tensor, Tensor
 
 
 class _Progression(NamedTuple):
-    """Per-ray constants of an axis's crossings, (R,) each: crossing k leaves voxel base + k·stride."""
+    """Constants (R,) of the crossings of rays along an axis: crossing k leaves voxel base + k·stride."""
 
-    begin: Tensor  # flat index of the ray's crossing 0
+    begin: Tensor  # position of the ray's crossing 0 in the flat tensor
     base: Tensor
     stride: Tensor
     step: Tensor  # |direction| along the axis
 
 
 class _Other(NamedTuple):
-    """Per-ray constants of another axis, (R,) each: its position at crossing k is (a + k·b)/step.
+    """Constants of each ray along another axis, (R,) each: its position at crossing k is (a + k·b)/step.
 
-    `a` holds the slack of the tie rule: a plane of a lower axis, which is crossed first in a tie,
-    counts as crossed slightly before it is reached, one of a higher axis only slightly after.
+    `a` includes the slack of the tie rule. A plane of a lower axis, which is crossed first in a tie, counts
+    as crossed slightly before the ray reaches it; a plane of a higher axis slightly after.
     """
 
     a: Tensor
@@ -115,7 +115,7 @@ class _Other(NamedTuple):
 def _voxels_left(
     ray: Tensor, along: _Progression, others: list[_Other], masked: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Voxel (V,) that each crossing leaves, and, if `masked`, whether it lies in the grid."""
+    """Voxel (V,) that each crossing leaves and, if `masked`, whether it is in the grid (V,)."""
     k = torch.arange(ray.shape[0], device=ray.device).sub(along.begin.index_select(0, ray)).double()
     voxel = torch.addcmul(along.base.index_select(0, ray), k, along.stride.index_select(0, ray))
     step = along.step.index_select(0, ray)
@@ -140,7 +140,7 @@ def _compiled_voxels_left() -> Callable[..., tuple[Tensor, Tensor | None]]:
 def _crossings(
     rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool, compiled: bool
 ) -> Visits:
-    """Every voxel left through a plane of `axis`."""
+    """All voxels left through planes of `axis`."""
     device = rays.start.device
     size = torch.tensor(shape, dtype=torch.float64, device=device)
     if masked:
@@ -153,7 +153,7 @@ def _crossings(
     signed = torch.where(rays.flipped, -stride_t, stride_t)  # mirrored voxel i is size − 1 − i
     shift = (rays.flipped * stride_t * (size - 1)).sum(1)
     step = rays.delta[:, axis]
-    # Along this axis the plane of crossing k is first + k + 1, and the voxel left is first + k.
+    # Along this axis crossing k is at plane first + k + 1 and leaves voxel first + k.
     along = _Progression(
         begin=torch.cumsum(count, 0) - count - skipped.long(),
         base=signed[:, axis] * rays.first[:, axis] + shift,
@@ -181,14 +181,18 @@ def _crossings(
 
 
 def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
-    """How far apart (R,) crossings of two axes may be, in units of the product of their steps, to be
-    taken for one: the same for (axis, other) and (other, axis), so that either decides alike."""
+    """Largest distance (R,) between crossings of two axes that count as one, times the product of their
+    steps.
+
+    It is the same for (axis, other) and (other, axis), so that both take the same decision.
+    """
     size_a = rays.start[:, axis].abs() + rays.delta[:, axis] + 1
     size_o = rays.start[:, other].abs() + rays.delta[:, other] + 1
     return _TIE * (size_o * rays.delta[:, axis] + size_a * rays.delta[:, other])
 
 
 def row_major_strides(shape: tuple[int, ...]) -> list[int]:
+    """Strides of a row-major flat index, one for each axis."""
     strides = [1] * len(shape)
     for axis in range(len(shape) - 2, -1, -1):
         strides[axis] = strides[axis + 1] * shape[axis + 1]
@@ -204,21 +208,20 @@ def traverse(
     compiled: bool = False,
     low: Tensor | None = None,
 ) -> Iterator[Visits]:
-    """Voxels passed through and left by each segment, the end voxel excluded.
+    """Voxels that each segment passes through and leaves; the voxel that it ends in is not included.
 
     Args:
-        starts: (R, D) segment starts in grid units, finite.
-        ends: (R, D) segment ends in grid units, finite.
-        shape: voxels along each axis; voxels outside are not reported.
-        chunk_visits: about how many visits each yielded chunk holds.
-        strides: of the flat voxel index, one for each axis; row-major if not given.
-        compiled: enumerate with torch.compile: the same voxels about twice as fast, after some ten
-            seconds for its first use in a process. Needs a C++ compiler.
-        low: (D,) index of the grid's lowest voxel, whose flat index is 0; zeros if not given.
+        starts: (R, D) starts of the segments in grid units, finite.
+        ends: (R, D) ends of the segments in grid units, finite.
+        shape: voxels along each axis; voxels outside are left out.
+        chunk_visits: approximate number of visits in each chunk.
+        strides: strides of the flat voxel index, one for each axis; row-major if not given.
+        compiled: use torch.compile: the same voxels about twice as fast, after about ten seconds for the
+            first call in a process. It needs a C++ compiler.
+        low: (D,) index of the grid's lowest voxel, which has the flat index 0; zeros if not given.
 
     Yields:
-        `Visits` of flat voxel indices and ray indices. Within a ray each voxel occurs once;
-        chunks and the order within them carry no meaning.
+        `Visits`. Each voxel occurs once for each ray; the order of visits and chunks is arbitrary.
     """
     if starts.shape[0] == 0:
         return
@@ -239,7 +242,7 @@ def traverse(
 
 
 def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
-    """Cut points [0, …, R] such that each run of rays makes about `chunk_visits` visits."""
+    """Cut points [0, …, R] between runs of rays with about `chunk_visits` visits each."""
     chunk = (torch.cumsum(visits, 0) / chunk_visits).floor()
     cuts = (chunk[1:] != chunk[:-1]).nonzero().squeeze(1) + 1
     return [0, *cuts.tolist(), visits.shape[0]]

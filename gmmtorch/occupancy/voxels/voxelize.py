@@ -1,10 +1,11 @@
-"""Which cells of the lattice a triangle mesh meets, exactly: the true map of a simulated world.
+"""Voxelization: the lattice cells that a triangle mesh meets, exact. It gives the true map of a simulated
+world.
 
-A triangle and a cell are apart if and only if they are apart along one of thirteen axes (Akenine-Möller,
-"Fast 3D triangle-box overlap testing", 2001): the three of the lattice, the triangle's normal, and the nine
-cross products of its edges with those of the cell. Candidates are found column by column along the axis
-that the triangle faces most, where its plane passes through at most four cells of each column: so a floor
-of 50 × 40 m costs its area, not the volume about it.
+A triangle and a cell are disjoint if and only if one of thirteen axes separates them (Akenine-Möller, "Fast
+3D triangle-box overlap testing", 2001): the three lattice axes, the triangle's normal, and the nine cross
+products of its edges with the cell's edges. Candidates come from columns of cells along the axis closest to
+the triangle's normal, where its plane passes through at most four cells of a column. So the cost of a
+triangle is proportional to its area, not to the volume of its bounding box.
 """
 
 from __future__ import annotations
@@ -20,28 +21,29 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_traversal import row_major_strides
 
 _NUDGE = 1e-6
-"""Of a cell, by which the mesh is moved up along all axes. A face in a plane of the lattice then counts for
-the cell above it, as its points do under `floor`, and for that cell alone."""
+"""Cells by which the mesh is moved up along all axes. A face in a lattice plane then counts only for the
+cell above it, like its points under `floor`."""
 
 _HALF = 0.5 - _NUDGE / 2
-"""Half a cell, less what lets a face that only touches an edge or a corner of the cell pass."""
+"""Half a cell, reduced so that a face which only touches an edge or a corner of a cell does not count."""
 
 _CHUNK = 1 << 16
-"""Columns worked on at once."""
+"""Columns processed in one pass."""
 
 
 def occupied_cells(triangles: Tensor, resolution: float, box: Box) -> Tensor:
-    """Cells (nx, ny, nz), bool, of a box of the lattice that triangles (T, 3, 3), metres, meet.
+    """Cells (nx, ny, nz), bool, of a box of the lattice that triangles (T, 3, 3), world metres, meet.
 
-    Cell c is the cube [c, c + 1) times the resolution: a face, or an edge of one, that lies in the plane
-    between two cells counts for the upper one, so a floor at height 0 for the cells above it. Triangles
-    without area count for the cells along their line. Raises `DataError` for corners that are not finite.
+    A face or edge in the plane between two cells counts for the upper cell: a floor at height 0 counts for
+    the cells above it. A triangle without area counts for the cells along its line.
+
+    Raises `InvalidArgumentError` for another shape, and `DataError` for corners that are not finite.
     """
     check_resolution(resolution)
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
         raise InvalidArgumentError(f"triangles has shape {tuple(triangles.shape)}; expected (T, 3, 3).")
     if not bool(torch.isfinite(triangles).all()):
-        raise DataError("triangles has a corner that is NaN or infinite; drop that triangle.")
+        raise DataError("triangles has a corner that is NaN or infinite; remove that triangle.")
     shape = box.shape
     strides = torch.tensor(row_major_strides(shape), device=triangles.device)
     size = torch.tensor(shape, device=triangles.device)
@@ -53,7 +55,7 @@ def occupied_cells(triangles: Tensor, resolution: float, box: Box) -> Tensor:
     for axis in range(3):
         order = torch.tensor([(axis + 1) % 3, (axis + 2) % 3, axis], device=triangles.device)
         turned = corners[facing == axis][:, :, order]
-        for cells in _met(turned, size[order]):
+        for cells in _cells_met(turned, size[order]):
             occupied.view(-1)[cells @ strides[order]] = True
     return occupied
 
@@ -62,10 +64,10 @@ def _normals(corners: Tensor) -> Tensor:
     return torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _met(corners: Tensor, size: Tensor) -> Iterator[Tensor]:
-    """Cells (C, 3) within [0, size) that triangles (T, 3, 3), in cells, meet; they face the last axis."""
+def _cells_met(corners: Tensor, size: Tensor) -> Iterator[Tensor]:
+    """Cells (C, 3) in [0, size) that triangles (T, 3, 3), in cells, meet; their normals are along axis 2."""
     axes, low, high = _slabs(corners)
-    # Height of the plane over a place: from the first corner, by the slopes of the plane.
+    # The height of the triangle's plane follows from its first corner and its slopes.
     normal = _normals(corners)
     flat = normal[:, 2] == 0  # no area
     slope = torch.where(flat[:, None], 0.0, -normal[:, :2] / normal[:, 2:].where(~flat[:, None], 1.0))
@@ -88,7 +90,7 @@ def _met(corners: Tensor, size: Tensor) -> Iterator[Tensor]:
 
 
 def _slabs(corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Axes (T, 13, 3), and between what (T, 13) a cell's centre lies along each if nothing parts the two."""
+    """Axes (T, 13, 3), and along each the interval [low, high], (T, 13), of cell centres not separated."""
     edges = corners.roll(-1, 1) - corners
     unit = torch.eye(3, dtype=corners.dtype, device=corners.device)
     across = torch.linalg.cross(edges[:, :, None].expand(-1, 3, 3, 3), unit.expand(len(corners), 3, 3, 3))
@@ -99,7 +101,7 @@ def _slabs(corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _columns(corners: Tensor, size: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Triangle (P,) and column (P, 2) of the cells under each triangle's rectangle, some at a time."""
+    """Chunks of triangles (P,) and the columns (P, 2) of cells in their bounding rectangles."""
     first = corners[:, :, :2].amin(1).floor().clamp_min(0)
     last = torch.minimum(corners[:, :, :2].amax(1).floor(), size[:2] - 1)
     span = (last - first + 1).clamp_min(0).long()
