@@ -76,7 +76,8 @@ def factory(changes: dict[str, float], dim: int):
     for whole in ("iterations", "max_origins"):
         if whole in options:
             options[whole] = int(options[whole])
-    return lambda resolution: GaussianMap(WindowedRule(window=window, **options))  # type: ignore[arg-type]
+    rule = WindowedRule(window=window, **options)  # type: ignore[arg-type]
+    return lambda resolution: GaussianMap(rule, cutoff=5.0, hit_length=None)
 
 
 def columns(name: str, rows: list[dict]) -> tuple[list[str], list[object]]:

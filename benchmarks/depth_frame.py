@@ -49,7 +49,8 @@ def learned(
         covariances.append(moved.covariances.cpu())
         support.append(moved.weights.cpu() * points.shape[0])
         origins.append(pose[:3, 3].expand_as(means[-1]))
-    built = GaussianMap.from_components(*(torch.cat(part) for part in (means, covariances, support, origins)))
+    parts = (torch.cat(part) for part in (means, covariances, support, origins))
+    built = GaussianMap.from_components(*parts, cutoff=5.0, hit_length=None)
     return built, 1e3 * statistics.median(seconds), statistics.mean(likelihood)
 
 

@@ -404,8 +404,7 @@ STUDIES: dict[str, type] = {
 def _map_schema(rule: type) -> type:
     """Options of a map: of its learning rule, and of its queries."""
     runtime = ("dtype", "random_state", "memory_limit", "compiled")
-    defaults = {"name": MISSING, "cutoff": None, "hit_length": 1.0, "codec": "quantized"}
-    return schema_of(rule, QueryOptions, without=runtime, **defaults)
+    return schema_of(rule, QueryOptions, without=runtime, name=MISSING, codec="quantized")
 
 
 @functools.cache  # the tests call it often

@@ -52,9 +52,10 @@ class GaussianMap(nn.Module):
         codec: rounding of components in files and queries: "quantized", about 10 bytes a component, or
             "float", every number as it is.
         prior: N_p of (3.9), counts added to each outcome.
-        cutoff: Mahalanobis distance at which a component ends. None: by support, see `QueryOptions`.
-        hit_length: ℓ (m). Occupancy multiplies hits by ℓ/resolution, so that thin walls count as occupied.
-            None: the factor is 1.
+        cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (a
+            median of at least 50 for each viewpoint), otherwise 5.
+        hit_length: ℓ (m). Occupancy multiplies hits by ℓ/resolution, so that thin walls count as occupied;
+            cells above ℓ lose hits. None: the factor is 1. `evidence` is not affected.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of Monte Carlo evidence.
@@ -90,8 +91,8 @@ class GaussianMap(nn.Module):
         robot: int = 0,
         codec: str = "quantized",
         prior: float = 1.0,
-        cutoff: float | None = 5.0,
-        hit_length: float | None = None,
+        cutoff: float | None = None,
+        hit_length: float | None = 1.0,
         n_samples: int = 1_000_000,
         sampling: Sampling = "sobol",
         memory_limit: int = 4 << 30,

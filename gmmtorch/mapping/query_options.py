@@ -36,8 +36,8 @@ class QueryOptions:
     """
 
     prior: float = 1.0
-    cutoff: float | None = 5.0
-    hit_length: float | None = None
+    cutoff: float | None = None
+    hit_length: float | None = 1.0
     n_samples: int = 1_000_000
     sampling: Sampling = "sobol"
     random_state: int = 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
+from gmmtorch import datasets
 from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap
 from gmmtorch.baselines.bgk_map import BGKMap
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
@@ -83,6 +84,20 @@ def test_a_saved_map_reproduces_its_row(method, all_methods):
     assert above == pytest.approx(row["auc"], rel=1e-9)
     assert row["auc"] > 0.7
     assert (row["n_components"] is None) == (method in BASELINES)
+
+
+def test_library_answers_as_the_command(all_methods, tmp_path):
+    """A map with the library's defaults is the map of `gmmtorch-occupancy`, to the bit."""
+    with np.load(all_methods.folder / "queries.npz") as asked:
+        points, train = asked["points"], asked["train_scans"].tolist()
+    scans = datasets.load(all_methods.results()["rows"][0]["dataset"], n_scans=8)
+    made = GaussianMap(resolution=0.25, n_samples=20_000)
+    for number in train:
+        made.insert(scans[number])
+    saved = all_methods.folder / "maps" / "point_1_0.25.safetensors"
+    made.save(tmp_path / "m.safetensors")
+    assert (tmp_path / "m.safetensors").read_bytes() == saved.read_bytes()
+    np.testing.assert_array_equal(made.occupancy(points), GaussianMap.load(saved).occupancy(points))
 
 
 def test_forms_of_evidence_share_one_map(all_methods):

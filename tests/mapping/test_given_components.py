@@ -72,7 +72,9 @@ def test_several_origins_share_the_support_in_proportion():
 @pytest.mark.parametrize(("method", "tolerance"), [("flux", 1e-3), ("monte_carlo", 0.05)])
 def test_given_components_hit_where_their_density_is(method, tolerance):
     mean, covariance = np.array([2.0, 0.4]), np.array([[0.02, 0.01], [0.01, 0.05]])
-    made = GaussianMap.from_components(mean[None], covariance[None], [100.0], [[0.1, 0.1]], n_samples=1 << 17)
+    made = GaussianMap.from_components(
+        mean[None], covariance[None], [100.0], [[0.1, 0.1]], n_samples=1 << 17, cutoff=5.0
+    )
     grid = VoxelGrid((1.5, -0.5), 0.25, (5, 8))
     low = grid.centers().numpy() - 0.125
     normal = multivariate_normal(mean, covariance)

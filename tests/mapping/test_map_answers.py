@@ -79,7 +79,7 @@ def test_the_order_and_the_company_of_questions_do_not_matter(dim, method):
 @dims
 @methods
 def test_evidence_on_a_grid_is_what_its_centres_are_told(dim, method):
-    made = built(drive(2, dim), method=method)
+    made = built(drive(2, dim), method=method, hit_length=None)
     grid = VoxelGrid.covering([-1.0] * dim, [3.5] * dim, 0.25)
     evidence = made.evidence(grid)
     assert float(evidence.hits.min()) >= 0

@@ -67,8 +67,17 @@ def test_settings_are_written_where_they_are_not_the_defaults(tmp_path):
         "method": "point",
         "codec": "float",
         "robot": 0,
+        "cutoff": None,
+        "hit_length": 1.0,
     }
     assert GaussianMap.load(tmp_path / "m.safetensors").query_options == GaussianMap().query_options
+
+
+def test_a_file_without_cutoff_and_hit_length_has_those_of_the_format(tmp_path, packed):
+    tensors, facts = packed
+    facts = {key: value for key, value in facts.items() if key not in ("cutoff", "hit_length")}
+    options = load_parts(tmp_path, tensors, facts).query_options
+    assert (options.cutoff, options.hit_length) == (5.0, None)
 
 
 @codecs

@@ -223,7 +223,12 @@ def map_rows(
 
     def factory(learning: WindowedRule) -> MapFactory:
         return lambda resolution: GaussianMap(
-            learning, window=study.window, n_samples=study.n_samples, random_state=seed
+            learning,
+            window=study.window,
+            cutoff=5.0,  # the options with which the published figures were made
+            hit_length=None,
+            n_samples=study.n_samples,
+            random_state=seed,
         )
 
     factories = {f"{name} {setting:g}": factory(learning) for name, setting, learning in cases}

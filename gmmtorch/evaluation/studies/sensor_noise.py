@@ -210,6 +210,8 @@ def _as_map(
         support[alive],
         viewpoints,
         resolution=study.resolution,
+        cutoff=5.0,  # the options with which the published figures were made
+        hit_length=None,
         n_samples=study.n_samples,
         random_state=seed,
     )

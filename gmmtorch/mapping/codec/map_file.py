@@ -1,7 +1,7 @@
 """Map files: one batch of the codec in a safetensors container, with the settings of the map. No pickle.
 
-The container takes about 200 bytes. Settings are written only if they differ from the defaults. See
-docs/formats.md.
+The container takes about 200 bytes. Settings are written only if they differ from the defaults of the file
+format. See docs/formats.md.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
 CODECS = ("quantized", "float")
 """About 10 bytes a component, rounded within bounds; or every number as it is, about 150 bytes."""
+
+FILE_OPTIONS = QueryOptions(cutoff=5.0, hit_length=None)
+"""The query options of a file that contains none; they are not those of `GaussianMap()`."""
 
 _MACHINE_OPTIONS = ("memory_limit", "compiled")  # query options that a file does not contain
 _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built; part of its byte budget
@@ -76,6 +79,7 @@ def number_after(ids: Tensor, next_number: int) -> int:
 def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:
     """Components and settings of a map file. Raises `DataError` for a damaged or foreign file."""
     tensors, facts = read_tensors(path, FILE_KIND, FILE_VERSION)
+    facts = {"cutoff": FILE_OPTIONS.cutoff, "hit_length": FILE_OPTIONS.hit_length, **facts}
     if tensors.keys() == {f.name for f in fields(Components)}:
         return _exact(tensors, path), facts
     batch = require(tensors, "components", (None,), torch.uint8, path)
@@ -93,7 +97,7 @@ def _facts(rule: LearningRule, settings: MapSettings, next_number: int) -> dict[
         "codec": settings.codec,
         "robot": settings.robot,
         "n_numbered": next_number,
-        **changed_options(settings.query, leave_out=_MACHINE_OPTIONS),
+        **changed_options(settings.query, FILE_OPTIONS, leave_out=_MACHINE_OPTIONS),
     }
 
 

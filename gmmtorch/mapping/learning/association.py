@@ -1,4 +1,4 @@
-"""Points that a map explains already are counted to the components that explain them (thesis 4.1.3)."""
+"""Association: points that a map explains are counted to the components that explain them (thesis 4.1.3)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import whitening
 
-_LEAST_DISTANCE = 1e-6  # squared Mahalanobis: at a mean itself the thesis's shares are undefined
+_LEAST_DISTANCE = 1e-6  # squared Mahalanobis: the thesis's shares are undefined at a mean
 _PAIRS_AT_ONCE = 1 << 20
 
 
 class Explained(NamedTuple):
-    """components: with the counts of what they explain; explained (N,): which points are counted there."""
+    """components: with the new counts; explained (N,) bool: the points that are counted."""
 
     components: Components
     explained: Tensor
@@ -33,18 +33,21 @@ def count_explained(
     max_range: bool = False,
     weight: float = 1.0,
 ) -> Explained:
-    """Points (N, D) seen from `origin` (D,) counted to the components that explain them.
+    """Counts points (N, D), observed from `origin` (D,), to the components that explain them.
 
-    A component explains a point if d = (z − μ)ᵀ Σ⁻¹ (z − μ) < `explained` (None: the 95 % quantile of
-    χ²_D) and it has an origin within `distance` (m) of the sensor: then it explains the free space
-    before the point, too. The point is shared by those in proportion to 1/d, and what each gets goes to
-    its nearest origin: N_k += Σ_n w_nk. Moments stay as they are. `max_range`: the points are ends of
-    beams without return, which only components of their kind explain. `weight`: measured points that each
-    point stands for.
+    A component explains a point if d = (z − μ)ᵀ Σ⁻¹ (z − μ) < `explained`, and if one of its origins is
+    within `distance` (m) of the sensor: then it also explains the free space before the point. The components
+    share the point in proportion to 1/d, N_k += Σ_n w_nk; each share goes to the origin nearest to the
+    sensor. Means and covariances do not change.
+
+    Args:
+        explained: squared Mahalanobis distance; None: the 95 % quantile of χ² with D degrees of freedom.
+        max_range: the points are ends of no-return beams, which only `max_range` components explain.
+        weight: number of measured points for which each point stands.
     """
     n, k = points.shape[0], len(components)
     found = torch.zeros(n, dtype=torch.bool, device=points.device)
-    near, nearest = _nearest_sightings(components, origin, distance)
+    near, nearest = _nearest_viewpoints(components, origin, distance)
     rows = (near & (components.max_range == max_range)).nonzero().squeeze(1)
     if n == 0 or len(rows) == 0:
         return Explained(components, found)
@@ -65,9 +68,9 @@ def count_explained(
 
 
 def summed(components: Components) -> Components:
-    """Each id once, in order, with the sum of the counts of all its rows.
+    """Each id once, in order, with the sum of the counts of all rows with this id.
 
-    For components that were each seen from one place, of which some rows add counts to others.
+    Every component must have one viewpoint.
     """
     robot, sequence = components.ids.unbind(1)
     row, n_ids = dense_ranks(robot * (int(sequence.max()) + 1 if len(robot) else 1) + sequence)
@@ -78,12 +81,11 @@ def summed(components: Components) -> Components:
     return replace(kept, support=support, seen_count=support[kept.seen_by])
 
 
-def _nearest_sightings(components: Components, origin: Tensor, distance: float) -> tuple[Tensor, Tensor]:
-    """Whether each component (K,) was seen from within `distance` of a place, and its sighting (K,) from
-    the place nearest to it."""
-    k, n_sightings = len(components), components.seen_by.shape[0]
+def _nearest_viewpoints(components: Components, origin: Tensor, distance: float) -> tuple[Tensor, Tensor]:
+    """Which components (K,) have an origin within `distance` of a position; their nearest viewpoints (K,)."""
+    k, n_viewpoints = len(components), components.seen_by.shape[0]
     apart = (components.origins[components.seen_from].double() - origin.double()).norm(dim=1)
     least = apart.new_full((k,), torch.inf).scatter_reduce_(0, components.seen_by, apart, "amin")
     best = (apart == least[components.seen_by]).nonzero().squeeze(1)
-    nearest = best.new_full((k,), n_sightings).scatter_reduce_(0, components.seen_by[best], best, "amin")
+    nearest = best.new_full((k,), n_viewpoints).scatter_reduce_(0, components.seen_by[best], best, "amin")
     return least <= distance, nearest

@@ -1,4 +1,4 @@
-"""Fewer components for nearly the same map: merging under an error bound and under a budget."""
+"""Merging of components: fewer components for nearly the same map, under an error bound or a budget."""
 
 from __future__ import annotations
 
@@ -16,61 +16,57 @@ from gmmtorch.mixture.reduction.merge import simplify
 from gmmtorch.mixture.reduction.moments import merge_components
 
 Size = Callable[[Components], int]
-"""Bytes that components take once written."""
+"""Number of bytes of the file of given components."""
 
 
 def estimated_bytes(components: Components) -> int:
-    """About what a file of the components takes: 16 bytes each, 2 for each sighting beyond the first, 7
-    for each origin, 300 in all."""
+    """Estimate of the file size: 16 bytes a component, 2 a viewpoint beyond the first, 7 an origin, 300 in
+    all."""
     further = components.seen_by.shape[0] - len(components)
     return 300 + 16 * len(components) + 2 * max(0, further) + 7 * components.origins.shape[0]
 
 
 def merged(components: Components, labels: Tensor) -> Components:
-    """Components with the same label (K,) as one each, moments and counts preserved, origins united.
+    """Merges the components of each label (K,). Moments and counts are preserved, viewpoints are united.
 
-    `labels` are numbered without gaps; who has a label of its own keeps every bit. Those that were
-    merged have no number (`UNNUMBERED`) and the robot of the first of them.
+    Labels are 0, 1, … without gaps. A component with a label of its own stays bit-identical. A merged
+    component is `UNNUMBERED` and has the robot of its first member.
     """
     n = int(labels.max()) + 1 if labels.numel() else 0
     members = torch.bincount(labels, minlength=n)
-    rows = torch.arange(len(components), device=labels.device)
-    first = rows.new_full((n,), len(components)).scatter_reduce_(0, labels, rows, "amin")
+    first = _first_rows(labels, n)
     joined = merge_components(components.support, components.means, components.covariances, labels, n)
-    alone = members == 1
+    single = members == 1
     ids = components.ids[first]
-    ids[~alone, 1] = UNNUMBERED
-    by, whence, count = union_of_viewpoints(components, labels)
+    ids[~single, 1] = UNNUMBERED
+    seen_by, seen_from, seen_count = union_of_viewpoints(components, labels)
     return replace(
         components,
-        means=torch.where(alone[:, None], components.means[first], joined.means),
-        covariances=torch.where(alone[:, None, None], components.covariances[first], joined.covariances),
-        support=torch.where(alone, components.support[first], joined.weights),
+        means=torch.where(single[:, None], components.means[first], joined.means),
+        covariances=torch.where(single[:, None, None], components.covariances[first], joined.covariances),
+        support=torch.where(single, components.support[first], joined.weights),
         max_range=components.max_range[first],
         ids=ids,
-        seen_by=by,
-        seen_from=whence,
-        seen_count=count,
+        seen_by=seen_by,
+        seen_from=seen_from,
+        seen_count=seen_count,
     )
 
 
 def compact(
     components: Components, max_components: int | None = None, max_cost: float | None = None
 ) -> Components:
-    """Components merged, the cheapest pairs first, until they are few enough; what costs little always.
+    """Merges pairs, cheapest first: all pairs up to `max_cost`, then more until `max_components` are left.
 
-    Surfaces merge with surfaces, and the ends of beams without return with their like; where both are
-    too many, both shrink in proportion. Total support, mean and covariance of either stay as they are.
+    Surfaces merge with surfaces, and `max_range` components with `max_range` components; both kinds shrink in
+    proportion. The total support, mean and covariance of each kind do not change.
 
     Args:
-        components: with any number of origins each.
-        max_components: left at most; the pair to merge is that of the least bound on the
+        max_components: largest number of components. The next pair is the one with the smallest bound on the
             Kullback–Leibler divergence of the map, weighted by support (Runnalls).
-        max_cost: squared Hellinger distance, from 0 to 1, up to which two components are merged even
-            if there is room for both.
+        max_cost: squared Hellinger distance, 0 to 1, up to which two components are always merged.
 
-    Raises:
-        InvalidArgumentError: neither, or one that cannot be.
+    Raises `InvalidArgumentError` if both are None, or for a value out of range.
     """
     if max_components is None and max_cost is None:
         raise InvalidArgumentError("max_components=None and max_cost=None: give one, or both.")
@@ -90,8 +86,9 @@ def _merged_by_kind(components: Components, limit: int | None, max_cost: float |
         rows = (components.max_range == flag).nonzero().squeeze(1)
         if len(rows) == 0:
             continue
-        if share == 0:  # a budget of one for both kinds: surfaces stay
-            return _merged_by_kind(_only(components, ~components.max_range), limit, max_cost)
+        if share == 0:  # a budget of one component for both kinds: surfaces stay
+            surfaces = (~components.max_range).nonzero().squeeze(1)
+            return _merged_by_kind(components.selected(surfaces), limit, max_cost)
         given = Parameters(components.support[rows], components.means[rows], components.covariances[rows])
         cost = "hellinger" if limit is None else "kullback_leibler"
         found = simplify(given, share, max_cost, cost, most_exact=0)
@@ -101,7 +98,7 @@ def _merged_by_kind(components: Components, limit: int | None, max_cost: float |
 
 
 def _shares(max_range: Tensor, limit: int | None) -> dict[bool, int | None]:
-    """Components left of each kind."""
+    """Number of components of each kind that are left."""
     if limit is None:
         return {False: None, True: None}
     n, n_empty = max_range.shape[0], int(max_range.sum())
@@ -111,31 +108,19 @@ def _shares(max_range: Tensor, limit: int | None) -> dict[bool, int | None]:
     return {False: limit - empty, True: empty}
 
 
-def _only(components: Components, chosen: Tensor) -> Components:
-    """The components marked in `chosen` (K,)."""
-    number = torch.cumsum(chosen.long(), 0) - 1
-    sighting = chosen[components.seen_by]
-    return replace(
-        components,
-        means=components.means[chosen],
-        covariances=components.covariances[chosen],
-        support=components.support[chosen],
-        max_range=components.max_range[chosen],
-        ids=components.ids[chosen],
-        seen_by=number[components.seen_by[sighting]],
-        seen_from=components.seen_from[sighting],
-        seen_count=components.seen_count[sighting],
-    )
-
-
 def _by_first_member(labels: Tensor) -> Tensor:
-    """Labels (K,) renumbered in the order in which they first occur."""
+    """Labels (K,) renumbered in the order of their first occurrence."""
     n = int(labels.max()) + 1 if labels.numel() else 0
-    rows = torch.arange(labels.shape[0], device=labels.device)
-    first = rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
+    first = _first_rows(labels, n)
     rank = torch.empty_like(first)
     rank[first.argsort()] = torch.arange(n, device=labels.device)
     return rank[labels]
+
+
+def _first_rows(labels: Tensor, n: int) -> Tensor:
+    """The first row (n,) of each label."""
+    rows = torch.arange(labels.shape[0], device=labels.device)
+    return rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
 
 
 def compact_to_bytes(
@@ -145,9 +130,9 @@ def compact_to_bytes(
     mean_origins: float | None = None,
     size: Size = estimated_bytes,
 ) -> Components:
-    """Components merged until they take at most `max_bytes` by `size`; origins as by `limit_origins`.
+    """Merges components until their `size` is at most `max_bytes`; origins are limited as by `limit_origins`.
 
-    Raises `InvalidArgumentError` where not even one component fits.
+    Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
     check_whole("max_bytes", max_bytes, 1)
     components = limit_origins(components, max_origins, mean_origins)

@@ -1,4 +1,4 @@
-"""Novelty of beams: how much of what a map does not know each of them would tell (thesis 4.1.2)."""
+"""Novelty of beams: by how many bits each beam lowers the entropy of a map (thesis 4.1.2)."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ _CHUNK_BEAMS = 1 << 14
 
 
 def entropy_reduction(components: Components, scan: Scan, rule: NoveltyRule) -> tuple[Tensor, Tensor]:
-    """Bits (N,) that each beam of a scan would take off the entropy, and whether it crosses a cell that
-    was not observed, (N,) bool; beams in the order of `Scan.ends`.
+    """Entropy reduction (N,) of each beam in bits, and whether it crosses an unobserved cell, (N,) bool.
 
-    Σ h(p) − h(p′) over the cells that a beam passes through or ends in: p is the occupancy of the cell
-    by the map, p′ that with this beam's miss or hit added. The cells are those of a lattice that has
-    the sensor in the middle of one, so that nothing depends on where the world's origin lies. A
-    reduction may be negative: of a beam that contradicts the map. A beam without return ends in no cell.
+    Beams are in the order of `Scan.ends`. The reduction is Σ h(p) − h(p′) over the cells that the beam
+    crosses or ends in: p is the cell's occupancy by the map, p′ the occupancy after this beam's miss or hit.
+    It is negative for a beam that contradicts the map. A no-return beam ends in no cell. The sensor is at the
+    centre of a cell, so the result does not depend on the world's origin.
     """
     ends, is_hit = scan.ends()
     ends, origin = ends.double(), scan.origin.double()
@@ -37,11 +36,11 @@ def entropy_reduction(components: Components, scan: Scan, rule: NoveltyRule) -> 
     unobserved = torch.zeros_like(bits, dtype=torch.bool)
     for begin in range(0, ends.shape[0], _CHUNK_BEAMS):
         part = slice(begin, begin + _CHUNK_BEAMS)
-        _of_beams(components, origin, ends[part], is_hit[part], rule, bits[part], unobserved[part])
+        _add_beams(components, origin, ends[part], is_hit[part], rule, bits[part], unobserved[part])
     return bits, unobserved
 
 
-def _of_beams(
+def _add_beams(
     components: Components,
     origin: Tensor,
     ends: Tensor,
@@ -50,7 +49,7 @@ def _of_beams(
     bits: Tensor,
     unobserved: Tensor,
 ) -> None:
-    """Adds what beams (N,) tell to `bits` and `unobserved`."""
+    """Writes the results of beams (N,) to `bits` and `unobserved`, in place."""
     stops = (ends - origin) / rule.resolution + 0.5
     starts = torch.full_like(stops, 0.5)
     cells = stops.floor()
@@ -76,16 +75,16 @@ def _of_beams(
     centers = origin + (index + low) * rule.resolution
     hits, misses = point_evidence(components.cones(), centers, rule.resolution, rule.cutoff)
     before = bernoulli_entropy(occupancy_probability(hits, misses, rule.prior))
-    missed = before - bernoulli_entropy(occupancy_probability(hits, misses + 1, rule.prior))
-    struck = before - bernoulli_entropy(occupancy_probability(hits + 1, misses, rule.prior))
-    bits.index_add_(0, ray, torch.where(ended, struck[number], missed[number]))
+    by_miss = before - bernoulli_entropy(occupancy_probability(hits, misses + 1, rule.prior))
+    by_hit = before - bernoulli_entropy(occupancy_probability(hits + 1, misses, rule.prior))
+    bits.index_add_(0, ray, torch.where(ended, by_hit[number], by_miss[number]))
     unobserved[ray[(hits + misses < rule.observed)[number]]] = True
 
 
 def novel_beams(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor:
-    """Which beams (N,) of a scan, in the order of `Scan.ends`, tell a map something new.
+    """Which beams (N,) of a scan are novel, in the order of `Scan.ends`.
 
-    Those that lower the entropy by at least the threshold, and those through any unobserved cell.
+    A beam is novel if its entropy reduction reaches the threshold, or if it crosses an unobserved cell.
     """
     if len(components) == 0:
         return torch.ones(scan.n_beams, dtype=torch.bool, device=scan.points.device)

@@ -210,7 +210,7 @@ _RULES: dict[str, type[LearningRule]] = {rule.kind: rule for rule in (WindowedRu
 
 def rule_facts(rule: LearningRule) -> dict[str, Any]:
     """The rule as plain values: its kind, and its options that differ from the defaults."""
-    return {"kind": rule.kind, **changed_options(rule)}
+    return {"kind": rule.kind, **changed_options(rule, type(rule)())}
 
 
 def read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) -> LearningRule:
@@ -220,10 +220,10 @@ def read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) 
     return _RULES[kind](**options)
 
 
-def changed_options(options: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
-    """The options of a dataclass that differ from its defaults."""
-    defaults = asdict(type(options)())
-    return {k: v for k, v in asdict(options).items() if v != defaults[k] and k not in leave_out}
+def changed_options(options: Any, defaults: Any, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+    """The fields of the dataclass `options` that differ from those of `defaults`."""
+    plain = asdict(defaults)
+    return {k: v for k, v in asdict(options).items() if v != plain[k] and k not in leave_out}
 
 
 class _Scale(NamedTuple):
