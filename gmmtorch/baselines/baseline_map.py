@@ -1,23 +1,31 @@
-"""BaselineMap: what the baselines share apart from how they learn and answer."""
+"""Base class of the baseline maps, and checks of their options."""
 
 from __future__ import annotations
 
+import inspect
+import math
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import read_tensors, write_bytes
+from gmmtorch.files import pack_tensors, read_tensors, write_bytes
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import ArrayLike, Scan
 
+_FILE_VERSION = 1
+
 
 class BaselineMap(ABC):
-    """A map behind the protocol `OccupancyMap` that says how it starts, learns, answers and is stored."""
+    """A map behind the protocol `OccupancyMap`.
+
+    A subclass keeps each constructor argument as an attribute of the same name, because files store
+    these, except `memory_limit`, as settings.
+    """
 
     any_resolution = False
     suffix = ".safetensors"
@@ -25,7 +33,7 @@ class BaselineMap(ABC):
     """2 or 3; None while the map is empty."""
 
     def insert(self, scan: Scan) -> None:
-        """Learn from one scan, in the world frame."""
+        """Learns from one scan, in the world frame."""
         check_scan(scan)
         if self.dim is None:
             self._start(scan.dim, scan.points.device)
@@ -37,13 +45,13 @@ class BaselineMap(ABC):
         if scan.n_beams:
             self._learn(scan.to(self.device))
 
-    def finish(self) -> None:  # noqa: B027  # most have nothing to do
-        """Everything is learned as it is inserted, so nothing is left to do."""
+    def finish(self) -> None:  # noqa: B027  most maps have no deferred work
+        """Does the work that is otherwise deferred to the first query."""
 
     def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Tensor | np.ndarray:
-        """Probability (M,) that the places (M, D) are occupied; exactly ½ where nothing is known.
+        """Probability (M,) that the points (M, D) are occupied; exactly ½ where nothing is known.
 
-        `resolution` is ignored: the map answers at its own.
+        `resolution` is ignored, because the map has a resolution of its own.
         """
         query = check_queries(points, self.dim)
         if self.dim is None or query.shape[0] == 0:
@@ -52,24 +60,27 @@ class BaselineMap(ABC):
             theta = self._answer(query.to(self.device)).to(query.device)
         return theta if isinstance(points, Tensor) else theta.cpu().numpy()
 
+    # -- files ------------------------------------------------------------------------------------
+
     @property
     def nbytes(self) -> int:
         """Bytes of the file that `save` writes; 0 for an empty map."""
         return 0 if self.dim is None else len(self._serialized())
 
     def save(self, path: str | Path) -> None:
-        """Write the map, atomically."""
+        """Writes the map to a file, atomically."""
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
         write_bytes(path, self._serialized())
 
-    @classmethod
-    def _opened(cls, path: str | Path, kind: str, version: int) -> tuple[Self, dict[str, Tensor]]:
-        """An empty map with the settings of a file, and the file's tensors.
+    def _facts(self) -> dict[str, Any]:
+        """Dimension and constructor arguments, as JSON values."""
+        options = [name for name in inspect.signature(type(self)).parameters if name != "memory_limit"]
+        return {"dim": self.dim, **{name: getattr(self, name) for name in options}}
 
-        `facts` of the file are the constructor's arguments, and `dim`. Raises `DataError` if they are not.
-        """
-        tensors, facts = read_tensors(path, kind, version)
+    @classmethod
+    def _from_facts(cls, facts: dict[str, Any], path: str | Path) -> Self:
+        """A map without content, with the settings of a file. Raises `DataError` if they are damaged."""
         try:
             options = dict(facts)
             dim = {2: 2, 3: 3}[options.pop("dim")]
@@ -78,25 +89,83 @@ class BaselineMap(ABC):
             raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
         made._start(dim, torch.device("cpu"))
         made.dim = dim
-        return made, tensors
+        return made
+
+    # -- implemented by each map ------------------------------------------------------------------
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """Where the map's tensors are."""
+        """Device of the map's tensors."""
 
     @abstractmethod
     def _start(self, dim: int, device: torch.device) -> None:
-        """Make what a map of this dimension needs before its first scan."""
+        """Creates the empty state of a map of this dimension."""
 
     @abstractmethod
     def _learn(self, scan: Scan) -> None:
-        """Learn from a scan of at least one beam."""
+        """Learns from a scan of at least one beam."""
 
     @abstractmethod
     def _answer(self, query: Tensor) -> Tensor:
-        """Probability (M,), float64, at points (M, D), float64, M ≥ 1, which may be infinite."""
+        """Probability (M,), float64, at points (M, D), float64, M ≥ 1; points can be infinite."""
 
     @abstractmethod
     def _serialized(self) -> bytes:
-        """The file."""
+        """The content of the file."""
+
+
+class TensorFileMap(BaselineMap):
+    """A baseline map with a safetensors file."""
+
+    file_kind: ClassVar[str]
+    """Format name in the files of this map."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a map that `save` wrote. Raises `DataError` for other or damaged content."""
+        tensors, facts = read_tensors(path, cls.file_kind, _FILE_VERSION)
+        made = cls._from_facts(facts, path)
+        made._restore(tensors, path)
+        return made
+
+    def _serialized(self) -> bytes:
+        return pack_tensors(self._tensors(), self.file_kind, _FILE_VERSION, **self._facts())
+
+    @abstractmethod
+    def _tensors(self) -> dict[str, Tensor]:
+        """The tensors of the file."""
+
+    @abstractmethod
+    def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
+        """Takes the state from the tensors of a file. Raises `DataError` if they are damaged."""
+
+
+# -- checks of options ------------------------------------------------------------------------------
+
+
+def check_length(name: str, value: float) -> float:
+    """A length (m) as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
+    if not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
+        raise InvalidArgumentError(f"{name}={value!r} must be a finite length above zero, in metres.")
+    return float(value)
+
+
+def check_max_range(max_range: float | None) -> float | None:
+    """The largest range (m), None for no limit. Raises `InvalidArgumentError` unless above zero."""
+    return None if max_range is None else check_length("max_range", max_range)
+
+
+def check_positive(name: str, value: float) -> float:
+    """A number as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
+    if not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
+        raise InvalidArgumentError(f"{name}={value!r} must be a finite number above zero.")
+    return float(value)
+
+
+def check_between(name: str, value: float, low: float, high: float = math.inf) -> float:
+    """A number as a float. Raises `InvalidArgumentError` unless it is finite and in [low, high]."""
+    if not isinstance(value, int | float) or not (math.isfinite(value) and low <= value <= high):
+        span = f"of at least {low}" if high == math.inf else f"from {low} to {high}"
+        raise InvalidArgumentError(f"{name}={value!r} must be a finite number {span}.")
+    return float(value)

@@ -1,31 +1,30 @@
-"""The classic occupancy grid, by counts or by log-odds, from the raw beams."""
+"""The classic occupancy grid from raw beams, with counts or log-odds."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.baselines.baseline_map import TensorFileMap
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import narrowest, pack_tensors, read_tensors, require, require_counts, write_bytes
+from gmmtorch.files import narrowest, require, require_counts
 from gmmtorch.occupancy.evidence import check_prior
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
-from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
-from gmmtorch.scan import ArrayLike, Scan
+from gmmtorch.scan import Scan
 
-_FILE_KIND, _FILE_VERSION = "gmmtorch.occupancy_grid", 1
-_RAYS_AT_ONCE = 1 << 18
+_CHUNK_RAYS = 1 << 18
 
 
 @dataclass(frozen=True)
 class LogOdds:
-    """What one beam adds to the log-odds of the cell it ends in, and of a cell it passes through."""
+    """What a beam adds to the log-odds of the cell where it ends, and of each cell that it passes."""
 
     hit: float = math.log(0.9 / 0.1)
     miss: float = math.log(0.4 / 0.6)
@@ -36,23 +35,22 @@ class LogOdds:
                 raise InvalidArgumentError(f"LogOdds: {name}={value!r} must be a finite number.")
 
 
-class OccupancyGrid:
-    """Cells of one size, stored in blocks where beams went.
+class OccupancyGrid(TensorFileMap):
+    """Cells of one size, stored in sparse blocks.
 
-    By counts: hits are beam ends in a cell, misses beams that passed through it, and θ follows from
-    (3.9), exactly as for a mixture. By log-odds: every beam adds its update to each cell it meets
-    (Moravec & Elfes 1985; Thrun et al. 2005, ch. 9), without a clamp, which would only tie cells.
+    With counts, hits are beam ends in a cell and misses are beams that passed through it; θ follows from
+    (3.9), as for a mixture. With log-odds, each beam adds its update to every cell on its way (Moravec &
+    Elfes 1985; Thrun et al. 2005, ch. 9). There is no clamp, because a clamp would only make cells equal.
 
     Args:
         resolution: side of a cell (m).
-        log_odds: the updates, for the log-odds variant; None counts.
-        prior: N_p of (3.9); counts only.
-        memory_limit: bytes that the cells may take.
-        compiled: cast rays with torch.compile, see `traverse`.
+        log_odds: the updates of the log-odds variant; None for counts.
+        prior: N_p of (3.9); for counts only.
+        memory_limit: largest size of the cells, bytes.
+        compiled: casts rays with torch.compile, see `traverse`.
     """
 
-    any_resolution = False
-    suffix = ".safetensors"
+    file_kind = "gmmtorch.occupancy_grid"
 
     def __init__(
         self,
@@ -68,122 +66,87 @@ class OccupancyGrid:
         self.prior = check_prior(prior)
         self.memory_limit = memory_limit
         self.compiled = compiled
-        self._blocks: SparseEvidence | None = None
-        self._waiting: list[Scan] = []  # counts are additive, so scans are cast many at a time
+        self._cells: SparseEvidence | None = None
+        self._pending: list[Scan] = []  # scans are counted in batches, because counts are additive
 
-    def insert(self, scan: Scan) -> None:
-        """Count the beams of a scan."""
-        check_scan(scan)
-        if self._blocks is None:
-            self._blocks = SparseEvidence(
-                self.resolution, scan.dim, scan.points.device, self.memory_limit, self.compiled
-            )
-        elif scan.dim != self._blocks.dim:
-            raise InvalidArgumentError(
-                f"scan is {scan.dim}-dimensional, but the grid is {self._blocks.dim}-dimensional."
-            )
-        self._waiting.append(scan.copied(self._blocks.keys.device))
-        if sum(waiting.n_beams for waiting in self._waiting) > _RAYS_AT_ONCE:
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu") if self._cells is None else self._cells.keys.device
+
+    def _start(self, dim: int, device: torch.device) -> None:
+        self._cells = SparseEvidence(self.resolution, dim, device, self.memory_limit, self.compiled)
+
+    def _learn(self, scan: Scan) -> None:
+        self._pending.append(scan.copied(self.device))
+        if sum(pending.n_beams for pending in self._pending) > _CHUNK_RAYS:
             self.evidence()
 
     def finish(self) -> None:
-        """Count the scans that wait now, rather than at the first question."""
-        if self._blocks is not None:
+        """Counts the pending scans, which is otherwise deferred to the first query."""
+        if self._cells is not None:
             self.evidence()
 
     def evidence(self) -> SparseEvidence:
-        """Hits and misses counted so far."""
-        if self._blocks is None:
+        """Hits and misses of all scans. Raises `InvalidArgumentError` if no scan was inserted."""
+        if self._cells is None:
             raise InvalidArgumentError("The grid is empty; insert a scan first.")
-        scans = self._waiting
-        if scans:
-            ends = [scan.ends() for scan in scans]
-            origins = torch.cat([scan.origin.double().expand(scan.n_beams, -1) for scan in scans])
-            self._blocks.add_rays(
+        if self._pending:
+            ends = [scan.ends() for scan in self._pending]
+            origins = torch.cat([scan.origin.double().expand(scan.n_beams, -1) for scan in self._pending])
+            self._cells.add_rays(
                 origins, torch.cat([e[0] for e in ends]), None, torch.cat([e[1] for e in ends])
             )
-            self._waiting = []  # only now: what could not be counted is still there to be
-        return self._blocks
+            self._pending = []  # only after success, so that an error loses no scan
+        return self._cells
 
-    def occupancy(self, points: ArrayLike, resolution: float | None = None) -> Tensor | np.ndarray:
-        """Probability (M,) of the cells that hold the points (M, D); ½ where no beam went.
+    def _answer(self, query: Tensor) -> Tensor:
+        cells = self.evidence()
+        if self.log_odds is None:
+            return cells.lookup(query, self.prior)
+        hits, misses = cells.at_points(query)
+        return torch.sigmoid(self.log_odds.hit * hits + self.log_odds.miss * misses)
 
-        `resolution` is ignored: a grid answers with its own cells.
+    # -- files ------------------------------------------------------------------------------------
+
+    def _facts(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {"dim": self.dim, "resolution": self.resolution, "prior": self.prior}
+        return facts if self.log_odds is None else {**facts, "log_odds": vars(self.log_odds)}
+
+    @classmethod
+    def _from_facts(cls, facts: dict[str, Any], path: str | Path) -> Self:
+        options = dict(facts)
+        if "log_odds" in options:
+            try:
+                options["log_odds"] = LogOdds(**options["log_odds"])
+            except (TypeError, ValueError) as error:
+                raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
+        return super()._from_facts(options, path)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Block keys, one bit per cell that tells whether it has evidence, and the counts of such cells.
+
+        Hits and misses are each stored in the narrowest integer type.
         """
-        query = check_queries(points, None if self._blocks is None else self._blocks.dim)
-        device = query.device
-        if self._blocks is not None:
-            query = query.to(self._blocks.keys.device)
-        if self._blocks is None:
-            theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64)
-        elif self.log_odds is None:
-            theta = self.evidence().lookup(query, self.prior)
-        else:
-            theta = torch.sigmoid(self._sum(*self.evidence().at_points(query), self.log_odds))
-        return theta.to(device) if isinstance(points, Tensor) else theta.cpu().numpy()
-
-    @staticmethod
-    def _sum(hits: Tensor, misses: Tensor, rule: LogOdds) -> Tensor:
-        """Log-odds of cells from what they met."""
-        return rule.hit * hits + rule.miss * misses
-
-    # -- keeping ----------------------------------------------------------------------------------
-
-    def _serialized(self) -> bytes:
-        """Block keys; one bit a cell: has it evidence; and the values of those that have.
-
-        Each sort of count takes the narrowest integer type that holds it.
-        """
-        blocks = self.evidence()
-        hits, misses = blocks.in_key_order()
-        facts: dict[str, Any] = {"resolution": self.resolution, "dim": blocks.dim, "prior": self.prior}
-        if self.log_odds is not None:
-            facts["log_odds"] = vars(self.log_odds)
+        cells = self.evidence()
+        hits, misses = cells.in_key_order()
         observed = (hits != 0) | (misses != 0)
-        tensors = {
-            "anchor": blocks.anchor if blocks.anchor is not None else blocks.keys.new_zeros(blocks.dim),
-            "keys": blocks.keys,
-            "observed": _pack_bits(observed),
+        return {
+            "anchor": cells.anchor if cells.anchor is not None else cells.keys.new_zeros(cells.dim),
+            "keys": cells.keys,
+            "observed": torch.from_numpy(np.packbits(observed.cpu().numpy(), axis=1)),
             "hits": narrowest(hits[observed]),
             "misses": narrowest(misses[observed]),
         }
-        return pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the file that `save` writes; 0 for an empty grid."""
-        return 0 if self._blocks is None else len(self._serialized())
-
-    def save(self, path: str | Path) -> None:
-        """Write the grid, atomically."""
-        write_bytes(path, self._serialized())
-
-    @classmethod
-    def load(cls, path: str | Path) -> OccupancyGrid:
-        """Read a grid that `save` wrote. Raises `DataError` if it is not one."""
-        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
-        try:
-            rule = LogOdds(**facts["log_odds"]) if "log_odds" in facts else None
-            grid = cls(facts["resolution"], log_odds=rule, prior=facts["prior"])
-            blocks = SparseEvidence(grid.resolution, {2: 2, 3: 3}[facts["dim"]])
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
-        anchor = require(tensors, "anchor", (blocks.dim,), torch.int64, path)
+    def _restore(self, tensors: dict[str, Tensor], path: str | Path) -> None:
+        assert self._cells is not None
+        anchor = require(tensors, "anchor", (self._cells.dim,), torch.int64, path)
         keys = require(tensors, "keys", (None,), torch.int64, path)
-        bits = require(tensors, "observed", (keys.shape[0], blocks.cells_per_block // 8), torch.uint8, path)
-        observed = _unpack_bits(bits)
+        shape = (keys.shape[0], self._cells.cells_per_block // 8)
+        bits = require(tensors, "observed", shape, torch.uint8, path)
+        observed = torch.from_numpy(np.unpackbits(bits.numpy(), axis=1)).bool()
         n = int(observed.sum())
         counts = [require_counts(tensors, name, (n,), path).double() for name in ("hits", "misses")]
         if bool((keys[1:] <= keys[:-1]).any()):
             raise DataError(f"{path}: the block keys are not sorted; the file is damaged.")
-        blocks.fill(anchor, keys, observed, *counts)
-        grid._blocks = blocks
-        return grid
-
-
-def _pack_bits(mask: Tensor) -> Tensor:
-    return torch.from_numpy(np.packbits(mask.cpu().numpy(), axis=1))
-
-
-def _unpack_bits(packed: Tensor) -> Tensor:
-    return torch.from_numpy(np.unpackbits(packed.numpy(), axis=1)).bool()
+        self._cells.fill(anchor, keys, observed, *counts)

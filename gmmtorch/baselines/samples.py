@@ -11,22 +11,11 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.baselines.baseline_map import check_length
+from gmmtorch.errors import MemoryLimitError
 from gmmtorch.scan import Scan
 
 _MAX_SAMPLES = 1 << 27
-
-
-def check_length(name: str, value: float) -> float:
-    """A length (m) as a float; raises `InvalidArgumentError` unless it is finite and above zero."""
-    if not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise InvalidArgumentError(f"{name}={value!r} must be a finite length above zero, in metres.")
-    return float(value)
-
-
-def check_range(max_range: float | None) -> float | None:
-    """The largest range (m), None for no limit; raises `InvalidArgumentError` unless above zero."""
-    return None if max_range is None else check_length("max_range", max_range)
 
 
 def beam_samples(

@@ -1,4 +1,4 @@
-"""BGK inference on a lattice and from points: the contract, a naive double loop, the authors' data."""
+"""BGK inference on a grid and from points: the map contract, a double loop, and the authors' data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattic
 from gmmtorch import datasets
 from gmmtorch.baselines.bgk_map import BGKMap, kernel_offsets, sparse_kernel
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
-from gmmtorch.baselines.samples import centroids, thinned_samples
+from gmmtorch.baselines.samples import thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.evaluation import metrics, queries, split
 from gmmtorch.files import pack_tensors, read_tensors
@@ -49,68 +49,36 @@ def random_scans(dim: int, n_scans: int = 3, n: int = 20) -> list[Scan]:
 
 
 def kernel(distance: float, length: float) -> float:
-    """Melkumyan & Ramos 2009, (8), in plain arithmetic."""
+    """Melkumyan & Ramos 2009, (8), with Python floats."""
     r = distance / length
     if r >= 1:
         return 0.0
     return (2 + math.cos(2 * math.pi * r)) / 3 * (1 - r) + math.sin(2 * math.pi * r) / (2 * math.pi)
 
 
-def by_double_loop(place: list[float], scans: list[Scan], made: BGKMap | BGKPointsMap) -> float:
-    """θ at one place from every sample of every scan."""
+def by_double_loop(point: list[float], scans: list[Scan], made: BGKMap | BGKPointsMap) -> float:
+    """θ at a point from all samples of all scans."""
     sums = {True: made.prior, False: made.prior}
     for scan in scans:
         samples, is_hit = thinned_samples(scan, made.free_resolution, made.ds_resolution)
         for sample, hit in zip(samples.tolist(), is_hit.tolist(), strict=True):
-            sums[hit] += made.scale * kernel(math.dist(place, sample), made.length)
+            sums[hit] += made.scale * kernel(math.dist(point, sample), made.length)
     return sums[True] / (sums[True] + sums[False])
 
 
-# -- the kernel and the samples ----------------------------------------------------------------------
+# -- the kernel ---------------------------------------------------------------------------------------
 
 
 @given(st.floats(0, 10), st.floats(1e-3, 1e3))
-def test_the_kernel_is_that_of_melkumyan_and_ramos(distance, length):
+def test_sparse_kernel_equals_its_formula(distance, length):
     value = float(sparse_kernel(torch.tensor(distance, dtype=torch.float64), length))
     assert value == pytest.approx(kernel(distance, length), abs=1e-12)
     assert 0 <= value <= 1
 
 
-def test_the_kernel_is_positive_definite_on_a_line():
+def test_sparse_kernel_is_positive_definite():
     x = torch.linspace(0, 3, 60, dtype=torch.float64)
     assert float(torch.linalg.eigvalsh(sparse_kernel((x[:, None] - x).abs(), 1.0)).min()) > -1e-10
-
-
-def test_samples_lie_where_the_authors_put_them():
-    scan = Scan(torch.tensor([[1.1, 0.0]]).double(), torch.zeros(2).double())
-    samples, is_hit = thinned_samples(scan, 0.5, 1e-3)
-    assert samples[is_hit].tolist() == [[pytest.approx(1.1), 0.0]]
-    assert sorted(samples[~is_hit][:, 0].tolist()) == pytest.approx([0.0, 0.5, 0.6, 1.0])
-
-
-def test_beams_beyond_the_range_are_dropped_and_empty_ones_cut():
-    scan = Scan(torch.tensor([[3.0, 0.0], [0.0, 1.0]]), torch.zeros(2), torch.tensor([[0.0, -9.0]]))
-    samples, is_hit = thinned_samples(scan, 0.5, 0.01, max_range=2.0)
-    assert samples[is_hit].tolist() == [[0.0, 1.0]]
-    assert float(samples[:, 0].max()) == 0.0
-    assert float(samples[:, 1].min()) == pytest.approx(-2.0)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_centroids_are_the_means_of_cubes(dim):
-    points = torch.randn(300, dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    cubes: dict[tuple[int, ...], list[list[float]]] = {}
-    for point in points.tolist():
-        cubes.setdefault(tuple(math.floor(x / 0.7) for x in point), []).append(point)
-    expected = sorted(
-        [sum(column) / len(column) for column in zip(*rows, strict=True)] for rows in cubes.values()
-    )
-    torch.testing.assert_close(torch.tensor(sorted(centroids(points, 0.7).tolist())), torch.tensor(expected))
-
-
-def test_centroids_far_apart_do_not_overflow():
-    points = torch.tensor([[0.0, 0, 0], [1e9, 1e9, 1e9], [1e9, 1e9, 1e9]]).double()
-    assert sorted(centroids(points, 1e-3).tolist()) == [[0.0] * 3, [1e9] * 3]
 
 
 # -- inference ----------------------------------------------------------------------------------------
@@ -118,7 +86,7 @@ def test_centroids_far_apart_do_not_overflow():
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("length", [0.06, 0.15, 0.4])
-def test_cells_agree_with_a_double_loop_over_all_samples(dim, length):
+def test_bgk_map_agrees_with_a_double_loop_over_all_samples(dim, length):
     made = BGKMap(0.1, length=length, prior=0.01, scale=0.7, free_resolution=0.3, ds_resolution=0.1)
     scans = random_scans(dim)
     for scan in scans:
@@ -127,7 +95,7 @@ def test_cells_agree_with_a_double_loop_over_all_samples(dim, length):
     cells = torch.cat([scan.points for scan in scans]).div(0.1).floor().long() + near * (length > 0.1)
     centers = (cells.double() + 0.5) * 0.1
     expected = [by_double_loop(center, scans, made) for center in centers.tolist()]
-    corner = centers + 0.04  # a cell answers for all of itself
+    corner = centers + 0.04  # the same cell
     torch.testing.assert_close(
         made.occupancy(corner), torch.tensor(expected, dtype=torch.float64), rtol=1e-5, atol=1e-6
     )
@@ -135,20 +103,20 @@ def test_cells_agree_with_a_double_loop_over_all_samples(dim, length):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_points_agree_with_a_double_loop_over_all_samples(dim):
+def test_bgk_points_map_agrees_with_a_double_loop_over_all_samples(dim):
     made = BGKPointsMap(0.1, length=0.4, prior=0.01, ds_resolution=1e-4, free_resolution=0.3)
     scans = random_scans(dim)
     for scan in scans:
         made.insert(scan)
-    place = 2.4 * torch.rand(60, dim, generator=torch.Generator().manual_seed(1)).double() - 1.2
-    expected = [by_double_loop(x, scans, made) for x in place.tolist()]
+    points = 2.4 * torch.rand(60, dim, generator=torch.Generator().manual_seed(1)).double() - 1.2
+    expected = [by_double_loop(x, scans, made) for x in points.tolist()]
     torch.testing.assert_close(
-        made.occupancy(place), torch.tensor(expected, dtype=torch.float64), rtol=1e-5, atol=1e-6
+        made.occupancy(points), torch.tensor(expected, dtype=torch.float64), rtol=1e-5, atol=1e-6
     )
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_no_cell_within_the_kernel_is_missed(dim):
+def test_kernel_offsets_contain_all_cells_in_reach(dim):
     offsets = {tuple(row) for row in kernel_offsets(0.23, 0.1, dim).tolist()}
     sample = 0.1 * torch.rand(200, dim, generator=torch.Generator().manual_seed(0)).double()
     cells = torch.cartesian_prod(*[torch.arange(-5, 6)] * dim)
@@ -163,23 +131,26 @@ def test_no_cell_within_the_kernel_is_missed(dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("max_points", [16, 50, 150])
-def test_a_budget_of_points_is_kept_and_weighs_what_it_replaces(dim, max_points, tmp_path):
+def test_max_points_limits_the_samples_and_keeps_their_total_weight(dim, max_points, tmp_path):
     made, whole = BGKPointsMap(RESOLUTION, max_points=max_points), BGKPointsMap(RESOLUTION)
     for seed in range(3):
         made.insert(wall_scan(dim, seed))
         whole.insert(wall_scan(dim, seed))
         assert made.n_points <= max_points < whole.n_points
-    weight = [sum(float(table.values[:, 0].sum()) for table in x._tables) for x in (made, whole)]
-    assert weight[0] == pytest.approx(weight[1], rel=1e-5)
     assert made.nbytes < whole.nbytes
-    made.save(tmp_path / "map.safetensors")
+    weights = []
+    for one, name in ((whole, "whole"), (made, "map")):
+        one.save(tmp_path / f"{name}.safetensors")
+        tensors, _ = read_tensors(tmp_path / f"{name}.safetensors", "gmmtorch.bgk_points_map", 1)
+        weights.append(sum(float(tensors[f"{label}_samples"][:, 0].sum()) for label in ("hit", "free")))
+    assert weights[0] == pytest.approx(weights[1], rel=1e-5)
     loaded = BGKPointsMap.load(tmp_path / "map.safetensors")
     assert torch.equal(loaded.occupancy(lattice(dim)), made.occupancy(lattice(dim)))
-    if max_points == 150:  # enough to tell the wall from the way to it
+    if max_points == 150:  # enough to separate the wall from the space before it
         assert made.occupancy([[3.06, 0.2, 0.1][:dim]])[0] > made.occupancy([[1.5, 0.2, 0.3][:dim]])[0]
 
 
-def test_a_point_costs_a_place_and_a_weight_and_little_more():
+def test_bgk_points_map_takes_about_16_bytes_per_point():
     made = BGKPointsMap(RESOLUTION, max_points=1000)
     for seed in range(3):
         made.insert(wall_scan(3, seed))
@@ -194,17 +165,17 @@ def test_a_point_costs_a_place_and_a_weight_and_little_more():
     "option", ["length", "prior", "scale", "free_resolution", "ds_resolution", "max_range"]
 )
 @pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "much"])
-def test_settings_that_are_none_are_refused(kind, option, value):
+def test_bgk_maps_reject_invalid_options(kind, option, value):
     with pytest.raises(InvalidArgumentError, match=option):
         kind(0.1, **{option: value})
 
 
-def test_a_budget_of_no_points_is_refused():
+def test_bgk_points_map_rejects_a_budget_of_zero_points():
     with pytest.raises(InvalidArgumentError, match="max_points"):
         BGKPointsMap(0.1, max_points=0)
 
 
-def test_what_would_not_fit_is_refused():
+def test_bgk_map_rejects_options_that_exceed_memory_or_range():
     scan = wall_scan(3)
     with pytest.raises(MemoryLimitError, match="length"):
         BGKMap(0.001, length=1.0, free_resolution=1.0).insert(scan)
@@ -231,7 +202,7 @@ def test_what_would_not_fit_is_refused():
     ],
     ids=lambda change: next(iter(change)),
 )
-def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, change):
+def test_bgk_map_load_rejects_damaged_tensors(tmp_path, change):
     path = tmp_path / "map.safetensors"
     made = BGKMap(0.1, length=0.05)
     made.insert(Scan(torch.tensor([[0.25, 0.25]]), torch.tensor([0.25, 0.25])))
@@ -247,18 +218,18 @@ def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, change):
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("world", ["sim_structured", "sim_unstructured"])
-def test_on_its_authors_data_it_tells_more_than_a_grid(real_data: Path, world):
-    """Doherty et al. 2017, Figure 4: above a plain grid on sparse scans, as it predicts between beams."""
+def test_bgk_map_is_more_accurate_than_a_grid_on_its_authors_data(real_data: Path, world):
+    """Doherty et al. 2017, Figure 4: it predicts between the beams of sparse scans."""
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 
     folder = real_data / "la3dm" / world
     scans = list(datasets.load("pcd_viewpoint", folder, max_range=8.0, no_return_range=8.0))
     train, test = split.split_indices(len(scans), 4)
-    asked = queries.hit_and_free(*queries.test_beams([scans[i] for i in test], 4000, 0), "uniform", 0.1, 0)
+    tested = queries.hit_and_free(*queries.test_beams([scans[i] for i in test], 4000, 0), "uniform", 0.1, 0)
     auc = {}
     for made in (BGKMap(0.1), OccupancyGrid(0.1)):
         for i in train:
             made.insert(scans[i])
-        theta = torch.as_tensor(made.occupancy(asked.points))
-        auc[type(made)] = metrics.roc(theta[asked.of(1)], theta[asked.of(0)]).auc
+        theta = torch.as_tensor(made.occupancy(tested.points))
+        auc[type(made)] = metrics.roc(theta[tested.of(1)], theta[tested.of(0)]).auc
     assert auc[BGKMap] > auc[OccupancyGrid] + 0.02

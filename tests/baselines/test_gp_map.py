@@ -1,4 +1,4 @@
-"""Gaussian process occupancy: the contract, and scikit-learn's processes block by block."""
+"""Gaussian process map: the map contract, and scikit-learn's processes block by block."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TestGPMap(OccupancyMapContract):
 
     @pytest.mark.parametrize("dim", [2, 3])
     def test_moved_by_whole_cells_it_gives_the_moved_answers(self, dim):
-        """The blocks, each with a process of its own, do not move along: so on average alone."""
+        """Blocks, which have separate processes, do not move with the scene, so answers match on average."""
         matrix = shifted(dim, (0.125, -0.375, 0.25))
         expected = self.ask(self.built(wall_scan(dim)), lattice(dim))
         theta = self.ask(self.built(wall_scan(dim).transformed(matrix)), move(matrix, lattice(dim)))
@@ -49,34 +49,34 @@ def sklearn_process(length: float, variance: float, noise: float) -> GaussianPro
     return GaussianProcessRegressor(kernel, alpha=noise, optimizer=None)
 
 
-# -- one process ---------------------------------------------------------------------------------------
+# -- regression -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(
     ("length", "variance", "noise"), [(1.0, 1.0, 0.01), (0.2, 2.5, 0.1), (5.0, 0.3, 0.01)]
 )
-def test_padded_processes_are_those_of_scikit_learn(dim, length, variance, noise):
+def test_gp_regression_with_padding_equals_scikit_learn(dim, length, variance, noise):
     generator = torch.Generator().manual_seed(0)
     sizes = [1, 7, 40]
-    places = torch.randn(3, 40, dim, generator=generator, dtype=torch.float64)
+    positions = torch.randn(3, 40, dim, generator=generator, dtype=torch.float64)
     values = torch.randn(3, 40, generator=generator, dtype=torch.float64)
-    given = torch.arange(40) < torch.tensor(sizes)[:, None]
+    is_sample = torch.arange(40) < torch.tensor(sizes)[:, None]
     query = torch.randn(3, 25, dim, generator=generator, dtype=torch.float64)
-    made = gp_regression(places, values, given, query, length=length, variance=variance, noise=noise)
+    made = gp_regression(positions, values, is_sample, query, length=length, variance=variance, noise=noise)
     for row, size in enumerate(sizes):
-        peer = sklearn_process(length, variance, noise).fit(places[row, :size], values[row, :size])
+        peer = sklearn_process(length, variance, noise).fit(positions[row, :size], values[row, :size])
         mean, deviation = peer.predict(query[row].numpy(), return_std=True)
         np.testing.assert_allclose(made.mean[row], mean, atol=1e-9)
         np.testing.assert_allclose(made.variance[row], deviation**2, atol=1e-9)
 
 
-# -- a map of them -------------------------------------------------------------------------------------
+# -- the map ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_map_is_a_committee_of_the_processes_of_its_blocks(dim):
-    """Every cell by hand: scikit-learn on each block's samples, fused over faces and scans."""
+def test_gp_map_equals_a_committee_of_scikit_learn_processes(dim):
+    """Each cell: scikit-learn on the samples of each block, fused over neighbouring blocks and scans."""
     generator = torch.Generator().manual_seed(dim)
     made = GPMap(0.25, length=0.8, noise=0.05, free_resolution=0.4, known_variance=0.3, block_side=2)
     precision: dict[tuple[int, ...], float] = {}
@@ -95,9 +95,9 @@ def test_a_map_is_a_committee_of_the_processes_of_its_blocks(dim):
             peer = sklearn_process(0.8, 1.0, 0.05)
             peer.fit(samples[members].numpy(), np.where(is_hit[members].numpy(), 1.0, -1.0))
             for axis, step in [(0, 0), *itertools.product(range(dim), (-1, 1))]:
-                beside = [x + (step if a == axis else 0) for a, x in enumerate(block)]
+                neighbour = [x + (step if a == axis else 0) for a, x in enumerate(block)]
                 for corner in itertools.product((0, 1), repeat=dim):
-                    cell = tuple(2 * b + c for b, c in zip(beside, corner, strict=True))
+                    cell = tuple(2 * b + c for b, c in zip(neighbour, corner, strict=True))
                     mean, deviation = peer.predict([[(x + 0.5) * 0.25 for x in cell]], return_std=True)
                     precision[cell] = precision.get(cell, 1 / 1000.0) + 1 / deviation[0] ** 2 - 1
                     weighted[cell] = weighted.get(cell, 0.0) + mean[0] / deviation[0] ** 2
@@ -131,18 +131,18 @@ def test_a_map_is_a_committee_of_the_processes_of_its_blocks(dim):
     ],
 )
 @pytest.mark.parametrize("value", [0, -1.0, math.nan, math.inf, "much"])
-def test_settings_that_are_none_are_refused(option, value):
+def test_gp_map_rejects_invalid_options(option, value):
     with pytest.raises(InvalidArgumentError, match=option):
         GPMap(0.1, **{option: value})
 
 
-def test_a_block_of_too_many_samples_is_refused():
+def test_gp_map_rejects_too_many_samples_per_block():
     scan = Scan(torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(2))
     with pytest.raises(InvalidArgumentError, match="ds_resolution"):
         GPMap(1.0, ds_resolution=1e-6).insert(scan)
 
 
-def test_the_same_place_hit_and_free_is_neither():
+def test_gp_map_fuses_contradicting_samples_to_an_uncertain_cell():
     end = torch.tensor([[1.0625, 0.1875]], dtype=torch.float64)
     made = GPMap(0.125, free_resolution=0.25)
     made.insert(Scan(end, torch.tensor([0.5, 0.1875])))
@@ -154,14 +154,16 @@ def test_the_same_place_hit_and_free_is_neither():
 @pytest.mark.parametrize(
     "change", [{"fused": torch.tensor([[0.0, -1.0]])}, {"fused": torch.zeros(1, 3)}, {"fused": None}]
 )
-def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, change):
+def test_gp_map_load_rejects_damaged_tensors(tmp_path, change):
     path = tmp_path / "map.safetensors"
     made = GPMap(0.125)
     made.insert(wall_scan(2))
     made.save(path)
     tensors, facts = read_tensors(path, "gmmtorch.gp_map", 1)
     value = change["fused"]
-    tensors.pop("fused") if value is None else tensors.update(fused=value.expand(len(made._table.keys), -1))
+    n_cells = len(tensors.pop("fused"))
+    if value is not None:
+        tensors["fused"] = value.expand(n_cells, -1)
     path.write_bytes(pack_tensors(tensors, "gmmtorch.gp_map", 1, **facts))
     with pytest.raises(DataError, match=r"map\.safetensors"):
         GPMap.load(path)

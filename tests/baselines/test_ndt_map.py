@@ -1,8 +1,9 @@
-"""NDT occupancy: the contract, and its recursive moments and likelihoods by other means."""
+"""NDT map: the map contract, and independent computations of its moments and likelihoods."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from scipy.optimize import minimize_scalar
 from gmmtorch.baselines.ndt_map import NDTMap, closest_on_line, combine_moments
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.scan import Scan
 
 
@@ -26,8 +28,14 @@ class TestNDTMap(OccupancyMapContract):
         return NDTMap(RESOLUTION)
 
 
+def stored(made: NDTMap, folder: Path) -> dict[str, torch.Tensor]:
+    """The tensors of the map's file."""
+    made.save(folder / "map.safetensors")
+    return read_tensors(folder / "map.safetensors", "gmmtorch.ndt_map", 1)[0]
+
+
 def moments(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Count, mean and scatter of points (N, D), all at once."""
+    """Count, mean and scatter of points (N, D)."""
     n = torch.tensor(float(points.shape[0]), dtype=torch.float64)
     mean = points.mean(0) if points.shape[0] else points.new_zeros(points.shape[1])
     return n, mean, (points - mean).T @ (points - mean)
@@ -37,7 +45,7 @@ def moments(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
 
 
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 9), min_size=1, max_size=6), st.integers(2, 3))
-def test_recursive_moments_are_those_of_all_points_together(seed, sizes, dim):
+def test_combined_moments_equal_those_of_all_points(seed, sizes, dim):
     generator = torch.Generator().manual_seed(seed)
     parts = [5 + torch.randn(size, dim, generator=generator, dtype=torch.float64) for size in sizes]
     state = moments(torch.empty(0, dim, dtype=torch.float64))
@@ -48,23 +56,24 @@ def test_recursive_moments_are_those_of_all_points_together(seed, sizes, dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_cell_holds_the_moments_of_all_returns_of_all_scans(dim):
-    """One cell, many scans from inside it, so that nothing is missed: against numpy."""
+def test_a_cell_stores_the_moments_of_its_returns(dim, tmp_path):
+    """One cell with several scans from inside it, so that it has no misses, against numpy."""
     generator = torch.Generator().manual_seed(dim)
     made = NDTMap(1.0)
     clouds = [500 + 0.99 * torch.rand(n, dim, generator=generator, dtype=torch.float64) for n in (3, 1, 40)]
     for cloud in clouds:
         made.insert(Scan(cloud, torch.full((dim,), 500.5, dtype=torch.float64)))
-    together = torch.cat(clouds).numpy()
-    rows, _ = made._table.find(torch.from_numpy(together[:1]))
-    log_odds, n, mean, scatter = made._unpacked(rows)
-    assert float(n[0]) == 44
-    assert float(log_odds[0]) == pytest.approx(44 * math.log(1.5), rel=1e-6)
-    np.testing.assert_allclose(mean[0] + 500.5, together.mean(0), atol=1e-6)
-    np.testing.assert_allclose(scatter[0] / 43, np.cov(together.T), rtol=1e-4, atol=1e-6)
+    points = torch.cat(clouds).numpy()
+    tensors = stored(made, tmp_path)
+    n, mean, scatter = tensors["gaussians"][0].double().split([1, dim, dim * (dim + 1) // 2])
+    assert float(n) == 44
+    assert float(tensors["log_odds"]) == pytest.approx(44 * math.log(1.5), rel=1e-6)
+    np.testing.assert_allclose(mean + 500.5, points.mean(0), atol=1e-6)
+    covariance = unpack_symmetric(scatter[None], dim)[0] / 43
+    np.testing.assert_allclose(covariance, np.cov(points.T), rtol=1e-4, atol=1e-6)
 
 
-def test_older_returns_are_forgotten_above_the_limit():
+def test_older_returns_lose_weight_above_max_points(tmp_path):
     generator = torch.Generator().manual_seed(0)
     old = torch.rand(1000, 2, generator=generator).double() * 0.2
     new = 0.7 + torch.rand(100, 2, generator=generator).double() * 0.2
@@ -73,7 +82,7 @@ def test_older_returns_are_forgotten_above_the_limit():
         made = NDTMap(1.0, max_points=limit)
         for cloud in (old, new):
             made.insert(Scan(cloud, torch.tensor([0.5, 0.5]).double()))
-        means.append(made._unpacked(torch.tensor([0]))[2][0, 0] + 0.5)
+        means.append(stored(made, tmp_path)["gaussians"][0, 1] + 0.5)
     assert float(means[0]) == pytest.approx(0.45, abs=0.02)  # half old, half new
     assert float(means[1]) == pytest.approx((1000 * 0.1 + 100 * 0.8) / 1100, abs=0.02)
 
@@ -82,39 +91,43 @@ def test_older_returns_are_forgotten_above_the_limit():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_likeliest_place_on_a_line_is_that_of_a_search(dim):
+def test_closest_on_line_equals_a_numerical_search(dim):
     generator = torch.Generator().manual_seed(dim)
     start, end, mean = torch.randn(3, 8, dim, generator=generator, dtype=torch.float64)
     factor = torch.randn(8, dim, dim, generator=generator, dtype=torch.float64)
     precision = factor @ factor.transpose(1, 2) + 0.1 * torch.eye(dim)
-    share, place, likelihood = closest_on_line(start, end, mean, precision)
+    share, point, likelihood = closest_on_line(start, end, mean, precision)
     for k in range(8):
 
         def cost(t: float, k: int = k) -> float:
-            off = start[k] + t * (end[k] - start[k]) - mean[k]
-            return float(off @ precision[k] @ off)
+            difference = start[k] + t * (end[k] - start[k]) - mean[k]
+            return float(difference @ precision[k] @ difference)
 
         best = minimize_scalar(cost, bracket=(-1.0, 1.0), tol=1e-12)
         assert float(share[k]) == pytest.approx(best.x, abs=1e-6)
         assert float(likelihood[k]) == pytest.approx(math.exp(-0.5 * best.fun), abs=1e-9)
-        torch.testing.assert_close(place[k], start[k] + share[k] * (end[k] - start[k]))
+        torch.testing.assert_close(point[k], start[k] + share[k] * (end[k] - start[k]))
 
 
-def sheet(n: int = 60) -> Scan:
-    """Returns of a thin, level sheet in the cell [1, 2) × [0, 1), seen from above."""
+N_RETURNS = 20
+
+
+def sheet(n: int = N_RETURNS) -> Scan:
+    """Returns of a thin, level sheet in the cell [1, 2) × [0, 1), observed from above."""
     x = 1.2 + 0.6 * torch.linspace(0, 1, n, dtype=torch.float64)
     y = 0.3 + 0.01 * (torch.arange(n) % 3).double()
     return Scan(torch.stack([x, y], 1), torch.tensor([1.5, 0.9], dtype=torch.float64))
 
 
-def log_odds_at(made: NDTMap, place: list[float]) -> float:
-    rows, known = made._table.find(torch.tensor([place], dtype=torch.float64))
-    return float(made._table.values[rows[0], 0]) if bool(known) else 0.0
+def log_odds_at(made: NDTMap, point: list[float]) -> float:
+    """Log-odds of a cell of a map with infinite spread, whose occupancy is that of the cell."""
+    theta = made.occupancy([point])[0]
+    return math.log(theta / (1 - theta))
 
 
-def test_a_beam_past_a_gaussian_tells_nothing_and_one_through_it_tells_by_its_likelihood():
-    before = 60 * math.log(1.5)
-    beside, through = NDTMap(1.0, min_deviation=0.001), NDTMap(1.0, min_deviation=0.001)
+def test_a_beam_adds_log_odds_by_its_likelihood_of_crossing_the_gaussian():
+    before = N_RETURNS * math.log(1.5)
+    beside, through = (NDTMap(1.0, min_deviation=0.001, spread=math.inf) for _ in range(2))
     for made, height in ((beside, 0.8), (through, 0.31)):
         made.insert(sheet())
         level = Scan(torch.tensor([[6.5, height]]).double(), torch.tensor([-3.5, height]).double())
@@ -122,35 +135,34 @@ def test_a_beam_past_a_gaussian_tells_nothing_and_one_through_it_tells_by_its_li
         assert log_odds_at(made, [4.5, 0.5]) == pytest.approx(-0.2)  # a cell without a Gaussian
         assert log_odds_at(made, [6.5, 0.5]) == pytest.approx(math.log(1.5))
     assert log_odds_at(beside, [1.5, 0.5]) == pytest.approx(before, rel=1e-6)
-    likelihood = 1.0  # its mean lies on the beam, five metres before the end
+    likelihood = 1.0  # the mean lies on the beam, five metres before its end
     free = 0.5 + 0.1 * likelihood
     assert log_odds_at(through, [1.5, 0.5]) == pytest.approx(before + math.log((1 - free) / free), rel=1e-4)
 
 
-def test_a_beam_that_ends_at_a_gaussian_does_not_tell_against_it():
-    made = NDTMap(1.0)
+def test_a_beam_that_ends_at_a_gaussian_hardly_lowers_its_log_odds():
+    made = NDTMap(1.0, spread=math.inf)
     made.insert(sheet())
-    down = torch.tensor([[1.5, -0.01]]).double()  # just below the cell, as if the return were late
+    down = torch.tensor([[1.5, -0.01]]).double()  # just below the cell
     made.insert(Scan(down, torch.tensor([1.5, 0.9]).double()))
     near = log_odds_at(made, [1.5, 0.5])
-    far = NDTMap(1.0, sensor_noise=0.01)
+    far = NDTMap(1.0, sensor_noise=0.01, spread=math.inf)
     far.insert(sheet())
     far.insert(Scan(down - torch.tensor([0.0, 3.0]), torch.tensor([1.5, 0.9]).double()))
-    assert log_odds_at(far, [1.5, 0.5]) < near <= 60 * math.log(1.5)
+    assert log_odds_at(far, [1.5, 0.5]) < near <= N_RETURNS * math.log(1.5) + 1e-6
 
 
-def test_the_gaussian_of_a_cell_that_turns_out_free_is_dropped():
+def test_the_gaussian_of_a_cell_that_becomes_free_is_deleted(tmp_path):
     made = NDTMap(1.0, max_log_odds=2.0)
     made.insert(sheet())
     assert float(made.occupancy([[1.5, 0.31]])[0]) > 0.8
     beam = Scan(torch.tensor([[6.5, 0.31]]).double().repeat(20, 1), torch.tensor([-3.5, 0.31]).double())
     made.insert(beam)
     assert float(made.occupancy([[1.5, 0.31]])[0]) < 0.5
-    rows, _ = made._table.find(torch.tensor([[1.5, 0.31]]))
-    assert (made._table.values[rows, 1:] == 0).all()
+    assert len(stored(made, tmp_path)["gaussians"]) == 1  # only that of the beam's end
 
 
-def test_occupancy_lies_where_the_gaussian_does():
+def test_occupancy_decreases_with_the_mahalanobis_distance():
     scan, spread = sheet(), 2.0
     made = NDTMap(1.0, spread=spread, min_deviation=0.005)
     made.insert(scan)
@@ -158,13 +170,13 @@ def test_occupancy_lies_where_the_gaussian_does():
     covariance = np.cov(scan.points.numpy().T)
     values, vectors = np.linalg.eigh(covariance)
     values = np.maximum(values, max(1e-3 * values[-1], 0.005**2))
-    off = (query.numpy() - scan.points.numpy().mean(0)) @ vectors
-    cell = 1 / (1 + math.exp(-60 * math.log(1.5)))
-    expected = cell * np.exp(-0.5 * (off**2 / values).sum(1) / spread**2)
+    difference = (query.numpy() - scan.points.numpy().mean(0)) @ vectors
+    cell = 1 / (1 + math.exp(-N_RETURNS * math.log(1.5)))
+    expected = cell * np.exp(-0.5 * (difference**2 / values).sum(1) / spread**2)
     np.testing.assert_allclose(made.occupancy(query.numpy()), expected, rtol=1e-3, atol=1e-9)
     whole = NDTMap(1.0, spread=math.inf)
     whole.insert(scan)
-    assert set(whole.occupancy(query).tolist()) == {cell}
+    np.testing.assert_allclose(whole.occupancy(query.numpy()), cell, rtol=1e-7)
 
 
 # -- bad input -------------------------------------------------------------------------------------------
@@ -189,12 +201,12 @@ def test_occupancy_lies_where_the_gaussian_does():
         ("max_log_odds", math.inf),
     ],
 )
-def test_settings_that_are_none_are_refused(option, value):
+def test_ndt_map_rejects_invalid_options(option, value):
     with pytest.raises(InvalidArgumentError, match=option):
         NDTMap(0.1, **{option: value})
 
 
-def test_what_would_not_fit_is_refused():
+def test_ndt_map_rejects_scans_that_exceed_memory():
     with pytest.raises(MemoryLimitError, match="resolution"):
         NDTMap(0.1, memory_limit=1000).insert(wall_scan(3))
     far = Scan(torch.full((1, 3), 500.0).double(), torch.zeros(3).double())
@@ -203,7 +215,7 @@ def test_what_would_not_fit_is_refused():
     NDTMap(0.001, max_range=1.0).insert(far)
 
 
-def test_beams_of_no_length_and_many_equal_returns_are_borne():
+def test_ndt_map_accepts_beams_of_zero_length_and_equal_returns():
     origin = torch.tensor([0.3, 0.3, 0.3]).double()
     made = NDTMap(0.1)
     for _ in range(3):
@@ -214,7 +226,7 @@ def test_beams_of_no_length_and_many_equal_returns_are_borne():
 
 
 @pytest.mark.parametrize("name", ["log_odds", "gaussians", "gaussian_cells"])
-def test_a_file_whose_numbers_are_damaged_is_refused(tmp_path, name):
+def test_ndt_map_load_rejects_damaged_tensors(tmp_path, name):
     path = tmp_path / "map.safetensors"
     made = NDTMap(0.125)
     made.insert(wall_scan(2))

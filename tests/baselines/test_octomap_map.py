@@ -1,4 +1,4 @@
-"""OctoMap behind the protocol: the contract, and its update rule by hand."""
+"""OctoMap behind the protocol: the map contract, and its update rule computed separately."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def log_odds(p: float) -> float:
     return math.log(p / (1 - p))
 
 
-def by_hand(hits: torch.Tensor, misses: torch.Tensor) -> torch.Tensor:
-    """OctoMap's sensor model, one scan: a cell that has any hit is hit, else missed, once."""
+def one_scan_probability(hits: torch.Tensor, misses: torch.Tensor) -> torch.Tensor:
+    """OctoMap's sensor model for one scan: one hit for a cell with hits, otherwise one miss."""
     value = torch.where(hits > 0, log_odds(0.7), log_odds(0.4))
     return torch.where(hits + misses > 0, torch.sigmoid(value), 0.5)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_one_scan_updates_each_cell_once_as_the_sensor_model_says(dim):
+def test_one_scan_updates_each_cell_once(dim):
     scan = wall_scan(dim)
     both = Scan(scan.points, scan.origin, open_scan(dim).no_return + torch.tensor([0.0, 0.5, 0.0])[:dim])
     for given in (scan, open_scan(dim), both):
@@ -52,27 +52,27 @@ def test_one_scan_updates_each_cell_once_as_the_sensor_model_says(dim):
         hits, misses = counts.evidence().at_points(query)
         made = OctoMapMap(RESOLUTION)
         made.insert(given)
-        expected = by_hand(hits, misses).double()
+        expected = one_scan_probability(hits, misses).double()
         wrong = (made.occupancy(query) - expected).abs() > 1e-6
-        # OctoMap follows beams in single precision: rays that touch a corner may name its other cell.
+        # OctoMap traverses in float32, so a ray that touches a corner can enter another cell.
         assert float(wrong.double().mean()) < 0.01
         assert len(expected.unique()) >= 2
 
 
-def test_by_ray_every_beam_updates_the_cells_it_meets():
+def test_by_ray_updates_a_cell_once_per_beam():
     end, origin = torch.tensor([[1.0625, 0.1875, 0.0625]]).double(), torch.tensor([0.31, 0.19, 0.06]).double()
     scan = Scan(end.repeat(3, 1), origin)
     once, by_ray = OctoMapMap(RESOLUTION), OctoMapMap(RESOLUTION, by_ray=True)
     once.insert(scan)
     by_ray.insert(scan)
     between = (end + origin) / 2
-    for place, p in ((end, 0.7), (between, 0.4)):
-        assert float(once.occupancy(place)[0]) == pytest.approx(p, abs=1e-6)
+    for point, p in ((end, 0.7), (between, 0.4)):
+        assert float(once.occupancy(point)[0]) == pytest.approx(p, abs=1e-6)
         expected = 1 / (1 + math.exp(-3 * log_odds(p)))
-        assert float(by_ray.occupancy(place)[0]) == pytest.approx(expected, abs=1e-6)
+        assert float(by_ray.occupancy(point)[0]) == pytest.approx(expected, abs=1e-6)
 
 
-def test_probabilities_are_clamped():
+def test_octomap_clamps_probabilities():
     made = OctoMapMap(RESOLUTION)
     for _ in range(30):
         made.insert(wall_scan(3))
@@ -81,7 +81,7 @@ def test_probabilities_are_clamped():
     assert float(theta.min()) == pytest.approx(0.1192, abs=1e-6)
 
 
-def test_beams_are_cut_at_the_range_and_free_their_way_only():
+def test_beams_beyond_max_range_add_misses_only():
     made = OctoMapMap(RESOLUTION, max_range=1.5)
     made.insert(wall_scan(3))
     made.insert(open_scan(3))
@@ -93,19 +93,19 @@ def test_beams_are_cut_at_the_range_and_free_their_way_only():
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def test_its_file_is_an_octomap_file(tmp_path: Path):
+def test_octomap_reads_the_file(tmp_path: Path):
     made = OctoMapMap(RESOLUTION)
     made.insert(wall_scan(3))
     made.save(tmp_path / "map.ot")
     tree = pyoctomap.OcTree(0.1).read(str(tmp_path / "map.ot"))
     assert tree.getResolution() == RESOLUTION
-    shift = made._anchor.double() * RESOLUTION
-    theirs = [tree.search(x) for x in (lattice(3) - shift).numpy()]
-    theta = [0.5 if node is None else node.getOccupancy() for node in theirs]
+    shift = (wall_scan(3).origin / RESOLUTION).floor() * RESOLUTION  # the octree's centre
+    nodes = [tree.search(x) for x in (lattice(3) - shift).numpy()]
+    theta = [0.5 if node is None else node.getOccupancy() for node in nodes]
     assert made.occupancy(lattice(3)).tolist() == theta
 
 
-def test_settings_and_resolution_are_kept_to_the_last_digit(tmp_path: Path):
+def test_octomap_file_stores_the_settings_exactly(tmp_path: Path):
     made = OctoMapMap(0.123456789, hit=0.8, miss=0.3, clamp_low=0.05, clamp_high=0.99, max_range=7.0)
     made.insert(wall_scan(3))
     made.save(tmp_path / "map.ot")
@@ -117,7 +117,7 @@ def test_settings_and_resolution_are_kept_to_the_last_digit(tmp_path: Path):
     assert len(made.occupancy(lattice(3)).unique()) == 3
 
 
-def test_an_octomap_file_of_others_is_refused(tmp_path: Path):
+def test_octomap_load_rejects_files_of_other_programs(tmp_path: Path):
     (tmp_path / "map.ot").write_bytes(pyoctomap.OcTree(0.1).write())
     with pytest.raises(DataError, match=r"map\.ot"):
         OctoMapMap.load(tmp_path / "map.ot")
@@ -128,12 +128,12 @@ def test_an_octomap_file_of_others_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, math.nan])
 @pytest.mark.parametrize("option", ["hit", "miss", "clamp_low", "clamp_high"])
-def test_settings_that_are_no_probabilities_are_refused(option, value):
+def test_octomap_rejects_invalid_probabilities(option, value):
     with pytest.raises(InvalidArgumentError, match=option):
         OctoMapMap(0.1, **{option: value})
 
 
-def test_a_beam_that_leaves_the_octree_is_refused_and_changes_nothing():
+def test_a_beam_that_leaves_the_octree_is_rejected_without_a_change():
     made = OctoMapMap(0.01)
     made.insert(Scan(torch.tensor([[1.0, 0, 0]]), torch.zeros(3)))
     size = made.nbytes
@@ -142,7 +142,7 @@ def test_a_beam_that_leaves_the_octree_is_refused_and_changes_nothing():
     assert made.nbytes == size
 
 
-def test_without_the_package_the_remedy_is_named(monkeypatch):
+def test_without_pyoctomap_the_error_states_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoctomap", None)
     with pytest.raises(GmmTorchError, match=r"pip install .*baselines"):
         OctoMapMap(0.1).insert(wall_scan(3))

@@ -1,1 +1,1 @@
-"""Figures and recordings of exploring teams."""
+"""Figures of exploration missions."""

@@ -1,4 +1,4 @@
-"""Labelled points of beams: where they are, how many, and what they are called."""
+"""Labelled points on beams: positions, numbers and labels, with and without thinning."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.baselines.samples import beam_samples
+from gmmtorch.baselines.samples import beam_samples, centroids, thinned_samples
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.scan import Scan
 
@@ -28,7 +28,7 @@ def random_scan(n: int, m: int, dim: int, seed: int, offset: float = 0.0) -> Sca
     spacing=st.floats(0.05, 20),
     gap=st.floats(0, 3),
 )
-def test_free_points_lie_on_their_beams_one_in_each_equal_piece(n, m, dim, seed, spacing, gap):
+def test_each_segment_of_a_beam_has_one_free_point(n, m, dim, seed, spacing, gap):
     scan = random_scan(n, m, dim, seed)
     points, is_hit = beam_samples(scan, spacing, gap=gap, generator=torch.Generator().manual_seed(seed))
     assert torch.equal(points[is_hit], scan.points)
@@ -37,18 +37,18 @@ def test_free_points_lie_on_their_beams_one_in_each_equal_piece(n, m, dim, seed,
     for beam, end in enumerate(torch.cat([scan.points, scan.no_return])):
         length = float((end - scan.origin).norm()) - (gap if beam < n else 0)
         count = max(0, math.ceil(length / spacing))
-        mine = free[start : start + count]
+        chosen = free[start : start + count]
         start += count
-        along = (mine - scan.origin) @ (end - scan.origin) / (end - scan.origin).norm()
-        apart = (mine - scan.origin - along[:, None] * (end - scan.origin) / (end - scan.origin).norm()).norm(
-            dim=1
-        )
-        assert float(apart.max() if count else 0) < 1e-9
+        along = (chosen - scan.origin) @ (end - scan.origin) / (end - scan.origin).norm()
+        offset = (
+            chosen - scan.origin - along[:, None] * (end - scan.origin) / (end - scan.origin).norm()
+        ).norm(dim=1)
+        assert float(offset.max() if count else 0) < 1e-9
         assert (along * count / length if count else along).floor().tolist() == list(range(count))
     assert start == len(free)
 
 
-def test_without_a_generator_free_points_are_in_the_middle_of_their_pieces():
+def test_without_a_generator_free_points_are_in_the_middle_of_their_segments():
     scan = Scan([[4.0, 0.0]], [0.0, 0.0])
     points, is_hit = beam_samples(scan, 1.0, gap=1.0)
     assert points.tolist() == [[4, 0], [0.5, 0], [1.5, 0], [2.5, 0]]
@@ -65,17 +65,16 @@ def test_random_free_points_are_uniform_along_the_beam():
     assert float((share.sort().values - expected).abs().max()) < 1.95 / 20_000**0.5  # Kolmogorov, p = 0.001
 
 
-def test_beams_without_return_and_beams_of_no_length():
+def test_beams_without_return_have_free_points_and_beams_of_zero_length_none():
     scan = Scan([[0.0, 0.0]], [0.0, 0.0], [[3.0, 0.0], [0.0, 0.0]])
     points, is_hit = beam_samples(scan, 1.5)
     assert points[is_hit].tolist() == [[0, 0]]
     assert points[~is_hit].tolist() == [[0.75, 0], [2.25, 0]]
-    nothing = beam_samples(Scan(torch.empty(0, 3), torch.zeros(3)), 1.0)
-    assert nothing[0].shape == (0, 3)
-    assert nothing[1].shape == (0,)
+    points, is_hit = beam_samples(Scan(torch.empty(0, 3), torch.zeros(3)), 1.0)
+    assert (points.shape, is_hit.shape) == ((0, 3), (0,))
 
 
-def test_thinned_ends_are_the_means_of_cubes():
+def test_thin_replaces_beam_ends_by_their_mean_per_cube():
     scan = Scan([[4.1, 0.1], [4.3, 0.3], [4.1, 1.1]], [0.0, 0.0])
     points, is_hit = beam_samples(scan, math.inf, thin=1.0)
     torch.testing.assert_close(
@@ -84,17 +83,52 @@ def test_thinned_ends_are_the_means_of_cubes():
     assert int((~is_hit).sum()) == 2
 
 
-def test_far_from_the_origin_points_keep_their_digits():
+def test_beam_samples_are_exact_far_from_the_origin():
     near, far = (beam_samples(random_scan(50, 10, 3, 0, offset), 0.5)[0] for offset in (0.0, 2.0**19))
     assert float((far - 2.0**19 - near).abs().max()) < 1e-8
 
 
 @pytest.mark.parametrize("option", [{"spacing": 0}, {"spacing": math.nan}, {"gap": -1}, {"thin": 0.0}])
-def test_lengths_that_are_none_are_refused(option):
+def test_beam_samples_rejects_invalid_lengths(option):
     with pytest.raises(InvalidArgumentError, match=next(iter(option))):
         beam_samples(random_scan(3, 0, 2, 0), **{"spacing": 1.0, **option})
 
 
-def test_more_points_than_fit_are_refused():
+def test_beam_samples_rejects_a_spacing_with_too_many_points():
     with pytest.raises(MemoryLimitError, match="spacing"):
         beam_samples(random_scan(3, 0, 2, 0), 1e-9)
+
+
+# -- thinned samples ----------------------------------------------------------------------------------
+
+
+def test_thinned_samples_have_the_positions_of_la3dm():
+    scan = Scan(torch.tensor([[1.1, 0.0]]).double(), torch.zeros(2).double())
+    samples, is_hit = thinned_samples(scan, 0.5, 1e-3)
+    assert samples[is_hit].tolist() == [[pytest.approx(1.1), 0.0]]
+    assert sorted(samples[~is_hit][:, 0].tolist()) == pytest.approx([0.0, 0.5, 0.6, 1.0])
+
+
+def test_thinned_samples_drop_hits_and_cut_no_return_beams_beyond_max_range():
+    scan = Scan(torch.tensor([[3.0, 0.0], [0.0, 1.0]]), torch.zeros(2), torch.tensor([[0.0, -9.0]]))
+    samples, is_hit = thinned_samples(scan, 0.5, 0.01, max_range=2.0)
+    assert samples[is_hit].tolist() == [[0.0, 1.0]]
+    assert float(samples[:, 0].max()) == 0.0
+    assert float(samples[:, 1].min()) == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_centroids_are_the_means_of_cubes(dim):
+    points = torch.randn(300, dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    cubes: dict[tuple[int, ...], list[list[float]]] = {}
+    for point in points.tolist():
+        cubes.setdefault(tuple(math.floor(x / 0.7) for x in point), []).append(point)
+    expected = sorted(
+        [sum(column) / len(column) for column in zip(*rows, strict=True)] for rows in cubes.values()
+    )
+    torch.testing.assert_close(torch.tensor(sorted(centroids(points, 0.7).tolist())), torch.tensor(expected))
+
+
+def test_centroids_of_distant_points_do_not_overflow():
+    points = torch.tensor([[0.0, 0, 0], [1e9, 1e9, 1e9], [1e9, 1e9, 1e9]]).double()
+    assert sorted(centroids(points, 1e-3).tolist()) == [[0.0] * 3, [1e9] * 3]
