@@ -13,7 +13,7 @@ from gmmtorch.evaluation.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint
-from gmmtorch.mixture.streaming.distributed import ALONE, Processes
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 from gmmtorch.mixture.streaming.stream_fit import fit_stream, score_stream
 from gmmtorch.mixture.streaming.stream_start import survey_all
 
@@ -61,7 +61,7 @@ def fit_streamed(
     seed: int,
     *,
     device: str = "cpu",
-    processes: Processes = ALONE,
+    processes: Processes = SINGLE_PROCESS,
     checkpoint: Checkpoint | None = None,
     on_event: Event = lambda stage, done, total: None,
 ) -> Streamed:

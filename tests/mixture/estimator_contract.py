@@ -1,4 +1,4 @@
-"""What every mixture estimator must do, however it learns: inherit, say how to make one, and run."""
+"""Tests that every mixture estimator passes: inherit `MixtureContract` and implement `make`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import copy
 import inspect
 import math
 import pickle
+import warnings
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
@@ -40,9 +42,9 @@ def shapes(dim: int) -> np.ndarray:
 
 
 def blobs(dim: int, n: int = 240, seed: int = 0) -> np.ndarray:
-    """Three clusters, well apart, of different shapes and sizes, in no order.
+    """Three well separated clusters of different shapes and sizes, in random order.
 
-    Coordinates are multiples of 2⁻²⁰, so that adding a large offset rounds nothing.
+    Coordinates are multiples of 2⁻²⁰, so that adding a large offset is exact.
     """
     rng = np.random.default_rng(seed)
     label = rng.choice(3, size=n, p=[0.5, 0.3, 0.2])
@@ -80,11 +82,11 @@ def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def global_numpy_state() -> list[int]:
-    return np.random.get_state()[1].tolist()  # noqa: NPY002 -- the one that nobody may touch
+    return np.random.get_state()[1].tolist()  # noqa: NPY002 -- the state that a fit must not change
 
 
 def degenerate_clouds(dim: int) -> dict[str, np.ndarray]:
-    """Clouds that span less than their space."""
+    """Clouds that do not span their space."""
     rng = np.random.default_rng(3)
     line = np.outer(rng.normal(size=30), np.arange(1.0, dim + 1)) + 2.0
     flat = np.array(rng.normal(size=(40, dim)))
@@ -103,7 +105,7 @@ def degenerate_clouds(dim: int) -> dict[str, np.ndarray]:
 
 
 def check_mixture(mixture: MixtureEstimator, points: np.ndarray, at_most: int) -> None:
-    """Parameters that are finite and a mixture's, close to the points, whose density is finite there."""
+    """Check that the parameters are a finite mixture near the points, with a finite density there."""
     weights, means, covariances = (
         t.detach().cpu().numpy() for t in (mixture.weights, mixture.means, mixture.covariances)
     )
@@ -131,39 +133,38 @@ def check_mixture(mixture: MixtureEstimator, points: np.ndarray, at_most: int) -
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 class MixtureContract(ABC):
-    """Inherit, implement `make`, name the class `Test…`, and say below what holds only roughly.
+    """Inherit, implement `make`, name the class `Test…`, and override the tolerances that differ.
 
-    Tolerances are of log-densities (nats) at points of the cloud. None: it does not hold.
+    Tolerances are for log-densities (nats) at points of the cloud. None: the property does not hold.
     """
 
     exact_components = True
-    """Whether a fit of n_components has exactly so many, rather than at most."""
-    seeded = True
-    """Whether the constructor takes `random_state`."""
+    """Whether a fit has exactly n_components components, rather than at most."""
+
     order_tolerance: float | None = 1e-6
-    """The same points in another order."""
+    """For the same points in another order."""
     repetition_tolerance: float | None = 1e-6
-    """A whole weight in place of a point repeated."""
+    """For an integer weight in place of repeated points."""
     motion_tolerance: float | None = 1e-6
-    """The cloud turned and shifted."""
+    """For the rotated and shifted cloud."""
     far_tolerance: float | None = 1e-5
-    """The cloud 4000 km from the origin."""
+    """For the cloud 4000 km from the origin."""
     score_tolerance = 0.3
-    """How far below the true density's the mean log-likelihood of fresh points may lie."""
+    """Largest loss of mean log-likelihood of new points against the true density."""
     bad_parameters: ClassVar[list[dict[str, Any]]] = []
-    """Constructor options beside the usual that `fit` must refuse; the first is the one to be named."""
+    """Further invalid constructor options; the error must name the first option."""
 
     @abstractmethod
     def make(self, n_components: int = 3, **options: Any) -> MixtureEstimator:
-        """An unfitted estimator, its random_state 0 unless the options say otherwise."""
+        """An unfitted estimator; its random_state is 0 unless the options set it."""
 
     def scores_after(self, points: np.ndarray, **fit: Any) -> np.ndarray:
         return np.asarray(self.make().fit(points, **fit).score_samples(points))
 
-    # -- what a fit is -----------------------------------------------------------------------------------
+    # -- the fitted mixture ------------------------------------------------------------------------------
 
     @dims
-    def test_a_fit_is_a_mixture(self, dim):
+    def test_fit_gives_a_valid_mixture(self, dim):
         points = blobs(dim)
         mixture = self.make()
         assert mixture.fit(points) is mixture
@@ -176,13 +177,13 @@ class MixtureContract(ABC):
         assert isinstance(mixture.converged_, bool)
 
     @dims
-    def test_the_fit_explains_fresh_points(self, dim):
+    def test_fit_has_the_likelihood_of_the_true_density(self, dim):
         fresh = blobs(dim, 400, seed=1)
         score = self.make().fit(blobs(dim)).score(fresh)
         assert score > true_score(fresh).mean() - self.score_tolerance
 
     @dims
-    def test_the_density_is_that_of_the_fitted_parameters(self, dim):
+    def test_score_samples_is_the_density_of_the_parameters(self, dim):
         mixture = self.make().fit(blobs(dim))
         fresh = blobs(dim, 50, seed=1)
         roots = np.linalg.cholesky(mixture.covariances_)
@@ -190,7 +191,7 @@ class MixtureContract(ABC):
         np.testing.assert_allclose(mixture.score_samples(fresh), expected, atol=1e-7)
         assert mixture.score(fresh) == pytest.approx(expected.mean())
 
-    def test_responsibilities_are_probabilities_and_the_largest_is_predicted(self):
+    def test_predict_is_the_largest_responsibility(self):
         points = blobs(2)
         mixture = self.make().fit(points)
         share = mixture.predict_proba(points)
@@ -198,7 +199,7 @@ class MixtureContract(ABC):
         np.testing.assert_allclose(share.sum(1), 1, rtol=1e-12)
         assert (mixture.predict(points) == share.argmax(1)).all()
 
-    def test_samples_come_from_the_mixture(self):
+    def test_samples_have_the_moments_of_the_mixture(self):
         mixture = self.make().fit(blobs(2))
         points, labels = mixture.sample(4000, random_state=0)
         assert points.shape == (4000, 2)
@@ -206,16 +207,16 @@ class MixtureContract(ABC):
         np.testing.assert_allclose(share, mixture.weights_, atol=0.05)
         np.testing.assert_allclose(points.mean(0), mixture.weights_ @ mixture.means_, atol=0.2)
 
-    def test_before_the_fit_there_are_no_answers(self):
+    def test_queries_before_fit_raise_not_fitted(self):
         mixture = self.make()
         for ask in (lambda: mixture.score_samples(blobs(2)), mixture.sample, mixture.n_parameters):
             with pytest.raises(NotFittedError, match="fit"):
                 ask()
 
-    # -- kinds -------------------------------------------------------------------------------------------
+    # -- arrays and tensors ------------------------------------------------------------------------------
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-    def test_arrays_in_arrays_out(self, dtype):
+    def test_arrays_give_arrays(self, dtype):
         points = blobs(2).astype(dtype)
         mixture = self.make().fit(points)
         for value in (mixture.weights_, mixture.means_, mixture.covariances_, mixture.precisions_):
@@ -226,7 +227,7 @@ class MixtureContract(ABC):
         assert isinstance(mixture.sample(2)[0], np.ndarray)
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_tensors_in_tensors_out(self, dtype):
+    def test_tensors_give_tensors(self, dtype):
         points = torch.from_numpy(blobs(2)).to(dtype)
         mixture = self.make().fit(points)
         for value in (mixture.weights_, mixture.means_, mixture.covariances_, mixture.precisions_):
@@ -237,13 +238,13 @@ class MixtureContract(ABC):
         assert mixture.predict(points).dtype == torch.int64
         assert isinstance(mixture.sample(2)[0], Tensor)
 
-    def test_tensors_and_arrays_are_fitted_alike(self):
+    def test_tensors_and_arrays_give_equal_fits(self):
         points = blobs(3)
         array, tensor = self.make().fit(points), self.make().fit(torch.from_numpy(points))
         assert torch.equal(array.means, tensor.means)
         assert torch.equal(array.covariances, tensor.covariances)
 
-    def test_fitting_leaves_points_weights_and_other_randomness_alone(self):
+    def test_fit_changes_neither_its_input_nor_global_random_states(self):
         points, weight = torch.from_numpy(blobs(2)).requires_grad_(), torch.ones(240)
         before = points.detach().clone()
         torch_state, numpy_state = torch.get_rng_state(), global_numpy_state()
@@ -255,29 +256,32 @@ class MixtureContract(ABC):
         assert points.grad is None
         assert not mixture.means.requires_grad
 
-    # -- what must not matter -----------------------------------------------------------------------------
+    # -- invariances -------------------------------------------------------------------------------------
 
-    def test_the_same_seed_gives_the_same_fit(self):
+    def test_same_seed_gives_the_same_fit(self):
         points = blobs(3)
-        states: list[Any] = [0, np.random.RandomState, torch.Generator] if self.seeded else [None]
-        for state in states:
-            fits = []
-            for _ in range(2):
-                fresh = (
-                    torch.Generator().manual_seed(4)
-                    if state is torch.Generator
-                    else np.random.RandomState(4)
-                    if state is np.random.RandomState
-                    else state
-                )
-                fits.append(self.make(**({"random_state": fresh} if self.seeded else {})).fit(points))
-            first, again = fits
+        for seeded in (int, np.random.RandomState, lambda seed: torch.Generator().manual_seed(seed)):
+            first, again = (self.make(random_state=seeded(4)).fit(points) for _ in range(2))
             assert torch.equal(first.weights, again.weights)
             assert torch.equal(first.means, again.means)
             assert torch.equal(first.covariances, again.covariances)
             assert first.lower_bounds_ == again.lower_bounds_
 
-    def test_a_second_fit_forgets_the_first(self):
+    def test_on_iteration_gets_each_lower_bound(self):
+        seen: list[tuple[int, float]] = []
+        mixture = self.make().fit(blobs(2), on_iteration=lambda *values: seen.append(values))
+        assert seen == list(enumerate(mixture.lower_bounds_, 1))
+
+    @pytest.mark.filterwarnings("default::sklearn.exceptions.ConvergenceWarning")
+    def test_reaching_max_iter_warns_unless_tol_is_zero(self):
+        points = blobs(2, 100) * 0.1 + np.random.default_rng(0).normal(size=(100, 2))  # overlapping clusters
+        with pytest.warns(ConvergenceWarning, match="max_iter=1"):
+            assert not self.make(max_iter=1, tol=1e-12).fit(points).converged_
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            self.make(max_iter=1, tol=0).fit(points)
+
+    def test_second_fit_is_independent_of_the_first(self):
         mixture = self.make().fit(blobs(2, seed=7)).fit(blobs(3))
         fresh = self.make().fit(blobs(3))
         assert torch.equal(mixture.means, fresh.means)
@@ -285,7 +289,7 @@ class MixtureContract(ABC):
         assert mixture.fit(torch.from_numpy(blobs(2))).means.shape[1] == 2
 
     @dims
-    def test_the_order_of_the_points_does_not_matter(self, dim):
+    def test_fit_does_not_depend_on_the_order_of_points(self, dim):
         if self.order_tolerance is None:
             pytest.skip("depends on the order of the points")
         points = blobs(dim)
@@ -294,7 +298,7 @@ class MixtureContract(ABC):
         np.testing.assert_allclose(shuffled, self.scores_after(points)[order], atol=self.order_tolerance)
 
     @pytest.mark.parametrize("dim", [2, 3, 5])
-    def test_the_fit_of_a_moved_cloud_is_the_moved_fit(self, dim):
+    def test_fit_of_a_moved_cloud_is_the_moved_fit(self, dim):
         if self.motion_tolerance is None:
             pytest.skip("depends on the frame")
         points, motion = blobs(dim), rigid_motion(dim)
@@ -302,7 +306,7 @@ class MixtureContract(ABC):
         np.testing.assert_allclose(moved, self.scores_after(points), atol=self.motion_tolerance)
 
     @dims
-    def test_far_from_the_origin_is_the_same_fit_moved(self, dim):
+    def test_fit_far_from_the_origin_is_the_shifted_fit(self, dim):
         if self.far_tolerance is None:
             pytest.skip("depends on the frame")
         points, offset = blobs(dim), FAR[:dim]
@@ -314,7 +318,7 @@ class MixtureContract(ABC):
     # -- weights -----------------------------------------------------------------------------------------
 
     @dims
-    def test_a_whole_weight_is_a_point_repeated(self, dim):
+    def test_integer_weight_equals_repeated_points(self, dim):
         if self.repetition_tolerance is None:
             pytest.skip("a weight is not a repetition")
         points = blobs(dim)
@@ -322,10 +326,10 @@ class MixtureContract(ABC):
         weighted = self.make().fit(points, sample_weight=weight).score_samples(points)
         repeated = self.make().fit(np.repeat(points, weight, axis=0)).score_samples(points)
         np.testing.assert_allclose(weighted, repeated, atol=self.repetition_tolerance)
-        assert np.abs(weighted - self.scores_after(points)).max() > 1e-3  # the weights do count
+        assert np.abs(weighted - self.scores_after(points)).max() > 1e-3  # the weights have an effect
 
     @kinds
-    def test_weight_zero_is_absence(self, kind):
+    def test_weight_zero_equals_absence(self, kind):
         points = blobs(2)
         present = np.random.default_rng(0).random(len(points)) > 0.3
         polluted = np.where(present[:, None], points, 1e3)
@@ -335,7 +339,7 @@ class MixtureContract(ABC):
         assert torch.equal(mixture.covariances, without.covariances)
 
     @kinds
-    def test_bad_weights_are_named(self, kind):
+    def test_invalid_weights_are_named(self, kind):
         for weight in (
             [1.0, -1.0, 1.0, 1.0],
             [1.0, math.nan, 1.0, 1.0],
@@ -347,10 +351,10 @@ class MixtureContract(ABC):
             with pytest.raises(InvalidArgumentError, match="sample_weight"):
                 self.make(1).fit(kind(blobs(2, 4)), sample_weight=kind(np.array(weight)))
 
-    # -- clouds that cannot be, or hardly -----------------------------------------------------------------
+    # -- invalid and degenerate clouds -------------------------------------------------------------------
 
     @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-    def test_points_that_are_not_finite_are_named(self, value):
+    def test_non_finite_points_are_named(self, value):
         points = blobs(2)
         points[7, 1] = value
         with pytest.raises(ValueError, match=r"NaN|infinity"):
@@ -362,7 +366,7 @@ class MixtureContract(ABC):
             mixture.score_samples(torch.from_numpy(points))
 
     @kinds
-    def test_what_is_no_cloud_is_refused(self, kind):
+    def test_input_of_another_shape_is_rejected(self, kind):
         for x in (
             np.empty((0, 2)),
             np.empty((4, 0)),
@@ -378,7 +382,7 @@ class MixtureContract(ABC):
 
     @pytest.mark.parametrize("dim", [1, 2, 3])
     @pytest.mark.parametrize("k", [1, 3])
-    def test_a_cloud_that_spans_less_than_its_space_is_learned(self, dim, k):
+    def test_degenerate_clouds_are_fitted(self, dim, k):
         for name, points in degenerate_clouds(dim).items():
             if len(points) < k:
                 continue
@@ -389,12 +393,12 @@ class MixtureContract(ABC):
                 close = np.broadcast_to(points[0], mixture.means_[used].shape)
                 np.testing.assert_allclose(mixture.means_[used], close, atol=1e-6)
 
-    def test_as_many_components_as_points(self):
+    def test_one_component_per_point_is_allowed(self):
         points = blobs(2, 6)
         check_mixture(self.make(6).fit(points), points, at_most=6)
 
     @kinds
-    def test_more_components_than_points_are_named_or_fewer_come_back(self, kind):
+    def test_more_components_than_points_are_rejected_or_reduced(self, kind):
         points = blobs(2, 6)
         for n in (7, 60):
             if self.exact_components:
@@ -406,7 +410,7 @@ class MixtureContract(ABC):
 
     @settings(max_examples=25)
     @given(data=st.data(), dim=st.integers(1, 3), n=st.integers(1, 8), k=st.integers(1, 4))
-    def test_any_small_cloud_is_learned_or_refused(self, data, dim, n, k):
+    def test_any_small_cloud_is_fitted_or_rejected(self, data, dim, n, k):
         scale, offset = data.draw(st.sampled_from([(1.0, 0.0), (1e-6, 0.0), (1e3, 5e5), (1e-3, -1e6)]))
         numbers = st.lists(st.sampled_from([0, 1, 2, 7]), min_size=n * dim, max_size=n * dim)
         points = offset + scale * np.array(data.draw(numbers), dtype=float).reshape(n, dim)
@@ -422,33 +426,32 @@ class MixtureContract(ABC):
 
     # -- parameters --------------------------------------------------------------------------------------
 
-    def test_parameters_that_cannot_be_are_named(self):
+    def test_invalid_parameters_are_named(self):
         usual: list[dict[str, Any]] = [{"n_components": value} for value in (0, -1, 1.5, "many")]
-        if self.seeded:
-            usual += [{"random_state": value} for value in (-1, "seed")]
+        usual += [{"random_state": value} for value in (-1, 1.5, "seed", 2**64)]
         for options in [*usual, *self.bad_parameters]:
             name = next(iter(options))
             with pytest.raises(InvalidArgumentError, match=f"^{name}"):
                 self.make(**options).fit(blobs(2))
 
-    def test_every_parameter_is_kept_as_given_and_documented(self):
+    def test_every_parameter_is_stored_and_documented(self):
         mixture = self.make()
         signature = inspect.signature(type(mixture).__init__).parameters
         assert set(mixture.get_params()) == set(signature) - {"self"}
         assert all(name in (type(mixture).__doc__ or "") for name in mixture.get_params())
 
-    def test_a_clone_is_unfitted_and_fits_alike(self):
+    def test_clone_is_unfitted_and_gives_the_same_fit(self):
         mixture = self.make().fit(blobs(2))
         other = clone(mixture)
         assert not hasattr(other, "means")
         assert other.get_params() == mixture.get_params()
         assert torch.equal(other.fit(blobs(2)).means, mixture.means)
 
-    # -- moving and keeping ------------------------------------------------------------------------------
+    # -- motions, copies and files -----------------------------------------------------------------------
 
     @pytest.mark.parametrize("dim", [2, 3])
     @kinds
-    def test_a_moved_mixture_scores_moved_points_alike(self, dim, kind):
+    def test_moved_mixture_has_equal_scores_at_moved_points(self, dim, kind):
         points, motion = blobs(dim), rigid_motion(dim)
         mixture = self.make().fit(kind(points))
         before = mixture.means.clone()
@@ -465,14 +468,15 @@ class MixtureContract(ABC):
         with pytest.raises(InvalidArgumentError, match="transform"):
             mixture.transform(2 * motion)
 
-    def test_an_unfitted_mixture_cannot_be_moved_or_saved(self, tmp_path):
-        assert not hasattr(self.make(), "transform")
+    def test_unfitted_mixture_has_no_fitted_attributes(self, tmp_path):
+        for name in ("transform", "means_", "weights_", "covariances_", "precisions_", "lower_bound_"):
+            assert not hasattr(self.make(), name)
         with pytest.raises(NotFittedError):
             self.make().save(tmp_path / "m.safetensors")
         assert list(tmp_path.iterdir()) == []
 
     def same(self, other: MixtureEstimator, mixture: MixtureEstimator) -> None:
-        """Fitted alike, to the bit."""
+        """Check that both mixtures are equal to the bit."""
         assert type(other) is type(mixture)
         mine, state = other.state_dict(), mixture.state_dict()
         assert mine.keys() == state.keys()
@@ -485,7 +489,7 @@ class MixtureContract(ABC):
         assert (other.score_samples(points) == mixture.score_samples(points)).all()
 
     @kinds
-    def test_copies_are_the_same(self, kind):
+    def test_copies_are_equal(self, kind):
         mixture = self.make().fit(kind(blobs(2)))
         for other in (copy.deepcopy(mixture), pickle.loads(pickle.dumps(mixture))):
             assert other is not mixture
@@ -493,7 +497,7 @@ class MixtureContract(ABC):
         assert not hasattr(copy.deepcopy(self.make()), "means")
 
     @kinds
-    def test_what_is_loaded_is_what_was_saved(self, tmp_path, kind):
+    def test_load_restores_what_save_wrote(self, tmp_path, kind):
         path = tmp_path / "m.safetensors"
         mixture = self.make().fit(kind(blobs(3)))
         mixture.save(path)
@@ -503,12 +507,12 @@ class MixtureContract(ABC):
         assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
         self.same(loaded.transform(np.eye(4)).fit(kind(blobs(3))), mixture)
 
-    def test_a_moved_mixture_can_be_saved(self, tmp_path):
+    def test_moved_mixture_can_be_saved(self, tmp_path):
         mixture = self.make().fit(blobs(2)).transform(rigid_motion(2))
         mixture.save(tmp_path / "m.safetensors")
         self.same(type(mixture).load(tmp_path / "m.safetensors"), mixture)
 
-    def test_a_file_that_is_missing_foreign_or_cut_is_named(self, tmp_path):
+    def test_missing_foreign_and_truncated_files_are_named(self, tmp_path):
         mixture = self.make().fit(blobs(2))
         path = tmp_path / "m.safetensors"
         with pytest.raises(MissingDataError, match=r"m\.safetensors"):
@@ -526,7 +530,7 @@ class MixtureContract(ABC):
 
     @settings(max_examples=60)
     @given(place=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255), in_header=st.booleans())
-    def test_a_damaged_file_is_refused_or_is_a_mixture(self, tmp_path, place, value, in_header):
+    def test_damaged_file_is_rejected_or_valid(self, tmp_path, place, value, in_header):
         path = tmp_path / "sound.safetensors"
         if not path.exists():
             self.make().fit(blobs(2)).save(path)
@@ -540,13 +544,13 @@ class MixtureContract(ABC):
             return
         assert np.isfinite(loaded.score_samples(np.zeros((2, 2)))).all()
 
-    def test_the_state_restores_a_fresh_mixture(self):
+    def test_state_dict_restores_an_unfitted_mixture(self):
         mixture, other = self.make().fit(torch.from_numpy(blobs(3))), self.make()
         other.load_state_dict(mixture.state_dict())
         points = torch.from_numpy(blobs(3, 20, seed=2))
         assert torch.equal(other(points), mixture(points))
         assert list(mixture.parameters()) == []
 
-    def test_a_cast_of_the_module_leaves_it_in_double_precision(self):
+    def test_cast_of_the_module_keeps_float64_parameters(self):
         mixture = self.make().fit(blobs(2)).to(torch.float16)
         assert all(value.dtype != torch.float16 for value in mixture.state_dict().values())

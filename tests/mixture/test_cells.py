@@ -1,4 +1,4 @@
-"""Cells: many points summed into few, with nothing lost."""
+"""Cells: points summed into few cells, with their exact moments."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cloud(n: int, dim: int, seed: int) -> Tensor:
     limit=st.integers(1, 300),
     finest=st.sampled_from([1e-3, 0.1, 1.0]),
 )
-def test_number_sum_and_sum_of_products_are_conserved_within_the_limit(seed, n, dim, limit, finest):
+def test_cells_conserve_moments_within_the_limit(seed, n, dim, limit, finest):
     points = cloud(n, dim, seed)
     cells = pool_into_cells(points, limit, finest)
     assert cells.weight.shape[0] <= limit
@@ -58,7 +58,7 @@ def test_each_cell_is_the_exact_mean_of_its_points():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_cells_of_the_finest_side_hold_only_neighbours(dim):
+def test_cells_have_the_finest_side(dim):
     points = cloud(3000, dim, 1)
     cells = pool_into_cells(points, 2999, 0.3)
     assert cells.weight.shape[0] < 2999
@@ -71,7 +71,7 @@ def test_cells_of_the_finest_side_hold_only_neighbours(dim):
 
 
 @pytest.mark.parametrize("limit", [50, 200, 1000])
-def test_no_coarser_than_the_limit_asks_for(limit):
+def test_cells_are_no_coarser_than_needed(limit):
     points = torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     n_cells = pool_into_cells(points, limit, 1e-3).weight.shape[0]
     # A third of an octave in side is 1.6 in area; the rest is partial cells at the far edges.
@@ -86,28 +86,22 @@ def test_few_points_are_not_pooled():
     assert cells.member.tolist() == list(range(20))
 
 
-def test_equal_points_share_one_cell():
-    cells = pool_into_cells(torch.full((50, 3), 0.7, dtype=torch.float64), 5, 0.01)
-    assert cells.weight.tolist() == [50.0]
-    assert cells.member.tolist() == [0] * 50
-
-
-def test_one_cell_takes_everything():
+def test_limit_of_one_cell_pools_all_points():
     cells = pool_into_cells(cloud(50, 2, 0), 1, 0.01)
     assert cells.weight.tolist() == [50.0]
 
 
-def test_an_outlier_far_out_does_not_break_the_keys():
+def test_distant_outlier_gets_its_own_cell():
     points = torch.cat([cloud(500, 3, 0), torch.full((1, 3), 5e5, dtype=torch.float64)])
     cells = pool_into_cells(points, 100, 0.01)
-    assert int(cells.weight[cells.member[-1]]) == 1  # it stays alone
+    assert int(cells.weight[cells.member[-1]]) == 1  # the outlier has its own cell
     assert float(cells.weight.sum()) == 501
     torch.testing.assert_close(
         (cells.features * cells.weight[:, None]).sum(0), quadratic_features(points).sum(0), rtol=1e-12, atol=0
     )
 
 
-def test_the_order_of_the_points_does_not_matter():
+def test_cells_do_not_depend_on_the_order_of_points():
     points = cloud(400, 2, 3)
     order = torch.randperm(400, generator=torch.Generator().manual_seed(1))
     cells, shuffled = pool_into_cells(points, 60, 0.01), pool_into_cells(points[order], 60, 0.01)
@@ -117,7 +111,7 @@ def test_the_order_of_the_points_does_not_matter():
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("limit", [30, 1000])
-def test_a_whole_weight_is_a_point_repeated(dim, limit):
+def test_integer_weights_equal_repeated_points(dim, limit):
     points = cloud(200, dim, 5)
     weight = torch.randint(1, 4, (200,), generator=torch.Generator().manual_seed(0)).double()
     weighted = pool_into_cells(points, min(limit, 199), 1e-3, weight)
@@ -132,7 +126,7 @@ def test_few_weighted_points_keep_their_weights():
     assert torch.equal(pool_into_cells(cloud(3, 2, 0), 3, 1.0, weight).weight, weight)
 
 
-def test_equal_points_share_one_cell_however_fine():
+def test_equal_points_share_one_cell():
     cells = pool_into_cells(torch.zeros(50, 3, dtype=torch.float64), 5, 0.0)
     assert cells.weight.tolist() == [50.0]
     assert cells.member.tolist() == [0] * 50
@@ -140,7 +134,7 @@ def test_equal_points_share_one_cell_however_fine():
 
 
 @given(seed=st.integers(0, 10**6), dim=st.integers(1, 3), k=st.integers(1, 5), limit=st.integers(5, 80))
-def test_a_step_on_cells_keeps_the_moments_of_the_cloud_and_the_bound_rises(seed, dim, k, limit):
+def test_em_on_cells_keeps_the_moments_of_the_cloud(seed, dim, k, limit):
     points = cloud(300, dim, seed)
     points = points - points.mean(0)
     cells = pool_into_cells(points, limit, 1e-3)
@@ -162,7 +156,7 @@ def test_a_step_on_cells_keeps_the_moments_of_the_cloud_and_the_bound_rises(seed
 
 @pytest.mark.parametrize("algorithm", ["exact", "truncated"])
 @pytest.mark.parametrize("init", ["kmeans", "flat_pieces"])
-def test_with_a_cell_for_every_point_the_fit_is_that_of_the_points(algorithm, init):
+def test_fit_with_one_cell_per_point_equals_fit_of_points(algorithm, init):
     points = cloud(300, 3, 1).numpy()
     options = {"algorithm": algorithm, "init_params": init, "random_state": 0, "dtype": "float64"}
     plain = GaussianMixture(20, **options).fit(points)
@@ -173,7 +167,7 @@ def test_with_a_cell_for_every_point_the_fit_is_that_of_the_points(algorithm, in
         np.testing.assert_allclose(pooled.covariances_, plain.covariances_, atol=1e-6)
 
 
-def test_a_fit_of_cells_is_nearly_as_likely_as_one_of_points():
+def test_fit_of_cells_is_nearly_as_likely_as_fit_of_points():
     centers = 6 * cloud(12, 3, 7)
     points = (centers.repeat(400, 1) + 0.5 * cloud(4800, 3, 8)).numpy()
     plain = GaussianMixture(12, init_params="flat_pieces", tol=1e-5).fit(points)

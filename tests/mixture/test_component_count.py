@@ -1,4 +1,4 @@
-"""How many components a cloud asks for."""
+"""Number of components from the flat pieces of a cloud."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOISE = 0.01
 
 
 def wall(n: int, center: tuple[float, ...], axis: int, seed: int, noise: float = NOISE) -> Tensor:
-    """A square of 4 m, thin along one axis."""
+    """A square of 4 m that is thin along one axis."""
     generator = torch.Generator().manual_seed(seed)
     points = 4 * torch.rand(n, 3, generator=generator, dtype=torch.float64) - 2
     points[:, axis] = noise * torch.randn(n, generator=generator, dtype=torch.float64)
@@ -35,7 +35,7 @@ def wall(n: int, center: tuple[float, ...], axis: int, seed: int, noise: float =
 
 
 def room(n_wall: int = 500, seed: int = 0) -> Tensor:
-    """Six walls of a cube, the origin in its middle."""
+    """Six walls of a cube around the origin."""
     sides = [
         wall(
             n_wall, tuple(2.0 * sign * (axis == a) for a in range(3)), axis, 10 * seed + 2 * axis + (sign > 0)
@@ -47,7 +47,7 @@ def room(n_wall: int = 500, seed: int = 0) -> Tensor:
 
 
 def sphere(n: int, seed: int = 0) -> Tensor:
-    """The surface of a ball of radius 1 m, 2 mm of noise."""
+    """The surface of a sphere of radius 1 m, with 2 mm of noise."""
     generator = torch.Generator().manual_seed(seed)
     points = torch.randn(n, 3, generator=generator, dtype=torch.float64)
     points /= points.norm(dim=1, keepdim=True)
@@ -74,17 +74,17 @@ def fitted(points: Tensor | np.ndarray, **options) -> GaussianMixture:
 # -- the count ------------------------------------------------------------------------------------
 
 
-def test_a_flat_wall_is_one_component_however_many_points_and_clutter_many():
+def test_flat_wall_is_one_component_and_clutter_many():
     assert [count(wall(n, (0, 0, 0), 1, 0)) for n in (10, 1000, 30_000)] == [1, 1, 1]
     assert count(clutter(1000)) > 15
 
 
-def test_a_room_takes_large_pieces_of_its_walls_and_small_ones_along_its_edges():
+def test_room_has_large_pieces_on_walls_and_small_ones_at_edges():
     points = room(2000)
     found, labels = surface_pieces(points, torch.ones(len(points)).double(), NOISE, 0.0)
     size = torch.bincount(labels)
     flat = torch.linalg.eigvalsh(found.covariances)[:, 0].sqrt() <= 2 * NOISE
-    # Pieces of two walls end when they would have too few points; they lie along an edge.
+    # Pieces across two walls have too few points to be halved, and are along an edge.
     assert bool((flat | (size < 4 * least_support(3))).all())
     from_edge = (2 - points.abs()).sort(1).values[:, 1]
     assert float(from_edge[~flat[labels]].max()) < 1
@@ -93,57 +93,57 @@ def test_a_room_takes_large_pieces_of_its_walls_and_small_ones_along_its_edges()
     assert len(size) < 0.6 * count(clutter(12_000))
 
 
-def test_less_noise_shows_more_of_a_curved_surface():
+def test_less_noise_gives_more_pieces_of_a_curved_surface():
     counts = [count(sphere(20_000), noise) for noise in (0.16, 0.08, 0.04, 0.02, 0.01)]
     assert counts == sorted(counts)
     # A cap of radius a on a unit ball is about a²/4 thick in standard deviations over √3: pieces grow
-    # with the noise, so their number falls as one over it.
+    # with the noise, so their number is inversely proportional to it.
     for fewer, more in itertools.pairwise(counts[1:]):
         assert 1.4 < more / fewer < 3
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
-def test_only_the_noise_has_a_unit(unit):
+def test_number_does_not_depend_on_the_unit(unit):
     for points in (room(200), sphere(3000), clutter(500)):
         assert count(unit * points, unit * NOISE) == count(points)
 
 
-def test_noise_in_another_unit_is_one_component_or_as_many_as_the_points_support():
+def test_noise_in_another_unit_gives_one_or_the_most_components():
     assert count(1e-3 * clutter(2000)) == 1
     n = count(1e3 * clutter(2000))
     assert 2000 / (4 * least_support(3)) <= n <= 2000 / least_support(3)
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 400), dim=st.integers(1, 6), noise=st.floats(1e-4, 10))
-def test_there_are_no_more_than_the_points_support(seed, n, dim, noise):
+def test_number_is_limited_by_the_points(seed, n, dim, noise):
     points = torch.rand(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     assert 1 <= count(points, noise) <= max(1, n // least_support(dim))
 
 
-def test_a_component_has_twice_as_many_points_as_numbers_in_three_dimensions_and_more():
+def test_least_support_is_twice_the_parameters_from_3d_on():
     assert [least_support(dim) for dim in (1, 2, 3)] == [6, 6, 20]
     for dim in range(3, 8):
         assert least_support(dim) == 2 * (1 + dim + dim * (dim + 1) // 2)
 
 
-def test_stray_returns_do_not_keep_what_they_belong_to_whole():
+def test_stray_returns_do_not_prevent_the_partition():
     points = torch.cat([wall(1000, (0, 0, 0), 2, 0), torch.tensor([[900.0, 5.0, 300.0]])])
     found, labels = surface_pieces(points - points.mean(0), points.new_ones(len(points)), NOISE, 1e-6)
     assert len(found.weights) <= 4
     assert (labels == labels[-1]).sum() == 1
 
 
-def test_a_weight_counts_as_so_many_points():
+def test_weights_count_as_points():
     points = room(100)
     weight = torch.randint(1, 4, (len(points),), generator=torch.Generator().manual_seed(1)).double()
     assert count(points, weight=weight) == count(points.repeat_interleave(weight.long(), 0))
-    # Ten times the points support more components; a thousandth of one each supports but one.
+    # Ten times the weight supports more components; a thousandth of it supports a single one.
     assert count(clutter(300), weight=torch.full((300,), 10.0).double()) > 2 * count(clutter(300))
     assert count(clutter(300), weight=torch.full((300,), 1e-3).double()) == 1
 
 
 @pytest.mark.parametrize("dim", [2, 3, 5])
-def test_neither_motion_nor_order_matters(dim):
+def test_number_does_not_depend_on_motion_or_order(dim):
     points = clutter(600, dim).numpy() * np.array([3.0, 1.0, 0.02, 0.5, 1.0])[:dim]
     moved = move(rigid_motion(dim, seed=1), points)
     shuffled = np.random.default_rng(0).permutation(points)
@@ -151,15 +151,15 @@ def test_neither_motion_nor_order_matters(dim):
     assert len(counts) == 1
 
 
-def test_cells_ask_for_about_as_many_components_as_their_points(monkeypatch):
+def test_cells_give_nearly_the_number_of_points(monkeypatch):
     points = torch.cat([room(3000), sphere(10_000)])
     exact = count(points)
     monkeypatch.setattr(initialization, "_SURFACE_CELLS", 8000)
     assert count(points) == pytest.approx(exact, rel=0.1)
 
 
-def test_maps_cut_by_the_same_rule():
-    """But for what they choose themselves: a length, and single points of several surfaces in 2D."""
+def test_maps_use_the_same_rule():
+    """Except for their own limits: a length, and in 2D single points of several surfaces."""
     plane, space = (flatness_rule(WindowedRule(noise=0.02), dim) for dim in (2, 3))
     assert plane == FlatnessRule(0.04, 0.3, 6, 1, None, 3.0)
     assert space == FlatnessRule(0.04, 0.3, 20, 20, None, 3.0)
@@ -189,15 +189,15 @@ def test_em_starts_from_the_pieces(algorithm):
     assert done.score(points) > given.score(points - center) + 0.05
 
 
-def test_the_number_is_that_of_the_noise():
+def test_number_depends_on_the_noise():
     points = sphere(4000)
     assert len(fitted(points, noise=0.08).means_) == count(points, 0.08)
     assert len(fitted(points, noise=0.02).means_) == count(points, 0.02)
-    # Of no matter where the number is given.
+    # Without effect if the number is given.
     assert len(GaussianMixture(3, noise=0.02, random_state=0).fit(points).means_) == 3
 
 
-def test_it_runs_on_cells():
+def test_number_from_cells_is_nearly_that_from_points():
     points = room(2000)
     mixture = fitted(points, max_cells=6000)
     assert len(mixture.means_) == pytest.approx(count(points), rel=0.1)
@@ -214,7 +214,7 @@ def test_degenerate_clouds_are_fitted(dim, algorithm):
             assert len(mixture.means_) <= max(1, len(points) // least_support(dim)) + 1, name
 
 
-def test_the_same_points_give_the_same_mixture_far_from_the_origin_too():
+def test_fit_is_deterministic_and_commutes_with_shifts():
     points = room(200)
     mixture, again = fitted(points), fitted(points)
     assert torch.equal(mixture.means, again.means)
@@ -224,7 +224,7 @@ def test_the_same_points_give_the_same_mixture_far_from_the_origin_too():
     assert moved.score(points + far) == pytest.approx(mixture.score(points), abs=1e-3)
 
 
-def test_none_stays_none_wherever_the_mixture_goes(tmp_path):
+def test_n_components_none_is_kept_by_files_states_and_copies(tmp_path):
     points = room(200)
     mixture = fitted(points, noise=0.02)
     k = len(mixture.means_)
@@ -242,11 +242,11 @@ def test_none_stays_none_wherever_the_mixture_goes(tmp_path):
     copy = clone(mixture)
     assert copy.n_components is None
     assert torch.equal(copy.fit(points).means, mixture.means)
-    # A fit is anew: of other points, another number.
+    # A new fit determines a new number.
     assert len(loaded.fit(wall(500, (0, 0, 0), 2, 0)).means_) == 1
 
 
-def test_what_goes_on_keeps_its_number():
+def test_warm_start_and_partial_fit_keep_the_number():
     points, other = room(300), sphere(2000)
     mixture = fitted(points, warm_start=True)
     k = len(mixture.means_)
@@ -262,12 +262,12 @@ def test_what_goes_on_keeps_its_number():
 
 
 @pytest.mark.parametrize("name", ["weights_init", "means_init", "precisions_init"])
-def test_a_given_start_is_refused(name):
+def test_given_start_is_rejected(name):
     with pytest.raises(InvalidArgumentError, match=f"{name}.*n_components=None"):
         GaussianMixture(None, **{name: np.ones(1)}).fit(room(10))
 
 
 @pytest.mark.parametrize("noise", [0, -1.0, math.nan, math.inf, "low", None])
-def test_noise_that_cannot_be_is_refused(noise):
+def test_invalid_noise_is_rejected(noise):
     with pytest.raises(InvalidArgumentError, match=r"^noise"):
         GaussianMixture(None, noise=noise).fit(room(10))

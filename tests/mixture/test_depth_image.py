@@ -1,4 +1,4 @@
-"""Depth images to mixtures, against the points that the pixels see."""
+"""Mixtures of depth images, against the back-projected points of the pixels."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def points_of(depth: Tensor, intrinsics: Tensor = INTRINSICS, max_range: float =
 
 
 def bad_pixels(depth: Tensor, seed: int, share: float) -> Tensor:
-    """The image with holes, and with all that is no depth."""
+    """The image with holes and with all kinds of invalid depth."""
     rng = np.random.default_rng(seed)
     values = rng.choice([0.0, math.nan, math.inf, -math.inf, -1.0], size=tuple(depth.shape))
     return torch.where(
@@ -50,7 +50,9 @@ def bad_pixels(depth: Tensor, seed: int, share: float) -> Tensor:
 
 
 def step(height: int, width: int, at: float, turn: float, near: float, far: float) -> Tensor:
-    """Two walls across the optical axis, the nearer one up to a slanted edge `at` pixels from the middle."""
+    """Two walls across the optical axis; the nearer one ends at a slanted edge `at` pixels from the
+    middle.
+    """
     v, u = np.mgrid[:height, :width]
     beyond = (u - width / 2) * math.cos(turn) + (v - height / 2) * math.sin(turn) > at
     return torch.from_numpy(np.where(beyond, far, near))
@@ -69,7 +71,7 @@ def step(height: int, width: int, at: float, turn: float, near: float, far: floa
     smooth=st.booleans(),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-def test_sums_are_those_of_the_points_that_the_pixels_see(
+def test_pooled_sums_equal_those_of_back_projected_points(
     seed, height, width, share, max_range, smooth, dtype
 ):
     depth = plane(height, width, (0.3, -0.2, 1.0), 2.0)
@@ -108,13 +110,13 @@ def brute_force_cells(depth: np.ndarray, noise: float) -> np.ndarray:
         if len(own) == 0:
             return True
         w = 1 / own[:, 2]
-        # About their mean, so that few pixels, or those in one line, have a solution.
+        # Relative to the mean, so that few pixels, or pixels in one line, have a solution.
         design = own[:, :2] - own[:, :2].mean(0)
         residual = (w - w.mean()) - design @ np.linalg.lstsq(design, w - w.mean(), rcond=1e-9)[0]
         return np.sqrt((residual**2).mean()) <= noise / 2 * max(1.0, w.mean() ** 2)
 
     def whole(top: int, left: int, side: int) -> bool:
-        """Whether the square is one cell; if not, the cells within it are noted."""
+        """Whether the square is one cell; if not, its cells are stored."""
         own = pixels(top, left, side)
         if side == 8:
             return True
@@ -145,9 +147,9 @@ def brute_force_cells(depth: np.ndarray, noise: float) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.003, 0.02, 0.3])
 @pytest.mark.parametrize("seed", range(4))
-def test_cells_are_those_of_a_tree_of_squares(noise, seed):
+def test_cells_equal_brute_force(noise, seed):
     rng = np.random.default_rng(seed)
-    height, width = 70, 101  # neither is whole cells
+    height, width = 70, 101  # neither is a multiple of the cell size
     depth = plane(height, width, (0.2, 0.5, 1.0), 1.2)
     depth[:, 40:] = plane(height, width, (-0.8, 0.0, 1.0), 3.0)[:, 40:]
     depth[20:50, 10:30] = 0.8
@@ -167,7 +169,7 @@ def test_cells_are_those_of_a_tree_of_squares(noise, seed):
     "normal", [(0.0, 0.0, 1.0), (0.7, 0.0, 1.0), (-1.2, 0.1, 1.0), (0.3, 1.1, 1.0), (0.9, -0.8, 1.0)]
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_flat_wall_at_any_angle_is_as_few_cells_as_can_be(normal, distance, dtype):
+def test_flat_wall_at_any_angle_gives_the_largest_cells(normal, distance, dtype):
     cells = pool_depth_image(plane(64, 96, normal, distance).to(dtype), INTRINSICS, noise=0.002)
     assert cells.weight.tolist() == [32.0 * 32.0] * 6
 
@@ -179,19 +181,19 @@ def test_a_flat_wall_at_any_angle_is_as_few_cells_as_can_be(normal, distance, dt
     gap=st.floats(1.2, 4),
     center=st.floats(-300, 300),
 )
-def test_no_cell_but_the_smallest_reaches_across_a_step(at, turn, near, gap, center):
+def test_only_the_smallest_cells_cross_a_step(at, turn, near, gap, center):
     intrinsics = INTRINSICS.clone()
-    intrinsics[0, 2] += center  # far off the optical axis, too
-    far = near + gap * 0.1 * max(1.0, near**2)  # many noises
+    intrinsics[0, 2] += center  # also far off the optical axis
+    far = near + gap * 0.1 * max(1.0, near**2)  # many standard deviations
     depth = step(96, 128, at, turn, near, far)
     cells = pool_depth_image(depth, intrinsics, noise=0.005)
     spread = cells.values[:, 9] - cells.values[:, 3] ** 2
     mixed = cells.weight[spread > 1e-4]
-    # A single pixel beyond the step is within the root mean square of 256.
+    # The root mean square over 256 pixels tolerates a single pixel beyond the step.
     assert mixed.numel() == 0 or float(mixed.max()) <= 64
 
 
-def test_a_step_seen_off_the_axis_is_no_plane_through_the_camera():
+def test_step_off_the_axis_is_not_flat():
     intrinsics = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
     depth = torch.full((480, 640), 2.0)
     depth[:, 610:] = 3.0
@@ -201,7 +203,7 @@ def test_a_step_seen_off_the_axis_is_no_plane_through_the_camera():
 
 
 @pytest.mark.parametrize(("z", "is_merged"), [(0.5, False), (1.0, False), (3.0, True), (6.0, True)])
-def test_beyond_one_metre_the_noise_grows_with_the_square_of_depth(z, is_merged):
+def test_noise_grows_with_the_square_of_depth_beyond_one_metre(z, is_merged):
     noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     cells = pool_depth_image(z + 0.02 * noise, INTRINSICS, noise=0.01)  # 0.02 is 0.005 z² at 2 m
     assert (float(cells.weight.median()) == 1024) is is_merged
@@ -209,19 +211,19 @@ def test_beyond_one_metre_the_noise_grows_with_the_square_of_depth(z, is_merged)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (3, 5)])
-def test_the_smallest_images_are_pooled(shape):
+def test_smallest_images_are_pooled(shape):
     depth = torch.full(shape, 1.5)
     cells = pool_depth_image(depth, INTRINSICS)
     assert float(cells.weight.sum()) == shape[0] * shape[1]
     assert cells.weight.shape[0] == -(-shape[0] // 32) * -(-shape[1] // 32)
-    if shape[1] == 1:  # a step in one column of pixels is a step all the same
+    if shape[1] == 1:  # a step in one column of pixels also splits cells
         depth[13:] = 2.5
         assert float(pool_depth_image(depth, INTRINSICS).weight.max()) < 30
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("value", "is_seen"), [(1e-30, True), (1e-12, True), (1e12, True), (1e25, False)])
-def test_a_pixel_that_is_tiny_or_huge_spoils_no_others(value, is_seen, dtype):
+def test_tiny_or_huge_pixel_affects_no_other_cell(value, is_seen, dtype):
     depth = plane(64, 64, (0.1, 0.2, 1.0), 2.0).to(dtype)
     clean = pool_depth_image(depth, INTRINSICS)
     assert clean.weight.tolist() == [1024.0] * 4
@@ -233,7 +235,7 @@ def test_a_pixel_that_is_tiny_or_huge_spoils_no_others(value, is_seen, dtype):
     assert torch.equal(others[-3:], clean.values[-3:])
 
 
-def test_float32_and_float64_images_are_pooled_alike():
+def test_float32_and_float64_images_give_equal_cells():
     depth = (plane(70, 90, (0.4, 0.2, 1.0), 2.0) * 1024).round() / 1024  # exact in both
     depth[30:, 20:60] = 1.0
     one, other = (pool_depth_image(depth.to(dtype), INTRINSICS) for dtype in (torch.float32, torch.float64))
@@ -241,7 +243,7 @@ def test_float32_and_float64_images_are_pooled_alike():
     torch.testing.assert_close(one.values, other.values, rtol=1e-7, atol=1e-7)
 
 
-def test_the_image_is_left_as_it_was():
+def test_image_is_not_modified():
     depth = plane(40, 40, (0.0, 0.0, 1.0), 2.0).requires_grad_()
     before = depth.detach().clone()
     cells = pool_depth_image(depth, INTRINSICS)
@@ -253,7 +255,7 @@ def test_the_image_is_left_as_it_was():
 
 
 def corner(height: int = 128, width: int = 160) -> tuple[Tensor, list[tuple[np.ndarray, float]]]:
-    """Depth of a corner of a room, two walls and the floor, and their planes: unit normal, distance."""
+    """Depth of a room corner, two walls and the floor, and their planes: unit normal, distance."""
     planes = [((-0.8, 0.0, 1.0), 2.5), ((0.9, 0.0, 1.0), 2.7), ((0.0, 1.0, 0.35), 1.4)]
     a, b = tangents(height, width)
     found, truth = torch.full((height, width), math.inf, dtype=torch.float64), []
@@ -266,7 +268,7 @@ def corner(height: int = 128, width: int = 160) -> tuple[Tensor, list[tuple[np.n
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_components_lie_on_the_planes_that_are_seen(dtype):
+def test_components_are_on_the_observed_planes(dtype):
     depth, planes = corner()
     noise = torch.randn(depth.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     mixture = fit_depth_image((depth + 0.002 * noise).to(dtype), INTRINSICS, 40, noise=0.01)
@@ -284,11 +286,11 @@ def test_components_lie_on_the_planes_that_are_seen(dtype):
         if offsets[nearest] < 0.01 and aligned and variance[0] < 0.015**2:
             good += weight
             seen.add(nearest)
-    assert good > 0.75  # the rest are pieces that reach around an edge
+    assert good > 0.75  # the rest are pieces across an edge
     assert seen == {0, 1, 2}
 
 
-def test_moments_are_those_of_the_points():
+def test_mixture_has_the_moments_of_the_points():
     depth = bad_pixels(corner()[0], 3, 0.1)
     mixture = fit_depth_image(depth, INTRINSICS, 30, noise=0.02, max_iter=5)
     points = points_of(depth).numpy()
@@ -302,7 +304,7 @@ def test_moments_are_those_of_the_points():
     np.testing.assert_allclose(within + between, expected, atol=1e-5)
 
 
-def test_more_iterations_are_likelier_and_bounds_rise():
+def test_more_iterations_increase_the_likelihood():
     depth = corner()[0]
     points = points_of(depth)
     few, many = (fit_depth_image(depth, INTRINSICS, 40, max_iter=n) for n in (1, 10))
@@ -313,7 +315,7 @@ def test_more_iterations_are_likelier_and_bounds_rise():
     assert few.reg_covar == pytest.approx(1e-4)
 
 
-def test_it_is_nearly_as_likely_as_a_fit_of_the_points():
+def test_mixture_is_nearly_as_likely_as_a_fit_of_points():
     depth = corner()[0] * (1 + 0.002 * torch.randn(128, 160, generator=torch.Generator().manual_seed(1)))
     points = points_of(depth)
     image = fit_depth_image(depth, INTRINSICS, 40, noise=0.01)
@@ -323,14 +325,14 @@ def test_it_is_nearly_as_likely_as_a_fit_of_the_points():
 
 @pytest.mark.parametrize(("noise", "distance"), [(0.01, 3.0), (0.01, 60.0), (0.001, 8.0), (1e-4, 1.0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_oblique_wall_is_as_thin_as_the_noise_however_far(noise, distance, dtype):
+def test_oblique_wall_is_as_thin_as_the_noise_at_any_distance(noise, distance, dtype):
     depth = plane(96, 128, (0.5, 0.3, 1.0), distance).to(dtype)
     mixture = fit_depth_image(depth, INTRINSICS, 12, noise=noise)
     thinnest = torch.linalg.eigvalsh(mixture.covariances)[:, 0].sqrt()
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, noise), rtol=0.02, atol=0)
 
 
-def test_moved_to_the_world_it_scores_the_moved_points():
+def test_transform_moves_the_mixture_to_the_world_frame():
     depth = corner()[0]
     mixture, points = fit_depth_image(depth, INTRINSICS, 30), points_of(depth)
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
@@ -341,19 +343,12 @@ def test_moved_to_the_world_it_scores_the_moved_points():
     torch.testing.assert_close(moved.score_samples(world), mixture.score_samples(points), rtol=0, atol=1e-4)
 
 
-def test_as_many_components_as_cells():
+def test_one_component_per_cell_is_allowed():
     depth = plane(64, 64, (0.3, 0.1, 1.0), 2.0)
     mixture = fit_depth_image(depth, INTRINSICS, 4)
     assert sorted(mixture.weights.tolist()) == pytest.approx([0.25] * 4, abs=0.1)
     with pytest.raises(InvalidArgumentError, match=r"^n_components=5 .* 4 cells"):
         fit_depth_image(depth, INTRINSICS, 5)
-
-
-def test_the_same_image_gives_the_same_mixture():
-    depth = corner()[0]
-    one, other = fit_depth_image(depth, INTRINSICS, 30), fit_depth_image(depth, INTRINSICS, 30)
-    assert torch.equal(one.means, other.means)
-    assert torch.equal(one.covariances, other.covariances)
 
 
 # -- errors ----------------------------------------------------------------------------------------
@@ -369,7 +364,7 @@ def test_the_same_image_gives_the_same_mixture():
         torch.full((4, 4), 1500, dtype=torch.int32),
     ],
 )
-def test_what_is_no_depth_image_is_named(depth):
+def test_invalid_depth_image_is_named(depth):
     with pytest.raises(InvalidArgumentError, match=r"^depth has shape"):
         pool_depth_image(depth, INTRINSICS)
 
@@ -384,7 +379,7 @@ def test_what_is_no_depth_image_is_named(depth):
         torch.tensor([[math.inf, 0.0, 3.0], [0.0, 80.0, 3.0], [0.0, 0.0, 1.0]]),
     ],
 )
-def test_what_are_no_intrinsics_are_named(intrinsics):
+def test_invalid_intrinsics_are_named(intrinsics):
     with pytest.raises(InvalidArgumentError, match=r"^intrinsics="):
         pool_depth_image(torch.ones(8, 8), intrinsics)
 
@@ -398,12 +393,12 @@ def test_what_are_no_intrinsics_are_named(intrinsics):
         *({"max_iter": value} for value in (0, 2.5)),
     ],
 )
-def test_options_that_cannot_be_are_named(options: dict[str, Any]):
+def test_invalid_options_are_named(options: dict[str, Any]):
     with pytest.raises(InvalidArgumentError, match=f"^{next(iter(options))}="):
         fit_depth_image(torch.ones(64, 64), INTRINSICS, **{"n_components": 2, **options})
 
 
 @pytest.mark.parametrize("value", [0.0, -2.0, math.nan, math.inf, 5.0])
-def test_an_image_without_a_pixel_says_so(value):
+def test_image_without_valid_pixels_is_rejected(value):
     with pytest.raises(InvalidArgumentError, match="no pixel"):
         fit_depth_image(torch.full((8, 8), value), INTRINSICS, 1, max_range=5.0)

@@ -1,4 +1,4 @@
-"""Fits that processes share, and what is left when one is lost; the command is in tests/cli."""
+"""Fits that processes share, and the loss of a process. tests/cli tests the command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gmmtorch.datasets.point_files.point_chunks import open_points
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, read_state
-from gmmtorch.mixture.streaming.distributed import ALONE, LostProcessError, is_launched, joined
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, LostProcessError, is_launched, joined
 from gmmtorch.mixture.streaming.stream_fit import fit_stream
 
 pytestmark = [
@@ -45,19 +45,19 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def test_alone_a_process_is_the_whole_group(monkeypatch):
+def test_single_process_is_the_whole_group(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     assert not is_launched()
     with joined() as processes:
-        assert processes is ALONE
+        assert processes is SINGLE_PROCESS
     value = torch.arange(3.0)
-    assert torch.equal(ALONE.sum(value), value)
-    assert torch.equal(ALONE.broadcast(value), value)
-    assert len(ALONE.gather(value[None])) == 1
+    assert torch.equal(SINGLE_PROCESS.sum(value), value)
+    assert torch.equal(SINGLE_PROCESS.broadcast(value), value)
+    assert len(SINGLE_PROCESS.gather(value[None])) == 1
 
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_timeout_must_be_one(timeout):
+def test_invalid_timeout_is_rejected(timeout):
     with pytest.raises(InvalidArgumentError, match="timeout"), joined(timeout=timeout):
         pass
 
@@ -98,7 +98,7 @@ with joined(timeout=3.0) as processes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_when_a_process_is_lost_the_others_say_so_and_the_checkpoint_goes_on(cloud, tmp_path, how):
+def test_lost_process_is_reported_and_the_checkpoint_continues(cloud, tmp_path, how):
     path = tmp_path / "state.safetensors"
     group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     arguments = [sys.executable, "-c", WORKER, str(cloud), str(path), how]
@@ -109,17 +109,17 @@ def test_when_a_process_is_lost_the_others_say_so_and_the_checkpoint_goes_on(clo
         for rank in (0, 1)
     ]
     try:
-        # Within the timeout of three seconds, and what it takes to start and to stop.
-        _, said = workers[0].communicate(timeout=90)
+        # The timeout of three seconds, plus the time to start and stop.
+        _, stderr = workers[0].communicate(timeout=90)
     finally:
         workers[1].kill()
         workers[1].communicate()
         workers[0].kill()
     assert workers[0].returncode == 1
     assert workers[1].returncode == -signal.SIGKILL
-    assert "lost: rank 0 of 2" in said
-    assert "in iteration 6" in said
-    assert f"{path}, is of iteration 4; start the run again with resume=true" in said
+    assert "lost: rank 0 of 2" in stderr
+    assert "in iteration 6" in stderr
+    assert f"{path}, is of iteration 4; start the run again with resume=true" in stderr
     assert len(read_state(path)[0].lower_bounds) == 4
     options = {"dtype": "float64", "tol": 0, "max_iter": 12, "random_state": 0}
     source = open_points(cloud, chunk_points=200)
@@ -130,7 +130,7 @@ def test_when_a_process_is_lost_the_others_say_so_and_the_checkpoint_goes_on(clo
     torch.testing.assert_close(found.means, whole.means, rtol=0, atol=1e-8)
 
 
-def test_processes_that_never_meet_give_up(monkeypatch):
+def test_processes_that_do_not_connect_raise(monkeypatch):
     group = {"WORLD_SIZE": "2", "RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     for name, value in group.items():
         monkeypatch.setenv(name, value)

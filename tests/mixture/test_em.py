@@ -1,4 +1,4 @@
-"""EM as two matrix products, against scipy, loops, and arithmetic with fifty digits."""
+"""Exact EM as two matrix products, against scipy, loops, and arithmetic with fifty digits."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def brute_force_statistics(
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_features_are_one_x_and_the_products(dim, generator):
+def test_quadratic_features_are_one_x_and_products(dim, generator):
     x = random_points(4, dim, generator)
     for row, feature in zip(x.tolist(), quadratic_features(x).tolist(), strict=True):
         assert feature == [1.0, *row, *(row[i] * row[j] for i in range(dim) for j in range(i, dim))]
@@ -75,7 +75,7 @@ def test_features_times_natural_parameters_are_weighted_log_densities(dim, k, ge
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_direct_log_joint_is_scipys(dim, generator):
+def test_log_joint_equals_scipy(dim, generator):
     parameters = random_parameters(4, dim, generator)
     points = random_points(50, dim, generator)
     joint = em.log_joint(points, parameters)
@@ -84,7 +84,7 @@ def test_the_direct_log_joint_is_scipys(dim, generator):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
-def test_expectation_sums_what_a_loop_over_points_sums(dim, dtype, rtol, generator):
+def test_expectation_equals_a_loop_over_points(dim, dtype, rtol, generator):
     parameters = random_parameters(4, dim, generator)
     points = random_points(60, dim, generator)
     weight = torch.rand(60, generator=generator, dtype=torch.float64) * 3
@@ -104,13 +104,13 @@ def test_chunks_do_not_change_the_statistics(generator, monkeypatch):
     natural = em.natural_parameters(parameters)
     whole = em.expectation(features, weight, natural, torch.float64)
     labels = em.most_likely(features, parameters)
-    monkeypatch.setattr(em, "CHUNK_ELEMENTS", 1)  # 64 rows at once, the last block shorter
+    monkeypatch.setattr(em, "CHUNK_ELEMENTS", 1)  # chunks of 64 rows, the last one shorter
     parts = em.expectation(features, weight, natural, torch.float64)
     torch.testing.assert_close(parts, whole, rtol=1e-12, atol=1e-10)
     assert torch.equal(em.most_likely(features, parameters), labels)
 
 
-def test_the_likeliest_component_is_the_largest_of_scipys(generator):
+def test_most_likely_equals_scipy(generator):
     parameters = random_parameters(6, 2, generator)
     points = random_points(300, 2, generator)
     labels = em.most_likely(quadratic_features(points), parameters)
@@ -136,7 +136,7 @@ def test_maximization_gives_weighted_means_and_covariances(dim, generator):
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 5))
-def test_the_log_likelihood_never_falls(seed, dim, k):
+def test_log_likelihood_never_decreases(seed, dim, k):
     generator = torch.Generator().manual_seed(seed)
     points = random_points(60 * k, dim, generator)
     weight = torch.rand(60 * k, generator=generator, dtype=torch.float64) + 0.01
@@ -152,7 +152,7 @@ def test_the_log_likelihood_never_falls(seed, dim, k):
 
 
 def _replayed(seed: int, points: Tensor) -> torch.Generator:
-    """The generator as it was when the starting parameters were drawn."""
+    """The generator in its state before the starting parameters were drawn."""
     generator = torch.Generator().manual_seed(seed)
     random_points(*points.shape, generator)
     torch.rand(points.shape[0], generator=generator, dtype=torch.float64)
@@ -161,7 +161,7 @@ def _replayed(seed: int, points: Tensor) -> torch.Generator:
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3), k=st.integers(1, 4))
-def test_on_cells_the_bound_never_falls_and_stays_below_the_log_likelihood(seed, dim, k):
+def test_bound_on_cells_never_decreases_and_is_below_the_log_likelihood(seed, dim, k):
     generator = torch.Generator().manual_seed(seed)
     points = random_points(1000, dim, generator)
     cells = pool_into_cells(points, 200, 0.05)
@@ -176,7 +176,7 @@ def test_on_cells_the_bound_never_falls_and_stays_below_the_log_likelihood(seed,
         previous = bound
 
 
-def test_cells_of_one_point_each_are_plain_em(generator):
+def test_cells_of_one_point_equal_plain_em(generator):
     points = random_points(100, 3, generator)
     start = random_parameters(3, 3, generator)
     cells = pool_into_cells(points, 100, 0.01)
@@ -186,11 +186,11 @@ def test_cells_of_one_point_each_are_plain_em(generator):
     assert bound == expected
 
 
-# -- the direct form, and when it is taken ----------------------------------------------------------
+# -- the direct form, and when it is used -----------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_both_forms_agree_where_nothing_cancels(dim, generator):
+def test_direct_and_natural_steps_agree(dim, generator):
     points = random_points(200, dim, generator)
     weight = torch.rand(200, generator=generator, dtype=torch.float64)
     start = random_parameters(4, dim, generator)
@@ -200,7 +200,7 @@ def test_both_forms_agree_where_nothing_cancels(dim, generator):
     assert bound == pytest.approx(float(total / weight.sum()), rel=1e-12)
 
 
-def test_a_room_is_well_conditioned_and_thin_walls_far_out_are_not():
+def test_only_thin_walls_far_from_the_centre_are_ill_conditioned():
     thin = torch.diag(torch.tensor([1e-6, 1.0, 1.0], dtype=torch.float64))[None]  # 1 mm thick
     weight = torch.ones(1, dtype=torch.float64)
     near = Parameters(weight, torch.tensor([[10.0, 10.0, 3.0]]).double(), thin)
@@ -209,7 +209,7 @@ def test_a_room_is_well_conditioned_and_thin_walls_far_out_are_not():
     assert em.is_ill_conditioned(far)
 
 
-def test_a_dead_component_does_not_make_a_step_ill_conditioned():
+def test_empty_component_does_not_make_a_step_ill_conditioned():
     covariances = 1e-6 * torch.eye(2, dtype=torch.float64).repeat(2, 1, 1)
     means = torch.tensor([[0.0, 0.0], [1e6, 0.0]], dtype=torch.float64)
     assert not em.is_ill_conditioned(Parameters(torch.tensor([1.0, 0.0]).double(), means, covariances))
@@ -229,7 +229,7 @@ def two_thin_walls(generator: torch.Generator) -> tuple[Tensor, Parameters]:
     )
 
 
-def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(generator):
+def test_thin_walls_500_km_apart_are_fitted_independently(generator):
     local, start = two_thin_walls(generator)
     shifts = torch.tensor([[-250_000.0, 0.0], [250_000.0, 4096.0]], dtype=torch.float64)
     points = torch.cat([local + shifts[0], local + shifts[1]])  # exact: 24 fractional bits fit
@@ -240,11 +240,11 @@ def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(generator):
     )
     weight = points.new_ones(points.shape[0])
     step = em.natural_step(quadratic_features(points), weight, 1e-8, torch.float64, points)
-    alone = em.natural_step(quadratic_features(local), weight[: len(local)], 1e-8, torch.float64)
+    separate = em.natural_step(quadratic_features(local), weight[: len(local)], 1e-8, torch.float64)
     far, near = both, start
     for _ in range(3):
         far, bound = step(far)
-        near, expected = alone(near)
+        near, expected = separate(near)
         assert bound == pytest.approx(expected - math.log(2), abs=1e-6)
     for part, shift in ((slice(0, 2), shifts[0]), (slice(2, 4), shifts[1])):
         torch.testing.assert_close(far.means[part] - shift, near.means, rtol=0, atol=1e-9)
@@ -252,7 +252,7 @@ def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(generator):
         torch.testing.assert_close(2 * far.weights[part], near.weights, rtol=1e-6, atol=0)
 
 
-def test_log_densities_far_out_have_the_digits_of_exact_arithmetic():
+def test_log_joint_far_from_the_origin_equals_exact_arithmetic():
     mean = [250_000.25, -40_000.5]
     covariance = [[1.25e-6, 5e-7], [5e-7, 4.0]]
     points = torch.tensor([[250_000.2509765625, -40_001.5], [250_000.25, -40_000.0]], dtype=torch.float64)
@@ -277,7 +277,7 @@ def test_log_densities_far_out_have_the_digits_of_exact_arithmetic():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("direct", [False, True])
-def test_a_component_of_weight_zero_stays_as_it_is(dtype, direct, generator):
+def test_component_of_weight_zero_stays_unchanged(dtype, direct, generator):
     points = random_points(80, 2, generator)
     start = random_parameters(3, 2, generator)
     weights = torch.tensor([0.4, 0.0, 0.6], dtype=torch.float64)
@@ -297,7 +297,7 @@ def test_a_component_of_weight_zero_stays_as_it_is(dtype, direct, generator):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_component_that_loses_every_point_dies_without_harm(dtype, generator):
+def test_component_that_loses_all_points_gets_weight_zero(dtype, generator):
     points = random_points(80, 2, generator)
     start = Parameters(
         torch.tensor([0.5, 0.5], dtype=torch.float64),
@@ -314,7 +314,7 @@ def test_a_component_that_loses_every_point_dies_without_harm(dtype, generator):
 # -- the loop -------------------------------------------------------------------------------------
 
 
-def test_em_stops_when_the_bound_rests_and_says_so(generator):
+def test_em_converges_when_the_bound_stops_changing(generator):
     points = random_points(300, 2, generator)
     step = em.natural_step(quadratic_features(points), points.new_ones(300), 1e-6, torch.float64)
     start = random_parameters(2, 2, generator)
@@ -328,7 +328,7 @@ def test_em_stops_when_the_bound_rests_and_says_so(generator):
     assert (changes[:-1] >= 1e-4).all()
 
 
-def test_em_stops_at_the_limit_and_says_so(generator):
+def test_em_stops_at_max_iter(generator):
     points = random_points(50, 2, generator)
     step = em.natural_step(quadratic_features(points), points.new_ones(50), 1e-6, torch.float64)
     found = em.run_em(step, random_parameters(2, 2, generator), tol=0, max_iter=3)

@@ -1,4 +1,4 @@
-"""Every mixture estimator keeps the contract of `mixture.estimator_contract`."""
+"""`GaussianMixture` and `VariationalGaussianMixture` pass `estimator_contract`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BAD_LOOP_PARAMETERS: list[dict[str, Any]] = [
     *({"init_params": value} for value in ("unheard_of", None)),
     *({"dtype": value} for value in ("float16", None)),
 ]
-"""Of the estimators that have an iteration, starts and a regularised covariance, as EM has."""
+"""Invalid options of estimators with iterations, starts and a regularised covariance."""
 
 
 class TestGaussianMixture(MixtureContract):
@@ -28,7 +28,7 @@ class TestGaussianMixture(MixtureContract):
 
 
 class TestVariationalGaussianMixture(MixtureContract):
-    score_tolerance = 1.2  # the default prior is as wide as the cloud
+    score_tolerance = 1.2  # because the default prior is as wide as the cloud
     bad_parameters: ClassVar[list[dict[str, Any]]] = [
         *BAD_LOOP_PARAMETERS,
         *({"weight_concentration_prior_type": value} for value in ("dirichlet", None)),
@@ -46,7 +46,7 @@ class TestVariationalGaussianMixture(MixtureContract):
         return VariationalGaussianMixture(n_components, **{"random_state": 0, **options})
 
 
-class TestVariationalGaussianMixtureOfDirichletWeights(MixtureContract):
+class TestVariationalGaussianMixtureWithDirichletWeights(MixtureContract):
     score_tolerance = 1.2
 
     def make(self, n_components: int = 3, **options: Any) -> VariationalGaussianMixture:

@@ -1,4 +1,4 @@
-"""Where EM starts."""
+"""Starting parameters of EM."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def begin(method: str, points: Tensor, k: int, weight: Tensor | None = None, see
     return initialize(method, points, weight, k, 1e-6, torch.Generator().manual_seed(seed))
 
 
-def test_distinct_points_are_sorted_and_carry_the_summed_weight():
+def test_distinct_points_are_sorted_with_summed_weights():
     points = torch.tensor([[1.0, 2.0], [0.0, 5.0], [1.0, 2.0], [1.0, -3.0]], dtype=torch.float64)
     rows, weight = distinct_points(points, torch.tensor([1.0, 2.0, 3.0, 0.5], dtype=torch.float64))
     assert rows.tolist() == [[0.0, 5.0], [1.0, -3.0], [1.0, 2.0]]
@@ -43,7 +43,7 @@ def test_distinct_points_are_sorted_and_carry_the_summed_weight():
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_start_is_a_mixture_within_the_cloud(method, dim):
+def test_start_is_a_mixture_within_the_cloud(method, dim):
     points = cloud(300, dim)
     weights, means, covariances = begin(method, points, 7)
     assert (weights.shape, means.shape, covariances.shape) == ((7,), (7, dim), (7, dim, dim))
@@ -54,7 +54,7 @@ def test_a_start_is_a_mixture_within_the_cloud(method, dim):
 
 
 @pytest.mark.parametrize("method", SEEDED)
-def test_the_seed_decides(method):
+def test_start_depends_on_the_seed(method):
     points = cloud(200, 2)
     first, again, other = begin(method, points, 5), begin(method, points, 5), begin(method, points, 5, seed=1)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
@@ -62,7 +62,7 @@ def test_the_seed_decides(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_weight_counts_as_so_many_points_in_any_order(method):
+def test_integer_weights_equal_repeated_points_in_any_order(method):
     points = cloud(100, 3)
     weight = torch.randint(1, 4, (100,), generator=torch.Generator().manual_seed(2)).double()
     repeated = points.repeat_interleave(weight.long(), 0)
@@ -71,7 +71,7 @@ def test_a_weight_counts_as_so_many_points_in_any_order(method):
     torch.testing.assert_close(tuple(found), tuple(same), rtol=1e-10, atol=1e-12)
 
 
-def test_random_points_starts_at_points_that_differ():
+def test_random_points_are_distinct():
     points = cloud(30, 2)
     means = begin("random_points", points, 30).means
     assert sorted(means.tolist()) == sorted(points.tolist())
@@ -80,12 +80,12 @@ def test_random_points_starts_at_points_that_differ():
 def test_random_points_are_drawn_by_weight():
     points = torch.arange(4.0, dtype=torch.float64)[:, None].expand(4, 2)
     weight = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
-    drawn = [float(begin("random_points", points, 1, weight, seed).means[0, 0]) for seed in range(2000)]
-    shares = np.bincount(np.array(drawn, dtype=int), minlength=4) / 2000
-    np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.045)  # four standard errors
+    drawn = [float(begin("random_points", points, 1, weight, seed).means[0, 0]) for seed in range(800)]
+    shares = np.bincount(np.array(drawn, dtype=int), minlength=4) / 800
+    np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.07)  # four standard errors
 
 
-def test_bounding_box_fills_the_box_evenly():
+def test_bounding_box_means_are_uniform():
     points = torch.tensor([[-1.0, 2.0], [3.0, 2.5], [0.0, 4.0]], dtype=torch.float64).repeat(300, 1)
     points = points + 1e-9 * torch.arange(900, dtype=torch.float64)[:, None]
     means = begin("bounding_box", points, 900).means
@@ -97,7 +97,7 @@ def test_bounding_box_fills_the_box_evenly():
 
 @pytest.mark.parametrize("method", ["random_points", "bounding_box"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_isotropic_starts_share_the_clouds_variance(method, dim):
+def test_isotropic_starts_have_the_reduced_variance_of_the_cloud(method, dim):
     points = cloud(500, dim)
     covariances = begin(method, points, 4).covariances
     variance = points.numpy().var(axis=0).mean() * 4 ** (-2 / dim) + 1e-6
@@ -105,7 +105,7 @@ def test_isotropic_starts_share_the_clouds_variance(method, dim):
     np.testing.assert_allclose(covariances.numpy(), expected, rtol=1e-10)
 
 
-def test_kmeans_gives_each_cluster_its_moments():
+def test_kmeans_start_has_the_moments_of_the_clusters():
     centers = torch.tensor([[-9.0, 0.0], [0.0, 9.0], [9.0, 0.0]], dtype=torch.float64)
     points = torch.cat(
         [center + 0.3 * cloud(n, 2, n) for center, n in zip(centers, (30, 50, 20), strict=True)]
@@ -119,7 +119,7 @@ def test_kmeans_gives_each_cluster_its_moments():
         np.testing.assert_allclose(covariances[i].numpy(), expected, rtol=1e-8, atol=1e-11)
 
 
-def test_of_kmeans_restarts_the_tightest_clustering_is_taken():
+def test_kmeans_restarts_keep_the_clustering_of_least_scatter():
     points = cloud(400, 2)
 
     def scatter(method: str, seed: int) -> float:
@@ -134,7 +134,7 @@ def test_of_kmeans_restarts_the_tightest_clustering_is_taken():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_with_few_distinct_points_copies_share_the_weight(method):
+def test_few_distinct_points_give_copies_that_share_weights(method):
     points = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64).repeat(10, 1)
     weights, means, covariances = begin(method, points, 5)
     assert weights.shape == (5,)
@@ -147,7 +147,7 @@ def test_with_few_distinct_points_copies_share_the_weight(method):
 
 
 def check_moments(found: Parameters, labels: Tensor, points: np.ndarray, weight: np.ndarray) -> None:
-    """That each component has the weight, mean and covariance of the points of its label."""
+    """Check that each component has the weight, mean and covariance of the points of its label."""
     dim = points.shape[1]
     for k, (share, mean, covariance) in enumerate(zip(*found, strict=True)):
         own, p = points[labels.numpy() == k], weight[labels.numpy() == k]
@@ -161,7 +161,7 @@ def check_moments(found: Parameters, labels: Tensor, points: np.ndarray, weight:
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 5])
 @pytest.mark.parametrize("pooled", [False, True])
-def test_flat_pieces_are_as_many_as_asked_for_and_have_their_points_moments(dim, pooled, monkeypatch):
+def test_flat_pieces_have_the_moments_of_their_points(dim, pooled, monkeypatch):
     if pooled:
         monkeypatch.setattr(initialization, "_FEWEST_CELLS", 100)
     points = cloud(600, dim)
@@ -173,7 +173,7 @@ def test_flat_pieces_are_as_many_as_asked_for_and_have_their_points_moments(dim,
     check_moments(found, labels, points.numpy(), weight.numpy())
 
 
-def test_flat_pieces_of_cells_have_the_moments_of_the_points_in_them():
+def test_flat_pieces_of_cells_have_the_moments_of_their_points():
     points, weight = cloud(600, 3), torch.ones(600, dtype=torch.float64)
     cells = pool_into_cells(points, 150, 1e-3)
     means = cells.features[:, 1:4].contiguous()
@@ -189,7 +189,7 @@ def test_flat_pieces_of_equal_points_are_one(n):
     assert set(labels.tolist()) == {0}
 
 
-def test_moments_of_thin_pieces_far_apart_keep_their_digits():
+def test_moments_of_distant_thin_pieces_keep_their_digits():
     rng = np.random.default_rng(0)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     wall = (rng.normal(size=(500, 3)) * [1, 1, 1e-3]) @ turn.T
@@ -202,7 +202,7 @@ def test_moments_of_thin_pieces_far_apart_keep_their_digits():
 
 
 @pytest.mark.parametrize("k", [3, 4, 7])
-def test_copies_share_the_weight_of_what_they_are_copies_of(k):
+def test_replicated_components_share_the_weight(k):
     weights = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
     found = Parameters(weights, cloud(3, 2), torch.eye(2, dtype=torch.float64).repeat(3, 1, 1))
     many, copy = replicated(found, k)

@@ -1,4 +1,4 @@
-"""Cutting a cloud into flat pieces."""
+"""Partition of a cloud into flat pieces."""
 
 from __future__ import annotations
 
@@ -42,9 +42,7 @@ def wall(n: int, seed: int = 0) -> Tensor:
     min_weight_thick=st.floats(1, 20),
     limit=st.none() | st.integers(1, 12),
 )
-def test_pieces_are_whole_supported_and_no_more_than_asked_for(
-    seed, n, dim, min_weight, min_weight_thick, limit
-):
+def test_pieces_are_supported_and_within_the_limit(seed, n, dim, min_weight, min_weight_thick, limit):
     points = cloud(n, dim, seed)
     weight = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 + 0.1
     rule = FlatnessRule(0.02, 0.3, min_weight, min_weight_thick, limit)
@@ -59,7 +57,7 @@ def test_pieces_are_whole_supported_and_no_more_than_asked_for(
 
 
 @given(seed=st.integers(0, 10**6), dim=st.integers(2, 3))
-def test_what_is_left_whole_is_flat_and_short_or_cannot_be_halved(seed, dim):
+def test_remaining_pieces_are_flat_and_short_or_cannot_be_halved(seed, dim):
     points = cloud(300, dim, seed)
     labels, n_pieces = cut(points, RULE)
     for piece in range(n_pieces):
@@ -74,30 +72,25 @@ def test_what_is_left_whole_is_flat_and_short_or_cannot_be_halved(seed, dim):
         assert (flat and short) or too_light
 
 
-def test_thin_pieces_keep_the_larger_least_weight():
+def test_thin_pieces_keep_min_weight():
     rule = FlatnessRule(thickness=0.02, length=0.05, min_weight=40, min_weight_thick=1)
     labels, n_pieces = cut(wall(1000), rule)
     assert n_pieces > 4
     assert int(torch.bincount(labels).min()) >= 40
 
 
-def test_the_same_cloud_is_cut_the_same_way():
-    points = cloud(500, 3, 1)
-    assert torch.equal(cut(points, RULE).labels, cut(points, RULE).labels)
-
-
-def test_a_wall_takes_few_pieces_and_clutter_many():
+def test_wall_gives_few_pieces_and_clutter_many():
     few = cut(wall(2000), RULE).n_pieces
     many = cut(cloud(2000, 3, 0), RULE).n_pieces
     assert 2 <= few <= 16  # 4 m × 2 m: standard deviations 1.15 and 0.58 m, halved to below 0.5 m
     assert many > 5 * few
 
 
-def test_more_points_on_a_wall_do_not_ask_for_more_pieces():
+def test_number_of_pieces_of_a_wall_hardly_grows_with_points():
     assert cut(wall(8000), RULE).n_pieces <= 2 * cut(wall(1000), RULE).n_pieces
 
 
-def test_with_a_limit_the_widest_pieces_are_cut_first():
+def test_widest_pieces_are_halved_first_within_a_limit():
     generator = torch.Generator().manual_seed(0)
     wide = torch.randn(200, 2, generator=generator, dtype=torch.float64)
     narrow = 0.1 * torch.randn(200, 2, generator=generator, dtype=torch.float64) + 50.0
@@ -108,7 +101,7 @@ def test_with_a_limit_the_widest_pieces_are_cut_first():
     assert len(set(labels[:200].tolist())) == 2
 
 
-def test_weights_count_as_points():
+def test_integer_weights_equal_repeated_points():
     points = cloud(120, 2, 4)
     weight = torch.randint(1, 4, (120,), generator=torch.Generator().manual_seed(0)).double()
     repeated = points.repeat_interleave(weight.long(), 0)
@@ -124,14 +117,14 @@ def test_equal_points_are_one_piece(n):
     assert cut(torch.zeros(n, 3, dtype=torch.float64), RULE).n_pieces == 1
 
 
-def test_a_line_is_cut_only_along_its_length():
+def test_line_is_cut_only_along_its_length():
     along = torch.linspace(-4, 4, 801, dtype=torch.float64)
     labels, n_pieces = cut(torch.stack([along, 0 * along], 1), RULE)
     assert 4 <= n_pieces <= 16
     assert (labels[1:] != labels[:-1]).sum() == n_pieces - 1  # pieces are intervals
 
 
-def test_pooled_statistics_are_sums_by_label(generator):
+def test_pool_sums_by_label(generator):
     features = quadratic_features(torch.randn(50, 3, generator=generator, dtype=torch.float64))
     weight = torch.rand(50, generator=generator, dtype=torch.float64)
     labels = torch.randint(4, (50,), generator=generator)
@@ -143,20 +136,20 @@ def test_pooled_statistics_are_sums_by_label(generator):
 
 
 @pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
-def test_a_few_far_returns_do_not_keep_a_cloud_in_one_piece(n_strays, distance):
+def test_few_far_returns_do_not_prevent_the_partition(n_strays, distance):
     generator = torch.Generator().manual_seed(0)
     room = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * torch.tensor([6.0, 5.0, 2.5])
     strays = torch.randn(n_strays, 3, generator=generator, dtype=torch.float64) + distance
     rule = FlatnessRule(min_weight=20, min_weight_thick=20)
-    alone = partition(room, torch.ones(len(room), dtype=torch.float64), rule)
+    separate = partition(room, torch.ones(len(room), dtype=torch.float64), rule)
     points = torch.cat([room, strays])
     both = partition(points - points.mean(0), torch.ones(len(points), dtype=torch.float64), rule)
-    assert both.n_pieces >= alone.n_pieces
+    assert both.n_pieces >= separate.n_pieces
     of_strays = both.labels[len(room) :]
     assert not torch.isin(both.labels[: len(room)], of_strays).any()
 
 
-# -- a given number of pieces ------------------------------------------------------------------------
+# -- a limited number of pieces ----------------------------------------------------------------------
 
 ALL = {"thickness": 0.0, "length": 0.0, "min_weight": 0.0, "min_weight_thick": 0.0, "outlier_gap": 0.0}
 
@@ -169,13 +162,13 @@ ALL = {"thickness": 0.0, "length": 0.0, "min_weight": 0.0, "min_weight_thick": 0
     grain=st.sampled_from([0.0, 0.5]),
     within=st.sampled_from([0.0, 1.0]),
 )
-def test_there_are_as_many_pieces_as_asked_for_or_as_distinct_points(seed, n, dim, limit, grain, within):
+def test_number_of_pieces_is_the_limit_or_the_distinct_points(seed, n, dim, limit, grain, within):
     points = cloud(n, dim, seed)
     points = (points / grain).round() * grain if grain else points
     generator = torch.Generator().manual_seed(seed)
-    weight = torch.rand(n, generator=generator, dtype=torch.float64) ** 8 + 1e-6  # a few cells weigh most
+    weight = torch.rand(n, generator=generator, dtype=torch.float64) ** 8 + 1e-6  # few heavy cells
     features = quadratic_features(points)
-    # Cells have an extent of their own, which no cut takes away.
+    # Cells have an extent, which no cut reduces.
     spread = within * torch.rand(n, generator=generator, dtype=torch.float64)
     for i in range(dim):
         features[:, 1 + dim + i * dim - i * (i - 1) // 2] += spread
@@ -185,7 +178,7 @@ def test_there_are_as_many_pieces_as_asked_for_or_as_distinct_points(seed, n, di
 
 
 def sheets(gap: float, n: int = 400) -> Tensor:
-    """Points of a strip 1 m × 0.2 m, on two sheets `gap` apart."""
+    """Points of a strip of 1 m × 0.2 m, on two sheets with distance `gap`."""
     generator = torch.Generator().manual_seed(1)
     points = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 0.2, 0.0])
     points[::2, 2] = gap
@@ -193,7 +186,7 @@ def sheets(gap: float, n: int = 400) -> Tensor:
 
 
 @pytest.mark.parametrize("thick_first", [False, True])
-def test_of_two_pieces_as_long_and_heavy_the_thick_one_is_cut_first(thick_first):
+def test_thicker_of_two_similar_pieces_is_halved_first(thick_first):
     pair = [sheets(0.1), sheets(0.0) + torch.tensor([0.0, 20.0, 0.0])]
     points = torch.cat(pair if thick_first else pair[::-1])
     labels, n_pieces = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=3))
@@ -203,7 +196,7 @@ def test_of_two_pieces_as_long_and_heavy_the_thick_one_is_cut_first(thick_first)
     assert len(set(thin.tolist())) == 1
 
 
-def test_of_two_pieces_of_one_shape_the_heavier_is_cut_first():
+def test_heavier_of_two_equal_shapes_is_halved_first():
     piece = sheets(0.02)
     points = torch.cat([piece, piece + torch.tensor([0.0, 20.0, 0.0])])
     weight = torch.cat([torch.full((400,), value, dtype=torch.float64) for value in (1.0, 1.5)])
@@ -213,15 +206,15 @@ def test_of_two_pieces_of_one_shape_the_heavier_is_cut_first():
     assert len(set(labels[:400].tolist())) == 1
 
 
-def test_with_room_for_more_pieces_thin_sheets_are_told_apart():
+def test_two_sheets_are_separated_if_the_limit_allows():
     points = sheets(0.3)
     labels, _ = cut(points - points.mean(0), FlatnessRule(**ALL, max_components=16))
     upper, lower = set(labels[::2].tolist()), set(labels[1::2].tolist())
     assert not upper & lower
 
 
-def test_pieces_that_cannot_be_cut_do_not_use_up_the_levels():
-    # Heavy cells, wide in themselves, are worth most, but only the light ones can be parted.
+def test_pieces_that_cannot_be_halved_do_not_use_up_the_levels():
+    # Heavy, wide cells have the highest priority, but only the light ones can be separated.
     heavy = torch.stack([torch.arange(90.0, dtype=torch.float64) * 50, torch.zeros(90)], 1)
     light = torch.stack([torch.arange(40.0, dtype=torch.float64) * 0.01 - 300, torch.zeros(40)], 1)
     points = torch.cat([heavy, light])

@@ -1,4 +1,4 @@
-"""Pruning: its formulas by hand, and phantoms in simulated scans."""
+"""Pruning: its formulas by hand, and spurious components in simulated scans."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def tensor(*rows: object) -> Tensor:
 # -- formulas ---------------------------------------------------------------------------------------------
 
 
-def test_support_densities_by_hand():
+def test_support_density_by_hand():
     covariances = torch.diag(tensor(0.04, 1e-6, 0.09))[None]
     assert float(support_density(tensor(100.0), covariances)) == pytest.approx(100 / (4 * math.pi * 0.06))
     covariances = torch.diag(tensor(1e-6, 0.09))[None]
@@ -34,14 +34,14 @@ def test_support_densities_by_hand():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_surface_evenly_covered_has_about_the_density_of_its_points(dim):
+def test_evenly_covered_surface_has_about_its_point_density(dim):
     points = torch.rand(200_000, dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     points[:, 0] = 0
     found = float(support_density(tensor(200_000.0), torch.cov(points.T)[None]))
     assert found == pytest.approx(200_000 / {2: 1.155, 3: 1.047}[dim], rel=0.01)
 
 
-def test_expected_densities_by_hand():
+def test_expected_density_by_hand():
     laser = LaserModel(angular_step=0.01)
     means, covariances = tensor([4.0, 3.0]), torch.diag(tensor(1e-4, 1.0))[None]  # normal along x
     found = expected_density(means, covariances, laser, tensor(0.0, 0.0))
@@ -50,7 +50,7 @@ def test_expected_densities_by_hand():
     assert float(expected_density(means, covariances, laser, several)) == pytest.approx(1 / 0.02)
 
 
-def test_views_that_saw_what_they_should_add_up():
+def test_expected_density_with_counts_by_hand():
     laser = LaserModel(angular_step=0.01)
     means, covariances = tensor([4.0, 3.0]), torch.diag(tensor(1e-4, 1.0))[None]
     origins = tensor([0.0, 3.0], [2.0, 3.0], [12.0, 3.0])
@@ -60,7 +60,7 @@ def test_views_that_saw_what_they_should_add_up():
         assert float(found) == pytest.approx(expected)
 
 
-def test_support_alone():
+def test_prune_by_support():
     mixture = Parameters(tensor(0.5, 0.3, 0.2), tensor([0.0], [1.0], [2.0]), torch.ones(3, 1, 1).double())
     left, kept = prune(mixture, 100, min_support=25)
     assert kept.tolist() == [True, True, False]
@@ -74,7 +74,7 @@ def test_support_alone():
 
 
 class Step:
-    """Walls across x at 3 and at 6 m, the nearer one where y > 0."""
+    """Walls across x at 3 m and at 6 m; the nearer one only for y > 0."""
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
         near = (3 - origin[0]) / directions[:, 0]
@@ -98,9 +98,9 @@ SHARE = 0.25
 
 
 def scene(kind: str) -> tuple[Parameters, int, Tensor]:
-    """A mixture of the pieces of a scan's two walls and, last, two phantoms; its points; the origin.
+    """A mixture of a scan's two walls plus two spurious components at the end; its points; the origin.
 
-    The phantoms take a hundredth of the points within 1.5 m of the walls' edge and of the whole walls.
+    The spurious components take a hundredth of the points within 1.5 m of the edge, and of all points.
     """
     sensor = SENSORS[kind][0]
     dim = sensor.directions.shape[1]
@@ -109,10 +109,10 @@ def scene(kind: str) -> tuple[Parameters, int, Tensor]:
     pose[1, dim] = -0.3
     scan = simulate_scan(sensor, pose, Step(), generator)
     points = scan.points[(scan.points[:, 1].abs() < 3) & (scan.points[:, 0] < 7)]
-    stolen = torch.rand(len(points), generator=generator)
+    draw = torch.rand(len(points), generator=generator)
     labels, n = partition(points, torch.ones(len(points)).double(), FlatnessRule(0.05, 0.3, 12, 12))
     edge = points[:, 1].abs() < 1.5
-    owner = torch.where((stolen < 0.01) & edge, n, torch.where(stolen > 0.99, n + 1, labels))
+    owner = torch.where((draw < 0.01) & edge, n, torch.where(draw > 0.99, n + 1, labels))
     parts = [points[owner == k] for k in range(n + 2)]
     parts = [part for part in parts if len(part) > dim]
     return (
@@ -127,10 +127,10 @@ def scene(kind: str) -> tuple[Parameters, int, Tensor]:
 
 
 @pytest.mark.parametrize("kind", SENSORS)
-def test_phantoms_between_two_walls_go_and_walls_stay(kind):
+def test_prune_removes_spurious_components_and_keeps_walls(kind):
     mixture, n_points, origin = scene(kind)
-    phantom_x = mixture.means[-2:, 0]
-    assert ((phantom_x > 3.3) & (phantom_x < 5.7)).all()  # in mid-air
+    spurious_x = mixture.means[-2:, 0]
+    assert ((spurious_x > 3.3) & (spurious_x < 5.7)).all()  # in free space
     left, kept = prune(mixture, n_points, min_density_share=SHARE, sensor=SENSORS[kind][1], origins=origin)
     assert kept[-2:].tolist() == [False, False]
     assert kept[:-2].double().mean() >= 0.95
@@ -142,7 +142,7 @@ def test_phantoms_between_two_walls_go_and_walls_stay(kind):
 
 
 @pytest.mark.parametrize("kind", SENSORS)
-def test_what_is_pruned_does_not_depend_on_the_frame(kind):
+def test_prune_does_not_depend_on_the_frame(kind):
     mixture, n_points, origin = scene(kind)
     rng = np.random.default_rng(0)
     dim = len(origin)
@@ -173,7 +173,7 @@ def test_what_is_pruned_does_not_depend_on_the_frame(kind):
         DeconvolvedGaussianMixture(4, tol=1e-4, thickness=2.0),
     ],
 )
-def test_an_estimator_stays_one(kind, estimator):
+def test_prune_returns_the_type_of_the_estimator(kind, estimator):
     rng = np.random.default_rng(0)
     sizes = [100, 80, 60, 8]
     centers = np.array([[0.0, 0], [9, 0], [0, 9], [9, 9]])
@@ -225,17 +225,17 @@ def two() -> Parameters:
         ),
     ],
 )
-def test_what_cannot_be_is_named(options, said):
+def test_invalid_arguments_are_named(options, said):
     with pytest.raises(InvalidArgumentError, match=said):
         prune(two(), **{"n_points": 100, **options})
 
 
-def test_density_is_for_surfaces_in_2d_and_3d():
+def test_min_density_share_needs_2d_or_3d():
     flat = Parameters(tensor(1.0), tensor([0.0]), torch.ones(1, 1, 1).double())
     with pytest.raises(InvalidArgumentError, match="D = 1"):
         prune(flat, 10, min_density_share=0.1, sensor=LaserModel(), origins=torch.zeros(1))
 
 
-def test_a_mixture_not_fitted_cannot_be_pruned():
+def test_unfitted_mixture_is_rejected():
     with pytest.raises(ValueError, match="not fitted"):
         prune(GaussianMixture(2), 10, min_support=1)

@@ -1,4 +1,4 @@
-"""Sensor models against hand computation, simulated sensors, and what must hold of any."""
+"""Sensor models against hand computation, simulated sensors, and general properties."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def rotation(dim: int, seed: int = 0) -> Tensor:
 # -- noise ------------------------------------------------------------------------------------------------
 
 
-def test_a_camera_by_hand():
+def test_camera_noise_by_hand():
     camera = DepthCameraModel(axial=(0.001, 0.002, 0.003), lateral=0.5, pixel_angle=0.01)
     (found,) = camera.noise_covariances(vector(5, 1, 1)[None], vector(3, 1, 1))
     # z = 2 m: σ = 1 + 4 + 12 mm along x, half a pixel of 2 cm across.
     torch.testing.assert_close(found, torch.diag(vector(0.017, 0.01, 0.01) ** 2))
 
 
-def test_the_kinect_is_as_published():
+def test_default_camera_noise_equals_the_published_kinect_model():
     """Nguyen et al.: σ_z = 1.2 mm + 1.9 mm (z − 0.4)², and within a factor of two Khoshelham's 1.4 mm z²."""
     z = torch.linspace(0.4, 5, 20, dtype=torch.float64)
     along = DepthCameraModel().deviations(z).along
@@ -57,7 +57,7 @@ def test_the_kinect_is_as_published():
     assert (along[far] / (1.425e-3 * z[far] ** 2) > 0.5).all()
 
 
-def test_a_lidar_by_hand():
+def test_lidar_noise_by_hand():
     lidar = LidarModel(noise=0.01, proportional_noise=0.001, divergence=0.004)
     normal = vector(0, math.sin(1.0), math.cos(1.0))[None]
     (found,) = lidar.noise_covariances(vector(0, 0, 10)[None], vector(0, 0, 0), normal)
@@ -65,7 +65,7 @@ def test_a_lidar_by_hand():
     torch.testing.assert_close(found, torch.diag(vector(0.01, 0.01, along) ** 2))
 
 
-def test_a_laser_by_hand():
+def test_laser_noise_by_hand():
     laser = LaserModel(noise=0.02, divergence=0.008)
     origin, points = vector(1, 1), torch.stack([vector(1, 6), vector(4, 5)])
     found = laser.noise_covariances(points, origin)
@@ -76,7 +76,7 @@ def test_a_laser_by_hand():
     torch.testing.assert_close(found[1], expected)
 
 
-def test_readings_of_the_simulated_laser_err_as_its_model_says():
+def test_laser_noise_equals_that_of_the_simulated_laser():
     class Wall:
         def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
             return (4 - origin[0]) / directions[:, 0]
@@ -93,7 +93,7 @@ def test_readings_of_the_simulated_laser_err_as_its_model_says():
 
 
 @models
-def test_incidence_grows_the_noise_along_the_beam_and_is_capped(model, dim):
+def test_noise_along_the_beam_grows_with_incidence_up_to_a_limit(model, dim):
     angles = torch.linspace(0, math.pi / 2, 40, dtype=torch.float64)
     normals = torch.zeros(40, dim, dtype=torch.float64)
     normals[:, 0], normals[:, 1] = -angles.cos(), angles.sin()
@@ -118,7 +118,7 @@ def test_incidence_grows_the_noise_along_the_beam_and_is_capped(model, dim):
 
 @models
 @given(seed=st.integers(0, 1000), scale=st.sampled_from([0.0, 1e-4, 1.0, 1e3]))
-def test_covariances_are_positive_definite_and_turn_with_the_world(model, dim, seed, scale):
+def test_covariances_are_positive_definite_and_rotate_with_the_world(model, dim, seed, scale):
     rng = np.random.default_rng(seed)
     points = torch.from_numpy(rng.normal(size=(12, dim)) * scale)
     origin = torch.from_numpy(rng.normal(size=dim) * 0.1)
@@ -134,7 +134,7 @@ def test_covariances_are_positive_definite_and_turn_with_the_world(model, dim, s
 
 
 @models
-def test_points_may_have_origins_of_their_own(model, dim):
+def test_each_point_may_have_its_own_origin(model, dim):
     rng = np.random.default_rng(0)
     points, origins = torch.from_numpy(rng.normal(size=(2, 9, dim)))
     each = torch.cat([model.noise_covariances(points[i : i + 1], origins[i]) for i in range(9)])
@@ -148,7 +148,7 @@ def test_points_may_have_origins_of_their_own(model, dim):
 # -- density ----------------------------------------------------------------------------------------------
 
 
-def test_densities_by_hand():
+def test_point_density_by_hand():
     camera = DepthCameraModel(pixel_angle=0.002)
     assert float(camera.point_density(vector(2.5), 0.5)) == pytest.approx(0.5 / 0.005**2)
     lidar = LidarModel(azimuth_step=0.004, elevation_step=0.02)
@@ -160,7 +160,7 @@ def test_densities_by_hand():
 
 
 class Plane:
-    """The plane through (4, 0, 0) whose normal is turned by `angle` towards y."""
+    """The plane through (4, 0, 0) whose normal is rotated by `angle` towards y."""
 
     def __init__(self, angle: float, dim: int) -> None:
         self.normal = torch.zeros(dim, dtype=torch.float64)
@@ -186,7 +186,7 @@ SENSORS = {
 
 @pytest.mark.parametrize("kind", SENSORS)
 @pytest.mark.parametrize("angle", [0.0, 0.8, -1.2])
-def test_a_simulated_sensor_samples_a_surface_as_densely_as_expected(kind, angle):
+def test_point_density_equals_that_of_the_simulated_sensor(kind, angle):
     sensor, model = SENSORS[kind]
     dim = sensor.directions.shape[1]
     plane = Plane(angle, dim)
@@ -205,7 +205,7 @@ def test_a_simulated_sensor_samples_a_surface_as_densely_as_expected(kind, angle
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_normals_of_a_noisy_plane_are_its_own(dim):
+def test_normals_of_a_noisy_plane(dim):
     rng = np.random.default_rng(0)
     turn = rotation(dim)
     flat = torch.from_numpy(rng.uniform(-1, 1, size=(3000, dim)))
@@ -216,14 +216,14 @@ def test_normals_of_a_noisy_plane_are_its_own(dim):
     assert ((normals @ turn[:, 0]).abs() > 0.99).double().mean() > 0.95
 
 
-def test_normals_of_a_sphere_are_its_radii():
+def test_normals_of_a_sphere():
     points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)))
     aligned = (estimate_normals(points, 12) * points.double()).sum(1).abs()
     assert float(aligned.min()) > 0.97
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_normals_exist_whatever_the_cloud(dim):
+def test_normals_of_degenerate_clouds_are_unit_vectors(dim):
     line = torch.arange(5.0)[:, None] * torch.ones(dim)
     for points in (torch.zeros(1, dim), torch.ones(7, dim), line, torch.zeros(2, dim)):
         normals = estimate_normals(points)
@@ -253,12 +253,12 @@ def test_normals_exist_whatever_the_cloud(dim):
         (lambda: estimate_normals(torch.zeros(3, 2), 0), "n_neighbors"),
     ],
 )
-def test_what_cannot_be_is_named(make, name):
+def test_invalid_arguments_are_named(make, name):
     with pytest.raises(InvalidArgumentError, match=f"^{name}="):
         make()
 
 
-def test_the_depth_noise_may_dip_but_not_below_zero():
+def test_axial_noise_may_decrease_but_not_below_zero():
     DepthCameraModel(axial=(0.001, -0.0019, 0.001))
     with pytest.raises(InvalidArgumentError, match="axial"):
         DepthCameraModel(axial=(0.001, -0.0021, 0.001))

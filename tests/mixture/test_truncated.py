@@ -1,4 +1,4 @@
-"""EM over the components that matter, against brute force and against EM over all of them."""
+"""Truncated EM against brute force and against EM over all components."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def room(n: int, seed: int = 0, noise: float = 0.005) -> np.ndarray:
 
 
 def beads(n: int, k: int, dim: int = 2, gap: float = 4.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points of k unit clusters `gap` apart in a square pattern, and the clusters' centers."""
+    """Points of k unit clusters with distance `gap` in a square pattern, and the centers of the clusters."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(k)))
     centers = np.zeros((k, dim))
@@ -109,12 +109,12 @@ def beads(n: int, k: int, dim: int = 2, gap: float = 4.0, seed: int = 0) -> tupl
     are_points=st.booleans(),
     build_rows=st.sampled_from([1 << 18, 7]),
 )
-def test_every_row_is_in_one_slot_of_its_owner_and_the_rest_weighs_nothing(
+def test_group_rows_puts_each_row_into_one_slot_of_its_owner(
     seed, n, k, dim, one_group, are_points, build_rows
 ):
     points, weight, centers = cloud(n, dim, seed), random_weight(n, seed), cloud(k, dim, seed + 1)
     owner = torch.randint(0, k, (n,), generator=torch.Generator().manual_seed(seed))
-    owner = owner // 2 * 2 if not one_group else torch.full_like(owner, k - 1)  # some groups are empty
+    owner = owner // 2 * 2 if not one_group else torch.full_like(owner, k - 1)  # with empty groups
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(grouping, "_BUILD_ROWS", build_rows)
         groups = group_rows(rows_of(points, weight, are_points), owner, centers, torch.float64)
@@ -132,7 +132,7 @@ def test_every_row_is_in_one_slot_of_its_owner_and_the_rest_weighs_nothing(
     empty[groups.slot] = False
     assert (found[empty] == 0).all()
     assert (features[empty] == 0).all()
-    assert int(empty.sum()) < block * len(set(owner.tolist()))  # no block is there for nothing
+    assert int(empty.sum()) < block * len(set(owner.tolist()))  # no block is empty
 
 
 # -- the E-step ------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def test_every_row_is_in_one_slot_of_its_owner_and_the_rest_weighs_nothing(
 @dims
 @kinds
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
-def test_with_every_component_a_candidate_it_is_the_e_step(dim, are_points, dtype, tolerance, monkeypatch):
+def test_e_step_over_all_candidates_equals_exact_e_step(dim, are_points, dtype, tolerance, monkeypatch):
     monkeypatch.setattr(grouping, "CHUNK_ELEMENTS", 500)  # several chunks
     points, weight, parameters = cloud(400, dim), random_weight(400), random_parameters(7, dim)
     owner = torch.randint(0, 7, (400,), generator=torch.Generator().manual_seed(3))
@@ -163,7 +163,7 @@ def test_with_every_component_a_candidate_it_is_the_e_step(dim, are_points, dtyp
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("m", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_with_fewer_candidates_it_is_the_sum_over_exactly_those(dim, m, dtype):
+def test_e_step_over_few_candidates_equals_brute_force(dim, m, dtype):
     k, n = 8, 300
     tolerance = {torch.float64: 1e-10, torch.float32: 1e-4}[dtype]
     points, weight, parameters = cloud(n, dim), random_weight(n), random_parameters(k, dim, seed=2)
@@ -191,7 +191,7 @@ def test_with_fewer_candidates_it_is_the_sum_over_exactly_those(dim, m, dtype):
 
 
 @dims
-def test_local_parameters_give_the_weighted_log_densities(dim):
+def test_local_parameters_give_weighted_log_densities(dim):
     k = 6
     points, parameters, centers = cloud(20, dim), random_parameters(k, dim), cloud(k, dim, seed=9)
     candidates = torch.arange(k).expand(k, k)
@@ -205,8 +205,8 @@ def test_local_parameters_give_the_weighted_log_densities(dim):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_candidates_are_the_owner_and_the_likeliest_for_its_rows(dtype):
-    k, m, n = 40, 5, 250  # few rows in each group: all of them are asked
+def test_candidates_are_the_owner_and_the_most_likely_components(dtype):
+    k, m, n = 40, 5, 250  # few rows in each group, so that the sample has all of them
     points, parameters = 2 * cloud(n, 2), random_parameters(k, 2)
     joint = scipy_joint(points, parameters)
     owner = torch.from_numpy(joint.argmax(1))
@@ -227,7 +227,7 @@ def test_the_candidates_are_the_owner_and_the_likeliest_for_its_rows(dtype):
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_rows_at_both_ends_of_a_group_are_asked_whatever_their_order(reverse):
+def test_candidate_sample_covers_a_group_in_any_row_order(reverse):
     along = torch.linspace(-10, 10, 5000, dtype=torch.float64)
     points = torch.stack([along.flip(0) if reverse else along, 0 * along], 1)
     means = torch.zeros(20, 2, dtype=torch.float64)
@@ -240,7 +240,7 @@ def test_rows_at_both_ends_of_a_group_are_asked_whatever_their_order(reverse):
     assert sorted(choose_candidates(groups, parameters, 3)[0].tolist()) == [0, 1, 2]
 
 
-def test_the_nearest_mean_is_that_of_all_distances():
+def test_nearest_equals_brute_force():
     points, means = cloud(200, 3), cloud(11, 3, seed=1)
     assert torch.equal(nearest(points, means), torch.cdist(points, means).argmin(1))
 
@@ -270,17 +270,17 @@ def check_run(found: em.EMResult, max_iter: int, slack: float = 0.0) -> None:
     grain=st.sampled_from([0.0, 0.5]),
     are_points=st.booleans(),
 )
-def test_bounds_never_fall_and_every_run_ends(
+def test_bounds_never_decrease_and_every_run_ends(
     seed, n, dim, k, n_candidates, tol, max_iter, dtype, grain, are_points
 ):
     points = cloud(n, dim, seed)
-    points = (points / grain).round() * grain if grain else points  # many equal points
+    points = (points / grain).round() * grain if grain else points  # with equal points
     weight = random_weight(n, seed)
     rows = rows_of(points, weight, are_points)
     calls: list[tuple[int, float]] = []
-    wishes = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    setup = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
     parameters = random_parameters(k, dim, seed)
-    found, owner, _ = run_truncated(rows, nearest(points, parameters.means), parameters, wishes)
+    found, owner, _ = run_truncated(rows, nearest(points, parameters.means), parameters, setup)
     check_run(found, max_iter)
     assert calls == list(enumerate(found.lower_bounds, 1))
     assert owner.shape == (n,)
@@ -296,15 +296,15 @@ def test_bounds_never_fall_and_every_run_ends(
     n_candidates=st.integers(2, 5),
     max_iter=st.integers(1, 20),
 )
-def test_what_is_returned_is_a_step_beyond_the_last_bound(seed, dim, k, n_candidates, max_iter):
+def test_result_is_at_least_as_good_as_the_last_bound(seed, dim, k, n_candidates, max_iter):
     points, weight, parameters = (
         cloud(400, dim, seed),
         random_weight(400, seed),
         random_parameters(k, dim, seed),
     )
-    wishes = Settings(1e-9, 1e-4, max_iter, torch.float64, n_candidates)
+    setup = Settings(1e-9, 1e-4, max_iter, torch.float64, n_candidates)
     found, owner, candidates = run_truncated(
-        rows_of(points, weight), nearest(points, parameters.means), parameters, wishes
+        rows_of(points, weight), nearest(points, parameters.means), parameters, setup
     )
     joint = em.log_joint(points, found.parameters)
     allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
@@ -312,27 +312,27 @@ def test_what_is_returned_is_a_step_beyond_the_last_bound(seed, dim, k, n_candid
     assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
 
 
-def test_one_iteration_is_one_step_of_em():
+def test_one_iteration_equals_one_em_step():
     points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
-    wishes = Settings(1e-6, 0.0, 1, torch.float64)
-    found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, wishes)
+    setup = Settings(1e-6, 0.0, 1, torch.float64)
+    found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, setup)
     step = em.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
     expected, bound = step(parameters)
     assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
     torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
 
 
-def test_cells_of_one_point_each_are_the_points():
+def test_cells_of_one_point_equal_points():
     points, weight, parameters = cloud(600, 2), random_weight(600), random_parameters(20, 2)
-    owner, wishes = nearest(points, parameters.means), Settings(tol=1e-5, dtype=torch.float64, max_iter=15)
+    owner, setup = nearest(points, parameters.means), Settings(tol=1e-5, dtype=torch.float64, max_iter=15)
     found = [
-        run_truncated(rows_of(points, weight, kind), owner, parameters, wishes)[0] for kind in (True, False)
+        run_truncated(rows_of(points, weight, kind), owner, parameters, setup)[0] for kind in (True, False)
     ]
     np.testing.assert_allclose(found[0].lower_bounds, found[1].lower_bounds, rtol=1e-9)
     torch.testing.assert_close(tuple(found[0].parameters), tuple(found[1].parameters), rtol=1e-6, atol=1e-7)
 
 
-def test_it_converges_where_em_does():
+def test_converges_to_the_result_of_em():
     points, _ = beads(2000, 4, gap=3.0)
     rows = rows_of(torch.from_numpy(points - points.mean(0)))
     parameters = random_parameters(4, 2, seed=3)
@@ -351,7 +351,7 @@ def test_it_converges_where_em_does():
 
 
 @pytest.mark.parametrize(("n_iter", "share"), [(10, 1.0), (30, 0.8), (100, 0.5)])
-def test_momentum_is_no_worse_than_as_many_steps_of_em(n_iter, share):
+def test_momentum_converges_faster_than_em(n_iter, share):
     generator = torch.Generator().manual_seed(0)
     label = torch.rand(3000, 1, generator=generator, dtype=torch.float64) < 0.5
     points = torch.randn(3000, 1, generator=generator, dtype=torch.float64) + torch.where(label, 1.0, -1.0)
@@ -366,11 +366,11 @@ def test_momentum_is_no_worse_than_as_many_steps_of_em(n_iter, share):
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter
     best = em.run_em(step, parameters, tol=0.0, max_iter=3000).lower_bounds[-1]
-    assert best - plain.lower_bounds[-1] > 1e-5  # it converges slowly
+    assert best - plain.lower_bounds[-1] > 1e-5  # plain EM converges slowly
     assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
 
 
-def test_undoing_gives_ems_own_step_and_starts_anew():
+def test_momentum_undo_gives_the_em_step_and_resets():
     parameters, momentum = random_parameters(3, 2), Momentum(1e-6)
     rows = rows_of(cloud(300, 2))
 
@@ -396,7 +396,7 @@ def test_undoing_gives_ems_own_step_and_starts_anew():
 
 
 class Spy:
-    """The E-step, with what it was given and found noted; made to fail at some calls."""
+    """An E-step that records its inputs and results, and decreases the bound at given calls."""
 
     def __init__(self, failing: tuple[int, ...] = ()) -> None:
         self.failing, self.given, self.dtypes, self.sets, self.found = failing, [], [], [], []
@@ -422,7 +422,7 @@ def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: 
     return found
 
 
-def test_a_momentum_that_lowers_the_bound_is_undone(monkeypatch):
+def test_momentum_that_decreases_the_bound_is_undone(monkeypatch):
     spy = Spy(failing=(4,))
     found = run_spied(monkeypatch, spy)
     assert found.n_iter == 12
@@ -431,14 +431,14 @@ def test_a_momentum_that_lowers_the_bound_is_undone(monkeypatch):
     plain = em.maximization(statistics, 1e-6, at)
     torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
     assert not torch.allclose(spy.given[4].means, spy.given[5].means, rtol=0, atol=1e-9)
-    # What is returned is EM's own step, too, though the momentum has a step of its own by then.
+    # The result is also EM's own step, although the momentum has extrapolated again by then.
     at, statistics = spy.given[-1], spy.found[-1].statistics
     plain = em.maximization(statistics, 1e-6, at)
     torch.testing.assert_close(found.parameters.means, plain.means + at.means, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(found.parameters.covariances[0], (plain.covariances[0]), rtol=1e-9, atol=0)
 
 
-def test_a_momentum_that_gains_little_is_not_yet_the_end(monkeypatch):
+def test_small_gain_of_an_extrapolated_step_does_not_end_the_run(monkeypatch):
     points, _ = beads(1500, 20, gap=2.0)
     rows = rows_of(torch.from_numpy(points - points.mean(0)))
     first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
@@ -446,7 +446,7 @@ def test_a_momentum_that_gains_little_is_not_yet_the_end(monkeypatch):
 
     def weak(*arguments):
         found = spy(*arguments)
-        if len(spy.found) == 5:  # a step of the momentum, that gains a thousandth of tol
+        if len(spy.found) == 5:  # an extrapolated step that gains a thousandth of tol
             found = found._replace(value=spy.found[3].value + 1500 * 1e-7)
         return found
 
@@ -460,23 +460,23 @@ def test_a_momentum_that_gains_little_is_not_yet_the_end(monkeypatch):
 
 
 @pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum
-def test_new_candidates_that_lower_the_bound_are_dropped_for_the_old(monkeypatch, failing):
+def test_candidates_that_decrease_the_bound_are_replaced_by_the_old_ones(monkeypatch, failing):
     spy = Spy(failing)
     found = run_spied(monkeypatch, spy, max_iter=20)
     assert found.n_iter == 20
     old, new = spy.sets[failing[0] - 1], spy.sets[failing[0]]
     assert all(given is new for given in spy.sets[failing[0] : failing[-1] + 1])
-    assert all(given is old for given in spy.sets[failing[-1] + 1 :])  # for good
+    assert all(given is old for given in spy.sets[failing[-1] + 1 :])  # permanently
 
 
-def test_where_ems_own_step_lowers_the_bound_it_ends(monkeypatch):
+def test_run_ends_if_the_em_step_decreases_the_bound(monkeypatch):
     spy = Spy(failing=(3, 4))
     found = run_spied(monkeypatch, spy)
     assert found.converged
     assert found.n_iter == 3
 
 
-def test_bounds_do_not_fall_where_candidates_are_too_few(monkeypatch):
+def test_bounds_increase_with_too_few_candidates(monkeypatch):
     points = torch.from_numpy(room(3000) - room(3000).mean(0))
     first, owner = flat_pieces(points, points.new_ones(3000), 40, 1e-6)
     found, *_ = run_truncated(
@@ -490,7 +490,7 @@ def test_bounds_do_not_fall_where_candidates_are_too_few(monkeypatch):
 
 
 def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
-    """Points of an oblique wall `size` across, 0.1 mm thick."""
+    """Points of an oblique wall with side `size`, 0.1 mm thick."""
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + 1e-4 * rng.normal(size=(n, 3))
@@ -499,21 +499,21 @@ def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
 
 
 def two_halves(points: Tensor) -> Parameters:
-    """Components of two halves of a cloud, cut along x."""
+    """Components of the two halves of a cloud, cut along x."""
     beyond = (points[:, 0] > 0).long()
     weight = points.new_ones(len(points))
     return moments_of(em.quadratic_features(points), weight, beyond, 2, 1e-6)
 
 
 @pytest.mark.parametrize(("size", "dtype"), [(0.2, torch.float32), (30.0, torch.float64)])
-def test_a_large_thin_cloud_is_worked_on_in_float64_and_agrees_with_em(size, dtype):
+def test_large_thin_cloud_uses_float64_and_equals_em(size, dtype):
     points = thin_wall(4000, size)
     rows, parameters = rows_of(points), two_halves(points)
-    wishes = Settings(1e-6, 0.0, 1)
+    setup = Settings(1e-6, 0.0, 1)
     owner = nearest(points, parameters.means)
-    groups, _ = truncated._candidate_sets(rows, owner, parameters, wishes)
+    groups, _ = truncated._candidate_sets(rows, owner, parameters, setup)
     assert groups.features.dtype == dtype
-    found, *_ = run_truncated(rows, owner, parameters, wishes)
+    found, *_ = run_truncated(rows, owner, parameters, setup)
     expected, total = em.direct_step(points, rows.weight, parameters, 1e-6)
     tolerance = 1e-8 if dtype == torch.float64 else 1e-3
     assert found.lower_bounds[0] == pytest.approx(float(total) / 4000, abs=tolerance)
@@ -521,7 +521,7 @@ def test_a_large_thin_cloud_is_worked_on_in_float64_and_agrees_with_em(size, dty
     torch.testing.assert_close(least, truth, rtol=100 * tolerance, atol=0)
 
 
-def test_components_that_become_thin_are_worked_on_in_float64_from_then_on(monkeypatch):
+def test_components_that_become_thin_switch_to_float64(monkeypatch):
     points = thin_wall(4000, 30.0)
     rows, parameters = rows_of(points), two_halves(points)
     parameters = parameters._replace(covariances=parameters.covariances + torch.eye(3, dtype=torch.float64))
@@ -538,7 +538,7 @@ def test_components_that_become_thin_are_worked_on_in_float64_from_then_on(monke
     torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)
 
 
-def test_a_large_thin_piece_keeps_its_digits_though_it_weighs_little():
+def test_large_thin_piece_of_low_weight_switches_to_float64():
     rng = np.random.default_rng(0)
     blobs = 0.05 * rng.normal(size=(40_000, 3)) + 5 * rng.random((40, 3))[rng.integers(40, size=40_000)]
     points = torch.cat([torch.from_numpy(blobs), thin_wall(20, 20.0)])
@@ -570,22 +570,22 @@ def test_a_large_thin_piece_keeps_its_digits_though_it_weighs_little():
 
 
 @pytest.mark.parametrize("k", [4, 24])  # all components are candidates, or not
-def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(k):
+def test_thin_walls_500_km_apart_are_fitted_independently(k):
     wall = thin_wall(1200, 3.0)
     offset = torch.tensor([5e5, -2e5, 1e3], dtype=torch.float64)
     options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-5}
-    alone = GaussianMixture(k // 2, **options).fit(wall)
+    separate = GaussianMixture(k // 2, **options).fit(wall)
     both = GaussianMixture(k, **options).fit(torch.cat([wall + offset, wall - offset]))
     check_mixture(both, torch.cat([wall + offset, wall - offset]).numpy(), at_most=k)
     score = float(both.score_samples(wall + offset).mean())
-    assert score + np.log(2) == pytest.approx(float(alone.score_samples(wall).mean()), abs=0.05)
+    assert score + np.log(2) == pytest.approx(float(separate.score_samples(wall).mean()), abs=0.05)
 
 
 # -- from cells to points --------------------------------------------------------------------------
 
 
 @settings(max_examples=30)
-@example(  # other candidates on the points would be worse
+@example(  # new candidates on the points would decrease the bound
     seed=9, k=6, dim=2, grain=0.0, max_iter=4, tol=0.0, n_candidates=2, dtype=torch.float64
 )
 @given(
@@ -598,7 +598,7 @@ def test_thin_walls_500_km_apart_are_learned_as_if_each_were_alone(k):
     n_candidates=st.integers(2, 7),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, tol, n_candidates, dtype):
+def test_bounds_never_decrease_from_cells_to_points(seed, k, dim, grain, max_iter, tol, n_candidates, dtype):
     points = cloud(1200, dim, seed) + 3 * (torch.arange(1200) % 4)[:, None]
     points = (points / grain).round() * grain if grain else points
     points = points - points.mean(0)
@@ -606,7 +606,7 @@ def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, 
     first, owner = flat_pieces(points, weight, k, 1e-6)
     k = first.weights.shape[0]
     calls: list[tuple[int, float]] = []
-    wishes = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    setup = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(truncated, "_MANY_POINTS", 1000)
         runs: list[Rows] = []
@@ -614,7 +614,7 @@ def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, 
         patch.setattr(
             truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
         )
-        found = fit_truncated(Rows(points, weight), owner, first, wishes)
+        found = fit_truncated(Rows(points, weight), owner, first, setup)
     assert [rows.are_points for rows in runs] == [False, True]
     assert float(runs[0].weight.sum()) == pytest.approx(float(weight.sum()))
     check_run(found, max_iter, slack=1e-6 if dtype == torch.float32 else 1e-10)
@@ -623,7 +623,7 @@ def test_bounds_do_not_fall_from_cells_to_points(seed, k, dim, grain, max_iter, 
 
 def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
     monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
-    monkeypatch.setattr(truncated, "pool_into_cells", None)  # would fail
+    monkeypatch.setattr(truncated, "pool_into_cells", None)  # a call would fail
     for points, k, max_iter in ((cloud(900, 2), 2, 9), (cloud(1200, 4), 2, 9), (cloud(1200, 2), 20, 9)):
         fit_truncated(
             rows_of(points),
@@ -635,7 +635,7 @@ def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
     fit_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
 
 
-def test_by_way_of_cells_the_fit_is_as_good(monkeypatch):
+def test_fit_through_cells_is_as_good(monkeypatch):
     x = room(6000)
     options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
     direct = GaussianMixture(30, **options).fit(x)
@@ -659,30 +659,30 @@ def same_start(centers: np.ndarray, variance: float = 1.0) -> dict[str, Any]:
 
 @pytest.mark.parametrize("dim", [2, 3, 5])
 @pytest.mark.parametrize(("gap", "tolerance"), [(8.0, 1e-4), (2.5, 0.01)])
-def test_from_the_same_start_it_is_as_likely_as_exact_em(dim, gap, tolerance):
+def test_equal_start_is_as_likely_as_exact_em(dim, gap, tolerance):
     x, centers = beads(3000, 30, dim, gap)
     options = {**same_start(centers), "tol": 1e-5, "max_iter": 500}
     exact = GaussianMixture(30, algorithm="exact", **options).fit(x)
     found = GaussianMixture(30, algorithm="truncated", **options).fit(x)
     assert found.lower_bound_ <= found.score(x) + 1e-4
-    assert found.score(x) > exact.score(x) - tolerance  # where they overlap, it may find a better optimum
+    assert found.score(x) > exact.score(x) - tolerance  # overlapping clusters may give a better optimum
     if gap == 8.0:
         np.testing.assert_allclose(found.means_, exact.means_, atol=0.01)
         np.testing.assert_allclose(found.covariances_, exact.covariances_, atol=0.02)
 
 
-def test_the_bound_is_little_below_the_likelihood():
+def test_bound_is_close_to_the_log_likelihood():
     x = room(8000)
     found = GaussianMixture(60, algorithm="truncated", init_params="flat_pieces", tol=1e-5).fit(x)
     assert 0 <= found.score(x) - found.lower_bound_ < 0.02
 
 
-def test_auto_is_truncated_for_many_pairs_and_exact_for_few(monkeypatch):
+def test_auto_selects_truncated_for_many_pairs_only(monkeypatch):
     called: list[int] = []
 
-    def learn(rows, owner, parameters, wishes):
+    def learn(rows, owner, parameters, setup):
         called.append(len(owner))
-        return fit_truncated(rows, owner, parameters, wishes)
+        return fit_truncated(rows, owner, parameters, setup)
 
     monkeypatch.setattr(gaussian_mixture, "fit_truncated", learn)
     monkeypatch.setattr(gaussian_mixture, "_MANY_PAIRS", 48 * 500)
@@ -696,7 +696,7 @@ def test_auto_is_truncated_for_many_pairs_and_exact_for_few(monkeypatch):
     assert called == [500]
 
 
-def test_far_from_the_origin_and_turned_it_is_the_same_fit():
+def test_fit_commutes_with_shift_and_rotation():
     x = room(3000)
     rng = np.random.default_rng(1)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -709,44 +709,27 @@ def test_far_from_the_origin_and_turned_it_is_the_same_fit():
     np.testing.assert_allclose(turned.score_samples(x @ turn.T), fit.score_samples(x), atol=1e-3)
 
 
-@pytest.mark.parametrize("order", ["shuffled", "by height and row"])
-def test_the_order_of_the_points_hardly_matters(order):
-    x = room(6000)
+def test_order_of_the_points_has_little_effect():
+    x = room(4000)
     options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
-    fit = GaussianMixture(60, **options).fit(x)
-    by = np.random.default_rng(0).permutation(6000)
-    if order != "shuffled":
-        by = np.lexsort((np.round(x[:, 1], 1), np.round(x[:, 2], 1)))
-    other = GaussianMixture(60, **options).fit(x[by])
-    assert other.score(x) == pytest.approx(fit.score(x), abs=0.02)
+    score = GaussianMixture(40, **options).fit(x).score(x)
+    by_height_and_row = np.lexsort((np.round(x[:, 1], 1), np.round(x[:, 2], 1)))
+    for order in (np.random.default_rng(0).permutation(4000), by_height_and_row):
+        assert GaussianMixture(40, **options).fit(x[order]).score(x) == pytest.approx(score, abs=0.02)
 
 
-def test_a_whole_weight_is_a_point_repeated():
-    x, centers = beads(900, 20)
-    weight = np.random.default_rng(0).integers(1, 4, len(x))
-    options: dict[str, Any] = {
-        **same_start(centers), "algorithm": "truncated", "dtype": "float64", "max_iter": 8
-    }  # fmt: skip
-    weighted = GaussianMixture(20, **options).fit(x, sample_weight=weight)
-    repeated = GaussianMixture(20, **options).fit(np.repeat(x, weight, axis=0))
-    assert weighted.score(x) == pytest.approx(repeated.score(x), abs=1e-3)
-    unweighted = GaussianMixture(20, **options).fit(x)
-    assert weighted.score(x) < unweighted.score(x) - 1e-3  # the weights do count
-
-
-@pytest.mark.parametrize("scale", [1e-3, 1e6])
-def test_only_the_ratios_of_the_weights_matter(scale):
+def test_fit_depends_only_on_weight_ratios():
     x, centers = beads(900, 20)
     weight = np.random.default_rng(0).random(len(x)) + 0.1
     options: dict[str, Any] = {**same_start(centers), "algorithm": "truncated", "max_iter": 8}
     one = GaussianMixture(20, **options).fit(x, sample_weight=weight)
-    other = GaussianMixture(20, **options).fit(x, sample_weight=scale * weight)
+    other = GaussianMixture(20, **options).fit(x, sample_weight=1e6 * weight)
     np.testing.assert_allclose(one.means_, other.means_, atol=1e-3)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("k", [4, 20])
-def test_a_component_of_weight_zero_stays_as_it_is(dtype, k):
+def test_component_of_weight_zero_stays_unchanged(dtype, k):
     x, centers = beads(900, k)
     start = same_start(centers)
     start["weights_init"] = np.where(np.arange(k) == 1, 0.0, 1 / (k - 1))
@@ -757,7 +740,7 @@ def test_a_component_of_weight_zero_stays_as_it_is(dtype, k):
     check_mixture(fit, x, at_most=k)
 
 
-def test_a_component_without_points_does_no_harm():
+def test_component_without_points_gets_weight_zero():
     x, centers = beads(900, 20)
     centers[3] += 1e4
     fit = GaussianMixture(20, **same_start(centers), algorithm="truncated", max_iter=20).fit(x)
@@ -765,9 +748,9 @@ def test_a_component_without_points_does_no_harm():
     assert fit.weights_[3] < 1e-12
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, 5])
-@pytest.mark.parametrize("n_distinct", [1, 2, 7])
-def test_more_components_than_distinct_points_share_the_weight(dim, n_distinct):
+@pytest.mark.parametrize("dim", [1, 3])
+@pytest.mark.parametrize("n_distinct", [1, 7])
+def test_more_components_than_distinct_points_share_weights(dim, n_distinct):
     places = cloud(n_distinct, dim).numpy()
     x = np.repeat(places, 30, axis=0)
     fit = GaussianMixture(20, algorithm="truncated", init_params="flat_pieces").fit(x)
@@ -776,11 +759,10 @@ def test_more_components_than_distinct_points_share_the_weight(dim, n_distinct):
     np.testing.assert_allclose(np.linalg.eigvalsh(fit.covariances_), 1e-6, rtol=1e-2)
 
 
-@pytest.mark.parametrize("init", ["kmeans", "random_points", "bounding_box", "flat_pieces"])
+@pytest.mark.parametrize("init", ["random_points", "flat_pieces"])
 @pytest.mark.parametrize("max_cells", [None, 300])
-@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
-def test_with_float64_no_float32_tensor_arises_anywhere(init, max_cells, kind):
-    x = kind(room(500))
+def test_float64_fit_creates_no_float32_tensor(init, max_cells):
+    x = room(500)
     with DtypeRecorder() as recorder:
         gmm = GaussianMixture(
             20,
@@ -791,31 +773,19 @@ def test_with_float64_no_float32_tensor_arises_anywhere(init, max_cells, kind):
             max_cells=max_cells,
             max_iter=8,
         )
-        gmm.fit(x, sample_weight=kind(np.linspace(0.5, 2, 500)))
+        gmm.fit(x, sample_weight=np.linspace(0.5, 2, 500))
     assert recorder.seen.keys() == {torch.float64}, recorder.seen
 
 
-@pytest.mark.parametrize("value", ["fast", "Exact", None, 1])
-def test_an_algorithm_that_is_not_known_is_named(value):
-    with pytest.raises(InvalidArgumentError, match=r"^algorithm="):
-        GaussianMixture(2, algorithm=value).fit(room(30))
-
-
-@pytest.mark.parametrize("value", [0, -3, 2.5, "many"])
-def test_a_number_of_cells_that_cannot_be_is_named(value):
-    with pytest.raises(InvalidArgumentError, match=r"^max_cells="):
-        GaussianMixture(2, max_cells=value).fit(room(30))
-
-
 @pytest.mark.parametrize("algorithm", ["exact", "truncated"])
-def test_cells_in_more_than_three_dimensions_are_refused(algorithm):
+def test_cells_in_more_than_three_dimensions_are_rejected(algorithm):
     with pytest.raises(InvalidArgumentError, match=r"^max_cells=20 .* 4\b"):
         GaussianMixture(2, max_cells=20, algorithm=algorithm).fit(cloud(50, 4))
 
 
 @pytest.mark.parametrize("algorithm", ["exact", "truncated"])
 @pytest.mark.parametrize("init", ["kmeans", "flat_pieces"])
-def test_fewer_cells_than_components_are_copies_that_share_the_weight(algorithm, init):
+def test_fewer_cells_than_components_give_copies(algorithm, init):
     x = room(400)
     fit = GaussianMixture(8, max_cells=3, algorithm=algorithm, init_params=init, random_state=0).fit(x)
     check_mixture(fit, x, at_most=8)
@@ -826,7 +796,7 @@ def test_fewer_cells_than_components_are_copies_that_share_the_weight(algorithm,
 
 
 class TestTruncatedGaussianMixture(MixtureContract):
-    # The E-step is one of float32.
+    # The E-step is in float32.
     order_tolerance = motion_tolerance = repetition_tolerance = far_tolerance = 2e-3
     bad_parameters: ClassVar[list[dict[str, Any]]] = [
         {"algorithm": "fast"},
@@ -844,14 +814,14 @@ class TestTruncatedGaussianMixtureInFloat64(TestTruncatedGaussianMixture):
         return super().make(n_components, **{"init_params": "flat_pieces", "dtype": "float64", **options})
 
 
-class TestGaussianMixtureOfCells(MixtureContract):
-    motion_tolerance = None  # cells lie along the axes
+class TestGaussianMixtureOnCells(MixtureContract):
+    motion_tolerance = None  # cells are aligned with the axes
 
     @pytest.fixture(autouse=True)
     def _up_to_three_dimensions(self, request):
         callspec = getattr(request.node, "callspec", None)
         if callspec is not None and callspec.params.get("dim", 0) > 3:
-            pytest.skip("cells are for up to three dimensions")
+            pytest.skip("cells need at most three dimensions")
 
     def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
         usual = {"random_state": 0, "max_cells": 50, "init_params": "flat_pieces"}
@@ -859,7 +829,7 @@ class TestGaussianMixtureOfCells(MixtureContract):
 
 
 @pytest.mark.slow
-def test_compiled_it_finds_the_same():
+def test_compiled_fit_equals_the_uncompiled_fit():
     points = torch.from_numpy(beads(3000, 60)[0])
     options = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
     plain, compiled = (GaussianMixture(60, compiled=value, **options).fit(points) for value in (False, True))
@@ -867,10 +837,10 @@ def test_compiled_it_finds_the_same():
     assert compiled.lower_bound_ == pytest.approx(plain.lower_bound_, abs=1e-4)
 
 
-def test_of_many_points_it_begins_on_a_sample_whose_bounds_are_left_out(monkeypatch):
+def test_many_points_start_on_a_sample_without_its_bounds(monkeypatch):
     points = torch.from_numpy(beads(6000, 5)[0])
     first, owner = flat_pieces(points, torch.ones(6000).double(), 5, 1e-6)
-    runs, told = [], []
+    runs, seen = [], []
     run = truncated.run_truncated
     monkeypatch.setattr(
         truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
@@ -879,18 +849,18 @@ def test_of_many_points_it_begins_on_a_sample_whose_bounds_are_left_out(monkeypa
         Rows(points, torch.ones(6000).double()),
         owner,
         first,
-        Settings(on_iteration=lambda *at: told.append(at)),
+        Settings(on_iteration=lambda *at: seen.append(at)),
     )
     sample, whole = runs
     assert sample.weight.shape[0] == 2000
     assert len(torch.unique(sample.values, dim=0)) == 2000
     assert whole.weight.shape[0] == 6000
-    assert told == list(enumerate(found.lower_bounds, 1))
+    assert seen == list(enumerate(found.lower_bounds, 1))
     assert found.lower_bounds == sorted(found.lower_bounds)
 
 
 class Halves(Processes):
-    """Two threads as the two processes of a group, each with half of the rows."""
+    """Two threads that act as two processes of a group, each with half of the rows."""
 
     size = 2
 
@@ -906,28 +876,28 @@ class Halves(Processes):
         return total
 
 
-@pytest.mark.parametrize("n", [700, 3000])  # on all points at once, and on a sample first
-def test_processes_that_share_the_rows_find_what_one_finds(n):
+@pytest.mark.parametrize("n", [700, 3000])  # on all points, and on a sample first
+def test_processes_that_share_rows_give_the_result_of_one(n):
     points = torch.from_numpy(beads(n, 5)[0])
     points = points[torch.randperm(n, generator=torch.Generator().manual_seed(1))]
     weight = torch.ones(n, dtype=torch.float64)
     first, owner = flat_pieces(points, weight, 5, 1e-6)
-    wishes = Settings(1e-6, 1e-6, 60, torch.float64)  # all components are candidates
-    alone = fit_truncated(Rows(points, weight), owner, first, wishes)
+    setup = Settings(1e-6, 1e-6, 60, torch.float64)  # all components are candidates
+    separate = fit_truncated(Rows(points, weight), owner, first, setup)
     barrier, board = threading.Barrier(2), [None, None]
 
     def work(rank: int) -> em.EMResult:
         mine = slice(rank, None, 2)
-        shared = replace(wishes, processes=Halves(rank, barrier, board))
+        shared = replace(setup, processes=Halves(rank, barrier, board))
         return fit_truncated(Rows(points[mine], weight[mine]), owner[mine], first, shared)
 
     with ThreadPoolExecutor(2) as pool:
         one, other = pool.map(work, range(2))
     assert all(torch.equal(a, b) for a, b in zip(one.parameters, other.parameters, strict=True))
-    tolerance = 1e-9 if n == 700 else 1e-3  # another sample begins elsewhere
-    assert one.lower_bounds[-1] == pytest.approx(alone.lower_bounds[-1], abs=tolerance)
+    tolerance = 1e-9 if n == 700 else 1e-3  # the processes draw another sample
+    assert one.lower_bounds[-1] == pytest.approx(separate.lower_bounds[-1], abs=tolerance)
     if n == 700:
-        torch.testing.assert_close(one.parameters.means, alone.parameters.means, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(one.parameters.means, separate.parameters.means, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.filterwarnings("ignore:EM did not converge")

@@ -26,7 +26,7 @@ from gmmtorch.mixture.em.grouping import (
     rounding,
     truncated_expectation,
 )
-from gmmtorch.mixture.streaming.distributed import ALONE, Processes
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 
 _FIRST_SETS = (2, 3, 3, 4, 4)  # iterations with the same candidates; afterwards _LATER_SETS
 _LATER_SETS = 8
@@ -55,7 +55,7 @@ class Settings:
     dtype: torch.dtype = torch.float32
     n_candidates: int = 16
     on_iteration: Callable[[int, float], None] | None = None
-    processes: Processes = ALONE
+    processes: Processes = SINGLE_PROCESS
     compiled: bool = False
 
 

@@ -47,7 +47,7 @@ class Processes:
         return vector
 
 
-ALONE = Processes()
+SINGLE_PROCESS = Processes()
 
 
 class ProcessGroup(Processes):
@@ -115,7 +115,7 @@ def joined(device: str | torch.device = "cpu", timeout: float = TIMEOUT) -> Iter
     if not (math.isfinite(timeout) and timeout > 0):
         raise InvalidArgumentError(f"timeout={timeout} must be above zero seconds, and finite.")
     if not is_launched():
-        yield ALONE
+        yield SINGLE_PROCESS
         return
     from torch import distributed
 

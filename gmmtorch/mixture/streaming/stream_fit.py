@@ -27,7 +27,7 @@ from gmmtorch.mixture.em.truncated import Settings, fit_truncated
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, CheckpointWriter
-from gmmtorch.mixture.streaming.distributed import ALONE, LostProcessError, Processes
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, LostProcessError, Processes
 from gmmtorch.mixture.streaming.stream_start import draw_seed, first_state, run_facts, survey_all
 from gmmtorch.mixture.validation import as_generator
 
@@ -70,7 +70,7 @@ def fit_stream(
     survey: Survey | None = None,
     device: str | torch.device = "cpu",
     e_step: EStep | None = None,
-    processes: Processes = ALONE,
+    processes: Processes = SINGLE_PROCESS,
     checkpoint: Checkpoint | None = None,
     on_iteration: Callable[[int, float], None] | None = None,
 ) -> GaussianMixture:
@@ -177,7 +177,7 @@ def _add_iteration_to_errors(done: list[float], checkpoint: Checkpoint | None) -
 
 
 def score_stream(
-    mixture: MixtureEstimator, source: PointChunks, processes: Processes = ALONE
+    mixture: MixtureEstimator, source: PointChunks, processes: Processes = SINGLE_PROCESS
 ) -> tuple[float, int]:
     """Mean log-likelihood (nats) of the points of all processes (NaN if there are none), and their number."""
     sums = torch.zeros(2, dtype=torch.float64)

@@ -13,11 +13,11 @@ from gmmtorch.datasets.point_files.point_survey import survey as survey_source
 from gmmtorch.errors import check_whole
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, RunFacts, State
-from gmmtorch.mixture.streaming.distributed import ALONE, Processes
+from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 
 
 def survey_all(
-    source: PointChunks, sample_points: int | None, seed: int, processes: Processes = ALONE
+    source: PointChunks, sample_points: int | None, seed: int, processes: Processes = SINGLE_PROCESS
 ) -> Survey:
     """Result of one pass over the sources of all processes, see `survey`. The seed of rank 0 is used."""
     if sample_points is not None:
