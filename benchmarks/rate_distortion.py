@@ -54,9 +54,8 @@ from gmmtorch.mapping.learning.incremental import surface_fit
 from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.occupancy.protocol import OccupancyMap
-from gmmtorch.report.save import save_figure
 from gmmtorch.report.studies.rate_distortion_figures import QUALITIES, bytes_for, figures, leads
-from gmmtorch.report.style import label_of
+from gmmtorch.report.style import label_of, save_figure
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
 

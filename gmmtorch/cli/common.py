@@ -182,7 +182,7 @@ def save_figures(config: DictConfig, figures: dict[str, Any], folder: Path) -> N
     """Write every figure as NAME.png if `report.figures` is set."""
     if not config.report.figures:
         return
-    from gmmtorch.report.save import save_figure
+    from gmmtorch.report.style import save_figure
 
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png")

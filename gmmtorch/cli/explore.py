@@ -140,7 +140,7 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
     columns = _TABLE.split()
     title = f"{rows[0]['world']}: {rows[0]['n_robots']} robots"
     if fields := differing(rows):
-        from gmmtorch.report.exploration.variant_figures import by_variant
+        from gmmtorch.report.exploration.trial_groups import by_variant
 
         rows = [{"variant": name, **row} for name, group in by_variant(rows).items() for row in group]
         named = [name for name in columns if name not in ("framework", "planner")]

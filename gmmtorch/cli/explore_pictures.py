@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gmmtorch.exploration.world.world import World
     from gmmtorch.mapping.components import Components
     from gmmtorch.report.exploration.mission_maps import TeamSnapshot
-    from gmmtorch.report.exploration.top_view import TopView
+    from gmmtorch.report.maps.map_images import MapImage
 
 _HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
 
@@ -31,27 +31,26 @@ class MissionRecorder:
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
         from gmmtorch.exploration.mission.snapshots import Snapshots
-        from gmmtorch.report.exploration.mission_tensorboard import MissionBoard
         from gmmtorch.report.tensorboard_writer import Board
 
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
-        self._live = MissionBoard(self._board) if self._board is not None else None
         self._n_told = 0  # samples
         self._components: Components | None = None  # at the mission's end
         self.album = Snapshots(self._content)
 
     def sample(self, mission: Mission) -> None:
         """Take note of a mission that has just noted its own numbers."""
-        if self._live is not None:
+        if self._board is not None:
             curves = dict(mission.samples)
             times, robots = curves.pop("times"), curves.pop("entropy_bits_per_robot")
             curves |= {f"robot_{number}/entropy_bits": curve for number, curve in enumerate(robots)}
             for i in range(self._n_told, len(times)):
-                self._live.step(times[i], {name: curve[i] for name, curve in curves.items()})
+                numbers = {name: curve[i] for name, curve in curves.items()}
+                self._board.scalars(numbers, "mission", step=int(times[i]))
             self._n_told = len(times)
             paths = {f"robot_{robot.number}/path_length": robot.path_length for robot in mission.robots}
-            self._live.step(mission.now, paths)
+            self._board.scalars(paths, "mission", step=int(mission.now))
         if mission.is_over:
             self._components = mission.robots[0].mapper.components()
 
@@ -74,13 +73,13 @@ class MissionRecorder:
             _save_mixture(components, self._world.resolution, self._folder / "map.safetensors")
         figures = self._figures(mission, row, paths, components)
         common.save_figures(self._config, figures, self._folder)
-        if self._board is not None and self._live is not None:
+        if self._board is not None:
             for moment in self.album.chosen():
                 seconds = moment.tick * mission.options.tick_seconds
                 if "means" in moment.content:
                     mixture = (moment.content["means"], moment.content["covariances"])
                     self._board.ellipsoids("mixture", *mixture, step=int(seconds))
-                self._live.scene(seconds, None, [path[: moment.tick + 1] for path in paths])
+                self._board.paths("paths", [path[: moment.tick + 1] for path in paths], step=int(seconds))
             write_exploration_board(self._board, [row], figures)
             self._board.close()
         if self._config.report.recording:
@@ -147,7 +146,8 @@ class MissionRecorder:
         from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means
         from gmmtorch.report.exploration.mission_curves import bandwidth_figure, entropy_figure
         from gmmtorch.report.exploration.mission_maps import team_map_figure, trajectories_figure
-        from gmmtorch.report.exploration.mission_scene import mixture_scene_figure
+        from gmmtorch.report.scenes.cutaway import first_viewpoints
+        from gmmtorch.report.scenes.scene import mixture_scene_figure
 
         if not (self._config.report.figures or self._config.report.tensorboard):
             return {}
@@ -164,12 +164,10 @@ class MissionRecorder:
             figures["bandwidth"] = bandwidth_figure([row], draco_error=mission.options.frame.noise)
         surfaces = _surfaces(components)
         if surfaces is not None:
-            first = surfaces.seen_from.new_zeros(len(surfaces))
-            first[surfaces.seen_by.flip(0)] = surfaces.seen_from.flip(0)
             figures["mixture"] = mixture_scene_figure(
                 surfaces.means,
                 surfaces.covariances,
-                seen_from=surfaces.origins[first],
+                seen_from=first_viewpoints(surfaces),
                 trajectories=paths,
             )
         return figures
@@ -189,8 +187,8 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
         entropy_figure,
         planner_comparison_figure,
     )
+    from gmmtorch.report.exploration.mission_summary import study_summary
     from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
-    from gmmtorch.report.studies.study_summary import study_summary
     from gmmtorch.report.tensorboard_writer import Board
 
     write_bytes(folder / "summary.md", study_summary(rows).encode())
@@ -251,15 +249,15 @@ def _layers(mission: Mission) -> tuple[int, int]:
     return max(0, first), min(world.box.shape[2], max(first + 1, last))
 
 
-def _view(mission: Mission, probability: Any) -> TopView:
-    from gmmtorch.report.exploration.top_view import top_view
+def _view(mission: Mission, probability: Any) -> MapImage:
+    from gmmtorch.report.maps.map_images import highest_occupancy
 
     low = mission.world.box.low.clone()
     low[2] += _layers(mission)[0]
-    return top_view(probability, low.double() * mission.world.resolution, mission.world.resolution)
+    return highest_occupancy(probability, low.double() * mission.world.resolution, mission.world.resolution)
 
 
-def _team_view(mission: Mission) -> TopView:
+def _team_view(mission: Mission) -> MapImage:
     """The team's map from above, in the band of heights that the robots began in."""
     from gmmtorch.occupancy.voxels.boxes import Box
 
@@ -270,7 +268,7 @@ def _team_view(mission: Mission) -> TopView:
     return _view(mission, mission.union.rule.probability(hits, misses))
 
 
-def _world_view(mission: Mission) -> TopView:
+def _world_view(mission: Mission) -> MapImage:
     """The true world from above, in the same band: occupied, free, or unseen by anybody ever."""
     first, last = _layers(mission)
     world = mission.world

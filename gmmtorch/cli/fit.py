@@ -93,9 +93,8 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
         return
     from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
     from gmmtorch.evaluation.fit_comparison import in_use
-    from gmmtorch.report.curves import convergence_figure
-    from gmmtorch.report.maps.comparison import comparison_figure
-    from gmmtorch.report.maps.mixture_figures import mixture_figure
+    from gmmtorch.report.maps.fitting_figures import comparison_figure, convergence_figure
+    from gmmtorch.report.scenes.mixture_figures import mixture_figure
     from gmmtorch.report.style import label_of
     from gmmtorch.report.tensorboard_writer import Board
 

@@ -85,11 +85,12 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     """The figures of a run by file name."""
     import torch
 
-    from gmmtorch.report.curves import roc_figure
+    from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, roc_figure
     from gmmtorch.report.maps.map_figures import map_figure
-    from gmmtorch.report.maps.mixture_figures import mixture_figure
-    from gmmtorch.report.maps.raster import MapPanel, busiest_regions, robust_bounds
-    from gmmtorch.report.studies.sparsity_figures import auc_against_kept_figure
+    from gmmtorch.report.maps.map_images import MapPanel
+    from gmmtorch.report.maps.regions import busiest_regions, robust_bounds
+    from gmmtorch.report.scenes.cutaway import first_viewpoints
+    from gmmtorch.report.scenes.mixture_figures import mixture_figure
 
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
@@ -113,7 +114,12 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     surfaces = _surfaces(outcome)
     if surfaces is not None:
         figures["mixture"] = mixture_figure(
-            points, surfaces.means, surfaces.covariances, surfaces.support, title="The map's surfaces"
+            points,
+            surfaces.means,
+            surfaces.covariances,
+            surfaces.support,
+            seen_from=first_viewpoints(surfaces) if surfaces.dim == 3 else None,
+            title="Surfaces of the map",
         )
     return figures
 
@@ -122,7 +128,7 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
     """The reliability diagram of the maps at one resolution."""
     from gmmtorch.evaluation.calibration import reliability
     from gmmtorch.evaluation.queries import OCCUPIED
-    from gmmtorch.report.studies.calibration_figures import reliability_figure
+    from gmmtorch.report.maps.accuracy_figures import reliability_figure
 
     curves = {}
     for built in shown:

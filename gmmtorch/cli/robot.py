@@ -290,7 +290,7 @@ def _leave(config: DictConfig, node: Node, outputs: Outputs, more: dict[str, Any
     outputs.written("results.json", lambda _: common.write_results("robot", config, [row], outputs.folder))
     if config.report.figures:
         from gmmtorch.report.exploration.team_figures import team_run_figure
-        from gmmtorch.report.save import save_figure
+        from gmmtorch.report.style import save_figure
 
         outputs.written("run.png", functools.partial(save_figure, team_run_figure([row])))
     return row

@@ -1,4 +1,7 @@
-"""Types of every option. Ranges are checked where the values are used."""
+"""The types and defaults of all options; conf/ explains them.
+
+Options of a library class come from that class, by `schema_of`. Ranges are checked by the library.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ class DepthFramesDataset(FileDataset):
 @dataclass
 class MeshDataset(FileDataset):
     n_points: int = 100_000
-    noise: float = 0.0  # standard deviation (m) along each axis
+    noise: float = 0.0
     seed: int = 0
 
 
@@ -72,9 +75,9 @@ class Stream:
     chunk_points: int = 1 << 17
     sample_points: int = 100_000
     max_range: float | None = None
-    checkpoint_every: int = 10  # iterations
+    checkpoint_every: int = 10
     checkpoint_seconds: float | None = None
-    timeout: float = 600.0  # seconds that processes wait for each other
+    timeout: float = 600.0
 
 
 @dataclass
@@ -86,7 +89,7 @@ class Report:
 
 @dataclass
 class OccupancyReport(Report):
-    magnify: int = 0  # regions of a 2D map that are shown close up, besides
+    magnify: int = 0
 
 
 @dataclass
@@ -177,19 +180,19 @@ class MeshWorldOptions:
 class Team:
     name: str = MISSING
     size: int = 3
-    start: Any = None  # a pose for each robot
+    start: Any = None  # a list of poses
 
 
 @dataclass
 class PlannerOptions:
     name: str = MISSING
-    prior: float = 0.125  # occupancy that the planner expects of what nobody has seen
-    rest: float = 0.01  # share of its best two minutes below which a robot that learns no more rests
+    prior: float = 0.125
+    rest: float = 0.01
 
 
 @dataclass
 class TreePlannerOptions(PlannerOptions):
-    beams: int = 160  # of a view
+    beams: int = 160
 
 
 @dataclass
@@ -242,21 +245,29 @@ class TeamMap:
 
 
 @dataclass
-class NetworkOptions:
-    delay: float = 0.05
-    jitter: float = 0.0
-    bandwidth: float | None = None
+class RobotNetwork:
     loss: float = 0.0
-    duplication: float = 0.0
-    reach: float | None = None
-    partitions: list[Any] = field(default_factory=list)
     announce: float = 5.0
     budget: float | None = None
 
 
 @dataclass
-class ExploreEvaluation:
+class SimulatedNetwork(RobotNetwork):
+    delay: float = 0.05
+    jitter: float = 0.0
+    bandwidth: float | None = None
+    duplication: float = 0.0
+    reach: float | None = None
+    partitions: list[Any] = field(default_factory=list)
+
+
+@dataclass
+class RobotEvaluation:
     every: float = 10.0
+
+
+@dataclass
+class ExploreEvaluation(RobotEvaluation):
     codecs: list[str] = field(default_factory=list)
 
 
@@ -267,10 +278,7 @@ class CheckpointOptions:
 
 
 @dataclass
-class ExploreReport:
-    progress: bool = True
-    figures: bool = True
-    tensorboard: bool = True
+class ExploreReport(Report):
     recording: bool = False
 
 
@@ -288,7 +296,7 @@ class ExploreRuntime(WorldRuntime):
 
 @dataclass
 class RobotRuntime(WorldRuntime):
-    memory_limit: int = 4 << 30  # of a log's map
+    memory_limit: int = 4 << 30
 
 
 @dataclass
@@ -301,7 +309,9 @@ class TrialsStudy:
 
 
 @dataclass
-class Explore:
+class Exploration:
+    """Options of conf/exploration_base.yaml, which gmmtorch-explore and gmmtorch-robot share."""
+
     world: Any = MISSING
     team: Any = MISSING
     planner: Any = MISSING
@@ -311,13 +321,17 @@ class Explore:
     coordination: str = "greedy"
     rounds: int = 3
     codec: str = "quantized"
-    transport: str = "in_process"
-    study: Any = None
     sensor: DepthSensor = field(default_factory=DepthSensor)
     robot: RobotBody = field(default_factory=RobotBody)
     belief: Belief = field(default_factory=Belief)
     map: TeamMap = field(default_factory=TeamMap)
-    network: NetworkOptions = field(default_factory=NetworkOptions)
+
+
+@dataclass
+class Explore(Exploration):
+    transport: str = "in_process"
+    study: Any = None
+    network: SimulatedNetwork = field(default_factory=SimulatedNetwork)
     evaluation: ExploreEvaluation = field(default_factory=ExploreEvaluation)
     checkpoint: CheckpointOptions = field(default_factory=CheckpointOptions)
     report: ExploreReport = field(default_factory=ExploreReport)
@@ -349,8 +363,6 @@ class JournalOptions:
 
 @dataclass
 class LogOptions:
-    """What a robot replays."""
-
     dataset: Any = None
     map: Any = MISSING
     rate: float = 1.0
@@ -359,26 +371,9 @@ class LogOptions:
 
 
 @dataclass
-class RobotNetwork:
-    """What there is to say of a network that is real."""
+class Robot(Exploration):
+    """Options of gmmtorch-robot and gmmtorch-team."""
 
-    loss: float = 0.0
-    announce: float = 5.0
-    budget: float | None = None
-
-
-@dataclass
-class RobotEvaluation:
-    every: float = 10.0
-
-
-@dataclass
-class Robot:
-    """Of a robot; a team has the same."""
-
-    world: Any = MISSING
-    team: Any = MISSING
-    planner: Any = MISSING
     id: int = 0
     source: str = "world"
     clock: str | None = "wall"
@@ -388,16 +383,6 @@ class Robot:
     link: Link = field(default_factory=Link)
     journal: JournalOptions = field(default_factory=JournalOptions)
     log: LogOptions = field(default_factory=LogOptions)
-    duration: float = 1600.0
-    seed: int = 0
-    information: str = "csqmi"
-    coordination: str = "greedy"
-    rounds: int = 3
-    codec: str = "quantized"
-    sensor: DepthSensor = field(default_factory=DepthSensor)
-    robot: RobotBody = field(default_factory=RobotBody)
-    belief: Belief = field(default_factory=Belief)
-    map: TeamMap = field(default_factory=TeamMap)
     network: RobotNetwork = field(default_factory=RobotNetwork)
     evaluation: RobotEvaluation = field(default_factory=RobotEvaluation)
     report: Report = field(default_factory=Report)

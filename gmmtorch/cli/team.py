@@ -191,7 +191,7 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.report.exploration.team_figures import team_run_figure
-    from gmmtorch.report.save import save_figure
+    from gmmtorch.report.style import save_figure
     from gmmtorch.report.tensorboard_writer import Board
 
     figure = team_run_figure(rows)

@@ -1,5 +1,5 @@
-"""What a run shows: figures, tables, progress bars and a TensorBoard run.
+"""Output of a run: figures, tables, progress bars and TensorBoard events.
 
-Figures are built on `matplotlib.figure.Figure` alone: no pyplot, no window, no global state. Nothing is
-imported here, so that a command loads no more than what it shows.
+Figures use `matplotlib.figure.Figure` directly, without pyplot, windows or global state. This module imports
+nothing, so a command loads only what it draws.
 """

@@ -1,10 +1,9 @@
-"""Where words go in a picture: beside what they name, and clear of lines, marks, bands and other words."""
+"""Text labels in figures: beside marks or at the ends of lines, without overlaps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,125 +12,107 @@ from matplotlib.path import Path
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-_OVER_WORDS, _OVER_MARK, _OVER_LINE, _OVER_BAND = 8.0, 4.0, 1.0, 0.5
-_OUTSIDE = 8.0
-_NOTHING = ("None", "none", " ", "", None)  # a line style or a marker that is not drawn
+from gmmtorch.report.style import LABEL_SIZE
 
-
-class Spot(NamedTuple):
-    """A place for a label: so many points from `xy`, which is given in `coordinates` of the axes."""
-
-    xy: tuple[float, float]
-    offset: tuple[float, float]
-    ha: str
-    va: str
-    coordinates: str | tuple[str, str] = "data"
+_OVER_TEXT, _OUTSIDE, _OVER_MARK, _OVER_LINE = 8.0, 8.0, 4.0, 1.0  # costs of a place
+_MARK_RADIUS = 5.0  # pixels
+_SIDES = {1: "left", 0: "center", -1: "right"}
+_HEIGHTS = {1: "bottom", 0: "center", -1: "top"}
+_DIRECTIONS = ((1, -1), (1, 1), (-1, 1), (-1, -1), (0, -1), (0, 1), (1, 0), (-1, 0))
+_GAPS = ((7, 4), (12, 8))  # points between mark and text, straight and diagonal: near, then farther
+_LINE_HEIGHT = 1.25  # of a line of text, in font sizes
 
 
 class Label(NamedTuple):
-    """Words, the spots that they may have in the order in which they are liked, and how they look."""
+    """A label for the mark at (x, y), in data coordinates, with the text properties `look`."""
 
     axes: Axes
     text: str
-    spots: Sequence[Spot]
+    x: float
+    y: float
     look: dict[str, Any]
 
 
-def around(x: float, y: float) -> list[Spot]:
-    """Spots around a mark at (x, y) of the data: near and a little farther, the lower right first."""
-    sides = {1: "left", 0: "center", -1: "right"}
-    heights = {1: "bottom", 0: "center", -1: "top"}
-    directions = [(1, -1), (1, 1), (-1, 1), (-1, -1), (0, -1), (0, 1), (1, 0), (-1, 0)]
-    return [
-        Spot((x, y), (gap * right, gap * up), sides[right], heights[up])
-        for straight, diagonal in ((7, 4), (12, 8))
-        for right, up in directions
-        for gap in (diagonal if right and up else straight,)
-    ]
+class LineEnd(NamedTuple):
+    """A label for a line: the value at its right end, text and colour."""
+
+    value: float
+    text: str
+    colour: str
 
 
-def along(y: float) -> list[Spot]:
-    """Spots above and beneath a horizontal line at y of the data, from the right end to the left one."""
-    ends = [(1.0, "right", -4), *((x / 20, "center", 0) for x in range(17, 3, -1)), (0.0, "left", 4)]
-    return [
-        Spot((x, y), (shift, up), side, height, ("axes fraction", "data"))
-        for x, side, shift in ends
-        for up, height in ((3, "bottom"), (-3, "top"))
-    ]
+class _Place(NamedTuple):
+    """A place of a label relative to its mark: offset in points, and alignment."""
+
+    offset: tuple[float, float]
+    ha: str
+    va: str
+
+
+_PLACES = [
+    _Place((gap * right, gap * up), _SIDES[right], _HEIGHTS[up])
+    for straight, diagonal in _GAPS
+    for right, up in _DIRECTIONS
+    for gap in (diagonal if right and up else straight,)
+]
 
 
 def place_labels(figure: Figure, labels: Sequence[Label]) -> None:
-    """Write each label where it covers least, one after the other.
+    """Writes each label beside its mark, at the place where it covers the fewest labels, marks and lines; the
+    lower right is preferred.
 
-    To be called last, as everything must be where it stays: limits, scales, legends and titles.
+    Call this last: limits, scales, legends and titles must be final.
     """
     figure.draw_without_rendering()
-    drawn = {axes: _Drawn.of(axes) for axes in dict.fromkeys(label.axes for label in labels)}
+    texts: list[Bbox] = []
     for label in labels:
-        first, there = label.spots[0], drawn[label.axes]
-        note = label.axes.annotate(
-            label.text, first.xy, first.offset, first.coordinates, "offset points", **label.look
-        )
+        axes = label.axes
+        note = axes.annotate(label.text, (label.x, label.y), (0, 0), textcoords="offset points", **label.look)
         note.set_in_layout(False)
-        boxes = [_box(note, spot) for spot in label.spots]
-        least = int(np.argmin([there.beneath(box) for box in boxes]))  # the first of equals
-        there.words.append(_box(note, label.spots[least]))
+        paths = [line.get_path().transformed(line.get_transform()) for line in axes.lines]
+        boxes = [_moved(note, place) for place in _PLACES]
+        costs = [_cost(box, axes.get_window_extent(), texts, paths) for box in boxes]
+        texts.append(_moved(note, _PLACES[int(np.argmin(costs))]))
 
 
-def _box(note: Annotation, spot: Spot) -> Bbox:
-    """What the words cover, pixels, once they are moved to the spot."""
-    note.set(position=spot.offset, ha=spot.ha, va=spot.va)
-    note.xy, note.xycoords = spot.xy, spot.coordinates
+def label_ends(axes: Axes, ends: Sequence[LineEnd], size: float = LABEL_SIZE) -> None:
+    """Writes labels to the right of the axes, beside the ends of their lines, and moves them apart as little
+    as possible (least squares).
+
+    Limits and scale of the axes must be final.
+    """
+    from sklearn.isotonic import isotonic_regression
+
+    if not ends:
+        return
+    ends = sorted(ends, key=lambda end: end.value)
+    to_share = axes.transScale + axes.transLimits  # from data to shares of the axes
+    left = axes.get_xlim()[0]
+    wanted = np.array([to_share.transform((left, end.value))[1] for end in ends])
+    line = _LINE_HEIGHT * size / 72 * cast(Figure, axes.figure).dpi / axes.bbox.height
+    heights = np.array([line * (end.text.count("\n") + 1.3) for end in ends])
+    # Least squares under the constraint "no label begins below the end of the previous one" is an isotonic
+    # regression.
+    offsets = np.cumsum(heights) - heights / 2
+    room = max(1 - float(heights.sum()), 0.0)
+    placed = np.asarray(isotonic_regression(wanted - offsets, y_min=0.0, y_max=room)) + offsets
+    for share, target, end in zip(placed, wanted, ends, strict=True):
+        look: dict[str, Any] = {"color": end.colour, "transform": axes.transAxes}
+        axes.plot([1.0, 1.025], [target, share], linewidth=0.9, clip_on=False, **look)
+        axes.text(1.032, share, end.text, fontsize=size, va="center", linespacing=1.15, **look)
+
+
+def _moved(note: Annotation, place: _Place) -> Bbox:
+    """Moves the text to the place, and returns the pixels that it covers there."""
+    note.set(position=place.offset, ha=place.ha, va=place.va)
     return note.get_window_extent()
 
 
-@dataclass
-class _Drawn:
-    """What is drawn in axes, in pixels: the paths of lines, marks with half their size, bands, words."""
-
-    frame: Bbox
-    lines: list[Path]
-    marks: list[tuple[np.ndarray, float]]
-    bands: list[Path]
-    words: list[Bbox]
-
-    @classmethod
-    def of(cls, axes: Axes) -> _Drawn:
-        paths = [(line, line.get_path().transformed(line.get_transform())) for line in axes.lines]
-        pixels = axes.figure.dpi / 72
-        return cls(
-            frame=axes.get_window_extent(),
-            lines=[path for line, path in paths if line.get_linestyle() not in _NOTHING],
-            marks=[
-                (np.asarray(path.vertices), pixels * line.get_markersize() / 2)
-                for line, path in paths
-                if line.get_marker() not in _NOTHING
-            ],
-            bands=[
-                path.transformed(band.get_transform())
-                for band in axes.collections
-                for path in band.get_paths()
-                if np.size(path.vertices)
-            ],
-            words=[words.get_window_extent() for words in axes.texts],
-        )
-
-    def beneath(self, box: Bbox) -> float:
-        """How much this box would cover, or stick out of the axes."""
-        frame = self.frame
-        inside = frame.x0 <= box.x0 <= box.x1 <= frame.x1 and frame.y0 <= box.y0 <= box.y1 <= frame.y1
-        marks = sum(_any_within(points, box.padded(size)) for points, size in self.marks)
-        lines = sum(bool(line.intersects_bbox(box, filled=False)) for line in self.lines)
-        bands = sum(bool(band.intersects_bbox(box)) for band in self.bands)
-        words = sum(bool(other.overlaps(box)) for other in self.words)
-        return (
-            _OUTSIDE * (not inside)
-            + _OVER_WORDS * words
-            + _OVER_MARK * marks
-            + _OVER_LINE * lines
-            + _OVER_BAND * bands
-        )
-
-
-def _any_within(points: np.ndarray, box: Bbox) -> bool:
-    return bool(((points > box.min) & (points < box.max)).all(1).any())
+def _cost(box: Bbox, frame: Bbox, texts: Sequence[Bbox], paths: Sequence[Path]) -> float:
+    """Adds up what a label in this box covers, and whether it leaves the axes; all in pixels."""
+    n_texts = sum(bool(other.overlaps(box)) for other in texts)
+    padded = box.padded(_MARK_RADIUS)
+    n_marks = sum(bool(padded.count_contains(path.vertices)) for path in paths)
+    n_lines = sum(bool(path.intersects_bbox(box, filled=False)) for path in paths)
+    outside = frame.count_contains(box.corners()) < 4
+    return _OUTSIDE * outside + _OVER_TEXT * n_texts + _OVER_MARK * n_marks + _OVER_LINE * n_lines

@@ -1,17 +1,16 @@
-"""Progress bars of whatever reports what it is doing."""
+"""Progress bars on standard error."""
 
 from __future__ import annotations
 
 import sys
-from types import TracebackType
 from typing import Any
 
 
 class ProgressBars:
-    """Turns events (stage, done, total) into progress bars on standard error.
+    """Shows events (stage, done, total) as progress bars on standard error.
 
-    A bar opens at the first event of a stage and closes, leaving no trace, when done reaches total;
-    what is still open closes with the context. A stage that begins again opens a bar again.
+    The first event of a stage opens a bar. The bar disappears when done reaches total, or when the context
+    ends. A stage that starts again opens a new bar.
 
         with ProgressBars() as progress:
             progress("fit", 3, 10)
@@ -25,7 +24,7 @@ class ProgressBars:
         self._bars: dict[str, Any] = {}
 
     def __call__(self, stage: str, done: int, total: int | None = None) -> None:
-        """`done` of `total` (None: how many there will be is not known) steps of `stage` are done."""
+        """Shows that `done` of `total` steps of `stage` are done; total None means unknown."""
         if not self.enabled:
             return
         bar = self._bars.get(stage)
@@ -39,29 +38,24 @@ class ProgressBars:
             self._bars.pop(stage).close()
 
     def note(self, stage: str, text: str) -> None:
-        """Text beside the bar of a stage that is open."""
+        """Shows text beside the bar of a stage, if that bar is open."""
         if stage in self._bars:
             self._bars[stage].set_postfix_str(text)
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Stages whose bars are open."""
+        """The stages whose bars are open."""
         return tuple(self._bars)
 
     def close(self) -> None:
-        """Close every bar."""
+        """Closes every bar."""
         while self._bars:
             self._bars.popitem()[1].close()
 
     def __enter__(self) -> ProgressBars:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

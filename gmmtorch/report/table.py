@@ -1,4 +1,4 @@
-"""Plain-text tables of result rows."""
+"""Result rows as plain-text tables."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _FOUR_DECIMALS = ("accuracy", "auc", "brier", "called", "ece", "recall")
 
 
 def format_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Rows as aligned text: a heading, a rule, one line a row; no trailing newline.
+    """Formats rows as aligned text: column names, a rule and one line per row; no trailing newline.
 
-    Numbers stand to the right: four decimals for areas, Brier scores and shares of answers, bytes
-    with SI prefixes (28.1 kB is 28,100 bytes), whole numbers with commas, other numbers with four
-    digits; None and what a row lacks is a dash.
+    Columns of numbers are right-aligned. Areas, Brier scores and shares have four decimals, bytes have SI
+    prefixes (28.1 kB is 28,100 bytes), integers have thousands separators, other numbers have four digits.
+    None and missing values are shown as "-".
 
     Args:
-        rows: by column name: numbers, text, truth values or None.
-        columns: which to show, in order; all that occur, in the order they do, if not given.
+        rows: values by column name: numbers, text, truth values or None.
+        columns: names and order of the columns; if None, all columns in order of first occurrence.
     """
     names = list(columns) if columns is not None else list(dict.fromkeys(key for row in rows for key in row))
     if not names:
@@ -33,7 +33,7 @@ def format_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | Non
 
 
 def format_value(name: str, value: Any) -> str:
-    """One value as a cell of the column `name`."""
+    """Formats one value as a cell of the column `name`."""
     if value is None:
         return "-"
     if isinstance(value, bool):

@@ -1,29 +1,29 @@
-"""A TensorBoard run: numbers, curves, figures, clouds and ellipsoids of one run directory."""
+"""TensorBoard events of a run: numbers, curves, figures, point clouds and ellipsoids."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.maps.mesh_figures import checked_components, ellipsoid_mesh
-from gmmtorch.report.style import as_array, evenly
+from gmmtorch.report.scenes.ellipsoids import checked_components, ellipsoid_mesh
+from gmmtorch.report.style import as_array, colour, even_sample
 from gmmtorch.scan import ArrayLike
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_POINTS = 50_000
-"""Points of a cloud, or vertices of a mesh: what a browser still turns smoothly."""
+"""Default limit of points per cloud and vertices per mesh: browsers still turn these smoothly."""
 
-_FINEST = 2  # subdivisions of an ellipsoid
+_MIN_VERTICES, _MAX_VERTICES = 12, 162  # of an ellipsoid
 
 
 class Board:
@@ -33,8 +33,8 @@ class Board:
             board.scalars({"auc": 0.97}, prefix="occupancy", step=0)
 
     Args:
-        directory: where the event file goes; made if it is not there.
-        max_points: points a cloud, and vertices a mesh, may have; of more an even share is kept.
+        directory: folder of the event file; created if missing.
+        max_points: limit of points per cloud and vertices per mesh; larger ones are thinned evenly.
     """
 
     def __init__(self, directory: str | Path, max_points: int = MAX_POINTS) -> None:
@@ -47,15 +47,15 @@ class Board:
         self._writer = SummaryWriter(str(self.directory))
 
     def scalars(self, row: Mapping[str, Any], prefix: str = "", step: int = 0) -> None:
-        """Every finite number of a row, tagged prefix/name; what is no finite number is not written."""
+        """Writes every finite number of a row with the tag prefix/name; skips all other values."""
         for name, value in row.items():
             if _is_number(value):
                 tag = f"{prefix}/{name}" if prefix else name
                 self._writer.add_scalar(tag, float(value), step)
 
     def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike, step: int = 0) -> None:
-        """How well probabilities (M,) tell labels (M,), 1 occupied and 0 free: a precision-recall curve
-        and, where both labels occur, a picture of the receiver operating characteristic (tag/roc)."""
+        """Writes the precision-recall curve of probabilities (M,) for labels (M,), 1 occupied and 0 free,
+        and a figure of the ROC curve (tag/roc) if both labels occur."""
         truth, theta = as_array(labels) > 0.5, as_array(probabilities)
         if truth.shape != theta.shape or truth.ndim != 1:
             raise InvalidArgumentError(
@@ -68,7 +68,7 @@ class Board:
             return
         from sklearn.metrics import roc_auc_score, roc_curve
 
-        from gmmtorch.report.curves import roc_figure
+        from gmmtorch.report.maps.accuracy_figures import roc_figure
 
         false_rate, true_rate, _ = roc_curve(truth, theta)
         name = tag.rsplit("/", 1)[-1]
@@ -76,21 +76,21 @@ class Board:
         self.figure(f"{tag}/roc", roc_figure(curves), step)
 
     def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
-        """A figure, as a picture."""
+        """Writes a figure as an image."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        # SummaryWriter.add_figure would load pyplot only to close what pyplot never opened.
+        # SummaryWriter.add_figure would import pyplot, only to close a figure that pyplot never opened.
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
         self._writer.add_image(tag, pixels, step, dataformats="HWC")
 
     def cloud(self, tag: str, points: ArrayLike, colors: ArrayLike | None = None, step: int = 0) -> None:
-        """Points (N, D), metres, with colours (N, 3) from 0 to 255; nothing is written for no points."""
+        """Writes points (N, D), metres, with colours (N, 3) from 0 to 255; writes nothing for no points."""
         cloud = torch.as_tensor(points).detach().cpu()
         if cloud.ndim != 2 or cloud.shape[1] not in (2, 3):
             raise InvalidArgumentError(f"points has shape {tuple(cloud.shape)}; expected (N, 2) or (N, 3).")
-        kept = torch.from_numpy(evenly(len(cloud), self.max_points))
+        kept = torch.from_numpy(even_sample(len(cloud), self.max_points))
         colour = None
         if colors is not None:
             colour = torch.as_tensor(colors).detach().cpu()
@@ -103,51 +103,52 @@ class Board:
             flat = cloud.new_zeros(len(kept), 3 - cloud.shape[1])
             self._add_mesh(tag, torch.cat([cloud[kept], flat], 1), colour, None, step)
 
+    def paths(self, tag: str, trajectories: Sequence[ArrayLike], step: int = 0) -> None:
+        """Writes the poses (T, ≥ 3) of each robot, world metres, as points in the colour of the robot."""
+        paths = [torch.from_numpy(as_array(path)[:, :3]) for path in trajectories]
+        if paths:
+            hues = [torch.tensor(to_rgb(colour(i))).expand(len(path), 3) for i, path in enumerate(paths)]
+            self.cloud(tag, torch.cat(paths), 255 * torch.cat(hues), step)
+
     def ellipsoids(
         self, tag: str, means: ArrayLike, covariances: ArrayLike, n_sigma: float = 2.0, step: int = 0
     ) -> None:
-        """Ellipsoids of components (K, D), (K, D, D), coloured by height; nothing is written for none.
-
-        They are as finely cut as the vertices allowed permit.
-        """
+        """Writes ellipsoids of components (K, D), (K, D, D), coloured by height, as finely as the limit of
+        vertices permits; writes nothing for no components."""
         mean, covariance = (value.cpu() for value in checked_components(means, covariances))
         if len(mean) == 0:
             return
-        fits = [n for n in range(_FINEST + 1) if len(mean) * _vertices(n) <= self.max_points]
-        subdivisions = max(fits, default=0)
-        kept = torch.from_numpy(evenly(len(mean), max(1, self.max_points // _vertices(subdivisions))))
-        mesh = ellipsoid_mesh(mean[kept], covariance[kept], n_sigma, subdivisions)
+        n_vertices = min(max(self.max_points // len(mean), _MIN_VERTICES), _MAX_VERTICES)
+        kept = torch.from_numpy(even_sample(len(mean), max(1, self.max_points // n_vertices)))
+        mesh = ellipsoid_mesh(mean[kept], covariance[kept], n_sigma, n_vertices)
         self._add_mesh(tag, mesh.vertices, mesh.colors, mesh.faces, step)
 
     def hparams(self, config_flat: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
-        """The settings of the run and what came of them, for TensorBoard's HPARAMS page, in this same run.
+        """Writes the settings of the run and its results for TensorBoard's HPARAMS page, in this same run.
 
-        Settings other than numbers, truth values and text are written as text, metrics that are
-        not finite numbers are left out.
+        Settings other than numbers, truth values and text are written as text; metrics that are not finite
+        numbers are left out.
         """
         from torch.utils.tensorboard.summary import hparams
 
-        settings = {key: _plain(value) for key, value in config_flat.items()}
+        settings = {
+            k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in config_flat.items()
+        }
         results = {key: float(value) for key, value in metrics.items() if _is_number(value)}
-        # SummaryWriter.add_hparams would open a run of its own, named by the time of day.
+        # SummaryWriter.add_hparams would create another run, named after the time.
         file_writer = self._writer._get_file_writer()
         for summary in hparams(settings, results):
             file_writer.add_summary(summary)
         self.scalars(results)
 
     def close(self) -> None:
-        """Write what is waiting, and close the file."""
+        """Writes pending events and closes the file."""
         self._writer.close()
 
     def __enter__(self) -> Board:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _add_mesh(
@@ -162,14 +163,5 @@ class Board:
         )
 
 
-def _vertices(subdivisions: int) -> int:
-    """Of one ellipsoid."""
-    return 10 * 4**subdivisions + 2
-
-
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, bool | int | float | str) else str(value)

@@ -36,8 +36,8 @@ from gmmtorch.cli import explore, export
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.exploration import mission_maps as exploration_maps
-from gmmtorch.report.exploration import mission_scene as exploration_scene
 from gmmtorch.report.exploration import rerun_recording as exploration_recording
+from gmmtorch.report.scenes import scene as exploration_scene
 
 Run = Callable[..., Finished]
 

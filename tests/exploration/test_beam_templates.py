@@ -17,7 +17,7 @@ FOV = (1.5184, 1.0123)
 
 
 @given(st.integers(0, 2**32), st.floats(0.2, 12.0))
-def test_cells_are_those_that_ray_casting_finds_in_order(seed, reach):
+def test_template_cells_equal_ray_traversal_in_order(seed, reach):
     generator = torch.Generator().manual_seed(seed)
     directions = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     directions /= directions.norm(dim=1, keepdim=True)
@@ -45,7 +45,7 @@ def test_cells_are_those_that_ray_casting_finds_in_order(seed, reach):
         assert not bool(cells[ray, length:].any())
 
 
-def test_axis_parallel_and_diagonal_rays_are_no_exception():
+def test_template_cells_of_axis_parallel_and_diagonal_rays():
     directions = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0.6, 0.8, 0]], dtype=torch.float64)
     cells, bounds, lengths = cells_along(directions, 3.2)
     assert lengths.tolist()[:2] == [4, 4]
@@ -55,7 +55,7 @@ def test_axis_parallel_and_diagonal_rays_are_no_exception():
 
 
 @pytest.mark.parametrize("n_beams", [1, 7, 160, 1000])
-def test_patches_tile_the_image(n_beams):
+def test_solid_angles_tile_the_image(n_beams):
     directions, solid_angles = pinhole_beams(*FOV, n_beams)
     assert 0.75 * n_beams <= len(directions) <= 1.25 * n_beams
     u, v = math.tan(FOV[0] / 2), math.tan(FOV[1] / 2)
@@ -73,7 +73,7 @@ def test_patches_tile_the_image(n_beams):
         assert bool((approximate > 0).all())
 
 
-def test_templates_are_one_camera_turned():
+def test_templates_are_rotations_of_one_camera():
     templates = beam_templates(*FOV, max_range=2.0, resolution=0.2, n_beams=40, n_yaws=8)
     solid_angle = float(pinhole_beams(*FOV, 40)[1].sum())
     volume = solid_angle * 2.0**3 / 3 / 0.2**3
@@ -91,13 +91,13 @@ def test_templates_are_one_camera_turned():
                 assert int(templates.leading[yaw, beam, axis, k]) == inside.index(False)
 
 
-def test_cells_much_larger_than_the_range_are_one():
+def test_template_of_cells_larger_than_the_range_has_one_cell():
     templates = beam_templates(*FOV, max_range=6.0, resolution=20.0, n_beams=10, n_yaws=4)
     assert templates.lengths.unique().tolist() == [1]
     assert not bool(templates.offsets.any())
 
 
-def test_cameras_that_see_nothing_are_refused():
+def test_beam_templates_reject_cameras_without_view():
     for fov in (0.0, -1.0, math.pi, math.nan):
         with pytest.raises(InvalidArgumentError, match="horizontal_fov"):
             pinhole_beams(fov, 1.0, 10)

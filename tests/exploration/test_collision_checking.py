@@ -77,7 +77,7 @@ def with_start(state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     radius=st.floats(0.01, 1.0),
     resolution=st.floats(0.05, 1.5),
 )
-def test_inflation_is_that_of_cells_compared_two_by_two(seed, shape, radius, resolution):
+def test_inflated_equals_pairwise_comparison(seed, shape, radius, resolution):
     if radius / resolution > 6:
         resolution = radius / 6
     blocked = torch.rand(shape, generator=seeded(seed)) < 0.05
@@ -90,7 +90,7 @@ def test_inflation_is_that_of_cells_compared_two_by_two(seed, shape, radius, res
     assert torch.equal(inflated(blocked, radius, resolution), touched)
 
 
-def test_a_body_anywhere_in_a_cell_that_is_left_touches_nothing():
+def test_inflated_leaves_only_cells_where_the_body_touches_nothing():
     blocked = torch.rand(12, 12, 12, generator=seeded(1)) < 0.004
     left = (~inflated(blocked, RADIUS, CELL)).nonzero()
     assert len(left) > 20
@@ -105,7 +105,7 @@ def test_a_body_anywhere_in_a_cell_that_is_left_touches_nothing():
     assert not bool(blocked[cell.unbind(1)].any())
 
 
-def test_inflation_is_not_wider_than_it_must_be():
+def test_inflated_is_tight():
     blocked = torch.zeros(15, 15, 15, dtype=torch.bool)
     blocked[7, 7, 7] = True
     found = inflated(blocked, RADIUS, CELL)[3:-3, 3:-3, 3:-3]
@@ -116,12 +116,12 @@ def test_inflation_is_not_wider_than_it_must_be():
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
-def test_a_body_without_size_is_refused(radius):
+def test_inflated_rejects_zero_radius(radius):
     with pytest.raises(InvalidArgumentError, match="radius="):
         inflated(torch.zeros(2, 2, 2, dtype=torch.bool), radius, CELL)
 
 
-def test_probabilities_are_those_of_pseudo_counts():
+def test_local_map_occupancy_equals_pseudo_counts():
     hits = torch.tensor([0.0, 0, 3, 0.5, 1, 0.5, 1]).view(7, 1, 1).expand(7, 4, 4)
     misses = torch.tensor([0.0, 9, 1, 0, 18, 7, 20]).view(7, 1, 1).expand(7, 4, 4)
     given_hits, given_misses = hits.clone(), misses.clone()
@@ -141,7 +141,7 @@ def test_probabilities_are_those_of_pseudo_counts():
 
 
 @given(seed=st.integers(0, 10**6), radius=st.floats(0.05, 2.0), far=st.sampled_from([0, 2_500_000]))
-def test_known_free_spheres_free_the_cells_that_lie_wholly_in_them(seed, radius, far):
+def test_cells_in_sphere_lie_entirely_inside(seed, radius, far):
     generator = seeded(seed)
     low = torch.tensor([-4 + far, 3, -6])
     center = (low + torch.rand(3, generator=generator, dtype=torch.float64) * 9) * CELL
@@ -159,7 +159,7 @@ def test_known_free_spheres_free_the_cells_that_lie_wholly_in_them(seed, radius,
     assert not bool(found.observed.any())
 
 
-def test_a_large_enough_start_sphere_lets_a_robot_leave():
+def test_start_sphere_makes_the_start_passable():
     nothing = torch.zeros(SHAPE)
     for radius in (0.2, 0.3, 0.5):
         for seed in range(5):
@@ -171,7 +171,7 @@ def test_a_large_enough_start_sphere_lets_a_robot_leave():
             assert bool(found.is_passable(center))
 
 
-def test_cells_of_recent_returns_are_never_free():
+def test_obstacle_cells_are_never_free():
     obstacles = torch.tensor([[-20, -20, -8], [0, 3, 2], [0, 3, 2], [-25, 0, 0], [24, 0, 0], [0, 0, 99]])
     found = local_map_of(
         LOW, CELL, torch.zeros(SHAPE), torch.full(SHAPE, 50.0),
@@ -186,14 +186,14 @@ def test_cells_of_recent_returns_are_never_free():
 @pytest.mark.parametrize(
     "bad", [{"prior": 0.0}, {"prior": math.nan}, {"planning_prior": 1.0}, {"free_below": 0.0}]
 )
-def test_probabilities_and_priors_are_checked(bad):
+def test_local_map_rejects_bad_probabilities_and_priors(bad):
     (name,) = bad
     settings = {"prior": 1.0, "planning_prior": 0.125, "free_below": 0.25, **bad}
     with pytest.raises(InvalidArgumentError, match=f"{name}="):
         local_map_of(LOW, CELL, torch.zeros(SHAPE), torch.zeros(SHAPE), radius=RADIUS, **settings)
 
 
-def test_passable_cells_keep_half_a_cell_more_than_the_body():
+def test_passable_cells_have_a_margin_of_half_a_cell():
     blocked = torch.rand(SHAPE, generator=seeded(8)) < 0.002
     passable = known(blocked).passable.nonzero()
     cells = blocked.nonzero()
@@ -203,7 +203,7 @@ def test_passable_cells_keep_half_a_cell_more_than_the_body():
     assert RADIUS + CELL / 2 - 1e-6 <= nearest < RADIUS + CELL
 
 
-def test_in_the_open_every_primitive_is_feasible():
+def test_all_primitives_are_feasible_in_open_space():
     state = torch.tensor([0.05, 0.1, 0.0, 0.3, 1.2, 0.4, -0.8], dtype=torch.float64)
     state = state.expand(3, 7)
     local_map = known(torch.zeros(60, 60, 40, dtype=torch.bool), torch.tensor([-30, -30, -20]))
@@ -213,7 +213,7 @@ def test_in_the_open_every_primitive_is_feasible():
     assert bool(feasible(rollout, braking, local_map, start=state[:, None]).all())
 
 
-def test_beyond_what_is_known_nothing_is_feasible_but_to_stay():
+def test_only_staying_is_feasible_in_unknown_space():
     state = torch.tensor([0.1, 0.1, 0.1, 0.0, 0, 0, 0], dtype=torch.float64)
     nothing = torch.zeros(SHAPE)
     unknown = local_map_of(
@@ -230,7 +230,7 @@ def test_beyond_what_is_known_nothing_is_feasible_but_to_stay():
 
 
 @given(seed=st.integers(0, 10**6), density=st.floats(0.0005, 0.006))
-def test_the_body_touches_only_free_cells_on_a_feasible_path_to_rest(seed, density):
+def test_feasible_paths_touch_only_free_cells_until_rest(seed, density):
     generator = seeded(seed)
     blocked = torch.rand(SHAPE, generator=generator) < density
     blocked[20:29, 20:29, 8:17] = False
@@ -253,7 +253,7 @@ def test_the_body_touches_only_free_cells_on_a_feasible_path_to_rest(seed, densi
         assert float(gaps(points, cells).min()) > RADIUS
 
 
-def test_among_obstacles_some_paths_are_feasible_and_some_are_not():
+def test_feasible_accepts_some_paths_among_obstacles():
     shares = []
     for seed in range(8):
         blocked = torch.rand(SHAPE, generator=seeded(seed)) < 0.003
@@ -264,7 +264,7 @@ def test_among_obstacles_some_paths_are_feasible_and_some_are_not():
     assert 0.25 < sum(shares) / len(shares) < 0.9
 
 
-def test_a_path_is_checked_between_its_states_and_while_braking():
+def test_feasible_checks_between_states_and_while_braking():
     state = torch.tensor([-1.0, 0.1, 0.1, 0, 1.5, 0, 0], dtype=torch.float64)
     rollout, braking, whole = with_start(state)
     straight = 0
@@ -292,7 +292,7 @@ def test_a_path_is_checked_between_its_states_and_while_braking():
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 5))
-def test_a_robot_that_no_longer_fits_comes_no_closer_to_what_it_knows(seed, n):
+def test_escaping_robot_comes_no_closer_to_obstacles(seed, n):
     generator = seeded(seed)
     blocked = torch.zeros(SHAPE, dtype=torch.bool)
     offset = torch.randint(-3, 4, (n, 3), generator=generator)
@@ -314,7 +314,7 @@ def test_a_robot_that_no_longer_fits_comes_no_closer_to_what_it_knows(seed, n):
     assert bool((now >= before - 1e-4).all())
 
 
-def test_a_robot_that_no_longer_fits_leaves_the_way_that_is_open():
+def test_escaping_robot_leaves_through_the_open_side():
     blocked = torch.zeros(SHAPE, dtype=torch.bool)
     blocked[22] = True  # a wall at x from −0.4 to −0.2 m; the robot's cell is [0, 0.2)
     for x, seen in ((0.02, False), (0.19, True)):
@@ -334,7 +334,7 @@ def test_a_robot_that_no_longer_fits_leaves_the_way_that_is_open():
             assert not bool(unaided[forward].any())
 
 
-def test_many_robots_are_answered_as_one_by_one():
+def test_feasible_of_a_batch_equals_single_robots():
     blocked = torch.rand(SHAPE, generator=seeded(5)) < 0.004
     local_map = known(blocked)
     generator = seeded(6)
@@ -351,7 +351,7 @@ def test_many_robots_are_answered_as_one_by_one():
         assert torch.equal(together[i], alone)
 
 
-def test_traffic_is_kept_clear_of():
+def test_feasible_paths_keep_clear_of_peers():
     local_map = known(torch.zeros(SHAPE, dtype=torch.bool))
     state = torch.zeros(7, dtype=torch.float64)
     rollout, braking, whole = with_start(state)
@@ -363,7 +363,7 @@ def test_traffic_is_kept_clear_of():
     assert bool(good[1:].any())
 
 
-def test_cells_much_finer_than_the_steps_are_refused():
+def test_feasible_rejects_steps_too_long_for_the_cells():
     state = torch.tensor([0, 0, 0, 0, 1.5, 0, 1.2], dtype=torch.float64)
     rollout, braking, _ = with_start(state)
     fine = known(torch.zeros(8, 8, 8, dtype=torch.bool), torch.zeros(3, dtype=torch.int64), 0.01, 0.01)
@@ -371,7 +371,7 @@ def test_cells_much_finer_than_the_steps_are_refused():
         feasible(rollout, braking, fine)
 
 
-def test_no_paths_are_answered_with_none():
+def test_feasible_of_no_paths_is_empty():
     local_map = known(torch.zeros(SHAPE, dtype=torch.bool))
     none = torch.zeros(0, 7, dtype=torch.float64)
     rollout = LIBRARY.rollout(none)

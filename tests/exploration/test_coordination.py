@@ -55,7 +55,7 @@ teams = st.lists(
 
 
 @given(choices=teams, name=st.sampled_from(COORDINATIONS), seed=st.integers(0, 99), n=st.integers(1, 5))
-def test_everyone_has_one_feasible_plan(choices, name, seed, n):
+def test_each_robot_gets_one_feasible_plan(choices, name, seed, n):
     plan, _ = planner_of(choices)
     plans = coordinate(name, range(len(choices)), plan, torch.Generator().manual_seed(seed), n)
     assert sorted(plans) == list(range(len(choices)))
@@ -86,7 +86,7 @@ def test_distributed_greedy_with_a_round_for_each_takes_the_best_gain_first(choi
     assert covered(plans) == len(taken)
 
 
-def test_who_plans_given_whom():
+def test_coordination_passes_the_right_plans():
     choices: Choices = [[frozenset({robot})] for robot in range(4)]
     plan, asked = planner_of(choices)
     coordinate("greedy", range(4), plan, torch.Generator())
@@ -100,7 +100,7 @@ def test_who_plans_given_whom():
 
 
 @given(seed=st.integers(0, 200), n_rounds=st.integers(1, 4))
-def test_in_a_random_partition_all_of_a_round_plan_given_all_rounds_before(seed, n_rounds):
+def test_random_partition_considers_all_earlier_rounds(seed, n_rounds):
     choices: Choices = [[frozenset({robot})] for robot in range(6)]
     rule = Coordination("random_partition", n_rounds)
     rounds = rule.rounds(6, torch.Generator().manual_seed(seed))
@@ -130,7 +130,7 @@ def test_random_partitions_lie_between_myopic_and_greedy_on_average():
     assert totals["myopic"] < totals["distributed_greedy"]
 
 
-def test_nobody_plans_in_an_empty_team():
+def test_empty_team_has_no_plans():
     for name in COORDINATIONS:
         plan, asked = planner_of([])
         assert coordinate(name, [], plan, torch.Generator()) == {}

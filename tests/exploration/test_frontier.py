@@ -28,7 +28,7 @@ def half_known() -> LocalMap:
     return LocalMap(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, passable)
 
 
-def test_frontier_cells_are_free_cells_next_to_the_unknown():
+def test_frontier_cells_are_free_cells_next_to_unknown_ones():
     generator = torch.Generator().manual_seed(0)
     observed = torch.rand(7, 6, 5, generator=generator) < 0.6
     free = (torch.rand(7, 6, 5, generator=generator) < 0.5) & observed
@@ -45,7 +45,7 @@ def test_frontier_cells_are_free_cells_next_to_the_unknown():
         assert bool(found[cell]) == (bool(free[cell]) and not all(beside))
 
 
-def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
+def test_frontier_poses_are_reachable_and_see_the_target():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
     found = find_frontiers(here, start, NONE, least=1, elevation=0.4)
@@ -61,7 +61,7 @@ def test_a_robot_looks_at_a_frontier_from_where_it_can_be_and_see_it():
     assert len(find_frontiers(here, start, NONE, least=145, elevation=0.4).sizes) == 0
 
 
-def test_what_was_given_up_is_no_frontier_again():
+def test_exhausted_targets_are_not_frontiers():
     here = half_known()
     start = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
     first = find_frontiers(here, start, NONE, least=20, elevation=0.4)
@@ -76,7 +76,7 @@ def test_what_was_given_up_is_no_frontier_again():
         raise AssertionError("frontiers never end")
 
 
-def test_nothing_unknown_means_no_frontier():
+def test_known_space_has_no_frontiers():
     here = half_known()
     known = torch.ones_like(here.observed)
     here = LocalMap(here.low, RESOLUTION, here.occupancy, known, here.free, here.passable)
@@ -84,7 +84,7 @@ def test_nothing_unknown_means_no_frontier():
     assert [len(values) for values in found] == [0, 0, 0, 0]
 
 
-def test_frontiers_lead_through_the_door():
+def test_frontier_planner_flies_through_the_door():
     explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
     explore(make_planner("frontier", PRIMITIVES, EVALUATOR), explorer, 30)
     beyond = ((explorer.hits + explorer.misses) > 0)[30:53, 1:-1, 1:-1].float().mean()

@@ -47,7 +47,7 @@ def local_map(passable: torch.Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> 
     shape=st.tuples(*[st.integers(1, 7)] * 3),
     n=st.integers(0, 3),
 )
-def test_is_what_dijkstra_finds(seed, share, shape, n):
+def test_geodesic_equals_dijkstra(seed, share, shape, n):
     generator = torch.Generator().manual_seed(seed)
     passable = torch.rand(shape, generator=generator) < share
     sources = (torch.rand(n, 3, generator=generator) * torch.tensor(shape)).long()
@@ -61,7 +61,7 @@ def test_is_what_dijkstra_finds(seed, share, shape, n):
     torch.testing.assert_close(found, 0.5 * by_dijkstra(opened, starts), rtol=1e-5, atol=1e-5)
 
 
-def test_coarse_cells_are_passable_where_half_of_theirs_are():
+def test_coarsened_cells_are_passable_if_half_is():
     generator = torch.Generator().manual_seed(0)
     passable = torch.rand(7, 6, 5, generator=generator) < 0.5
     found = coarsened(passable, 2)
@@ -71,7 +71,7 @@ def test_coarse_cells_are_passable_where_half_of_theirs_are():
         assert bool(found[cell]) == (int(part.sum()) >= 4)
 
 
-def test_a_passage_one_cell_wide_is_open_and_a_wall_two_cells_thick_is_closed():
+def test_coarsened_keeps_narrow_passages_and_thick_walls():
     passable = torch.zeros(12, 12, 12, dtype=torch.bool)
     passable[:, 5] = True  # wherever it lies, and however the coarse cells do
     along = geodesic(passable, torch.tensor([[0, 5, 6]]), 0.2)
@@ -83,7 +83,7 @@ def test_a_passage_one_cell_wide_is_open_and_a_wall_two_cells_thick_is_closed():
         assert bool(torch.isinf(beyond[5]).all())
 
 
-def test_a_detour_is_as_long_as_it_looks():
+def test_geodesic_measures_a_detour():
     passable = torch.ones(40, 40, 6, dtype=torch.bool)
     passable[18:22, :30] = False
     here = local_map(passable, low=(-20, -20, -3))
@@ -96,7 +96,7 @@ def test_a_detour_is_as_long_as_it_looks():
 
 
 @given(seed=st.integers(0, 200))
-def test_never_shorter_than_a_straight_line_nor_much_longer_in_the_open(seed):
+def test_geodesic_is_close_to_euclidean_in_open_space(seed):
     generator = torch.Generator().manual_seed(seed)
     here = local_map(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
     corner = here.low.double() * 0.2
@@ -107,7 +107,7 @@ def test_never_shorter_than_a_straight_line_nor_much_longer_in_the_open(seed):
     assert straight - 0.4 < found < 1.13 * straight + 0.8  # to the goal's cell, by steps of 45°
 
 
-def test_the_way_ahead_comes_closer_cell_by_cell():
+def test_way_approaches_the_goal_cell_by_cell():
     passable = torch.ones(40, 40, 6, dtype=torch.bool)
     passable[18:22, :30] = False
     field = DistanceField.to(local_map(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
@@ -126,7 +126,7 @@ def test_the_way_ahead_comes_closer_cell_by_cell():
     assert float((field.way(point, 50)[1] - torch.tensor([1.0, 1.0, 0.6])).norm()) < 0.4
 
 
-def test_where_there_is_no_way():
+def test_geodesic_without_a_way_is_infinite():
     passable = torch.ones(20, 8, 8, dtype=torch.bool)
     passable[8:12] = False
     here = local_map(passable)

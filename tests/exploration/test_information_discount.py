@@ -23,7 +23,7 @@ corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
 
 
 @given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
-def test_weights_are_those_of_a_dictionary_wherever_the_window_is(lows, seed):
+def test_weights_equal_a_dictionary_for_any_window(lows, seed):
     generator = torch.Generator().manual_seed(seed)
     fatigue, kept = Fatigue(decay=0.3), {}
     for now, low in enumerate(lows):
@@ -40,7 +40,7 @@ def test_weights_are_those_of_a_dictionary_wherever_the_window_is(lows, seed):
         torch.testing.assert_close(fatigue.weights(window(low)), torch.tensor(expected))
 
 
-def test_a_look_counts_once():
+def test_note_counts_once_for_each_time():
     fatigue = Fatigue(decay=0.5)
     assert fatigue.weights(window((0, 0, 0))).tolist() == [1.0] * 18
     for _ in range(3):

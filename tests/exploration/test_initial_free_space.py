@@ -49,7 +49,7 @@ def place(*coordinates: float) -> torch.Tensor:
 # -- what it is told --------------------------------------------------------------------------------------
 
 
-def test_with_room_it_knows_the_sphere_that_is_clear_and_no_more(hall: World) -> None:
+def test_open_start_knows_only_the_clear_sphere(hall: World) -> None:
     here = place(5.1, 4.3, 1.7)
     launch = initial_free_space(hall, here, PRIMITIVES)
     assert launch is not None
@@ -60,7 +60,7 @@ def test_with_room_it_knows_the_sphere_that_is_clear_and_no_more(hall: World) ->
 
 @settings(max_examples=15)
 @given(x=st.floats(0.45, 9.7), y=st.floats(0.45, 7.7), z=st.floats(0.45, 2.7), seed=st.integers(0, 2))
-def test_what_it_is_told_is_true_and_the_way_touches_nothing(
+def test_initial_free_cells_are_free_and_the_trail_is_clear(
     hall: World, x: float, y: float, z: float, seed: int
 ) -> None:
     against = [place(0.42, y, z), place(x, 7.78, z), place(x, y, 0.42)][seed]
@@ -90,12 +90,12 @@ def test_what_it_is_told_is_true_and_the_way_touches_nothing(
         (0.45, 0.45, 0.45, 0.8),  # in a corner
     ],
 )
-def test_a_robot_that_starts_near_a_surface_flies_off(hall: World, start: tuple[float, ...]) -> None:
+def test_robot_near_a_surface_flies_off(hall: World, start: tuple[float, ...]) -> None:
     (robot,) = flown(hall, start).robots
     assert robot.path_length > 1
 
 
-def test_teams_start_where_a_narrow_corridor_is_widest_and_fly() -> None:
+def test_teams_start_at_the_widest_part_of_a_corridor() -> None:
     world = corridor(1.8, 2.5)
     mission = flown(world, size=2, duration=20.0)
     starts = torch.stack([path[0][:3] for path in mission.trajectories])
@@ -104,14 +104,14 @@ def test_teams_start_where_a_narrow_corridor_is_widest_and_fly() -> None:
     assert max(robot.path_length for robot in mission.robots) > 2
 
 
-def test_a_low_room_is_flown_in_at_half_its_height() -> None:
+def test_low_room_is_flown_at_half_height() -> None:
     world = World.from_mesh(box((0.1, 0.1, 0.1), (8.1, 6.1, 1.5)), cache=False, name="low")
     mission = flown(world)
     assert abs(float(mission.trajectories[0][0][2]) - 0.8) < 0.11
     assert mission.robots[0].path_length > 2
 
 
-def test_where_nothing_leads_anywhere_starts_are_refused_and_told_where_to() -> None:
+def test_start_without_safe_motion_is_rejected_with_a_better_place() -> None:
     closet = box((3.1, 3.1, 0.1), (4.7, 4.7, 2.0))
     hall = World.from_mesh(room(closet), cache=False, name="hall")
     inside = World.from_mesh(room(closet), start=(3.9, 3.9, 1.1), cache=False, name="hall")
@@ -129,7 +129,7 @@ def test_where_nothing_leads_anywhere_starts_are_refused_and_told_where_to() -> 
         flown(inside)
 
 
-def test_above_no_floor_robots_are_told_so() -> None:
+def test_start_without_a_floor_is_rejected() -> None:
     floorless = torch.cat([room()[:10], box((1.1, 1.1, 0.1), (3.1, 3.1, 0.3))])
     world = World.from_mesh(floorless, cache=False, name="hall")
     with pytest.raises(

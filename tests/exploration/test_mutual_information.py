@@ -58,7 +58,7 @@ def enumerated_csqmi(occupancy, depths, sigma):
 
 
 @given(beams)
-def test_first_hits_are_those_of_all_maps(occupancy):
+def test_first_hit_equals_enumeration_of_maps(occupancy):
     expected = torch.zeros(N_CELLS + 1, dtype=torch.float64)
     expected.index_add_(0, FIRST, map_probability(occupancy))
     torch.testing.assert_close(first_hit(occupancy), expected, rtol=0, atol=1e-14)
@@ -66,7 +66,7 @@ def test_first_hits_are_those_of_all_maps(occupancy):
 
 @pytest.mark.parametrize("sigma", [0.02, 0.05, 0.15])
 @given(occupancy=beams)
-def test_csqmi_is_that_of_all_maps(sigma, occupancy):
+def test_csqmi_equals_enumeration_of_maps(sigma, occupancy):
     depths = uneven_depths()
     expected = enumerated_csqmi(occupancy, depths, sigma)
     got = csqmi(occupancy, depths, sigma, band=N_CELLS)
@@ -74,7 +74,7 @@ def test_csqmi_is_that_of_all_maps(sigma, occupancy):
 
 
 @given(beams)
-def test_fsmi_of_a_sensor_without_noise_is_shannons_information(occupancy):
+def test_fsmi_of_a_noise_free_sensor_equals_shannon_information(occupancy):
     prior = map_probability(occupancy)
     reading = torch.zeros(N_CELLS + 1, dtype=torch.float64).index_add_(0, FIRST, prior)
     possible = prior > 0
@@ -87,7 +87,7 @@ def test_fsmi_of_a_sensor_without_noise_is_shannons_information(occupancy):
 
 @pytest.mark.parametrize(("delta_occ", "delta_emp"), [(1.5, 1 / 1.5), (20.0, 0.3)])
 @given(occupancy=beams)
-def test_fsmi_is_the_expected_divergence_of_updated_cells(delta_occ, delta_emp, occupancy):
+def test_fsmi_equals_the_expected_divergence_of_updated_cells(delta_occ, delta_emp, occupancy):
     """f(δ, r) is the Kullback–Leibler divergence of a cell from what it was before its odds r become rδ."""
 
     def divergence(o, delta):
@@ -111,21 +111,21 @@ def both(occupancy, depths=None, **options):
     return csqmi(occupancy, depths, 0.05, **options), fsmi(occupancy, **options)
 
 
-def test_known_cells_tell_nothing():
+def test_information_of_known_cells_is_zero():
     for known in itertools.product([0.0, 1.0], repeat=6):
         for information in both(torch.tensor(known)):
             assert float(information) == 0.0
 
 
 @given(beams)
-def test_a_cell_behind_a_surely_occupied_one_does_not_matter(occupancy):
+def test_information_ignores_cells_behind_an_occupied_one(occupancy):
     walled = torch.cat([occupancy, torch.ones(1, dtype=torch.float64)])
     deeper = torch.cat([walled, torch.full((3,), 0.3, dtype=torch.float64)])
     for near, far in zip(both(walled), both(deeper), strict=True):
         torch.testing.assert_close(far, near, rtol=0, atol=1e-12)
 
 
-def test_information_saturates_by_the_prior():
+def test_information_saturates_with_the_prior():
     """An even prior lets no beam through: 1.08 nats after 4 cells; with 0.125 it grows to 5.3 over 64."""
     for n_cells, expected in ((4, 1.08), (64, 1.08)):
         even = csqmi(torch.full((n_cells,), 0.5), 0.2 * torch.arange(n_cells), 0.05)
@@ -137,7 +137,7 @@ def test_information_saturates_by_the_prior():
     assert values[-1] == pytest.approx(5.3, abs=0.05)
 
 
-def test_more_unknown_cells_tell_more():
+def test_information_grows_with_unknown_cells():
     for prior in (0.05, 0.125, 0.3):
         values = [both(torch.full((n,), prior, dtype=torch.float64)) for n in range(1, 40)]
         for before, after in itertools.pairwise(values):
@@ -145,7 +145,7 @@ def test_more_unknown_cells_tell_more():
 
 
 @pytest.mark.parametrize("n_cells", [64, 400])
-def test_single_precision_serves_for_long_beams(n_cells):
+def test_csqmi_in_float32_is_accurate_for_long_beams(n_cells):
     generator = torch.Generator().manual_seed(0)
     rows = torch.rand(5, n_cells, generator=generator, dtype=torch.float64)
     rows = torch.cat([rows, rows**6, torch.full((1, n_cells), 0.5), torch.full((1, n_cells), 0.125)])
@@ -161,7 +161,7 @@ def test_single_precision_serves_for_long_beams(n_cells):
 
 
 @pytest.mark.parametrize("prior", [0.125, 0.5, None])
-def test_the_band_is_chosen_by_distance(prior):
+def test_needed_band_follows_the_depths(prior):
     """Cells 1 cm apart in one part of a beam and 20 cm in the other: the chosen band is as good as none."""
     depths = torch.cat([torch.arange(20) * 0.01, 0.2 + torch.arange(20) * 0.2]).double()
     generator = torch.Generator().manual_seed(0)
@@ -180,7 +180,7 @@ def test_the_band_is_chosen_by_distance(prior):
     torch.testing.assert_close(two, csqmi(occupancy, even, 0.05, band=39), rtol=0, atol=1e-4)
 
 
-def test_the_kernel_is_the_dense_one_within_its_band():
+def test_depth_kernel_equals_the_dense_kernel_within_its_band():
     depths, lengths = uneven_depths(), torch.tensor([8, 5, 1, 0])
     kernel = depth_kernel(depths.expand(4, 8), 0.1, 3, lengths)
     assert kernel.shape == (3, 4, 9)
@@ -192,7 +192,7 @@ def test_the_kernel_is_the_dense_one_within_its_band():
 
 
 @given(beams, st.integers(0, N_CELLS))
-def test_cells_beyond_the_end_of_a_beam_do_not_exist(occupancy, length):
+def test_information_ignores_cells_beyond_the_lengths(occupancy, length):
     depths = uneven_depths()
     short = both(occupancy[:length], depths[:length])
     cleared = both(torch.where(torch.arange(N_CELLS) < length, occupancy, 0), depths)
@@ -205,7 +205,7 @@ def test_cells_beyond_the_end_of_a_beam_do_not_exist(occupancy, length):
     assert not bool(hit[length:-1].any())
 
 
-def test_beams_are_worked_on_together():
+def test_information_of_a_batch_equals_single_beams():
     generator = torch.Generator().manual_seed(0)
     occupancy = torch.rand(3, 4, 7, generator=generator, dtype=torch.float64)
     depths = torch.rand(3, 4, 7, generator=generator, dtype=torch.float64).cumsum(-1)
@@ -221,7 +221,7 @@ def test_beams_are_worked_on_together():
         assert information.shape == (0,)
 
 
-def test_what_cannot_be_evaluated_is_refused():
+def test_rejects_bad_input():
     depths = 0.2 * torch.arange(3)
     for bad in ([0.5, math.nan, 0.5], [0.5, 1.1, 0.5], [-0.1, 0.5, 0.5]):
         with pytest.raises(InvalidArgumentError, match="occupancy"):

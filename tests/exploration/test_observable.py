@@ -31,7 +31,7 @@ def seen_from(cells: Tensor, directions: Tensor, max_range: float, lattice: Box 
     return observable_cells(MeshWorld(ROOM), occupied, lattice, RESOLUTION, cells, directions, max_range)
 
 
-def test_cells_seen_are_those_that_rays_cross_or_end_in():
+def test_observable_cells_equal_dda_cells():
     cells = torch.tensor([[3, 3, 4], [18, 9, 7], [10, 13, 2]])
     directions = view_directions(1.0, 0.15)
     origins = (cells + 0.5).double() * RESOLUTION
@@ -49,7 +49,7 @@ def test_cells_seen_are_those_that_rays_cross_or_end_in():
         assert float((found == crossed).double().mean()) > 0.99
 
 
-def test_a_window_cuts_rays_off_and_changes_nothing_within_it():
+def test_observable_cells_of_a_smaller_box_are_a_crop():
     cells = torch.tensor([[3, 3, 4], [6, 9, 7]])
     directions = view_directions(1.0, 0.15)
     whole = seen_from(cells, directions, 4.0)
@@ -59,7 +59,7 @@ def test_a_window_cuts_rays_off_and_changes_nothing_within_it():
     assert torch.equal(part, whole[1:9, 2:14, 3:9])
 
 
-def test_insides_of_solids_are_never_seen_and_every_cell_seen_has_a_line_of_sight():
+def test_observable_cells_have_a_line_of_sight():
     start = viewpoints(~_solid(), 3)
     found = seen_from(start, view_directions(1.2, 0.06), 6.0)
     inside = torch.zeros(LATTICE.shape, dtype=torch.bool)
@@ -84,7 +84,7 @@ def _solid() -> Tensor:
     return solid
 
 
-def test_directions_cover_the_view_about_evenly(generator):
+def test_view_directions_cover_the_view_evenly(generator):
     fov, angle = 1.0123, 0.08
     directions = view_directions(fov, angle)
     assert torch.allclose(directions.norm(dim=1), torch.ones(len(directions), dtype=torch.float64))
@@ -100,7 +100,7 @@ def test_directions_cover_the_view_about_evenly(generator):
     assert 0.7 < len(directions) * angle**2 / area < 1.5
 
 
-def test_one_viewpoint_a_block_nearest_its_middle(generator):
+def test_viewpoints_are_nearest_to_block_middles(generator):
     navigable = torch.rand(17, 11, 9, generator=generator) < 0.05
     found = viewpoints(navigable, 4)
     best: dict[tuple[int, ...], int] = {}
@@ -115,6 +115,6 @@ def test_one_viewpoint_a_block_nearest_its_middle(generator):
     assert len(viewpoints(torch.zeros(3, 3, 3, dtype=torch.bool), 4)) == 0
 
 
-def test_no_viewpoints_see_nothing():
+def test_observable_cells_without_viewpoints_are_empty():
     nowhere = torch.zeros(0, 3, dtype=torch.int64)
     assert not bool(seen_from(nowhere, view_directions(1.0, 0.3), 3.0).any())

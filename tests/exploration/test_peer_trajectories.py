@@ -39,7 +39,7 @@ def at(path: Tensor, time: Tensor) -> Tensor:
     lengths=st.lists(st.integers(1, 15), min_size=1, max_size=3),
     shift=st.floats(-0.5, 0.5),
 )
-def test_clear_paths_are_clear_at_all_times_and_if_the_others_are_early_or_late(seed, n_path, lengths, shift):
+def test_clear_paths_tolerate_early_and_late_peers(seed, n_path, lengths, shift):
     generator = torch.Generator().manual_seed(seed)
     others = [walk(n, generator) for n in lengths]
     paths = torch.stack([walk(n_path, generator) for _ in range(20)])
@@ -50,7 +50,7 @@ def test_clear_paths_are_clear_at_all_times_and_if_the_others_are_early_or_late(
         assert bool((apart[clear] >= 0.7 - 1e-9).all())
 
 
-def test_far_from_all_others_everything_is_clear_and_on_their_paths_nothing():
+def test_paths_are_clear_far_from_peers_and_not_on_their_paths():
     generator = torch.Generator().manual_seed(0)
     other = walk(10, generator)
     peers = PeerTrajectories.of([other])
@@ -68,7 +68,7 @@ def test_paths_that_cross_at_different_times_are_clear():
     assert clear_of(torch.stack([late, through]), PeerTrajectories.of([through])).tolist() == [True, False]
 
 
-def test_where_another_comes_to_rest_stays_taken():
+def test_resting_place_of_a_peer_stays_occupied():
     waiting = torch.zeros(3, 3, dtype=torch.float64)
     coming = torch.linspace(6, 0.2, 15, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
     assert not bool(
@@ -79,7 +79,7 @@ def test_where_another_comes_to_rest_stays_taken():
     assert bool(clear_of(aside[None], PeerTrajectories.of([waiting])))
 
 
-def test_a_robot_that_is_too_close_may_stay_or_move_away():
+def test_robot_too_close_may_stay_or_move_away():
     other = torch.zeros(1, 3, dtype=torch.float64)
     start = torch.tensor([0.5, 0, 0], dtype=torch.float64)
     step = torch.arange(1, 6, dtype=torch.float64)[:, None] * torch.tensor([0.1, 0, 0])
@@ -89,7 +89,7 @@ def test_a_robot_that_is_too_close_may_stay_or_move_away():
     assert clear_of(paths, peers).tolist() == [False, False, False, False]
 
 
-def test_moving_robots_keep_farther_apart_than_resting_ones():
+def test_moving_robots_need_more_separation():
     rest = torch.tensor([[0.75, 0, 0]], dtype=torch.float64).expand(1, 4, 3)
     other = torch.zeros(1, 3, dtype=torch.float64)
     assert bool(clear_of(rest, PeerTrajectories.of([other])))
@@ -98,7 +98,7 @@ def test_moving_robots_keep_farther_apart_than_resting_ones():
     assert not bool(clear_of(rest + sweep, PeerTrajectories.of([other])))
 
 
-def test_later_traffic_is_the_same_traffic_from_then_on():
+def test_later_shifts_the_paths():
     generator = torch.Generator().manual_seed(3)
     other = walk(8, generator)
     peers = PeerTrajectories.of([other, walk(5, generator)])
@@ -109,17 +109,17 @@ def test_later_traffic_is_the_same_traffic_from_then_on():
 
 
 @pytest.mark.parametrize("paths", [torch.zeros(2, 3), torch.zeros(2, 0, 3), torch.full((1, 1, 3), math.nan)])
-def test_traffic_that_is_nowhere_is_refused(paths):
+def test_peer_trajectories_reject_nonfinite_paths(paths):
     with pytest.raises(InvalidArgumentError, match="paths"):
         PeerTrajectories(paths)
 
 
-def test_separation_must_be_a_distance():
+def test_peer_trajectories_reject_bad_separation():
     with pytest.raises(InvalidArgumentError, match="separation="):
         PeerTrajectories.of([], 0.0)
 
 
-def test_a_robot_collides_where_a_surface_is_within_its_radius():
+def test_collides_flags_surfaces_within_the_radius():
     room = MeshWorld(torch.cat([box((0, 0, 0), (8, 6, 3)), box((4, 2, 0), (5, 3, 3))]))
     generator = torch.Generator().manual_seed(4)
     size = torch.tensor([8.0, 6, 3], dtype=torch.float64)
@@ -136,7 +136,7 @@ def test_a_robot_collides_where_a_surface_is_within_its_radius():
     assert collides(room, points[:0], 0.3).shape == (0,)
 
 
-def test_robots_collide_where_two_bodies_overlap():
+def test_meets_others_flags_overlapping_bodies():
     generator = torch.Generator().manual_seed(5)
     positions = torch.rand(4, 50, 3, generator=generator, dtype=torch.float64) * 1.5
     found = meets_others(positions, 0.3)

@@ -50,7 +50,7 @@ def same(one: Plan, other: Plan) -> bool:
 
 @pytest.mark.parametrize("name", PLANNERS)
 @pytest.mark.parametrize("world", [two_rooms, corridor])
-def test_paths_are_feasible_and_touch_nothing(name, world):
+def test_planned_paths_are_feasible_and_touch_nothing(name, world):
     explorer = Explorer.at(world(), (1.2, 1.2, 1.2, math.pi))
     planner, generator = planner_named(name), torch.Generator().manual_seed(3)
     for _ in range(8):
@@ -67,7 +67,7 @@ def test_paths_are_feasible_and_touch_nothing(name, world):
         explorer.follow(plan)
 
 
-def test_the_tree_explores_both_rooms_and_more_than_chance():
+def test_tree_planner_explores_more_than_random():
     seen = {}
     for name in ("mcts", "random"):
         explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
@@ -79,7 +79,7 @@ def test_the_tree_explores_both_rooms_and_more_than_chance():
     assert sum(seen["mcts"]) > sum(seen["random"])
 
 
-def test_the_tree_goes_round_the_corner_of_a_corridor():
+def test_tree_planner_flies_around_a_corner():
     explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi))
     explore(planner_named("mcts"), explorer, 18)
     open_cells = ~explorer.solid
@@ -88,7 +88,7 @@ def test_the_tree_goes_round_the_corner_of_a_corridor():
     assert float(((explorer.hits + explorer.misses) > 0)[51:61, 30:41, 1:12].float().mean()) > 0.5
 
 
-def test_with_nothing_left_around_it_travels_to_a_far_view():
+def test_tree_planner_travels_to_a_distant_view():
     """A robot that has seen its room knows of a view beyond the corner, and of the way there."""
     explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, 0.0))
     explorer.misses[~explorer.solid] = 9.0
@@ -110,7 +110,7 @@ def test_with_nothing_left_around_it_travels_to_a_far_view():
     assert len(kinds) < 14
 
 
-def test_a_journey_ends_where_it_leads_nowhere():
+def test_journey_ends_without_progress():
     explorer = Explorer.at(hollow(30, 20, 13), (1.2, 1.2, 1.2, 0.0))
     explorer.misses[~explorer.solid] = 9.0
     explorer.hits[explorer.solid] = 9.0
@@ -124,7 +124,7 @@ def test_a_journey_ends_where_it_leads_nowhere():
     assert here.goal(explorer.task(generator), 1.0) is None
 
 
-def test_teammates_plans_send_a_robot_elsewhere():
+def test_teammates_plans_send_the_robot_elsewhere():
     explorer = Explorer.at(hollow(60, 20, 13), (6.0, 2.0, 1.2, math.pi / 2))
     looks = []
     for side in (slice(0, 30), slice(30, 60)):
@@ -138,7 +138,7 @@ def test_teammates_plans_send_a_robot_elsewhere():
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_robot_that_is_boxed_in_waits_looks_around_and_goes_on(name):
+def test_boxed_in_robot_waits_then_looks_around(name):
     explorer = Explorer.at(hollow(30, 20, 13), (2.0, 2.0, 1.2, 0.0))
     planner, generator = planner_named(name), torch.Generator().manual_seed(0)
     hits, misses, start = explorer.hits, explorer.misses, explorer.start
@@ -159,7 +159,7 @@ def test_a_robot_that_is_boxed_in_waits_looks_around_and_goes_on(name):
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_a_moving_robot_whose_way_is_shut_brakes(name):
+def test_moving_robot_brakes_if_its_way_closes(name):
     explorer = Explorer.at(hollow(60, 20, 13), (3.0, 2.0, 1.2, 0.0))
     explorer.state[4] = 1.5
     around = torch.tensor([[x, 2.0, 1.2] for x in (1.6, 4.6)], dtype=torch.float64)
@@ -188,7 +188,7 @@ def test_the_same_seed_gives_the_same_plans_and_so_does_a_restored_planner(name)
         assert same(a, b)
 
 
-def test_asked_again_at_once_a_planner_starts_from_what_it_found():
+def test_second_plan_at_one_time_starts_from_the_first():
     """As in rounds of planning: what was found before is among what is tried."""
     explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
     generator = torch.Generator().manual_seed(0)
@@ -200,7 +200,7 @@ def test_asked_again_at_once_a_planner_starts_from_what_it_found():
         value = plan.value
 
 
-def test_chance_keeps_on_and_changes():
+def test_random_planner_persists_and_changes():
     explorer = Explorer.at(hollow(80, 60, 13), (6.0, 6.0, 1.2, 0.0))
     explorer.misses[~explorer.solid] = 9.0
     explorer.hits[explorer.solid] = 9.0

@@ -51,7 +51,7 @@ def flown(state: Tensor, command: Tensor, dynamics: Dynamics, duration: float) -
     return np.stack(found)
 
 
-def test_the_library_holds_what_a_quadrotor_flies():
+def test_primitives_contain_arcs_turns_climbs_and_stop():
     commands = LIBRARY.commands
     assert commands.shape == (len(LIBRARY), 3)
     assert len(LIBRARY) == 25
@@ -68,7 +68,7 @@ def test_the_library_holds_what_a_quadrotor_flies():
     assert {tuple(row) for row in mirrored.tolist()} == {tuple(row) for row in commands.tolist()}
 
 
-def test_at_the_commanded_velocity_paths_are_the_closed_forms():
+def test_rollout_at_constant_velocity_equals_the_closed_form():
     for index, (v, climb, turn) in enumerate(LIBRARY.commands.tolist()):
         state = torch.tensor([[2.0, -1.0, 1.5, 0.7, v, climb, turn]], dtype=torch.float64)
         path = LIBRARY.rollout(state)[0, index]
@@ -84,7 +84,7 @@ def test_at_the_commanded_velocity_paths_are_the_closed_forms():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_ramps_are_those_of_a_differential_equation_solver(seed):
+def test_rollout_of_ramps_equals_an_ode_solver(seed):
     dynamics = Dynamics(acceleration=0.9, yaw_acceleration=1.7)
     library = Primitives(dynamics)
     states = random_states(2, seed)
@@ -95,7 +95,7 @@ def test_ramps_are_those_of_a_differential_equation_solver(seed):
             np.testing.assert_allclose(paths[n, p, :, :4].numpy(), exact, atol=2e-7)
 
 
-def test_braking_is_that_of_a_differential_equation_solver():
+def test_braking_equals_an_ode_solver():
     states = random_states(4, 9)
     paths = LIBRARY.braking(states)
     at_rest = torch.zeros(3)
@@ -104,7 +104,7 @@ def test_braking_is_that_of_a_differential_equation_solver():
         np.testing.assert_allclose(path[:, :4].numpy(), exact, atol=2e-7)
 
 
-def test_ends_of_primitives_are_followed_as_any_other_state_is():
+def test_cached_rollouts_equal_computed_ones():
     paths = LIBRARY.rollout(random_states(4, 1))
     ends = paths[:, :, -1]
     one = random_states(1, 2)  # in its company none is looked up
@@ -127,7 +127,7 @@ def test_ends_of_primitives_are_followed_as_any_other_state_is():
     yaw_acceleration=st.floats(0.3, 9),
     step=st.sampled_from([0.05, 0.1, 0.2, 0.5, 1.0]),
 )
-def test_limits_hold_at_every_step_and_every_path_can_be_stopped(
+def test_limits_hold_at_every_step_and_braking_reaches_rest(
     seed, speed, acceleration, yaw_acceleration, step
 ):
     dynamics = Dynamics(speed=speed, acceleration=acceleration, yaw_acceleration=yaw_acceleration, step=step)
@@ -149,20 +149,20 @@ def test_limits_hold_at_every_step_and_every_path_can_be_stopped(
     assert bool(torch.isfinite(whole).all())
 
 
-def test_velocities_reach_the_command_and_stay_there():
+def test_velocities_reach_the_command_and_stay():
     paths = LIBRARY.rollout(random_states(8, 4))
     # 3 m/s at 1.5 m/s² would take the whole two seconds.
     assert torch.equal(paths[:, :, -1, 4:], LIBRARY.commands.expand(8, 25, 3))
 
 
-def test_a_command_that_takes_longer_than_the_primitive_is_approached_evenly():
+def test_slow_command_is_approached_linearly():
     library = Primitives(Dynamics(acceleration=0.25))
     path = library.rollout(torch.zeros(1, 7, dtype=torch.float64))[0, 0]
     torch.testing.assert_close(path[:, 4], 0.05 * torch.arange(1, 11, dtype=torch.float64))
     assert library.braking(path[-1]).shape == (30, 7)
 
 
-def test_a_robot_at_rest_that_stops_or_turns_stays_exactly_where_it_is():
+def test_stop_and_turn_keep_the_position_exactly():
     at_rest = random_states(5, 6)
     at_rest[:, 4:] = 0
     paths = LIBRARY.rollout(at_rest)
@@ -174,7 +174,7 @@ def test_a_robot_at_rest_that_stops_or_turns_stays_exactly_where_it_is():
     assert torch.equal(braked, at_rest[:, None].expand_as(braked))
 
 
-def test_states_do_not_depend_on_their_company_and_paths_move_with_them():
+def test_rollout_is_equivariant_and_independent_of_the_batch():
     states = random_states(6, 7)
     together = LIBRARY.rollout(states)
     alone = torch.cat([LIBRARY.rollout(states[i : i + 1]) for i in range(6)])
@@ -192,14 +192,14 @@ def test_states_do_not_depend_on_their_company_and_paths_move_with_them():
     torch.testing.assert_close(LIBRARY.rollout(moved), expected, rtol=0, atol=1e-12)
 
 
-def test_no_states_have_no_paths():
+def test_rollout_of_no_states_is_empty():
     none = torch.zeros(0, 7, dtype=torch.float64)
     assert LIBRARY.rollout(none).shape == (0, 25, 10, 7)
     assert LIBRARY.braking(none).shape == (0, 5, 7)
 
 
 @pytest.mark.parametrize("velocity", [(1.6, 0, 0), (0, -0.8, 0), (0, 0, 1.3), (math.nan, 0, 0)])
-def test_states_beyond_the_limits_are_refused(velocity):
+def test_rollout_rejects_states_beyond_the_limits(velocity):
     state = torch.tensor([[0, 0, 0, 0, *velocity]], dtype=torch.float64)
     for fly in (LIBRARY.rollout, LIBRARY.braking):
         with pytest.raises(InvalidArgumentError, match="velocities"):
@@ -217,6 +217,6 @@ def test_states_beyond_the_limits_are_refused(velocity):
         ({"step": 5.0}, "does not divide"),
     ],
 )
-def test_dynamics_that_cannot_be_are_refused(bad, message):
+def test_dynamics_reject_bad_values(bad, message):
     with pytest.raises(InvalidArgumentError, match=message):
         Dynamics(**bad)

@@ -63,7 +63,7 @@ def task(free: bool = False, trail: Tensor | None = None, **changes: Any) -> Pla
     )
 
 
-def test_it_goes_back_slowly_and_is_at_rest_at_the_end() -> None:
+def test_recovery_flies_back_and_ends_at_rest() -> None:
     plan = retreat(PRIMITIVES, task())
     assert plan is not None
     assert plan.kind == "retreat"
@@ -85,7 +85,7 @@ def test_it_goes_back_slowly_and_is_at_rest_at_the_end() -> None:
     assert torch.equal(plan.braking, plan.path[-1:])
 
 
-def test_again_and_again_it_comes_back_to_where_the_trail_begins() -> None:
+def test_repeated_recovery_returns_to_the_start_of_the_trail() -> None:
     trail, state = corner(), task().state
     first = trail[0]
     for _ in range(4):
@@ -98,7 +98,7 @@ def test_again_and_again_it_comes_back_to_where_the_trail_begins() -> None:
 
 
 @pytest.mark.parametrize("case", ["it fits", "it moves", "no trail", "somebody is there"])
-def test_else_it_does_not(case: str) -> None:
+def test_recovery_is_none_if_the_robot_can_leave(case: str) -> None:
     moving = torch.cat([HERE, torch.tensor([0.7, 0.4, 0, 0], dtype=torch.float64)])
     behind = corner()[-6] - torch.tensor([0.6, 0.0, 0.0])
     tasks = {

@@ -42,7 +42,7 @@ def maze() -> torch.Tensor:
     return passable
 
 
-def test_distances_are_those_of_the_cells():
+def test_route_lengths_agree_with_cell_distances():
     passable = maze()
     roadmap = seen_through_windows(passable, low=(-13, 6, 3))
     shift = torch.tensor([-13, 6, 3], dtype=torch.float64) * RESOLUTION
@@ -55,7 +55,7 @@ def test_distances_are_those_of_the_cells():
     assert float(route.metres[3]) > 20  # around both bends, 9 m as the crow flies
 
 
-def test_paths_run_through_passable_space_from_start_to_goal():
+def test_route_paths_run_through_passable_space():
     passable = maze()
     roadmap = seen_through_windows(passable)
     start, goal = torch.tensor([[1.1, 1.3, 1.7], [10.0, 7.3, 1.7]], dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_paths_run_through_passable_space_from_start_to_goal():
         assert bool(passable[around.unbind(1)].any())
 
 
-def test_a_wall_of_three_cells_keeps_apart_wherever_it_stands():
+def test_wall_of_three_cells_separates_nodes():
     for begin in range(20, 26):
         passable = torch.ones(48, 24, 12, dtype=torch.bool)
         passable[begin : begin + 3] = False
@@ -83,7 +83,7 @@ def test_a_wall_of_three_cells_keeps_apart_wherever_it_stands():
         assert math.isfinite(float(roadmap.route(ends[0], ends[1:]).metres[0]))
 
 
-def test_a_way_that_closes_is_forgotten():
+def test_update_removes_closed_edges():
     passable = torch.ones(48, 24, 12, dtype=torch.bool)
     roadmap = seen_through_windows(passable)
     ends = torch.tensor([[1.0, 2.0, 1.0], [9.0, 2.0, 1.0]], dtype=torch.float64)
@@ -97,7 +97,7 @@ def test_a_way_that_closes_is_forgotten():
 
 
 @given(seed=st.integers(0, 50))
-def test_what_is_reached_from_a_goal_agrees_with_the_routes_to_it(seed):
+def test_reaching_agrees_with_route(seed):
     generator = torch.Generator().manual_seed(seed)
     roadmap = seen_through_windows(maze(), step=12)
     lane = torch.rand(1, generator=generator, dtype=torch.float64) * 11 + 0.6
@@ -109,7 +109,7 @@ def test_what_is_reached_from_a_goal_agrees_with_the_routes_to_it(seed):
         torch.testing.assert_close(route.metres[0], metres[row])
 
 
-def test_nothing_known_means_no_way():
+def test_empty_roadmap_has_no_route():
     roadmap = Roadmap()
     point = torch.zeros(1, 3, dtype=torch.float64)
     assert len(roadmap) == 0
@@ -121,7 +121,7 @@ def test_nothing_known_means_no_way():
     assert len(roadmap) == 0
 
 
-def test_far_from_the_origin():
+def test_roadmap_works_far_from_the_origin():
     passable = torch.ones(WINDOW, dtype=torch.bool)
     roadmap = Roadmap()
     roadmap.update(surroundings_from(passable, (2_500_000, -2_500_001, 3)))
@@ -143,7 +143,7 @@ def test_restored_it_answers_as_before():
     assert len(roadmap) < len(other)  # nothing is shared
 
 
-def test_the_rim_of_a_window():
+def test_at_the_rim_selects_points_near_the_border():
     here: LocalMap = surroundings_from(torch.ones(10, 10, 10, dtype=torch.bool), (5, 5, 5))
     points = torch.tensor(
         [[1.1, 2.0, 2.0], [2.0, 2.0, 2.0], [0.9, 2.0, 2.0], [2.0, 2.9, 2.0]], dtype=torch.float64

@@ -40,7 +40,7 @@ def entropy_by_hand(belief: BeliefMap, seen: Tensor, rule: BeliefRule) -> float:
 
 
 @given(seeds=st.lists(st.integers(0, 1000), max_size=6), clamp=st.sampled_from([0.01, 0.05, 0.2]))
-def test_entropy_kept_up_is_the_sum_over_the_observable_cells(seeds: list[int], clamp: float) -> None:
+def test_belief_entropy_equals_the_sum_over_observable_cells(seeds: list[int], clamp: float) -> None:
     rule, seen = BeliefRule(clamp=clamp), observable()
     belief = BeliefMap(0.5, BOX, seen, rule)
     for seed in seeds:
@@ -50,12 +50,12 @@ def test_entropy_kept_up_is_the_sum_over_the_observable_cells(seeds: list[int], 
     assert belief.n_observed == int(((h + m) > 0).sum())
 
 
-def test_nothing_known_is_one_bit_a_cell() -> None:
+def test_empty_belief_has_one_bit_a_cell() -> None:
     belief = BeliefMap(0.5, BOX, observable(), BeliefRule())
     assert belief.entropy_bits == belief.observable_bits == float(observable().sum())
 
 
-def test_order_of_evidence_does_not_matter() -> None:
+def test_belief_does_not_depend_on_the_order_of_evidence() -> None:
     one, other = (BeliefMap(0.5, BOX, observable(), BeliefRule()) for _ in range(2))
     for seed in range(5):
         one.add(evidence(seed))
@@ -73,7 +73,7 @@ def test_a_restored_map_goes_on_as_the_first() -> None:
     assert other.n_observed == one.n_observed
 
 
-def test_accuracy_against_a_loop() -> None:
+def test_accuracy_equals_a_loop() -> None:
     seen = observable()
     belief = BeliefMap(0.5, BOX, seen, BeliefRule())
     for seed in range(4):
@@ -94,7 +94,7 @@ def test_accuracy_against_a_loop() -> None:
     assert found["auc"] == pytest.approx(sum(pairs) / len(pairs))
 
 
-def test_of_cells_of_one_kind_there_is_no_auc() -> None:
+def test_accuracy_has_no_auc_for_cells_of_one_class() -> None:
     belief = BeliefMap(0.5, BOX, observable(), BeliefRule())
     assert accuracy(belief, torch.tensor([[0, 3, 1]]), torch.tensor([True]))["auc"] is None
 
@@ -111,12 +111,12 @@ def test_disagreement_counts_cells_in_different_classes() -> None:
     assert disagreement(maps[:1], cells) is None
 
 
-def test_overlap_is_the_share_seen_twice() -> None:
+def test_overlap_is_the_share_of_cells_seen_twice() -> None:
     assert overlap(torch.tensor([0, 1, 2, 3, 1])) == 0.5
     assert math.isnan(overlap(torch.zeros(4)))
 
 
 @pytest.mark.parametrize("options", [{"clamp": 0.5}, {"clamp": -0.1}, {"prior": -1.0}, {"free": 0.9}])
-def test_rules_that_make_no_sense(options: dict[str, float]) -> None:
+def test_belief_rule_rejects_bad_values(options: dict[str, float]) -> None:
     with pytest.raises(InvalidArgumentError):
         BeliefRule(**options)

@@ -105,7 +105,7 @@ def return_of(task: PlanningTask, evaluator: MadeUp, actions: tuple[int, ...], d
     return total
 
 
-def test_with_time_enough_it_finds_the_best_of_all_branches():
+def test_search_finds_the_best_of_all_branches():
     rule = SearchRule(depth=2, n_rounds=20, n_leaves=64, discount=0.8)
     for seed in range(3):
         task, evaluator = task_in(ROOM, MIDDLE, seed, residual=torch.rand(N_BLOCKS)), MadeUp(seed)
@@ -122,7 +122,7 @@ def test_with_time_enough_it_finds_the_best_of_all_branches():
         )
 
 
-def test_what_is_returned_is_the_branch():
+def test_found_describes_its_branch():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, evaluator))
     assert found is not None
@@ -136,7 +136,7 @@ def test_what_is_returned_is_the_branch():
     assert tuple(found.actions) in set(all_branches(task, 1)) or len(found.actions) > 1
 
 
-def test_few_views_are_spent_well():
+def test_search_beats_random_branches_with_few_leaves():
     rule = SearchRule(depth=3, n_rounds=4, n_leaves=32)
     shares = []
     for seed in range(6):
@@ -156,7 +156,7 @@ def test_few_views_are_spent_well():
     assert sum(shares) / len(shares) > 0.8
 
 
-def test_each_round_asks_once_and_never_for_what_is_known():
+def test_search_evaluates_each_view_once_in_batches():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
     TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, Memory(task, evaluator))
     assert len(evaluator.calls) <= 5
@@ -165,7 +165,7 @@ def test_each_round_asks_once_and_never_for_what_is_known():
     assert 40 < len(keys) <= 129
 
 
-def test_what_teammates_will_see_is_worth_nothing():
+def test_views_planned_by_teammates_have_no_value():
     evaluator = MadeUp(0)
     for seen in range(2):
         residual = torch.zeros(N_BLOCKS)
@@ -183,7 +183,7 @@ def test_what_teammates_will_see_is_worth_nothing():
 
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=5)
-def test_the_same_seed_gives_the_same_branch(seed):
+def test_same_seed_gives_the_same_branch(seed):
     runs = []
     for _ in range(2):
         task = task_in(ROOM, MIDDLE, seed)
@@ -192,7 +192,7 @@ def test_the_same_seed_gives_the_same_branch(seed):
     assert runs[0].value == runs[1].value
 
 
-def test_the_rest_of_the_last_branch_is_tried_first():
+def test_rest_of_the_last_branch_is_tried_first():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(7)
     full = SearchRule(depth=2, n_rounds=20, n_leaves=64)
     best = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
@@ -205,7 +205,7 @@ def test_the_rest_of_the_last_branch_is_tried_first():
     assert len(beyond.actions) <= 2
 
 
-def test_with_a_goal_it_comes_closer_the_sooner_the_better():
+def test_search_with_a_goal_approaches_it():
     task = task_in(ROOM, MIDDLE)
     goal_at = torch.tensor([[4.6, 3.4, 1.4]], dtype=torch.float64)
     goal = Goal(DistanceField.to(task.local_map, goal_at), weight=2.0, yaw=1.5)
@@ -223,7 +223,7 @@ def test_with_a_goal_it_comes_closer_the_sooner_the_better():
     assert found.value == pytest.approx(sooner, rel=1e-6)
 
 
-def test_the_cost_to_the_goal_counts_the_way_and_the_turns():
+def test_goal_cost_includes_the_way_and_the_turns():
     here = surroundings_from(torch.ones(50, 50, 10, dtype=torch.bool))
     goal_at = torch.tensor([[8.2, 5.0, 1.0]], dtype=torch.float64)
     goal = Goal(DistanceField.to(here, goal_at), weight=1.0, yaw=math.pi / 2, turning=2.0)
@@ -237,7 +237,7 @@ def test_the_cost_to_the_goal_counts_the_way_and_the_turns():
     assert cost(8.2, 5.0, 1.0, -math.pi / 2) == pytest.approx(2 * math.pi, abs=0.1)
 
 
-def test_traffic_is_kept_clear_of_when_it_comes():
+def test_search_keeps_clear_of_peers_in_time():
     other = torch.tensor([[2.9, 2.7, 1.2]], dtype=torch.float64)
     task = task_in(ROOM, MIDDLE, peers=PeerTrajectories.of([other]))
     free = TreeSearch(PRIMITIVES, SearchRule(depth=1, n_rounds=1)).search(
@@ -251,14 +251,14 @@ def test_traffic_is_kept_clear_of_when_it_comes():
     assert float((found.views[:, :3] - other).norm(dim=1).min()) > 0.7
 
 
-def test_boxed_in_there_is_no_branch_that_moves():
+def test_boxed_in_robot_has_no_moving_branch():
     nowhere = torch.zeros(30, 30, 12, dtype=torch.bool)
     task = task_in(nowhere, MIDDLE)
     found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
     assert found is None or bool((found.views[:, :3] == task.state[:3]).all())
 
 
-def test_at_the_start_it_looks_around():
+def test_search_at_the_start_looks_around():
     """All that is free is the sphere around the start: there is nowhere to go, but much to see."""
     solid = torch.zeros(40, 40, 20, dtype=torch.bool)
     explorer = Explorer.at(solid, (4.0, 4.0, 2.0, 0.0))
@@ -273,7 +273,7 @@ def test_at_the_start_it_looks_around():
     assert len({PRIMITIVES.commands[action, 2].item() for action in found.actions} - {0.0}) >= 1
 
 
-def test_bad_rules_are_named():
+def test_search_rule_rejects_bad_values():
     with pytest.raises(InvalidArgumentError, match="depth=0"):
         SearchRule(depth=0)
     with pytest.raises(InvalidArgumentError, match="exploration"):

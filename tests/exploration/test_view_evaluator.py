@@ -184,7 +184,7 @@ def slow_view(around, camera, yaw, max_range, beams, information):
 
 @pytest.mark.parametrize("information", ["csqmi", "fsmi"])
 @pytest.mark.parametrize("seed", range(3))
-def test_views_are_those_of_slow_code(information, seed):
+def test_view_values_equal_a_slow_reference(information, seed):
     """On maps of any kind, from everywhere, at the window's border and outside; no side divides by 4."""
     shape, low = (17, 14, 11), (-5, 3, -4)
     around = random_map(shape, seed, low)
@@ -225,7 +225,7 @@ def evaluator(request):
 
 
 @pytest.mark.parametrize("make", [hall, unknown])
-def test_a_view_that_is_planned_already_is_worth_little(evaluator, make):
+def test_repeated_view_is_worth_little(evaluator, make):
     around = make()
     keys = torch.cat([all_headings(evaluator, (x, y, 0)) for x in (-6, 0, 6) for y in (-4, 0, 4)])
     values = evaluator.evaluate(around, keys)
@@ -235,7 +235,7 @@ def test_a_view_that_is_planned_already_is_worth_little(evaluator, make):
     assert max(left) <= 0.15
 
 
-def test_views_of_other_space_do_not_matter(evaluator):
+def test_views_of_other_space_do_not_change_the_value(evaluator):
     for around in (hall(), unknown()):
         values = evaluator.evaluate(around, all_headings(evaluator))
         half = evaluator.n_yaws // 2
@@ -244,7 +244,7 @@ def test_views_of_other_space_do_not_matter(evaluator):
 
 
 @pytest.mark.parametrize("make", [hall, unknown])
-def test_a_view_is_discounted_by_the_share_that_it_has_in_common(evaluator, make):
+def test_overlapping_view_is_discounted_by_the_shared_part(evaluator, make):
     """Turned by n of 16 headings two views share 1 − n·22.5°/87° of what they see, if all round is alike."""
     around = make(known=14) if make is hall else make()
     values = evaluator.evaluate(around, all_headings(evaluator))
@@ -257,7 +257,7 @@ def test_a_view_is_discounted_by_the_share_that_it_has_in_common(evaluator, make
             assert max(abs(x - expected) for x in left) < 0.15
 
 
-def test_the_residual_is_what_all_views_together_leave(evaluator):
+def test_residual_is_the_product_over_all_views(evaluator):
     around = hall()
     keys = all_headings(evaluator)[:5]
     values = evaluator.evaluate(around, keys)
@@ -273,7 +273,7 @@ def test_the_residual_is_what_all_views_together_leave(evaluator):
     assert torch.equal(evaluator.residual(around, poses[:0].float()), torch.ones_like(expected))
 
 
-def test_values_do_not_grow_with_the_number_of_beams():
+def test_view_values_do_not_depend_on_the_number_of_beams():
     for around in (hall(), unknown()):
         sums = []
         for n_beams in (80, 160, 320, 640):
@@ -286,7 +286,7 @@ def test_values_do_not_grow_with_the_number_of_beams():
             assert float(ratio.max()) < 1.15
 
 
-def test_known_space_is_worth_nothing(evaluator):
+def test_views_of_known_space_have_no_value(evaluator):
     generator = torch.Generator().manual_seed(0)
     shape = (40, 36, 21)
     occupancy = torch.where(torch.rand(shape, generator=generator) < 0.05, 0.9, 0.01)
@@ -297,7 +297,7 @@ def test_known_space_is_worth_nothing(evaluator):
     assert not bool(values.measured.any())
 
 
-def test_what_lies_behind_a_wall_is_worth_nothing(evaluator):
+def test_space_behind_a_wall_has_no_value(evaluator):
     shape = (80, 60, 30)
     observed = torch.zeros(shape, dtype=torch.bool)
     observed[:61] = True
@@ -310,12 +310,12 @@ def test_what_lies_behind_a_wall_is_worth_nothing(evaluator):
     assert float(evaluator.evaluate(opened, torch.tensor([[5, 0, 0, 0]])).values) > 100
 
 
-def test_a_small_prior_is_not_taken_for_knowledge(evaluator):
+def test_small_prior_does_not_count_as_known_free(evaluator):
     values = evaluator.evaluate(unknown(prior=0.01), all_headings(evaluator)[:1])
     assert float(values.values) > 1
 
 
-def test_gain_lies_where_it_is_seen_and_sums_to_the_value(evaluator):
+def test_gain_lies_in_seen_blocks_and_sums_to_the_value(evaluator):
     around = hall()
     values = evaluator.evaluate(around, all_headings(evaluator))
     torch.testing.assert_close(values.gain.sum(1), values.values)
@@ -332,7 +332,7 @@ def test_gain_lies_where_it_is_seen_and_sums_to_the_value(evaluator):
 
 
 @given(st.lists(st.integers(-4, 4), min_size=3, max_size=3), st.integers(0, 10**6))
-def test_moving_the_lattice_changes_nothing(shift, seed):
+def test_view_values_are_translation_invariant(shift, seed):
     evaluator = ViewEvaluator(*FOV, 2.0, RESOLUTION, n_beams=30, n_yaws=4)
     here = random_map((15, 14, 9), seed)
     cells = tuple(2 * 10**6 * s for s in shift)  # 1600 km away at most
@@ -345,7 +345,7 @@ def test_moving_the_lattice_changes_nothing(shift, seed):
         assert torch.equal(one, other)
 
 
-def test_views_do_not_depend_on_their_company(evaluator):
+def test_view_values_do_not_depend_on_the_batch(evaluator):
     around = hall()
     generator = torch.Generator().manual_seed(0)
     keys = torch.cat(
@@ -366,7 +366,7 @@ def test_views_do_not_depend_on_their_company(evaluator):
     assert none.gain.shape == none.measured.shape == (0, together.gain.shape[1])
 
 
-def test_windows_are_told_apart_and_forgotten():
+def test_local_maps_are_cached_by_identity_and_released():
     evaluator = ViewEvaluator(*FOV, 2.0, RESOLUTION, n_beams=30, n_yaws=4)
     keys = torch.tensor([[3, 3, 2, 0]])
     maps = [random_map((15, 14, 9), 0), random_map((15, 14, 9), 1), random_map((14, 15, 10), 1)]
@@ -386,7 +386,7 @@ coordinates = st.floats(-6e5, 6e5)
 
 
 @given(st.tuples(coordinates, coordinates, coordinates, st.floats(-50, 50)))
-def test_keys_name_the_nearest_pose(pose):
+def test_keys_are_the_nearest_lattice_poses(pose):
     evaluator = ViewEvaluator(*FOV, 1.0, RESOLUTION, n_beams=4)
     keys = evaluator.keys(torch.tensor([pose], dtype=torch.float64))
     nearest = evaluator.poses(keys)
@@ -400,7 +400,7 @@ def test_keys_name_the_nearest_pose(pose):
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
-def test_positions_are_centres_of_every_nth_cell(stride):
+def test_lattice_positions_are_centres_of_every_nth_cell(stride):
     evaluator = ViewEvaluator(*FOV, 1.0, RESOLUTION, n_beams=4, stride=stride, n_yaws=6)
     keys = torch.tensor([[-3, 0, 7, 5]])
     x, y, z, yaw = evaluator.poses(keys)[0].tolist()
@@ -408,7 +408,7 @@ def test_positions_are_centres_of_every_nth_cell(stride):
     assert yaw == pytest.approx(5 * 2 * math.pi / 6)
 
 
-def test_what_cannot_be_evaluated_is_refused():
+def test_rejects_bad_input():
     evaluator = ViewEvaluator(*FOV, 1.0, RESOLUTION, n_beams=4)
     around = random_map((9, 9, 9), 0)
     for bad in (math.nan, math.inf, 1e300):

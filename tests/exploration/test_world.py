@@ -32,7 +32,7 @@ def hall() -> World:
     return World.from_mesh(HALL, cache=False, name="hall")
 
 
-def test_the_box_is_that_of_the_mesh_and_cells_that_it_meets_are_occupied(hall):
+def test_world_box_covers_the_mesh_and_marks_met_cells_occupied(hall):
     assert hall.box.low.tolist() == [0, 0, 0]
     assert hall.box.shape == (50, 30, 15)
     assert bool(hall.occupied[0].all())
@@ -40,7 +40,7 @@ def test_the_box_is_that_of_the_mesh_and_cells_that_it_meets_are_occupied(hall):
     assert not bool(hall.occupied[5:15, 5:20, 5:10].any())
 
 
-def test_navigable_cells_are_those_from_which_the_mesh_is_farther_than_the_robot_is_wide(hall):
+def test_navigable_cells_keep_the_robot_radius_from_the_mesh(hall):
     cells = torch.ones(hall.box.shape).nonzero()
     room = MeshWorld(HALL).clearance(hall.centers(cells)).view(hall.box.shape)
     inside = torch.zeros(hall.box.shape, dtype=torch.bool)
@@ -49,7 +49,7 @@ def test_navigable_cells_are_those_from_which_the_mesh_is_farther_than_the_robot
     assert bool(((room > 0.3) & inside).any())
 
 
-def test_all_that_is_free_in_a_hall_is_observable_and_no_inside_of_a_solid(hall):
+def test_observable_cells_include_free_space_and_exclude_solids(hall):
     inside = torch.zeros(hall.box.shape, dtype=torch.bool)
     inside[36:42, 21:25, 1:7] = True
     assert not bool((hall.observable & inside).any())
@@ -60,14 +60,14 @@ def test_all_that_is_free_in_a_hall_is_observable_and_no_inside_of_a_solid(hall)
     assert float(hall.observable[0, 2:-2, 2:-2].double().mean()) > 0.98  # a wall
 
 
-def test_a_narrow_camera_sees_less(hall):
+def test_narrow_camera_observes_fewer_cells(hall):
     narrow = World.from_mesh(HALL, cache=False, vertical_fov=0.2, max_range=1.0)
     assert torch.equal(narrow.navigable, hall.navigable)
     assert int((narrow.observable & ~hall.observable).sum()) < 0.01 * int(hall.observable.sum())
     assert int(narrow.observable.sum()) < int(hall.observable.sum())
 
 
-def test_bounds_cut_the_world_off(hall):
+def test_bounds_crop_the_world(hall):
     part = World.from_mesh(HALL, bounds=(0.5, 0.5, 0.0, 3.5, 5.1, 2.3), cache=False)
     assert part.box.low.tolist() == [2, 2, 0]
     assert part.box.high.tolist() == [18, 26, 12]
@@ -77,7 +77,7 @@ def test_bounds_cut_the_world_off(hall):
     assert not bool((part.observable & ~hall.observable[window]).any())
 
 
-def test_a_hall_without_roof_or_with_a_hole_ends_at_its_bounds():
+def test_open_hall_ends_at_its_bounds():
     # The faces of a prism are its sides (8), its top (2) and its bottom (2).
     roofless = torch.cat([HALL[:8], HALL[10:]])
     world = World.from_mesh(roofless, bounds=(0, 0, 0, 10, 6, 2.7), cache=False)
@@ -90,14 +90,14 @@ def test_a_hall_without_roof_or_with_a_hole_ends_at_its_bounds():
     assert not bool((world.observable & outside).any())
 
 
-def test_inverted_and_degenerate_triangles_change_nothing(hall):
+def test_world_ignores_inverted_and_degenerate_triangles(hall):
     odd = torch.cat([HALL.flip(1)[::2], HALL[1::2], torch.ones(1, 3, 3, dtype=torch.float64)])
     world = World.from_mesh(odd, cache=False)
     assert torch.equal(world.navigable, hall.navigable)
     assert torch.equal(world.occupied, hall.occupied)
 
 
-def test_a_start_chooses_the_part_of_the_world_that_is_flown_in():
+def test_start_selects_the_navigable_part():
     two = torch.cat([box((0.1, 0.1, 0.1), (5.9, 3.9, 2.9)), box((7.1, 0.1, 0.1), (9.9, 2.9, 2.9))])
     left = World.from_mesh(two, cache=False)
     right = World.from_mesh(two, cache=False, start=(8.5, 1.5, 1.5))
@@ -131,12 +131,12 @@ def test_a_start_chooses_the_part_of_the_world_that_is_flown_in():
         ({"start": (1.0, 2.0)}, "three finite numbers"),
     ],
 )
-def test_settings_that_leave_no_world_are_refused(options, message):
+def test_world_rejects_settings_without_navigable_space(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         World.from_mesh(HALL, cache=False, **options)
 
 
-def test_meshes_that_are_none_and_lattices_too_fine_are_refused():
+def test_world_rejects_bad_meshes_and_too_many_cells():
     with pytest.raises(DataError, match="no triangles"):
         World.from_mesh(HALL[:0], cache=False)
     with pytest.raises(MemoryLimitError, match="coarser resolution"):
@@ -145,7 +145,7 @@ def test_meshes_that_are_none_and_lattices_too_fine_are_refused():
         World.from_mesh(1000 * HALL, cache=False)
 
 
-def test_starts_are_apart_in_sight_roomy_and_level(hall):
+def test_start_poses_are_separated_visible_roomy_and_level(hall):
     poses = hall.start_poses(4, 1.2, at=(2.0, 3.0, 1.5))
     assert poses.shape == (4, 4)
     assert torch.equal(poses, hall.check_start(poses))
@@ -162,7 +162,7 @@ def test_starts_are_apart_in_sight_roomy_and_level(hall):
     assert torch.allclose(turn, torch.full((3,), math.pi / 2, dtype=torch.float64))
 
 
-def test_without_a_place_teams_start_at_an_end_and_large_ones_fit(hall):
+def test_default_start_poses_lie_at_an_end_and_fit_large_teams(hall):
     one = hall.start_poses(1)
     assert float((one[0, :2] - torch.tensor([5.0, 3.0])).abs()[0]) > 3
     assert len(hall.check_start(hall.start_poses(16, 1.0))) == 16
@@ -188,13 +188,13 @@ def test_without_a_place_teams_start_at_an_end_and_large_ones_fit(hall):
         ((1.3, 1.0, 1.5, 0.0), r"touches the robot of team.start\[0\]"),
     ],
 )
-def test_starts_where_no_robot_can_be_are_named(hall, pose, message):
+def test_check_start_names_impossible_poses(hall, pose, message):
     poses = torch.tensor([(1.1, 1.1, 1.5, 0.0), pose], dtype=torch.float64)
     with pytest.raises(InvalidArgumentError, match=message):
         hall.check_start(poses)
 
 
-def test_start_poses_of_another_shape_are_refused(hall):
+def test_check_start_rejects_wrong_shapes(hall):
     for shape in ((3, 3), (0, 4), (4,)):
         with pytest.raises(InvalidArgumentError, match="expected"):
             hall.check_start(torch.zeros(shape))
@@ -206,7 +206,7 @@ def same(a: World, b: World) -> bool:
     )
 
 
-def test_a_world_is_read_back_as_it_was_and_not_worked_out_again(hall, tmp_path):
+def test_world_cache_returns_equal_cells_without_computing(hall, tmp_path):
     def stages(**options) -> tuple[World, set[str]]:
         heard: set[str] = set()
         world = World.from_mesh(HALL, on_event=lambda stage, done, total: heard.add(stage), **options)
@@ -225,7 +225,7 @@ def test_a_world_is_read_back_as_it_was_and_not_worked_out_again(hall, tmp_path)
 
 
 @pytest.mark.parametrize("harm", ["cut", "flip", "foreign", "swap"])
-def test_a_damaged_or_foreign_cache_is_not_believed(hall, tmp_path, caplog, harm):
+def test_world_cache_rejects_damaged_and_foreign_files(hall, tmp_path, caplog, harm):
     World.from_mesh(HALL)
     (file,) = (tmp_path / "cache").rglob("*.safetensors")
     data = file.read_bytes()
@@ -246,7 +246,7 @@ def test_a_damaged_or_foreign_cache_is_not_believed(hall, tmp_path, caplog, harm
     assert same(World.from_mesh(HALL), hall)  # it was mended
 
 
-def test_where_nothing_can_be_kept_a_warning_is_all(hall, tmp_path, monkeypatch, caplog):
+def test_world_cache_warns_if_it_cannot_write(hall, tmp_path, monkeypatch, caplog):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "file"))
     with caplog.at_level(logging.WARNING):
@@ -254,7 +254,7 @@ def test_where_nothing_can_be_kept_a_warning_is_all(hall, tmp_path, monkeypatch,
     assert "not kept" in caplog.text
 
 
-def test_worlds_by_name(tmp_path):
+def test_open_world_opens_each_name(tmp_path):
     store = open_world("warehouse", size=(18.0, 14.0, 5.0), resolution=0.4, cache=False)
     assert store.box.shape == (45, 35, 13)
     assert len(store.check_start(store.start_poses(3))) == 3
@@ -268,7 +268,7 @@ def test_worlds_by_name(tmp_path):
     assert bool(part.navigable.any())
 
 
-def test_worlds_that_are_none_are_refused(tmp_path):
+def test_open_world_rejects_unknown_names_and_options(tmp_path):
     with pytest.raises(InvalidArgumentError, match="world='moon'"):
         open_world("moon")
     with pytest.raises(MissingDataError, match=r"world.path=.*nowhere\.ply"):
@@ -289,7 +289,7 @@ def test_worlds_that_are_none_are_refused(tmp_path):
         ("edgar_mine.ply", (60, -200, -1, 100, -160, 3), (100.0, 3000.0)),
     ],
 )
-def test_real_meshes(real_data, file, bounds, volume):
+def test_open_world_reads_real_meshes(real_data, file, bounds, volume):
     world = open_world("mesh", path=real_data / "meshes" / file, bounds=bounds, cache=False)
     assert volume[0] < float(world.navigable.sum()) * 0.2**3 < volume[1]
     assert bool((world.observable & world.occupied).any())

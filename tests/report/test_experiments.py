@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.report.maps.comparison import comparison_figure
+from gmmtorch.report.maps.fitting_figures import comparison_figure
 from gmmtorch.report.studies import sensor_noise_figures as sensor_noise
 from gmmtorch.report.studies.component_count_figures import figures as count_figures
 from gmmtorch.report.studies.initialization_figures import figures
@@ -37,7 +37,7 @@ def test_the_four_panels_of_fig_2_1_have_a_line_a_start_with_means_and_range():
     figure = figures(STUDY)["initialization"]
     figure.canvas.draw()
     titles = [axes.get_title() for axes in figure.axes]
-    assert titles == ["initialization time", "iterations of EM", "initialization and EM", "PSNR2"]
+    assert titles == ["initialization time", "iterations of EM", "time of initialization and EM", "PSNR2"]
     assert "bunny, 5,000 points" in figure.get_suptitle()
     assert "2 seeds" in figure.get_suptitle()
     for axes in figure.axes:
@@ -56,7 +56,7 @@ def test_the_four_panels_of_fig_2_1_have_a_line_a_start_with_means_and_range():
 def test_quality_is_drawn_against_the_first_start():
     figure = figures(STUDY)["initialization_quality"]
     figure.canvas.draw()
-    assert "over random points" in figure.get_suptitle()
+    assert "Gain over random points" in figure.get_suptitle()
     first, other = figure.axes[3].lines
     assert first.get_ydata() == pytest.approx([0.0, 0.0])
     assert other.get_ydata() == pytest.approx([0.5, 0.5])
@@ -99,7 +99,7 @@ def test_each_method_has_a_mark_against_its_seconds():
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["em: 40 components", "scikit learn: 40 components"]
     assert "hall, 900 points" in figure.get_suptitle()
-    assert "held out" in left.get_title()
+    assert "held-out" in left.get_title()
 
 
 def test_without_points_held_out_those_that_were_learned_from_are_shown():
@@ -107,7 +107,7 @@ def test_without_points_held_out_those_that_were_learned_from_are_shown():
     figure = comparison_figure([row])
     figure.canvas.draw()
     left, right = figure.axes
-    assert "held out" not in left.get_title()
+    assert "held-out" not in left.get_title()
     assert float(*left.lines[0].get_ydata()) == -1.0
     assert np.isnan(right.lines[0].get_ydata()).all()
 
@@ -135,7 +135,7 @@ def test_variants_of_the_sensor_model_are_drawn_against_bytes():
     figure.canvas.draw()
     assert len(figure.axes) == 4
     for axes in figure.axes:
-        assert axes.get_xlabel() == "bytes"
+        assert axes.get_xlabel() == "map size [bytes]"
         assert [line.get_label() for line in axes.lines] == ["plain", "noise planar"]
         assert [int(x) for x in axes.lines[1].get_xdata()] == [9_001, 30_001]
     assert "seeds" not in figure.get_suptitle()
@@ -171,7 +171,7 @@ def test_a_rule_is_marked_with_what_it_was_told_on_the_line_of_all_numbers():
     figure.canvas.draw()
     psnr, likelihood, seconds, auc = figure.axes
     names = [line.get_label() for line in psnr.lines]
-    assert names == ["fixed number", "flat pieces (× noise)", "least BIC of the curve"]
+    assert names == ["fixed number", "flat pieces (multiple of the noise)", "lowest BIC"]
     assert psnr.lines[0].get_xdata().tolist() == [320, 640, 1280]
     assert psnr.lines[0].get_ydata().tolist() == [88.0, 96.0, 112.0]
     assert psnr.lines[1].get_xdata().tolist() == [400, 800]

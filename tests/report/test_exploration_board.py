@@ -3,38 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from exploration_rows import OBSERVABLE_BITS, flights, trial
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.util.tensor_util import make_ndarray
 
-from gmmtorch.mapping.components import Components
 from gmmtorch.report.exploration.mission_curves import entropy_figure
-from gmmtorch.report.exploration.mission_tensorboard import MissionBoard, write_exploration_board
+from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
 from gmmtorch.report.tensorboard_writer import Board
 
 
 def read(directory) -> EventAccumulator:
     events = EventAccumulator(str(directory), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     return events.Reload()
-
-
-def mixture() -> Components:
-    empty = Components.empty(3)
-    means = torch.tensor([[0.0, 0.0, 1.0], [5.0, 0.0, 2.0]], dtype=torch.float64)
-    flags = torch.tensor([False, True])
-    covariances = 0.1 * torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
-    return Components(
-        means,
-        covariances,
-        torch.ones(2, dtype=torch.float64),
-        flags,
-        torch.zeros(2, 2, dtype=torch.int64),
-        empty.origins,
-        empty.seen_by,
-        empty.seen_from,
-        empty.seen_count,
-    )
 
 
 def test_trials_and_figures(tmp_path):
@@ -56,23 +36,19 @@ def test_trials_and_figures(tmp_path):
     assert events.Tags()["images"] == ["figures/entropy"]
 
 
-def test_a_scene_that_grows(tmp_path):
+def test_paths_are_points_of_all_robots(tmp_path):
     paths = flights(2, 30)
     with Board(tmp_path) as board:
-        live = MissionBoard(board)
-        live.scene(0.0, None, [path[:1] for path in paths])
-        live.scene(9.5, Components.empty(3), [path[:10] for path in paths])
-        live.scene(29.0, mixture(), paths)
+        for n in (1, 10, 30):
+            board.paths("paths", [path[:n] for path in paths], step=n)
+        board.paths("none", [])
     events = read(tmp_path)
     clouds = events.Tensors("paths_VERTEX")
-    assert [event.step for event in clouds] == [0, 9, 29]
+    assert [event.step for event in clouds] == [1, 10, 30]
     for event, n in zip(clouds, (1, 10, 30), strict=True):
         expected = np.concatenate([path[:n, :3] for path in paths])
         np.testing.assert_allclose(make_ndarray(event.tensor_proto)[0], expected, rtol=1e-6)
-    (event,) = events.Tensors("mixture_VERTEX")
-    assert event.step == 29
-    across = make_ndarray(event.tensor_proto)[0, :, 0]
-    assert across.max() < 1  # the beams without return, at x = 5, are no surface
+    assert not any("none" in tag for tag in events.Tags()["tensors"])
 
 
 def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
@@ -100,22 +76,3 @@ def test_variants_that_differ_by_their_network_alone_have_tags_of_their_own(tmp_
     found = events.Scalars(lossy)
     np.testing.assert_allclose([event.value for event in found], [0, 0.5, 0.3], rtol=1e-6)
     assert any("partitions_60-120.5_0_1.2" in tag for tag in tags)
-
-
-def test_a_running_mission_by_its_simulated_seconds(tmp_path):
-    with Board(tmp_path) as board:
-        live = MissionBoard(board)
-        live.step(0.0, {"entropy_bits": 10.0})
-        live.step(12.9, {"entropy_bits": 5.0, "nothing": None})
-    events = read(tmp_path)
-    assert events.Tags()["scalars"] == ["mission/entropy_bits"]
-    found = events.Scalars("mission/entropy_bits")
-    assert [(event.step, event.value) for event in found] == [(0, 10.0), (12, 5.0)]
-
-
-def test_nothing_to_show(tmp_path):
-    with Board(tmp_path) as board:
-        write_exploration_board(board, [], {})
-        MissionBoard(board).scene(0.0, Components.empty(3), [])
-    assert read(tmp_path).Tags()["scalars"] == []
-    assert read(tmp_path).Tags()["tensors"] == []

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import mean_band
 from gmmtorch.report.exploration.loss_figures import loss_figure
-from gmmtorch.report.exploration.variant_figures import by_variant
+from gmmtorch.report.exploration.trial_groups import by_variant
 from gmmtorch.report.style import PALETTE
 
 CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
@@ -83,7 +83,7 @@ def test_labels_say_times_bytes_ratios_and_how_maps_end():
     assert "50 % lost\nt90 in 1 of 2" in left
     total = np.mean([rows[i]["wire_bytes_over_time"][-1] for i in (3, 8)])
     assert f"50 % lost\n{total / 1e6:.2f} MB, 2.00×" in sent
-    assert "partition 0 | 1 2, 60\N{EN DASH}120 s\n0.3 % of cells differ\nwhole again in 10 s" in lacking
+    assert "partition 0 | 1 2, 60\N{EN DASH}120 s\n0.3 % of cells differ\ncomplete after 10 s" in lacking
     assert "lossless\n0.3 % of cells differ" in lacking
 
 
@@ -138,7 +138,7 @@ def test_nothing_lacking_at_all_can_be_drawn():
         ([{}, {"partitions": [CUT]}], ["lossless", "partition 0 | 1 2, 60\N{EN DASH}120 s"]),
         ([{"budget": None}, {"budget": 2000.0}], ["no budget", "budget 2.00 kB/s"]),
         ([{"bandwidth": None}, {"bandwidth": 2e4, "loss": 0.1}], ["no limit", "20.0 kB/s, 10 % lost"]),
-        ([{"reach": 15.0}, {"duplication": 0.2}], ["reach 15 m", "20 % twice, any reach"]),
+        ([{"reach": 15.0}, {"duplication": 0.2}], ["reach 15 m", "20 % duplicated, any reach"]),
         ([{"jitter": 0.0}, {"jitter": 0.02}], ["jitter 0 s", "jitter 0.02 s"]),
         ([{"codec": "float"}, {"codec": "thesis"}], ["float", "thesis"]),
         ([{"framework": "grid_shared"}, {"loss": 0.1}], ["E1, lossless", "E0, 10 % lost"]),

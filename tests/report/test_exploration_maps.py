@@ -14,12 +14,12 @@ from matplotlib.colors import to_rgb
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.world.scoring import BeliefRule
-from gmmtorch.report.exploration.cutaway import cut_away
 from gmmtorch.report.exploration.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
-from gmmtorch.report.exploration.mission_scene import mixture_scene_figure
-from gmmtorch.report.exploration.path_figures import smooth_path
-from gmmtorch.report.exploration.scene_renderer import Camera, Canvas, render
-from gmmtorch.report.exploration.top_view import TopView, top_view
+from gmmtorch.report.maps.map_images import MapImage, highest_occupancy
+from gmmtorch.report.scenes.cutaway import cut_away
+from gmmtorch.report.scenes.paths import smooth_path
+from gmmtorch.report.scenes.scene import mixture_scene_figure
+from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
 from gmmtorch.report.style import UNKNOWN
 
 
@@ -38,16 +38,18 @@ def test_top_view_is_the_highest_of_what_is_known_within_the_band():
     theta[0, 0] = torch.tensor([0.9, 0.1, 0.2, 0.5])
     theta[0, 1] = torch.tensor([0.5, 0.5, 0.505, 0.8])
     theta[1, 0] = torch.tensor([0.5, 0.1, 0.7, 0.9])
-    view = top_view(theta, (1.0, 2.0, -0.5), 0.5, band=(0.0, 1.0))  # centres at −0.25, 0.25, 0.75, 1.25
+    view = highest_occupancy(
+        theta, (1.0, 2.0, -0.5), 0.5, band=(0.0, 1.0)
+    )  # centres at −0.25, 0.25, 0.75, 1.25
     np.testing.assert_allclose(view.image, [[0.2, 0.5], [0.7, 0.5]], atol=1e-7)
     assert view.band == (0.0, 1.0)
     assert view.extent == (1.0, 2.0, 2.0, 3.0)
-    truth = top_view(theta > 0.5, (0, 0, 0), 0.5)
+    truth = highest_occupancy(theta > 0.5, (0, 0, 0), 0.5)
     assert truth.image.tolist() == [[1, 1], [1, 0]]
 
 
 def test_coverage_is_shaded_where_it_is():
-    world = TopView(torch.zeros(6, 4, dtype=torch.bool), (-1.0, 0.0), 0.5)
+    world = MapImage(torch.zeros(6, 4, dtype=torch.bool), (-1.0, 0.0), 0.5)
     world.image[5, 0] = True
     coverage = torch.zeros(6, 4, dtype=torch.int64)
     coverage[1, 2], coverage[2, 2], coverage[3, 3] = 1, 1, 2
@@ -68,7 +70,7 @@ def test_coverage_is_shaded_where_it_is():
 
 @pytest.mark.parametrize(("n_robots", "n_poses"), [(0, 5), (1, 0), (1, 1), (16, 5)])
 def test_any_number_of_robots_and_poses(n_robots, n_poses):
-    world = TopView(torch.rand(5, 9), (0.0, 0.0), 1.0)
+    world = MapImage(torch.rand(5, 9), (0.0, 0.0), 1.0)
     coverage = torch.randint(0, n_robots + 1, (5, 9))
     paths = [path[:n_poses] for path in flights(n_robots, max(n_poses, 1))]
     trajectories_figure(world, paths, coverage).canvas.draw()
@@ -80,7 +82,7 @@ def test_any_number_of_robots_and_poses(n_robots, n_poses):
 
 
 def test_team_map_outlines_the_components_of_the_layer():
-    view = top_view(torch.rand(8, 8, 6), (0, 0, 0), 0.5, (0.5, 2.0))
+    view = highest_occupancy(torch.rand(8, 8, 6), (0, 0, 0), 0.5, (0.5, 2.0))
     means, covariances = components(40)
     snapshots = [
         TeamSnapshot(60.0, view, [p[:5, :2] for p in flights(2, 5)]),
@@ -102,7 +104,7 @@ def test_team_map_outlines_the_components_of_the_layer():
 
 
 def test_cells_are_called_what_the_belief_calls_them():
-    view = TopView(torch.tensor([[0.1, 0.3, 0.5, 0.6, 0.7]]), (0.0, 0.0), 1.0)
+    view = MapImage(torch.tensor([[0.1, 0.3, 0.5, 0.6, 0.7]]), (0.0, 0.0), 1.0)
     free, unknown, occupied = (1.0, 1.0, 1.0), to_rgb(UNKNOWN), to_rgb("#2b2b2b")
     usual = [free, unknown, unknown, unknown, occupied]
     for belief, expected in (
@@ -113,12 +115,12 @@ def test_cells_are_called_what_the_belief_calls_them():
         np.testing.assert_allclose(np.asarray(image.get_array())[:, 0], expected)
 
 
-@pytest.mark.parametrize(("height", "said"), [(1.0, []), (3.0, ["path above 1.8 m"])])
+@pytest.mark.parametrize(("height", "said"), [(1.0, []), (3.0, ["path above or below these heights"])])
 def test_paths_above_the_heights_shown_look_it(height, said):
-    world = TopView(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
+    world = MapImage(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
     poses = np.array([[1.0, 1, 1.0, 0], [3, 1, height, 0], [5, 1, 1.0, 0]])
     figure = trajectories_figure(world, [poses])
-    assert figure.get_suptitle() == "Where the robots flew\nsurfaces between z = 0.8 m and 1.8 m"
+    assert figure.get_suptitle() == "Robot paths\nsurfaces between z = 0.8 m and 1.8 m"
     assert [t.get_text() for t in figure.legends[0].get_texts() if "path" in t.get_text()] == said
     paths = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
     above = [line for line in paths if len(line.get_path_effects()) == 3]
@@ -128,7 +130,7 @@ def test_paths_above_the_heights_shown_look_it(height, said):
         np.testing.assert_allclose(crossed, 1.8, atol=0.5)
     assert sum(np.abs(np.diff(line.get_xdata())).sum() for line in paths) == pytest.approx(4)
     below = trajectories_figure(world, [poses - [0, 0, 1, 0]])
-    assert "path below 0.8 m" in [t.get_text() for t in below.legends[0].get_texts()]
+    assert "path above or below these heights" in [t.get_text() for t in below.legends[0].get_texts()]
 
 
 def test_paths_between_poses_are_those_that_were_flown():
@@ -165,7 +167,7 @@ def test_paths_against_the_heading_or_without_one_are_straight():
 
 @pytest.mark.parametrize("n_robots", [1, 16])
 def test_legends_of_one_panel_fit(n_robots):
-    view = TopView(torch.rand(12, 30), (0.0, 0.0), 1.0, (0.8, 1.8))
+    view = MapImage(torch.rand(12, 30), (0.0, 0.0), 1.0, (0.8, 1.8))
     paths = flights(n_robots, 30)
     for figure in (
         team_map_figure([TeamSnapshot(1.0, view, paths, *components(5))]),
@@ -177,19 +179,19 @@ def test_legends_of_one_panel_fit(n_robots):
 
 
 def test_maps_say_what_is_wrong():
-    world = TopView(torch.zeros(3, 3), (0.0, 0.0), 1.0)
+    world = MapImage(torch.zeros(3, 3), (0.0, 0.0), 1.0)
     with pytest.raises(InvalidArgumentError, match="coverage has shape"):
         trajectories_figure(world, [], torch.zeros(2, 3))
     with pytest.raises(InvalidArgumentError, match="snapshots is empty"):
         team_map_figure([])
     with pytest.raises(InvalidArgumentError, match="owners has shape"):
         team_map_figure([TeamSnapshot(0.0, world, [], *components(3), owners=[0])])
-    with pytest.raises(InvalidArgumentError, match="holds no layer"):
-        top_view(torch.zeros(2, 2, 2), (0, 0, 0), 1.0, (5.0, 6.0))
+    with pytest.raises(InvalidArgumentError, match="contains no layer"):
+        highest_occupancy(torch.zeros(2, 2, 2), (0, 0, 0), 1.0, (5.0, 6.0))
     with pytest.raises(InvalidArgumentError, match="no layer"):
-        top_view(torch.zeros(2, 2, 0), (0, 0, 0), 1.0)
+        highest_occupancy(torch.zeros(2, 2, 0), (0, 0, 0), 1.0)
     with pytest.raises(InvalidArgumentError, match="probability has shape"):
-        top_view(torch.zeros(2, 2), (0, 0, 0), 1.0)
+        highest_occupancy(torch.zeros(2, 2), (0, 0, 0), 1.0)
 
 
 # -- in space -------------------------------------------------------------------------------------
@@ -326,12 +328,8 @@ def test_scene_by_height_and_by_robot(k):
     figure = mixture_scene_figure(means, covariances, trajectories=flights(2, 20), max_pixels=300)
     figure.canvas.draw()
     assert any(axes.get_ylabel() == "height z [m]" for axes in figure.axes)
-    by_robot = mixture_scene_figure(
-        means, covariances, owners=torch.arange(k) % 2, ceiling=10.0, title="mine", max_pixels=300
-    )
-    by_robot.canvas.draw()
-    assert by_robot.get_suptitle() == "mine"
-    assert len(by_robot.axes) == 1
+    named = mixture_scene_figure(means, covariances, ceiling=10.0, title="mine", max_pixels=300)
+    assert named.get_suptitle() == "mine"
 
 
 def test_scene_is_the_same_every_time_and_far_from_the_origin():
@@ -356,7 +354,5 @@ def test_scene_says_what_is_wrong():
         mixture_scene_figure(means[:, :2], covariances[:, :2, :2])
     with pytest.raises(InvalidArgumentError, match="seen_from has shape"):
         mixture_scene_figure(means, covariances, seen_from=means[:2])
-    with pytest.raises(InvalidArgumentError, match="owners has shape"):
-        mixture_scene_figure(means, covariances, owners=torch.zeros(2))
     with pytest.raises(InvalidArgumentError, match="n_sigma=0"):
         render(means, covariances, means, Camera(), Canvas(0, 1, 0, 1, 10), n_sigma=0)

@@ -14,26 +14,12 @@ from exploration_rows import flights, trial
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.report.exploration.rerun_recording import (
     RecordedMap,
-    _ellipsoids,
     _log_robot,
     load_rerun,
     record_rerun,
 )
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs rerun-sdk")
-
-
-def test_half_axes_and_quaternions_make_the_covariance():
-    from scipy.spatial.transform import Rotation
-
-    factors = torch.randn(50, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    covariances = factors @ factors.mT
-    sizes, turns = _ellipsoids(covariances)
-    axes = Rotation.from_quat(turns).as_matrix()
-    np.testing.assert_allclose(
-        axes @ ((sizes / 2) ** 2 * np.eye(3)[:, None]).transpose(1, 0, 2) @ axes.transpose(0, 2, 1),
-        covariances,
-    )
 
 
 @needs_rerun

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 
-from gmmtorch.report.labels import Label, along, around, place_labels
-from gmmtorch.report.style import dress, figure_title, new_figure
+from gmmtorch.report.labels import Label, place_labels
+from gmmtorch.report.style import figure_title, label_axes, new_figure
 
 
 def pixels(axes: Axes, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -31,12 +31,12 @@ def test_there_is_room_for_labels_along_two_lines(heights, has_legend):
     lines = [np.array(heights), 2.5 - np.array(heights)]
     for y in lines:
         axes.plot(x, y, "o-", label="line")
-    dress(axes, "two lines", "x", "y")
+    label_axes(axes, "two lines", "x", "y")
     if has_legend:
         figure.legend(loc="outside lower center")
     figure_title(figure, "Labels\nin two lines of title")
     corners = [(a, b) for y in lines for a, b in zip(x, y, strict=True)]
-    labels = [Label(axes, f"{b:.2f}", around(a, b), {"fontsize": 9.0}) for a, b in corners]
+    labels = [Label(axes, f"{b:.2f}", a, b, {"fontsize": 9.0}) for a, b in corners]
     place_labels(figure, labels)
     figure.canvas.draw()
     boxes = [note.get_window_extent() for note in axes.texts]
@@ -52,29 +52,11 @@ def test_there_is_room_for_labels_along_two_lines(heights, has_legend):
         assert np.abs((box.min + box.max) / 2 - mark).max() < 60  # beside its own mark
 
 
-def test_a_label_moves_along_its_line_to_where_no_curve_is():
-    figure = new_figure(7.0, 5.0)
-    axes = figure.subplots()
-    x = np.linspace(0, 10, 50)
-    axes.set(xlim=(0, 10), ylim=(0, 3))
-    axes.axhline(1.0)
-    axes.plot(x, np.where(x > 4, 1.05, 2.8))  # above the line on the right,
-    axes.fill_between(x, np.where(x > 4, 0.5, 0.0), np.where(x > 4, 0.98, 0.0))  # and a band beneath it
-    place_labels(figure, [Label(axes, "level", along(1.0), {"fontsize": 9.0})])
-    figure.canvas.draw()
-    box = axes.texts[0].get_window_extent()
-    left, low = axes.transData.inverted().transform(box.min)
-    right, high = axes.transData.inverted().transform(box.max)
-    assert 0 <= left < right < 4
-    assert low > 1 or high < 1
-    assert abs((low + high) / 2 - 1) < 0.3
-
-
 def test_where_nothing_is_free_the_least_is_covered():
     figure = new_figure(3.0, 3.0)
     axes = figure.subplots()
     axes.set(xlim=(0, 1), ylim=(0, 1))
     for height in np.linspace(0, 1, 60):
         axes.plot([0, 1], [height, height])
-    place_labels(figure, [Label(axes, "x", around(0.5, 0.5), {})])
+    place_labels(figure, [Label(axes, "x", 0.5, 0.5, {})])
     assert axes.texts[0].get_text() == "x"

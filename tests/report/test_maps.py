@@ -11,7 +11,8 @@ from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.report.maps.map_figures import map_figure
-from gmmtorch.report.maps.raster import MapPanel, height_image, plan, robust_bounds, roof_above, slice_image
+from gmmtorch.report.maps.map_images import MapPanel, height_image, roof_above, slice_image
+from gmmtorch.report.maps.regions import robust_bounds
 
 
 def wall_map(dim: int) -> SparseEvidence:
@@ -53,7 +54,7 @@ def test_draws_an_all_unknown_map(dim, path):
     panel = MapPanel("nothing", unknown, 0.5, *box(dim))
     trajectory = {None: None, "empty": torch.empty(0, dim), "one": torch.zeros(1, dim)}[path]
     map_figure([panel], trajectory).canvas.draw()
-    assert np.isnan(slice_image(panel)[0]).all()
+    assert slice_image(panel).image.isnan().all()
 
 
 def test_pixels_are_the_cells_of_the_grid():
@@ -61,11 +62,11 @@ def test_pixels_are_the_cells_of_the_grid():
     evidence.hits[2, 0] = 3.0
     evidence.misses[0, 1] = 1.0
     panel = MapPanel("grid", evidence.lookup, 0.5, (-1.0, 2.0), (0.5, 3.0))
-    image, raster = slice_image(panel)
-    assert raster.extent == (-1.0, 0.5, 2.0, 3.0)
-    expected = np.full((2, 3), np.nan)  # rows are y
-    expected[0, 2], expected[1, 0] = 4 / 5, 1 / 3
-    np.testing.assert_allclose(image, expected)
+    found = slice_image(panel)
+    assert found.extent == (-1.0, 0.5, 2.0, 3.0)
+    expected = np.full((3, 2), np.nan)
+    expected[2, 0], expected[0, 1] = 4 / 5, 1 / 3
+    np.testing.assert_allclose(found.image, expected)
 
 
 def test_every_nth_cell_is_asked_where_there_are_too_many():
@@ -76,11 +77,11 @@ def test_every_nth_cell_is_asked_where_there_are_too_many():
         return unknown(points)
 
     panel = MapPanel("large", occupancy, 0.1, (0.0, 0.0), (100.0, 50.0))
-    image, raster = slice_image(panel, max_pixels=100)
+    found = slice_image(panel, max_pixels=100)
     points = torch.cat(asked)
-    assert image.shape == (50, 100)
+    assert found.image.shape == (100, 50)
     assert len(points) == 5000
-    assert raster.spacing == pytest.approx(1.0)
+    assert found.resolution == pytest.approx(1.0)
     inside_a_cell = (points / 0.1) % 1.0
     torch.testing.assert_close(inside_a_cell, torch.full_like(inside_a_cell, 0.5), atol=1e-6, rtol=0)
 
@@ -93,11 +94,11 @@ def test_shrinking_keeps_walls_and_unknown():
 
     def occupancy(points):
         cell = points.floor().long()
-        return theta[cell[:, 1], cell[:, 0]]
+        return theta[cell[:, 0], cell[:, 1]]
 
-    image, raster = slice_image(MapPanel("m", occupancy, 1.0, (0.0, 0.0), (4.0, 4.0)), shown_pixels=2)
-    np.testing.assert_allclose(image, [[0.9, np.nan], [np.nan, 0.25]])
-    assert raster.extent == (0.0, 4.0, 0.0, 4.0)
+    found = slice_image(MapPanel("m", occupancy, 1.0, (0.0, 0.0), (4.0, 4.0)), shown_pixels=2)
+    np.testing.assert_allclose(found.image, [[0.9, np.nan], [np.nan, 0.25]])
+    assert found.extent == (0.0, 4.0, 0.0, 4.0)
 
 
 def test_heights_are_of_the_highest_occupied_cell():
@@ -107,16 +108,15 @@ def test_heights_are_of_the_highest_occupied_cell():
         return torch.where(occupied, 0.9, 0.1)
 
     panel = MapPanel("steps", occupancy, 1.0, (0.0, 0.0, 0.0), (3.0, 1.0, 4.0))
-    image, raster = height_image(panel, 0.5)
-    np.testing.assert_allclose(image, [[0.5, np.nan, 1.5]])
-    coarse, _ = height_image(panel, 0.5, max_queries=4)
-    assert coarse.size < image.size
-    assert raster.spacing == 1.0
+    found = height_image(panel, 0.5)
+    np.testing.assert_allclose(found.image, [[0.5], [np.nan], [1.5]])
+    assert found.resolution == 1.0
+    assert height_image(panel, 0.5, max_queries=4).image.numel() < found.image.numel()
 
 
 def test_unknown_cells_are_no_surface_however_low_the_threshold():
     panel = MapPanel("nothing", unknown, 0.5, *box(3))
-    assert np.isnan(height_image(panel, 0.1)[0]).all()
+    assert height_image(panel, 0.1).image.isnan().all()
 
 
 @pytest.mark.parametrize("roof", [2.0, 100.0])
@@ -145,7 +145,7 @@ def test_robust_bounds():
 
 def test_arrays_are_taken_as_answers():
     panel = MapPanel("array", lambda points: np.full(len(points), 0.25), 0.5, *box(2))
-    assert (slice_image(panel)[0] == 0.25).all()
+    assert (slice_image(panel).image == 0.25).all()
 
 
 def test_says_what_is_wrong():
@@ -164,8 +164,7 @@ def test_says_what_is_wrong():
         slice_image(MapPanel("short", lambda points: torch.zeros(1), 0.5, *box(2)))
 
 
-def test_rasters_cover_the_region_on_the_lattice_of_cells():
-    raster = plan(MapPanel("m", unknown, 0.1, (-0.25, 0.3), (0.31, 0.4)))
-    assert raster.extent == pytest.approx((-0.3, 0.4, 0.3, 0.4))
-    assert raster.x[0] == pytest.approx(-0.25)
-    assert (len(raster.x), len(raster.y)) == (7, 1)
+def test_images_cover_the_region_aligned_with_cells():
+    image = slice_image(MapPanel("m", unknown, 0.1, (-0.25, 0.3), (0.31, 0.4)))
+    assert image.extent == pytest.approx((-0.3, 0.4, 0.3, 0.4))
+    assert image.image.shape == (7, 1)

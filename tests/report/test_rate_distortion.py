@@ -62,7 +62,7 @@ def test_settings_that_a_smaller_one_beats_are_no_part_of_a_curve():
 
 def test_other_ways_to_write_our_components_are_no_rivals():
     curves = {"ours": [(100, 50.0), (800, 80.0)], "ours_without_counts": [(90, 50.0), (700, 80.0)]}
-    with pytest.raises(InvalidArgumentError, match="nobody else"):
+    with pytest.raises(InvalidArgumentError, match="no other codec"):
         leads(rows_of(curves), "auc")
     with pytest.raises(InvalidArgumentError, match="'ours'"):
         leads(rows_of({"raw": curves["ours"]}), "auc")
@@ -113,7 +113,7 @@ def test_the_figure_has_a_line_for_each_codec_and_shades_the_lead():
     figure = figures(rows_of(curves) + rows_of(curves, "hall"))["rate_distortion"]
     assert len(figure.axes) == 4
     for axes in figure.axes:
-        assert [line.get_label() for line in axes.lines] == ["mixture, ours", "octree, zstd"]
+        assert [line.get_label() for line in axes.lines] == ["mixture (gmmtorch)", "octree, zstd"]
         assert len(axes.patches) == 1
         assert any("octaves" in text.get_text() for text in axes.texts)
     figure.savefig(io.BytesIO(), dpi=40)

@@ -7,8 +7,8 @@ import pytest
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import Reliability
-from gmmtorch.report.save import save_figure
-from gmmtorch.report.studies.calibration_figures import reliability_figure
+from gmmtorch.report.maps.accuracy_figures import reliability_figure
+from gmmtorch.report.style import save_figure
 
 CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
 
@@ -23,7 +23,7 @@ def test_a_line_a_method_in_both_panels_with_its_error_in_the_legend():
     for line in lower.lines:
         np.testing.assert_allclose(line.get_ydata(), [0.5, 0.25, 0.25])
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["point, ECE 0.100", "occupancy grid, ECE 0.000"]
+    assert labels == ["calibrated", "point, ECE 0.100", "occupancy grid, ECE 0.000"]
     assert figure.get_suptitle() == "Kinect, 0.05 m"
 
 

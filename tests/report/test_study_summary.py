@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.studies.study_summary import study_summary
+from gmmtorch.report.exploration.mission_summary import study_summary
 
 AUC = {"gmm_shared": [0.979, 0.98, 0.9755], "grid_shared": [0.979, 0.976, 0.975]}
 T90 = {"gmm_shared": [198.0, 232.0, 240.0], "grid_shared": [249.0, 229.0, None]}
@@ -38,7 +38,7 @@ def test_means_ranges_and_how_many_have_a_value():
     assert cells(first, "AUC, all observable cells") == ["0.978 (0.976 to 0.980)", "0.977 (0.975 to 0.979)"]
     assert cells(first, "t90 (s)") == ["223 (198 to 240)", "239 (229 to 249), 2 of 3"]
     assert cells(first, "collisions") == ["0", "0"]
-    assert cells(first, "of it components (kB)") == ["421", "–"]
+    assert cells(first, "sent as components (kB)") == ["421", "–"]
     assert "overlap" not in first
 
 

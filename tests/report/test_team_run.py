@@ -9,7 +9,7 @@ import pytest
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.exploration.team_figures import team_run_figure
-from gmmtorch.report.save import save_figure
+from gmmtorch.report.style import save_figure
 
 
 def row(robot: int, explores: bool = True, **changes: Any) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def row(robot: int, explores: bool = True, **changes: Any) -> dict[str, Any]:
 
 def test_robots_in_a_world_have_lines_of_the_entropy_left():
     left, right = team_run_figure([row(0), row(3)]).axes
-    assert "entropy left" in left.get_ylabel()
+    assert "remaining entropy" in left.get_ylabel()
     assert left.lines[1].get_xdata().tolist() == [0.0, 10.0, 20.0]
     assert left.lines[1].get_ydata().tolist() == [100.0, 60.0, 23.5]
     assert left.get_xlim() == (0.0, 20.0)  # lines end where their names are
@@ -40,7 +40,7 @@ def test_robots_in_a_world_have_lines_of_the_entropy_left():
 
 def test_others_have_lines_of_their_records():
     left, _ = team_run_figure([row(0), row(1, explores=False)]).axes
-    assert left.get_ylabel() == "records held"
+    assert left.get_ylabel() == "number of records"
     assert left.lines[1].get_ydata().tolist() == [0.0, 50.0, 81.0]
 
 
@@ -58,8 +58,8 @@ def test_bars_end_where_the_bytes_do_and_kinds_that_nobody_sent_are_left_out():
     ("rows", "title"),
     [
         ([row(4)], "Robot 4"),
-        ([row(0), row(1)], "2 robots: all hold the same map"),
-        ([row(0), row(1, digest="cd")], "2 robots: their maps differ"),
+        ([row(0), row(1)], "2 robots with the same map"),
+        ([row(0), row(1, digest="cd")], "2 robots with different maps"),
     ],
 )
 def test_the_title_says_what_it_is_of(rows, title):

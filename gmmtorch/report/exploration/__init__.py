@@ -1,1 +1,1 @@
-"""Figures of exploration missions."""
+"""Figures and recordings of exploring teams."""

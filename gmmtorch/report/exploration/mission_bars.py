@@ -1,43 +1,36 @@
-"""What frameworks came to, side by side with their paired differences, and where their time went."""
+"""Figures that compare frameworks: results with paired differences, and computing time by stage."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.paired_statistics import Interval, mean_band, paired_interval
-from gmmtorch.report.exploration.mission_style import (
+from gmmtorch.evaluation.paired_statistics import Interval, mean_band
+from gmmtorch.report import style
+from gmmtorch.report.exploration.trial_groups import (
     about,
     by_framework,
     framework_colour,
     framework_name,
+    paired_difference,
     seeds_note,
+    short_name,
 )
 from gmmtorch.report.quantities import byte_text
-from gmmtorch.report.style import (
-    LABEL_SIZE,
-    TICK_SIZE,
-    Rows,
-    colour,
-    draw_grid,
-    dress,
-    figure_title,
-    label_of,
-    new_figure,
-)
+from gmmtorch.report.style import Rows
 
 
 class _Measure(NamedTuple):
-    """A field of the rows, its name and unit; whether of many magnitudes, and compared by ratios."""
+    """A field of the rows, its title and unit; whether to compare logarithms, on a logarithmic axis."""
 
     field: str
     title: str
@@ -54,43 +47,46 @@ _MEASURES = (
 
 
 def summary_bars(rows: Rows, title: str | None = None) -> Figure:
-    """Bytes sent, t90, AUC and coverage per metre of each framework, and beneath them what differs.
+    """Draws bytes sent, t90, AUC and coverage per metre of each framework, and below them the differences.
 
-    Above, a dot for each seed, and the mean with its 95 % interval. Where some seeds have no value (a t90
-    never reached) there is no mean, which would be that of the lucky ones, but how many have one.
-    Beneath, the mean difference of each two frameworks over the seeds that both ran, with its paired
-    95 % interval, which does not touch the line at zero where there is a difference; of bytes, the
-    geometric mean of the ratio, and the line at one. Nothing where a seed lacks a value.
+    Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
+    text says how many have one, because a mean of these would be biased. Below: the mean difference of two
+    frameworks over their common seeds with its paired 95 % interval, and a line at zero; for bytes, the
+    geometric mean of the ratio, and a line at one. Empty if a seed has no value.
+
+    Args:
+        rows: explore rows of `results.json`.
+        title: title of the figure; by default world, robots, frameworks and number of seeds.
 
     Raises:
         InvalidArgumentError: no row.
     """
     groups = by_framework(rows)
-    n = len(_MEASURES)
     pairs = list(itertools.combinations(groups, 2))
-    figure = new_figure(3.2 * n + 1.0, (5.6 if pairs else 3.6) + 0.3)
-    grid = figure.subplots(2 if pairs else 1, n, squeeze=False, height_ratios=[1.25, 1] if pairs else [1])
+    figure = style.new_figure(3.2 * len(_MEASURES) + 1.0, 5.9 if pairs else 3.9)
+    grid = figure.subplots(
+        2 if pairs else 1, len(_MEASURES), squeeze=False, height_ratios=[1.25, 1] if pairs else [1]
+    )
     for measure, column in zip(_MEASURES, grid.T, strict=True):
+        values = {name: _by_seed(trials, measure) for name, trials in groups.items()}
         for place, (framework, trials) in enumerate(groups.items()):
-            values = [value for value in _by_seed(trials, measure).values() if value is not None]
-            _draw_group(column[0], place, np.array(values), len(trials), framework_colour(framework))
+            _draw_group(column[0], place, values[framework], len(trials), framework_colour(framework))
         if measure.by_ratio:
-            column[0].set_yscale("log")
-            column[0].yaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
-        _name_places(column[0], [framework_name(name).split()[0] for name in groups])
-        dress(column[0], measure.title, "", measure.unit)
+            _log_ticks(column[0], lambda value: byte_text(value, digits=1))
+        _name_places(column[0], [short_name(name) for name in groups])
+        style.label_axes(column[0], measure.title, "", measure.unit)
         if pairs:
-            _draw_differences(column[1], groups, pairs, measure)
+            _draw_differences(column[1], values, pairs, measure)
     for axes in grid.flat:
-        draw_grid(axes, "y")
+        style.draw_grid(axes, "y")
     names = ", ".join(framework_name(name) for name in groups)
-    figure_title(figure, title or f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
+    style.figure_title(figure, title or f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
     return figure
 
 
 def stage_means(rows: Rows) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
-    """Mean wall seconds of each stage, and mean simulated seconds, of each framework, as `profile_figure`
-    takes them. Rows: explore rows with `stage_seconds`."""
+    """Returns the mean wall seconds of each stage, and the mean simulated seconds, by framework: the
+    arguments of `profile_figure`. Rows are explore rows with `stage_seconds`."""
     stages, simulated = {}, {}
     for framework, trials in by_framework(rows).items():
         names = dict.fromkeys(name for row in trials for name in row["stage_seconds"])
@@ -104,82 +100,70 @@ def stage_means(rows: Rows) -> tuple[dict[str, dict[str, float]], dict[str, floa
 def profile_figure(
     stages: Mapping[str, Mapping[str, float]],
     simulated_seconds: Mapping[str, float] | float,
-    title: str | None = "Wall time of a simulated second",
+    title: str | None = "Computing time per simulated second",
 ) -> Figure:
-    """Where the time goes: milliseconds a simulated second by stage, a bar for each framework.
+    """Draws the milliseconds of computing per simulated second by stage, one bar per framework.
 
-    At its end how many simulated seconds pass in one of the wall.
+    The end of a bar gives the ratio of simulated to computing time.
 
     Args:
-        stages: by framework, wall seconds of each stage of a mission, of all robots together.
-        simulated_seconds: how long the missions were, by framework or one for all.
-        title: of the figure.
+        stages: by framework: wall seconds of each stage of a mission, for all robots together.
+        simulated_seconds: duration of the missions, by framework or one for all.
+        title: title of the figure.
 
     Raises:
-        InvalidArgumentError: no framework, negative times, or a mission of no length.
+        InvalidArgumentError: no framework, negative times, or a duration that is not positive.
     """
     if not stages:
         raise InvalidArgumentError("stages is empty; give the wall seconds of one framework at least.")
-    names = list(dict.fromkeys(stage for times in stages.values() for stage in times))
-    hues = {name: colour(index + 3) for index, name in enumerate(names)}
-    figure = new_figure(9.6, 1.9 + 0.62 * len(stages))
-    axes = figure.subplots()
     costs = {f: _milliseconds(f, times, simulated_seconds) for f, times in stages.items()}
-    longest = max(sum(cost.values()) for cost in costs.values()) or 1.0
-    for place, cost in enumerate(costs.values()):
-        start = 0.0
-        for name, width in cost.items():
-            axes.barh(
-                place, width, left=start, color=hues[name], height=0.62, edgecolor="white", linewidth=0.8
-            )
-            if width > 0.05 * longest:
-                ink = "white" if _luminance(hues[name]) < 0.4 else "#111111"
-                axes.text(
-                    start + width / 2,
-                    place,
-                    f"{width:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=TICK_SIZE,
-                    color=ink,
-                )
-            start += width
-        pace = f"{1000 / start:.1f}× real time" if start > 0 else ""
-        axes.text(start + 0.01 * longest, place, f" {start:.0f} ms, {pace}", va="center", fontsize=LABEL_SIZE)
-    axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=LABEL_SIZE)
-    axes.invert_yaxis()
+    names = list(dict.fromkeys(stage for cost in costs.values() for stage in cost))
+    sizes = {style.label_of(n): np.array([cost.get(n, 0.0) for cost in costs.values()]) for n in names}
+    hues = [style.colour(index + 3) for index in range(len(names))]
+    figure = style.new_figure(9.6, 1.9 + 0.62 * len(stages))
+    axes = figure.subplots()
+    totals = style.stacked_bars(axes, sizes, hues)
+    longest = float(totals.max(initial=0.0)) or 1.0
+    for bars, hue in zip(cast(list[BarContainer], axes.containers), hues, strict=True):
+        texts = [f"{bar.get_width():.0f}" if bar.get_width() > 0.05 * longest else "" for bar in bars]
+        ink = "white" if hue in (style.PALETTE[0], style.PALETTE[6]) else "#111111"  # on dark bars
+        axes.bar_label(bars, texts, label_type="center", fontsize=style.TICK_SIZE, color=ink)
+    for place, total in enumerate(totals):
+        pace = f", {1000 / total:.1f}× real time" if total > 0 else ""
+        axes.text(total, place, f"  {total:.0f} ms{pace}", va="center", fontsize=style.LABEL_SIZE)
+    style.label_axes(axes, "", "computing time [ms per simulated second]", "")
+    axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=style.LABEL_SIZE)
     axes.set_xlim(0, 1.3 * longest)
-    dress(axes, "", "wall time [ms a simulated second]", "")
-    draw_grid(axes, "x")
-    for name in names:
-        axes.barh(0, 0, color=hues[name], label=label_of(name))
-    figure.legend(loc="outside lower center", ncols=min(len(names), 7), frameon=False, fontsize=LABEL_SIZE)
-    figure_title(figure, title)
+    style.legend_below(figure, max_columns=7)
+    style.figure_title(figure, title)
     return figure
 
 
 def _by_seed(trials: Rows, measure: _Measure) -> dict[Any, float | None]:
-    """The value of each seed; None for one that has no number, or nothing to take ratios of."""
+    """Returns the value of each seed; None if there is none, or none to take a ratio of."""
     values: dict[Any, float | None] = {}
     for row in trials:
         value = math.nan if row.get(measure.field) is None else float(row[measure.field])
-        sound = math.isfinite(value) and (value > 0 or not measure.by_ratio)
-        values[row.get("seed")] = value if sound else None
+        valid = math.isfinite(value) and (value > 0 or not measure.by_ratio)
+        values[row.get("seed")] = value if valid else None
     return values
 
 
-def _draw_group(axes: Axes, place: float, values: np.ndarray, n_trials: int, hue: str) -> None:
+def _draw_group(
+    axes: Axes, place: float, by_seed: Mapping[Any, float | None], n_trials: int, hue: str
+) -> None:
+    values = np.array([value for value in by_seed.values() if value is not None])
     spread = place + np.linspace(-0.12, 0.12, len(values)) if len(values) > 1 else [place] * len(values)
     axes.plot(spread, values, "o", color=hue, alpha=0.45, markersize=5, markeredgewidth=0)
     if len(values) < n_trials:
         text = f"{len(values)} of {n_trials}" if len(values) else "none"
         axes.text(place, 0.5, text, ha="center", color=hue, transform=axes.get_xaxis_transform())
         return
-    mean, low, high = (float(part[0]) for part in mean_band(values[:, None]))
-    _draw_interval(axes, place, mean, low, high, hue)
+    _draw_interval(axes, place, Interval(*(float(part[0]) for part in mean_band(values[:, None]))), hue)
 
 
-def _draw_interval(axes: Axes, place: float, mean: float, low: float, high: float, hue: str) -> None:
+def _draw_interval(axes: Axes, place: float, interval: Interval, hue: str) -> None:
+    mean, low, high = interval
     axes.plot([place - 0.24, place + 0.24], [mean, mean], color=hue, linewidth=2.4)
     if math.isfinite(low):
         axes.errorbar(place, mean, [[mean - low], [high - mean]], color=hue, capsize=5, linewidth=1.5)
@@ -187,34 +171,30 @@ def _draw_interval(axes: Axes, place: float, mean: float, low: float, high: floa
 
 def _draw_differences(
     axes: Axes,
-    groups: Mapping[str, Rows],
+    values: Mapping[str, Mapping[Any, float | None]],
     pairs: Sequence[tuple[str, str]],
     measure: _Measure,
 ) -> None:
     axes.axhline(1 if measure.by_ratio else 0, color="#777777", linewidth=1)
-    short = {name: framework_name(name).split()[0] for name in groups}
     for place, (first, second) in enumerate(pairs):
-        a, b = _by_seed(groups[first], measure), _by_seed(groups[second], measure)
-        shared = [(a[seed], b[seed]) for seed in a if seed in b]
-        known = [(x, y) for x, y in shared if x is not None and y is not None]
-        if not shared or len(known) < len(shared):
-            continue
-        scale = math.log if measure.by_ratio else float
-        interval = paired_interval([scale(x) for x, _ in known], [scale(y) for _, y in known])
-        if measure.by_ratio:
-            interval = Interval(*np.exp(interval).tolist())
-        _draw_interval(axes, place, *interval, hue="#333333")
+        interval = paired_difference(values[first], values[second], by_ratio=measure.by_ratio)
+        if interval is not None:
+            _draw_interval(axes, place, interval, hue="#333333")
     if measure.by_ratio:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}×"))
+        _log_ticks(axes, lambda value: f"{value:g}×")
     sign = "/" if measure.by_ratio else "\N{MINUS SIGN}"
-    _name_places(axes, [f"{short[a]} {sign} {short[b]}" for a, b in pairs])
+    _name_places(axes, [f"{short_name(a)} {sign} {short_name(b)}" for a, b in pairs])
     kind = "ratio" if measure.by_ratio else "difference"
-    dress(axes, "", "", f"{kind} [{measure.unit}]" if measure.unit else kind)
+    style.label_axes(axes, "", "", f"{kind} [{measure.unit}]" if measure.unit else kind)
+
+
+def _log_ticks(axes: Axes, text: Callable[[float], str]) -> None:
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
 
 
 def _name_places(axes: Axes, names: Sequence[str]) -> None:
-    axes.set_xticks(range(len(names)), names, fontsize=TICK_SIZE)
+    axes.set_xticks(range(len(names)), names, fontsize=style.TICK_SIZE)
     axes.set_xlim(-0.6, len(names) - 0.4)
 
 
@@ -227,8 +207,3 @@ def _milliseconds(
             f"{framework}: simulated_seconds={length} must be above zero, and no stage below: {dict(stages)}."
         )
     return {name: 1000 * seconds / length for name, seconds in stages.items()}
-
-
-def _luminance(hue: str) -> float:
-    red, green, blue = to_rgb(hue)
-    return 0.2126 * red + 0.7152 * green + 0.0722 * blue

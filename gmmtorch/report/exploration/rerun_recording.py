@@ -1,4 +1,4 @@
-"""A recording of an exploration for the rerun viewer: robots, map and mixture over simulated time."""
+"""Recordings of explorations for the rerun viewer: robots, map and mixture over simulated time."""
 
 from __future__ import annotations
 
@@ -11,23 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from matplotlib.colors import to_rgb
-from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.files import write_atomically
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.report.maps.mesh_figures import checked_components, height_colors
+from gmmtorch.report.scenes.ellipsoids import N_SIGMA, checked_components, height_colours, principal_axes
 from gmmtorch.report.style import as_array, colour
 from gmmtorch.scan import ArrayLike
 
 TIMELINE = "simulated_time"
 
-_N_SIGMA = 2.0
-
 
 class RecordedMap(NamedTuple):
-    """What was known at a time (s): occupied cells, as indices (C, 3) of the lattice, and the mixture's means
-    (K, 3) and covariances (K, 3, 3), metres; either may be empty."""
+    """The map at a time (s): occupied cells, as indices (C, 3) of the lattice, and means (K, 3) and
+    covariances (K, 3, 3) of the mixture, metres; either may be empty."""
 
     time: float
     cells: ArrayLike = ()
@@ -44,22 +41,22 @@ def record_rerun(
     resolution: float = 0.2,
     row: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write a recording, and return its path: open it with `rerun FILE`.
+    """Writes a recording and returns its path; `rerun FILE` opens it.
 
-    Robots move along their paths, occupied cells and 2σ ellipsoids (coloured by height) follow as they were,
-    and the curves of entropy and bytes beside them, all on one timeline of simulated seconds.
+    One timeline of simulated seconds shows moving robots, occupied cells, 2σ ellipsoids coloured by height,
+    and curves of entropy and bytes.
 
     Args:
-        path: of the file, which ends in .rrd.
-        trajectories: of each robot, poses (T, ≥ 3), world metres.
+        path: file name that ends in .rrd.
+        trajectories: poses (T, ≥ 3) of each robot, world metres.
         period: seconds between poses.
-        maps: at some times, in any order.
+        maps: maps at several times, in any order.
         resolution: side (m) of the maps' cells.
-        row: an explore row of `results.json`, for the curves.
+        row: explore row of `results.json` with the curves.
 
     Raises:
         GmmTorchError: rerun is not installed, or older than 0.23.
-        InvalidArgumentError: another suffix, a period that is not above zero, or shapes that disagree.
+        InvalidArgumentError: another suffix, a period that is not positive, or shapes that disagree.
         OutputError: the file cannot be written.
     """
     path = Path(path)
@@ -69,21 +66,34 @@ def record_rerun(
         raise InvalidArgumentError(f"period={period} must be above zero seconds.")
     check_resolution(resolution)
     rerun = load_rerun()
-    return write_atomically(
-        path, lambda temporary: _write(rerun, temporary, trajectories, period, maps, resolution, row)
-    )
+
+    def write(temporary: Path) -> None:
+        with rerun.RecordingStream("gmmtorch_exploration") as stream:
+            stream.save(str(temporary))
+            stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            for robot, trajectory in enumerate(trajectories):
+                _log_robot(rerun, stream, robot, as_array(trajectory), period)
+            for recorded in sorted(maps, key=lambda recorded: recorded.time):
+                stream.set_time(TIMELINE, duration=float(recorded.time))
+                _log_map(rerun, stream, recorded, resolution)
+            if row is not None:
+                _log_curves(rerun, stream, row)
+            stream.flush()
+            stream.disconnect()
+
+    return write_atomically(path, write)
 
 
 def load_rerun() -> Any:
-    """The library that recordings are written with. Raises `GmmTorchError` if it is not there, or too old."""
+    """Imports rerun. Raises `GmmTorchError` if it is not installed or too old."""
     try:
         rerun = importlib.import_module("rerun")
     except ImportError as error:
         raise GmmTorchError(
-            f"The recording for the rerun viewer needs rerun-sdk, which does not load ({error}); "
+            f"The recording for the rerun viewer needs rerun-sdk, which cannot be imported ({error}); "
             "pip install 'rerun-sdk>=0.23'."
         ) from error
-    if not hasattr(rerun, "Scalars"):  # came with the present way to set times
+    if not hasattr(rerun, "Scalars"):  # was introduced together with set_time(duration=…)
         version = getattr(rerun, "__version__", "unknown")
         raise GmmTorchError(
             f"rerun-sdk {version} is too old for the recording; pip install 'rerun-sdk>=0.23'."
@@ -91,31 +101,8 @@ def load_rerun() -> Any:
     return rerun
 
 
-def _write(
-    rerun: Any,
-    path: Path,
-    trajectories: Sequence[ArrayLike],
-    period: float,
-    maps: Sequence[RecordedMap],
-    resolution: float,
-    row: Mapping[str, Any] | None,
-) -> None:
-    with rerun.RecordingStream("gmmtorch_exploration") as stream:
-        stream.save(str(path))
-        stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for robot, trajectory in enumerate(trajectories):
-            _log_robot(rerun, stream, robot, as_array(trajectory), period)
-        for known in sorted(maps, key=lambda known: known.time):
-            stream.set_time(TIMELINE, duration=float(known.time))
-            _log_map(rerun, stream, known, resolution)
-        if row is not None:
-            _log_curves(rerun, stream, row)
-        stream.flush()
-        stream.disconnect()
-
-
 def _log_robot(rerun: Any, stream: Any, robot: int, poses: np.ndarray, period: float) -> None:
-    """The whole path, faintly and at all times; the robot and its heading at each."""
+    """Logs the whole path, visible at all times, and the robot and its heading at each pose."""
     if poses.ndim != 2 or poses.shape[1] < 3:
         raise InvalidArgumentError(
             f"trajectories[{robot}] has shape {poses.shape}; expected (T, 3) or more, metres."
@@ -132,38 +119,32 @@ def _log_robot(rerun: Any, stream: Any, robot: int, poses: np.ndarray, period: f
             stream.log(f"{name}/heading", rerun.Arrows3D(origins=[pose[:3]], vectors=[ahead], colors=[hue]))
 
 
-def _log_map(rerun: Any, stream: Any, known: RecordedMap, resolution: float) -> None:
-    cells = as_array(known.cells).reshape(-1, 3)
-    centres = torch.from_numpy((cells + 0.5) * resolution)
-    half = np.full((len(cells), 3), resolution / 2)
-    shades = height_colors(centres[:, 2]).numpy()
-    stream.log("world/cells", rerun.Boxes3D(centers=centres.numpy(), half_sizes=half, colors=shades))
-    means, covariances = checked_components(
-        torch.as_tensor(known.means).reshape(-1, 3), torch.as_tensor(known.covariances).reshape(-1, 3, 3)
-    )
-    sizes, turns = _ellipsoids(covariances.cpu())
-    stream.log(
-        "world/mixture",
-        rerun.Ellipsoids3D(
-            centers=means.cpu().numpy(),
-            half_sizes=sizes,
-            quaternions=turns,
-            colors=height_colors(means[:, 2]).numpy(),
-            fill_mode="solid",
-        ),
-    )
-
-
-def _ellipsoids(covariances: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Half axes (K, 3), metres, and the quaternions (K, 4), x y z w, that turn them."""
+def _log_map(rerun: Any, stream: Any, recorded: RecordedMap, resolution: float) -> None:
     from scipy.spatial.transform import Rotation
 
-    if len(covariances) == 0:
-        return np.empty((0, 3)), np.empty((0, 4))
-    variances, directions = torch.linalg.eigh((covariances + covariances.mT) / 2)
-    flip = torch.where(torch.linalg.det(directions) < 0, -1.0, 1.0)
-    turns = Rotation.from_matrix((directions * flip[:, None, None]).numpy()).as_quat()
-    return (_N_SIGMA * variances.clamp_min(0).sqrt()).numpy(), turns
+    cells = as_array(recorded.cells).reshape(-1, 3)
+    centres = (cells + 0.5) * resolution
+    half = np.full((len(cells), 3), resolution / 2)
+    boxes = rerun.Boxes3D(centers=centres, half_sizes=half, colors=_shades(centres))
+    stream.log("world/cells", boxes)
+    means, covariances = checked_components(
+        torch.as_tensor(recorded.means).reshape(-1, 3),
+        torch.as_tensor(recorded.covariances).reshape(-1, 3, 3),
+    )
+    deviations, directions = principal_axes(covariances.cpu())
+    ellipsoids = rerun.Ellipsoids3D(
+        centers=means.cpu().numpy(),
+        half_sizes=(N_SIGMA * deviations).numpy(),
+        quaternions=Rotation.from_matrix(directions.numpy()).as_quat() if len(means) else np.empty((0, 4)),
+        colors=_shades(means.cpu().numpy()),
+        fill_mode="solid",
+    )
+    stream.log("world/mixture", ellipsoids)
+
+
+def _shades(centres: np.ndarray) -> np.ndarray:
+    """Returns the colours of heights (K, 3), 0 to 255, of centres (K, 3)."""
+    return (255 * height_colours(torch.from_numpy(centres[:, 2])).numpy()).astype(np.uint8)
 
 
 def _log_curves(rerun: Any, stream: Any, row: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""How far off each form of evidence is (thesis Fig 3.3), and what its accuracy costs."""
+"""Figures of the error of each form of evidence (thesis Fig 3.3), and of the time that accuracy costs."""
 
 from __future__ import annotations
 
@@ -12,111 +12,84 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from gmmtorch.report.style import (
-    LABEL_SIZE,
-    TICK_SIZE,
-    UNKNOWN,
-    Rows,
-    colour,
-    draw_grid,
-    dress,
-    figure_title,
-    log_axis,
-    marker,
-    new_figure,
-)
+from gmmtorch.report import style
 
 _LABELS = {
     "point": "point form",
+    "cone_exact": "projection, exact polygon",
     "monte_carlo": "Monte Carlo",
     "monte_carlo_plain": "Monte Carlo, plain",
     "monte_carlo_stratified": "Monte Carlo, stratified",
     "monte_carlo_sobol": "Monte Carlo, Sobol",
-    "monte_carlo_large": "Monte Carlo, Sobol, many",
+    "monte_carlo_large": "Monte Carlo, Sobol, many rays",
     "flux": "face flux",
     "flux_float32": "face flux, float32",
 }
-_COLOURS = {
-    name: colour(i)
-    for i, name in enumerate(
-        ("flux", "cone", "cone_exact", "monte_carlo_plain", "monte_carlo_stratified", "monte_carlo_sobol")
-    )
-}
+_CURVES = ("flux", "cone", "cone_exact", "monte_carlo_plain", "monte_carlo_stratified", "monte_carlo_sobol")
 _SCALE = LogNorm(1e-6, 1.0)
-_QUANTILES = (("median", 0.45), ("p99", 0.75), ("max", 1.0))
+_QUANTILES = {"median": "median", "p99": "99th percentile", "max": "largest"}
+_LEAST = 1e-9  # smallest error that the sweep shows
 
 
-def figures(rows: Rows) -> dict[str, Figure]:
-    """`approximation_error` and `approximation_error_probability`: maps of the error of E and of θ;
-    `approximation_error_sweep`: quantiles on scenes at random; `approximation_error_curve`: error against
-    time. Each where there are rows of its study."""
-    drawn = {
-        "approximation_error": ("map", _map_figure, "error", "Error of the share of rays E (hits + misses)"),
-        "approximation_error_probability": (
-            "map",
-            _map_figure,
-            "probability_error",
-            "Error of the occupancy probability θ",
-        ),
-        "approximation_error_sweep": (
-            "sweep",
-            _sweep_figure,
-            "",
-            "Error on components and cells at random, of any size, distance and incidence",
-        ),
-        "approximation_error_curve": ("curve", _curve_figure, "", "What accuracy costs on a whole grid"),
-    }
+def figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws the figures whose study has rows.
+
+    `approximation_error` and `approximation_error_probability`: maps of the error of E = hits + misses and
+    of θ; `approximation_error_sweep`: quantiles of the error in random scenes; `approximation_error_curve`:
+    error against time.
+    """
+    maps, sweep, curve = ([row for row in rows if row["study"] == name] for name in ("map", "sweep", "curve"))
     found = {}
-    for name, (study, draw, field, title) in drawn.items():
-        chosen = [row for row in rows if row["study"] == study]
-        if chosen:
-            found[name] = draw(chosen, field, title)
+    if maps:
+        found["approximation_error"] = _map_figure(maps, "error", "Error of E = hits + misses per ray")
+        title = "Error of the occupancy probability θ"
+        found["approximation_error_probability"] = _map_figure(maps, "probability_error", title)
+    if sweep:
+        found["approximation_error_sweep"] = _sweep_figure(sweep)
+    if curve:
+        found["approximation_error_curve"] = _curve_figure(curve)
     return found
 
 
 def label(method: str, dim: int) -> str:
-    """A method as a reader would name it: the thesis's form is another one in 2D and in 3D."""
+    """Returns the name of a method as shown in figures; the thesis's form differs between 2D and 3D."""
     if method == "cone":
         return "thesis cone (3.3)" if dim == 2 else "thesis projection (3.4\N{EN DASH}3.7)"
-    if method == "cone_exact":
-        return "projection, exact polygon"
     return _LABELS.get(method, method)
 
 
-def _dims(rows: Rows) -> list[int]:
-    return sorted({int(row["dim"]) for row in rows})
+def _by_dim(rows: style.Rows) -> dict[int, list[Mapping[str, Any]]]:
+    dims = sorted({int(row["dim"]) for row in rows})
+    return {dim: [row for row in rows if row["dim"] == dim] for dim in dims}
 
 
-def _map_figure(rows: Rows, field: str, title: str) -> Figure:
-    dims = _dims(rows)
-    most = max(sum(row["dim"] == dim for row in rows) for dim in dims)
-    figure = new_figure(3.1 * most + 1.4, 3.3 * len(dims) + 1.3)
-    grid = figure.subplots(len(dims), most, squeeze=False, sharex=True, sharey=True)
-    for line, dim in zip(grid, dims, strict=True):
-        here = [row for row in rows if row["dim"] == dim]
-        for axes, row in zip(line, here, strict=False):
+def _map_figure(rows: style.Rows, field: str, title: str) -> Figure:
+    groups = _by_dim(rows)
+    n_columns = max(map(len, groups.values()))
+    figure = style.new_figure(3.1 * n_columns + 1.4, 3.3 * len(groups) + 1.3)
+    grid = figure.subplots(len(groups), n_columns, squeeze=False, sharex=True, sharey=True)
+    for line, (dim, own) in zip(grid, groups.items(), strict=True):
+        for axes, row in zip(line, own, strict=False):
             _draw_map(axes, row, field)
-        for axes in line[len(here) :]:
+        for axes in line[len(own) :]:
             axes.set_visible(False)
-        line[0].set_ylabel(f"{dim}D:  depth r′ − p  [deviations]", fontsize=LABEL_SIZE)
-    for column in range(most):
-        lowest = max(i for i in range(len(dims)) if grid[i, column].get_visible())
-        grid[lowest, column].set_xlabel("distance p  [deviations]", fontsize=LABEL_SIZE)
-        grid[lowest, column].tick_params(labelbottom=True)
-    bar = figure.colorbar(
-        ScalarMappable(_SCALE, "cividis"), ax=grid.ravel().tolist(), pad=0.015, aspect=30, extend="both"
-    )
-    bar.set_label("largest absolute error, cells up to 2 deviations off axis", fontsize=LABEL_SIZE)
-    bar.ax.tick_params(labelsize=TICK_SIZE)
-    handles = [Patch(facecolor=UNKNOWN, edgecolor="#666666", label="cell begins behind the sensor")]
-    figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=LABEL_SIZE)
-    figure_title(figure, title)
+        line[0].set_ylabel(f"{dim}D: depth beyond the mean r′ − p [σ]", fontsize=style.LABEL_SIZE)
+    for column in grid.T:
+        lowest = [axes for axes in column if axes.get_visible()][-1]
+        lowest.set_xlabel("distance of the mean p [σ]", fontsize=style.LABEL_SIZE)
+        lowest.tick_params(labelbottom=True)
+    colours = ScalarMappable(_SCALE, "cividis")
+    text = "largest absolute error, cells up to 2σ off axis"
+    style.colour_bar(figure, colours, grid.ravel().tolist(), text, aspect=30, extend="both")
+    unknown = Patch(facecolor=style.UNKNOWN, edgecolor=style.EDGE, label="cell begins behind the sensor")
+    style.legend_below(figure, [unknown])
+    style.figure_title(figure, title)
     return figure
 
 
 def _draw_map(axes: Axes, row: Mapping[str, Any], field: str) -> None:
     values = np.array([[np.nan if v is None else max(v, 1e-12) for v in line] for line in row[field]])
-    axes.set_facecolor(UNKNOWN)
+    axes.set_facecolor(style.UNKNOWN)
     axes.pcolormesh(
         row["distances"],
         row["depths"],
@@ -126,117 +99,85 @@ def _draw_map(axes: Axes, row: Mapping[str, Any], field: str) -> None:
         shading="nearest",
         rasterized=True,
     )
-    dress(axes, label(row["method"], row["dim"]))
-    log_axis(axes, "x", row["distances"])
-    worst = f"max {np.nanmax(values):.1g}" if np.isfinite(values).any() else ""
-    axes.text(
-        0.97,
-        0.04,
-        worst,
-        transform=axes.transAxes,
-        ha="right",
-        fontsize=TICK_SIZE,
-        bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2.5},
-    )
+    style.label_axes(axes, label(row["method"], row["dim"]))
+    style.log_axis(axes, "x", row["distances"])
+    if np.isfinite(values).any():
+        axes.text(
+            0.97,
+            0.04,
+            f"max {np.nanmax(values):.1g}",
+            transform=axes.transAxes,
+            ha="right",
+            fontsize=style.TICK_SIZE,
+            bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 2.5},
+        )
 
 
-def _sweep_figure(rows: Rows, field: str, title: str) -> Figure:
-    dims = _dims(rows)
-    names = ("hits", "misses", "probability")
-    titles = {"hits": "hits per ray", "misses": "misses per ray", "probability": "probability θ"}
-    figure = new_figure(13.5, 4.2 * len(dims) + 0.9)
-    grid = figure.subplots(len(dims), len(names), squeeze=False, sharex=True)
-    for line, dim in zip(grid, dims, strict=True):
-        here = [row for row in rows if row["dim"] == dim]
-        places = np.arange(len(here))[::-1]
-        for axes, name in zip(line, names, strict=True):
-            _draw_quantiles(axes, here, name, places)
-            dress(axes, f"{dim}D: {titles[name]}")
-            log_axis(axes, "x", [1e-9, 1.0])
-            axes.set_xlim(3e-10, 3)
-            axes.set_xticks([1e-9, 1e-6, 1e-3, 1], ["≤ 1e-9", "1e-6", "1e-3", "1"])
-            axes.set_yticks(places, [label(r["method"], dim) for r in here] if axes is line[0] else [])
-            axes.set_ylim(-0.6, len(here) - 0.4)
-            draw_grid(axes, "x")
-    for axes in grid[-1]:
-        axes.set_xlabel("absolute error", fontsize=LABEL_SIZE)
-    handles, texts = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, fontsize=LABEL_SIZE)
-    figure_title(figure, f"{title}: {rows[0]['n_cases']:,} cases each")
+def _sweep_figure(rows: style.Rows) -> Figure:
+    groups = _by_dim(rows)
+    quantities = {"hits": "hits per ray", "misses": "misses per ray", "probability": "probability θ"}
+    figure = style.new_figure(13.5, 4.2 * len(groups) + 0.9)
+    grid = figure.subplots(len(groups), len(quantities), squeeze=False, sharex=True)
+    for line, (dim, own) in zip(grid, groups.items(), strict=True):
+        places = np.arange(len(own))[::-1]
+        for axes, (field, quantity) in zip(line, quantities.items(), strict=True):
+            _draw_quantiles(axes, own, field, places)
+            style.label_axes(axes, f"{dim}D: {quantity}", "absolute error" if line is grid[-1] else "")
+            style.log_axis(axes, "x", [_LEAST, 1.0])
+            axes.set_xlim(_LEAST / 3, 3)
+            axes.set_xticks([_LEAST, 1e-6, 1e-3, 1], ["≤ 1e-9", "1e-6", "1e-3", "1"])
+            axes.set_yticks(places, [label(r["method"], dim) for r in own] if axes is line[0] else [])
+            axes.set_ylim(-0.6, len(own) - 0.4)
+            style.draw_grid(axes, "x")
+    style.legend_below(figure)
+    title = "Error for random components and cells of any size, distance and incidence"
+    style.figure_title(figure, f"{title}: {rows[0]['n_cases']:,} cases each")
     return figure
 
 
-def _draw_quantiles(axes: Axes, rows: Rows, name: str, places: np.ndarray) -> None:
-    values = {q: np.array([max(row[f"{name}_{q}"], 1e-9) for row in rows]) for q, _ in _QUANTILES}
+def _draw_quantiles(axes: Axes, rows: style.Rows, field: str, places: np.ndarray) -> None:
+    values = {q: np.array([max(row[f"{field}_{q}"], _LEAST) for row in rows]) for q in _QUANTILES}
     axes.hlines(places, values["median"], values["max"], color="#bbbbbb", linewidth=3, zorder=1)
-    for index, (quantile, _) in enumerate(_QUANTILES):
-        text = {"median": "median", "p99": "99th percentile", "max": "largest"}[quantile]
-        axes.plot(
-            values[quantile],
-            places,
-            linestyle="",
-            marker=marker(index),
-            color=colour(index),
-            markersize=8,
-            label=text,
-            zorder=2,
-        )
+    for index, (quantile, text) in enumerate(_QUANTILES.items()):
+        look = style.line_look(index) | {"linestyle": "", "markersize": 8}
+        axes.plot(values[quantile], places, label=text, zorder=2, **look)
 
 
-def _curve_figure(rows: Rows, field: str, title: str) -> Figure:
-    dims = _dims(rows)
-    figure = new_figure(5.8 * len(dims) + 0.6, 9.4)
-    grid = figure.subplots(2, len(dims), squeeze=False, sharex="col", sharey="row")
-    panels = (
-        ("error", "error of hits and misses, of all evidence"),
-        ("probability_error", "root mean square error of θ"),
-    )
-    for column, dim in enumerate(dims):
-        here = [row for row in rows if row["dim"] == dim]
-        for axes, (name, text) in zip(grid[:, column], panels, strict=True):
-            _draw_curves(axes, here, name)
-            first = here[0]
-            size = f"{dim}D: {first['n_components']:,} components, {first['n_cells']:,} cells"
-            dress(axes, size if axes is grid[0, column] else "", "", text if column == 0 else "")
-            log_axis(axes, "y", [row[name] for row in rows])
-            log_axis(axes, "x", [row["seconds"] for row in here])
-            axes.tick_params(labelbottom=True, labelleft=True)
-            draw_grid(axes)
-        grid[1, column].set_xlabel("time  [s]", fontsize=LABEL_SIZE)
-    handles = {
-        text: h for axes in grid.flat for h, text in zip(*axes.get_legend_handles_labels(), strict=True)
+def _curve_figure(rows: style.Rows) -> Figure:
+    groups = _by_dim(rows)
+    figure = style.new_figure(5.8 * len(groups) + 0.6, 9.4)
+    grid = figure.subplots(2, len(groups), squeeze=False, sharex="col", sharey="row")
+    panels = {
+        "error": "relative error of hits and misses",
+        "probability_error": "root mean square error of θ",
     }
-    figure.legend(
-        handles.values(),
-        handles.keys(),
-        loc="outside lower center",
-        ncols=3,
-        frameon=False,
-        fontsize=LABEL_SIZE,
-    )
-    figure_title(figure, title)
+    for number, (dim, own) in enumerate(groups.items()):
+        size = f"{dim}D: {own[0]['n_components']:,} components, {own[0]['n_cells']:,} cells"
+        for axes, (field, text) in zip(grid[:, number], panels.items(), strict=True):
+            _draw_curves(axes, own, field)
+            style.label_axes(axes, "", "", text if number == 0 else "")
+            style.log_axis(axes, "y", [row[field] for row in rows])
+            style.log_axis(axes, "x", [row["seconds"] for row in own])
+            axes.tick_params(labelbottom=True, labelleft=True)
+            style.draw_grid(axes)
+        grid[0, number].set_title(size, fontsize=style.TITLE_SIZE)
+        grid[1, number].set_xlabel("time [s]", fontsize=style.LABEL_SIZE)
+    style.legend_below(figure, max_columns=3)
+    style.figure_title(figure, "Error against computing time on a whole grid")
     return figure
 
 
-def _draw_curves(axes: Axes, rows: Rows, name: str) -> None:
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    for method in methods:
-        here = [row for row in rows if row["method"] == method]
-        index = list(_COLOURS).index(method) if method in _COLOURS else len(_COLOURS)
-        axes.plot(
-            [row["seconds"] for row in here],
-            [row[name] for row in here],
-            color=_COLOURS.get(method, colour(index)),
-            marker=marker(index),
-            markersize=8,
-            linewidth=2,
-            linestyle="-" if len(here) > 1 else "",
-            label=label(method, rows[0]["dim"]) + _settings(here),
-        )
+def _draw_curves(axes: Axes, rows: style.Rows, field: str) -> None:
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = [row for row in rows if row["method"] == method]
+        index = _CURVES.index(method) if method in _CURVES else len(_CURVES)
+        look = style.line_look(index) | {"markersize": 8, "linestyle": "-" if len(own) > 1 else ""}
+        name = label(method, rows[0]["dim"]) + _settings(own)
+        axes.plot([row["seconds"] for row in own], [row[field] for row in own], label=name, **look)
 
 
-def _settings(rows: Rows) -> str:
-    """The settings along a line, from its first point to its last."""
+def _settings(rows: style.Rows) -> str:
+    """Returns the settings along a line, from its first point to its last."""
     first, last = rows[0]["setting"], rows[-1]["setting"]
     if first is None:
         return ""

@@ -1,4 +1,4 @@
-"""Bytes against quality: the curves of codecs, and over which rates one is ahead of all others."""
+"""Bytes against quality: the curves of codecs, and the range of sizes in which one leads all others."""
 
 from __future__ import annotations
 
@@ -12,38 +12,39 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import style
 from gmmtorch.report.quantities import byte_text
-from gmmtorch.report.style import LABEL_SIZE, TICK_SIZE, Rows, draw_grid, dress, figure_title, new_figure
 
 QUALITIES = {"psnr2_db": "PSNR2", "psnr_lesser_db": "lesser term of PSNR2", "auc": "AUC"}
 OURS = "ours"
 MIXTURES = (OURS, "ours_without_counts", "float")
-"""Ways to write our components: none of them is another codec."""
-_STEPS = 400  # of a curve on which leads are looked for
+"""Encodings of the components of this package; they are not compared with each other."""
 
-_LINES: dict[str, tuple[str, str, str, str]] = {  # label, colour, marker, style
-    "ours": ("mixture, ours", "#0072B2", "o", "-"),
-    "thesis": ("mixture, 57 B a component", "#56B4E9", "P", "-"),
-    "octree": ("octree, zstd", "#D55E00", "s", "-"),
-    "draco": ("Draco", "#009E73", "^", "-"),
-    "quantized": ("quantised points, zstd", "#CC79A7", "D", "-"),
-    "depth_image": ("depth image, zstd", "#E69F00", "v", "-"),
-    "depth_image_thinned": ("depth image of fewer pixels, zstd", "#E69F00", "v", ":"),
-    "raw": ("raw points, 12 B", "#333333", "X", "-"),
+_N_SIZES = 400  # sizes on a curve at which `leads` compares
+_LINES: dict[str, tuple[str, str, str, str]] = {  # label, colour, marker, line style
+    "ours": ("mixture (gmmtorch)", style.PALETTE[0], "o", "-"),
+    "thesis": ("mixture, 57 B per component", style.PALETTE[5], "P", "-"),
+    "octree": ("octree, zstd", style.PALETTE[1], "s", "-"),
+    "draco": ("Draco", style.PALETTE[2], "^", "-"),
+    "quantized": ("quantized points, zstd", style.PALETTE[3], "D", "-"),
+    "depth_image": ("depth image, zstd", style.PALETTE[4], "v", "-"),
+    "depth_image_thinned": ("depth image with fewer pixels, zstd", style.PALETTE[4], "v", ":"),
+    "raw": ("raw points, 12 B each", style.PALETTE[6], "X", "-"),
 }
 _TITLES = {
-    "kinect": "kinect: depth camera, a room",
+    "kinect": "kinect: depth camera in a room",
     "hall": "hall: spinning lidar",
     "warehouse": "warehouse: simulated depth camera",
 }
+_Y_LABELS = {"psnr2_db": "PSNR2 of the decoded surface [dB]", "auc": "AUC of the map on held-out frames"}
 
 
 class Lead(NamedTuple):
-    """The longest run of rates over which ours takes no more bytes than any other for the same quality.
+    """The longest range of sizes in which one codec needs no more bytes than any other for the same quality.
 
-    low, high: bytes of ours at its ends; octaves: log₂(high/low), 0 where there is none. most: how many
-    times more bytes the best other takes, at most. ended_by: who is ahead beyond `high`; "" where our
-    curve ends first.
+    low, high: its bytes at the ends. octaves: log₂(high/low), 0 if there is no such range. most: largest
+    ratio of the bytes of the best other codec to its own. ended_by: codec that is better above `high`; ""
+    if the curve ends there.
     """
 
     low: float
@@ -54,36 +55,38 @@ class Lead(NamedTuple):
 
 
 class _Curve(NamedTuple):
-    """Settings worth their bytes: log₂ of the bytes (N,) and quality (N,), both rising."""
+    """The settings of a codec that are better than all smaller ones: log₂ of the bytes (N,) and quality (N,),
+    both increasing."""
 
     log_bytes: np.ndarray
     quality: np.ndarray
 
     def bytes_for(self, quality: np.ndarray) -> np.ndarray:
-        """log₂ of the least bytes for at least this quality; straight between settings, ∞ beyond the best,
-        and those of the coarsest setting below it."""
+        """Returns log₂ of the fewest bytes for at least this quality: linear between settings, ∞ above the
+        best one, and the bytes of the smallest one below its quality."""
         needed = np.interp(quality, self.quality, self.log_bytes)
         return np.where(quality > self.quality[-1], math.inf, needed)
 
 
-def leads(rows: Rows, quality: str, left_out: Sequence[str] = (), ours: str = OURS) -> Lead:
-    """Over which rates `ours` is at or below every other codec in bytes at equal quality.
+def leads(rows: style.Rows, quality: str, left_out: Sequence[str] = (), ours: str = OURS) -> Lead:
+    """Returns the range of sizes in which `ours` needs no more bytes than every other codec.
 
     Args:
-        rows: of one data set: codec, nbytes, and `quality`, the more the better, ∞ where nothing is lost.
-        left_out: codecs that are not compared with, besides other ways to write our components.
+        rows: of one data set: codec, nbytes, and `quality`; higher is better, ∞ is lossless.
+        quality: field of the rows.
+        left_out: codecs to ignore, in addition to `MIXTURES`.
+        ours: the codec in question.
 
-    Raises `InvalidArgumentError` where there are no rows of ours, or of no other.
+    Raises `InvalidArgumentError` if `ours` or all other codecs have no rows.
     """
-    other_names = dict.fromkeys(
-        row["codec"] for row in rows if row["codec"] not in (ours, *MIXTURES, *left_out)
-    )
-    mine = _curve(rows, ours, quality)
+    ignored = (ours, *MIXTURES, *left_out)
+    other_names = dict.fromkeys(row["codec"] for row in rows if row["codec"] not in ignored)
+    own = _curve(rows, ours, quality)
     others = {name: _curve(rows, name, quality) for name in other_names}
-    if not len(mine.quality) or not others:
-        raise InvalidArgumentError(f"rows hold nothing of {ours!r}, or of nobody else.")
-    rate = np.linspace(mine.log_bytes[0], mine.log_bytes[-1], _STEPS)
-    reached = np.interp(rate, mine.log_bytes, mine.quality)
+    if not len(own.quality) or not others:
+        raise InvalidArgumentError(f"rows contain nothing of {ours!r}, or of no other codec.")
+    rate = np.linspace(own.log_bytes[0], own.log_bytes[-1], _N_SIZES)
+    reached = np.interp(rate, own.log_bytes, own.quality)
     needed = np.stack([curve.bytes_for(reached) for curve in others.values()])
     margin = needed.min(0) - rate
     ahead = np.concatenate([[False], margin >= 0, [False]])
@@ -102,99 +105,80 @@ def leads(rows: Rows, quality: str, left_out: Sequence[str] = (), ours: str = OU
     )
 
 
-def bytes_for(rows: Rows, codec: str, quality: str, value: float) -> float:
-    """Least bytes with which a codec reaches `value`, as in `leads`; ∞ where it never does, or is absent."""
+def bytes_for(rows: style.Rows, codec: str, quality: str, value: float) -> float:
+    """Returns the fewest bytes with which a codec reaches `value`; ∞ if it never does or has no rows."""
     curve = _curve(rows, codec, quality)
     return float(2 ** curve.bytes_for(np.array(value))) if len(curve.quality) else math.inf
 
 
-def _curve(rows: Rows, codec: str, quality: str) -> _Curve:
-    """The settings of a codec that no smaller one of it is as good as."""
+def _curve(rows: style.Rows, codec: str, quality: str) -> _Curve:
     own = sorted((row for row in rows if row["codec"] == codec), key=lambda row: row["nbytes"])
     kept: list[tuple[float, float]] = []
     for row in own:
         if not kept or row[quality] > kept[-1][1]:
             kept.append((math.log2(row["nbytes"]), float(row[quality])))
     table = np.array(kept).reshape(-1, 2)
-    return _Curve(table[:, 0], np.minimum(table[:, 1], 1e6))  # differences of infinities are none
+    return _Curve(table[:, 0], np.minimum(table[:, 1], 1e6))  # ∞ − ∞ is undefined
 
 
-def figures(rows: Rows) -> dict[str, Figure]:
-    """`rate_distortion`: PSNR2 above and AUC below against bytes a frame, a column for each data set.
+def figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws `rate_distortion`: PSNR2 (top) and AUC (bottom) against bytes per frame, a column per data set.
 
-    A line for each codec, off the scale where it is better than the finest octree; the rates over which
-    ours leads are shaded. Depth images of fewer pixels are left out of the lead in PSNR2, whose backward
-    term is all but zero for a few of a cloud's own points.
+    There is a line for each codec; qualities above the best octree are not shown. The range in which the
+    mixture of this package leads is shaded. Depth images with fewer pixels do not count for PSNR2: its
+    backward term is almost zero for a subset of the points.
 
     Args:
         rows: dataset, codec, nbytes, psnr2_db, auc.
     """
     names = list(dict.fromkeys(str(row["dataset"]) for row in rows))
-    figure = new_figure(1.0 + 4.4 * len(names), 8.6)
+    figure = style.new_figure(1.0 + 4.4 * len(names), 8.6)
     grid = figure.subplots(2, len(names), squeeze=False)
     for column, name in enumerate(names):
         own = [row for row in rows if row["dataset"] == name]
-        for axes, quality in zip(grid[:, column], ("psnr2_db", "auc"), strict=True):
-            _draw(axes, own, quality)
-            dress(axes, _TITLES.get(name, name) if quality == "psnr2_db" else "", "bytes a frame")
+        for axes, (quality, y_label) in zip(grid[:, column], _Y_LABELS.items(), strict=True):
             _scale(axes, [float(row["nbytes"]) for row in own if row["codec"] in _LINES])
-    grid[0][0].set_ylabel("PSNR2 of the decoded surface [dB]", fontsize=LABEL_SIZE)
-    grid[1][0].set_ylabel("AUC of the map on held-out frames", fontsize=LABEL_SIZE)
-    lines = {
-        label: line
-        for axes in grid.flat
-        for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        list(lines.values()),
-        list(lines),
-        loc="outside lower center",
-        ncols=4,
-        frameon=False,
-        fontsize=LABEL_SIZE,
-    )
-    figure_title(figure, "A frame as a message: what its bytes bring")
+            _draw(axes, own, quality)
+            heading = _TITLES.get(name, name) if quality == "psnr2_db" else ""
+            style.label_axes(axes, heading, "bytes per frame", y_label if column == 0 else "")
+    style.legend_below(figure, max_columns=4)
+    style.figure_title(figure, "Quality of one frame against its bytes")
     return {"rate_distortion": figure}
 
 
-def _draw(axes: Axes, rows: Rows, quality: str) -> None:
-    for codec, (label, colour, mark, style) in _LINES.items():
-        own = sorted(
-            (row for row in rows if row["codec"] == codec and math.isfinite(row[quality])),
-            key=lambda row: row["nbytes"],
-        )
+def _draw(axes: Axes, rows: style.Rows, quality: str) -> None:
+    finite = [row for row in rows if math.isfinite(row[quality])]
+    for codec, (label, hue, mark, line_style) in _LINES.items():
+        own = sorted((row for row in finite if row["codec"] == codec), key=lambda row: row["nbytes"])
         if own:
             axes.plot(
                 [row["nbytes"] for row in own],
                 [row[quality] for row in own],
-                color=colour,
+                color=hue,
                 marker=mark,
-                linestyle=style,
+                linestyle=line_style,
                 linewidth=2.6 if codec == OURS else 1.5,
                 markersize=7 if codec == OURS else 5.5,
                 label=label,
                 zorder=4 if codec == OURS else 3,
-                clip_on=True,
             )
     left_out = ("depth_image_thinned",) if quality == "psnr2_db" else ()
     lead = leads(rows, quality, left_out)
-    scale = [row for row in rows if math.isfinite(row[quality])]
-    low = min(row[quality] for row in scale if row["codec"] in (OURS, "octree"))
-    high = max(row[quality] for row in scale if row["codec"] in ((OURS, "octree") if left_out else _LINES))
+    low = min(row[quality] for row in finite if row["codec"] in (OURS, "octree"))
+    high = max(row[quality] for row in finite if row["codec"] in ((OURS, "octree") if left_out else _LINES))
     axes.set_ylim(low - 0.04 * (high - low), high + 0.22 * (high - low))
+    style.draw_grid(axes)
     if lead.octaves:
-        axes.axvspan(lead.low, lead.high, color="#0072B2", alpha=0.09, linewidth=0, zorder=0)
+        axes.axvspan(lead.low, lead.high, color=style.PALETTE[0], alpha=0.09, linewidth=0, zorder=0)
         axes.text(
-            math.sqrt(lead.low * lead.high),
-            0.975,
-            f"ours ahead{' of solid lines' if left_out else ''}:\n{lead.octaves:.1f} octaves",
-            transform=axes.get_xaxis_transform(),
-            ha="center",
+            0.02,
+            0.98,
+            f"shaded: gmmtorch best{' of solid lines' if left_out else ''}, {lead.octaves:.1f} octaves",
+            transform=axes.transAxes,
             va="top",
-            fontsize=TICK_SIZE,
+            fontsize=style.TICK_SIZE,
             color="#00507f",
         )
-    draw_grid(axes)
 
 
 def _scale(axes: Axes, values: Sequence[float]) -> None:

@@ -1,0 +1,250 @@
+"""Images of maps: slices, views from above and heights of any map that answers occupancy queries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.report.maps.regions import corner_of
+from gmmtorch.report.style import as_array
+from gmmtorch.scan import ArrayLike
+
+MAX_PIXELS = 2000
+"""Largest number of cells queried along a side of a picture."""
+
+MAX_QUERIES = 4_000_000
+"""Largest number of cells queried for one image of heights."""
+
+_BATCH = 1 << 18  # queries at a time
+_UNKNOWN_BAND = 0.02  # around θ = ½: the tails of a component are no evidence
+_TOLERANCE = 1e-3  # of a cell: float32 corners on a boundary between cells count as exact
+
+
+@dataclass(frozen=True)
+class MapPanel:
+    """One map and the region of it to show.
+
+    Attributes:
+        title: text above the picture, such as the method's name.
+        occupancy: probability (M,) at the points (M, D), float64 world metres; ½ is unknown.
+        resolution: side (m) of a cell; one pixel, unless the region is too large for that.
+        low, high: corners (D,) of the region, world metres; D is 2 or 3.
+
+    Raises `InvalidArgumentError` for corners that span no region.
+    """
+
+    title: str
+    occupancy: Callable[[Tensor], Any]
+    resolution: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "resolution", check_resolution(self.resolution))
+        for name in ("low", "high"):
+            object.__setattr__(self, name, corner_of(getattr(self, name)))
+        low, high = self.low, self.high
+        valid = len(low) == len(high) and len(low) in (2, 3)
+        if not valid or not all(-math.inf < a < b < math.inf for a, b in zip(low, high, strict=True)):
+            raise InvalidArgumentError(
+                f"low={low}, high={high} span no region; give two corners of 2 or 3 finite coordinates (m), "
+                "low below high."
+            )
+
+    @property
+    def dim(self) -> int:
+        return len(self.low)
+
+
+class MapImage(NamedTuple):
+    """An image of a map in the x-y plane.
+
+    image: (nx, ny), one value per cell; cell (i, j) begins at low + (i, j)·resolution. low: corner (x, y),
+    world metres. resolution: side of a cell, metres. band: lowest and highest z (m) that the image shows.
+    """
+
+    image: Tensor
+    low: tuple[float, float]
+    resolution: float
+    band: tuple[float, float] = (-math.inf, math.inf)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top, metres."""
+        nx, ny = self.image.shape
+        (x, y), side = self.low, self.resolution
+        return x, x + nx * side, y, y + ny * side
+
+    def draw(self, axes: Axes, colours: np.ndarray, interpolation: str = "nearest") -> None:
+        """Draws colours (nx, ny, 3 or 4) of the cells, with equal scales and the limits of the image."""
+        axes.imshow(
+            np.moveaxis(colours, 0, 1),
+            origin="lower",
+            extent=self.extent,
+            aspect="equal",
+            interpolation=interpolation,
+        )
+        axes.autoscale(False)
+
+
+def slice_image(
+    panel: MapPanel, height: float = 0.0, max_pixels: int = MAX_PIXELS, shown_pixels: int | None = None
+) -> MapImage:
+    """Returns the occupancy in the plane, in 3D of the cells at `height` (m); NaN where it is unknown.
+
+    With `shown_pixels`, the longer side is reduced to about that many pixels. A pixel shows its highest
+    occupancy if that is above ½, so thin walls stay visible; else the mean of its known cells, or unknown
+    if most of its cells are.
+    """
+    image = _pixels(panel, max_pixels)
+    theta = _query(panel, _centres(image, panel, height)).reshape(image.image.shape)
+    theta[_is_unknown(theta)] = torch.nan
+    image = image._replace(image=theta)
+    factor = 1 if shown_pixels is None else round(max(theta.shape) / max(shown_pixels, 1))
+    return _reduced(image, factor) if factor > 1 else image
+
+
+def height_image(
+    panel: MapPanel, occupied_above: float, max_pixels: int = MAX_PIXELS, max_queries: int = MAX_QUERIES
+) -> MapImage:
+    """Returns the height (m) of the highest known cell with θ > `occupied_above` in each column, NaN if none.
+
+    Queries layers from the top down, each only in the columns without a cell yet. Pixels grow if that could
+    take more than `max_queries` queries.
+    """
+    cell = panel.resolution
+    levels = torch.arange(
+        math.floor(panel.low[2] / cell + _TOLERANCE), math.ceil(panel.high[2] / cell - _TOLERANCE)
+    )
+    levels = levels.double().add(0.5).mul(cell).flip(0)
+    sides = [(panel.high[a] - panel.low[a]) / cell for a in range(2)]
+    affordable = max(sides) * math.sqrt(max_queries / max(math.prod(sides) * len(levels), 1))
+    image = _pixels(panel, max(1, min(max_pixels, int(affordable))))
+    columns = _centres(image, panel, 0.0)
+    heights = torch.full((len(columns),), torch.nan, dtype=torch.float64)
+    for level in levels.tolist():
+        still_open = heights.isnan().nonzero()[:, 0]
+        if len(still_open) == 0:
+            break
+        points = columns[still_open]
+        points[:, 2] = level
+        heights[still_open[_is_occupied(_query(panel, points), occupied_above)]] = level
+    return image._replace(image=heights.reshape(image.image.shape))
+
+
+def highest_occupancy(
+    probability: ArrayLike,
+    low: ArrayLike,
+    resolution: float,
+    band: tuple[float, float] = (-math.inf, math.inf),
+) -> MapImage:
+    """Returns the highest occupancy of the known cells in each column within a band; ½ where none is known.
+
+    Args:
+        probability: occupancy (nx, ny, nz) of the cells; within 0.02 of ½ is unknown. Truth values are
+            accepted.
+        low: corner (3,) of the lowest cell, world metres.
+        resolution: side (m) of a cell.
+        band: lowest and highest z (m) of the centres of cells that count.
+
+    Raises:
+        InvalidArgumentError: shapes disagree, or the band contains no layer of cells.
+    """
+    theta, corner = torch.as_tensor(probability).detach().cpu().double(), as_array(low)
+    side = check_resolution(resolution)
+    if theta.ndim != 3 or corner.shape != (3,):
+        raise InvalidArgumentError(
+            f"probability has shape {tuple(theta.shape)} and low {corner.shape}; expected (nx, ny, nz), (3,)."
+        )
+    heights = corner[2] + (torch.arange(theta.shape[2]) + 0.5) * side
+    within = (heights >= band[0]) & (heights <= band[1])
+    if not bool(within.any()):
+        raise InvalidArgumentError(
+            f"band={band} contains no layer of cells between {heights.min():g} and {heights.max():g} m."
+            if len(heights)
+            else "probability has no layer of cells."
+        )
+    layers = theta[:, :, within]
+    highest = torch.where(_is_unknown(layers), -1.0, layers).amax(2)
+    shown = (float(heights[within][0]) - side / 2, float(heights[within][-1]) + side / 2)
+    image = torch.where(highest < 0, 0.5, highest)
+    return MapImage(image, (float(corner[0]), float(corner[1])), side, shown)
+
+
+def roof_above(panel: MapPanel, path: np.ndarray, occupied_above: float, headroom: float = 0.5) -> bool:
+    """Returns whether most of the path (S, 3) has an occupied cell more than `headroom` metres above it."""
+    levels = torch.arange(float(path[:, 2].min()) + headroom, panel.high[2], panel.resolution).double()
+    if len(levels) == 0:
+        return False
+    stops = torch.from_numpy(path)[torch.linspace(0, len(path) - 1, min(len(path), 200)).long()]
+    points = stops[:, None].repeat(1, len(levels), 1)
+    points[:, :, 2] = levels
+    occupied = _is_occupied(_query(panel, points.reshape(-1, 3)), occupied_above).reshape(len(stops), -1)
+    occupied &= points[:, :, 2] > stops[:, 2:] + headroom
+    return bool(occupied.any(1).double().mean() > 0.5)
+
+
+def _pixels(panel: MapPanel, max_pixels: int) -> MapImage:
+    """Returns an empty image aligned with the cells; a pixel spans several cells in large regions."""
+    cell = panel.resolution
+    first = [math.floor(panel.low[axis] / cell + _TOLERANCE) for axis in range(2)]
+    last = [math.ceil(panel.high[axis] / cell - _TOLERANCE) for axis in range(2)]
+    factor = max(1, math.ceil(max(b - a for a, b in zip(first, last, strict=True)) / max(max_pixels, 1)))
+    shape = [max(1, math.ceil((b - a) / factor)) for a, b in zip(first, last, strict=True)]
+    return MapImage(torch.empty(*shape), (first[0] * cell, first[1] * cell), cell * factor)
+
+
+def _centres(image: MapImage, panel: MapPanel, height: float) -> Tensor:
+    """Returns the query points (nx·ny, D): the centre of the middle cell of each pixel."""
+    cell = panel.resolution
+    factor = round(image.resolution / cell)
+    x, y = (
+        (round(corner / cell) + torch.arange(n, dtype=torch.float64) * factor + factor // 2 + 0.5) * cell
+        for corner, n in zip(image.low, image.image.shape, strict=True)
+    )
+    points = torch.cartesian_prod(x, y)
+    if panel.dim == 2:
+        return points
+    return torch.cat([points, torch.full((len(points), 1), height, dtype=torch.float64)], 1)
+
+
+def _reduced(image: MapImage, factor: int) -> MapImage:
+    """Pools factor × factor pixels into one, as `slice_image` describes."""
+    shape = [-(-n // factor) for n in image.image.shape]
+    padded = torch.full((shape[0] * factor, shape[1] * factor), torch.nan, dtype=torch.float64)
+    padded[: image.image.shape[0], : image.image.shape[1]] = image.image
+    tiles = padded.reshape(shape[0], factor, shape[1], factor).transpose(1, 2).flatten(2)
+    n_known = tiles.isfinite().sum(2)
+    highest = tiles.nan_to_num(0.0).amax(2)
+    mean = torch.where(2 * n_known < factor**2, torch.nan, tiles.nansum(2) / n_known)
+    return MapImage(
+        torch.where(highest > 0.5, highest, mean), image.low, image.resolution * factor, image.band
+    )
+
+
+def _is_unknown(theta: Tensor) -> Tensor:
+    return (theta - 0.5).abs() < _UNKNOWN_BAND
+
+
+def _is_occupied(theta: Tensor, occupied_above: float) -> Tensor:
+    return (theta > occupied_above) & ~_is_unknown(theta)
+
+
+def _query(panel: MapPanel, points: Tensor) -> Tensor:
+    answers = [torch.as_tensor(panel.occupancy(part)) for part in points.split(_BATCH)]
+    theta = torch.cat(answers).detach().cpu().double()
+    if theta.shape != (len(points),):
+        raise InvalidArgumentError(
+            f"occupancy of the panel {panel.title!r} returned shape {tuple(theta.shape)} for {len(points)} "
+            "points; it must return one probability for each point."
+        )
+    return theta

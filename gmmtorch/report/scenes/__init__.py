@@ -1,0 +1,1 @@
+"""Ellipsoids, points and paths in space: one renderer for all commands."""

@@ -1,0 +1,153 @@
+"""The geometry of Gaussian components: principal axes, 2σ outlines, triangle meshes and height colours."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.colors import ListedColormap, Normalize
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.report import style
+from gmmtorch.scan import ArrayLike
+
+N_SIGMA = 2.0
+"""Size in standard deviations at which components are drawn."""
+
+_THINNESS = 0.1  # thickness of an embedded 2D ellipse, as a share of its minor axis
+_LIGHTER = 0.25  # share of white in height colours, because shading darkens them
+
+
+class EllipsoidMesh(NamedTuple):
+    """A triangle mesh: vertices (V, 3) float64, metres; faces (F, 3) int64, counter-clockwise from outside;
+    colors (V, 3) uint8."""
+
+    vertices: Tensor
+    faces: Tensor
+    colors: Tensor
+
+
+def checked_components(means: ArrayLike, covariances: ArrayLike) -> tuple[Tensor, Tensor]:
+    """Returns means (K, D) and covariances (K, D, D) as float64 tensors.
+
+    Raises `InvalidArgumentError` for other shapes, D other than 2 or 3, and values that are not finite.
+    """
+    mean = torch.as_tensor(means).detach().double()
+    covariance = torch.as_tensor(covariances).detach().double()
+    if mean.ndim != 2 or mean.shape[1] not in (2, 3) or covariance.shape != (*mean.shape, mean.shape[1]):
+        raise InvalidArgumentError(
+            f"means has shape {tuple(mean.shape)} and covariances {tuple(covariance.shape)}; expected "
+            "(K, D) and (K, D, D) with D = 2 or 3."
+        )
+    for name, value in (("means", mean), ("covariances", covariance)):
+        if not bool(torch.isfinite(value).all()):
+            raise InvalidArgumentError(f"{name} contains NaN or infinite values; remove these components.")
+    return mean, covariance
+
+
+def checked_rows(name: str, value: ArrayLike | None, mean: Tensor) -> Tensor | None:
+    """Returns one vector per component, (K, D) like the means, as a float64 tensor; None stays None.
+
+    Raises `InvalidArgumentError` for another shape.
+    """
+    if value is None:
+        return None
+    rows = torch.as_tensor(value).detach().cpu().double()
+    if rows.shape != mean.shape:
+        raise InvalidArgumentError(
+            f"{name} has shape {tuple(rows.shape)}; expected {tuple(mean.shape)}, one row per component."
+        )
+    return rows
+
+
+def principal_axes(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the standard deviations (K, D), in ascending order, and the directions (K, D, D) as the columns
+    of rotation matrices, of covariances (K, D, D)."""
+    variances, directions = torch.linalg.eigh((covariances + covariances.mT) / 2)
+    flip = torch.ones_like(variances)
+    flip[:, 0] = torch.linalg.det(directions).sign()
+    return variances.clamp_min(0).sqrt(), directions * flip[:, None, :]
+
+
+def ellipse_outlines(means: Tensor, covariances: Tensor, n_corners: int = 40) -> np.ndarray:
+    """Returns the 2σ outlines (K, n_corners, 2) of 2D components (K, 2), (K, 2, 2)."""
+    angle = torch.arange(n_corners, dtype=torch.float64) * (2 * torch.pi / n_corners)
+    circle = torch.stack([angle.cos(), angle.sin()], 1)
+    deviations, directions = principal_axes(covariances)
+    axes = directions * deviations[:, None, :]
+    return (means[:, None] + N_SIGMA * circle @ axes.mT).numpy()
+
+
+def height_colour_map() -> ListedColormap:
+    """Returns the colour map of heights for shaded surfaces: lighter than that of flat pictures."""
+    usual = matplotlib.colormaps[style.HEIGHTS](np.linspace(0, 1, 256))[:, :3]
+    return ListedColormap(_LIGHTER + (1 - _LIGHTER) * usual)
+
+
+def height_colours(heights: Tensor, scale: Normalize | None = None) -> Tensor:
+    """Returns colours (K, 3) in [0, 1] of heights (K,), by default on their own `style.height_scale`."""
+    shares = np.asarray((scale or style.height_scale(heights))(heights.detach().cpu().double().numpy()))
+    return torch.from_numpy(height_colour_map()(shares)[:, :3].copy())
+
+
+def ellipsoid_mesh(
+    means: ArrayLike, covariances: ArrayLike, n_sigma: float = N_SIGMA, n_vertices: int = 162
+) -> EllipsoidMesh:
+    """Returns the surfaces (x − μ)ᵀ Σ⁻¹ (x − μ) = n_sigma² of K components, in order, coloured by height.
+
+    Args:
+        means: (K, D), metres; 2D components become thin 3D ones at z = 0.
+        covariances: (K, D, D), m²; a singular one gives a flat ellipsoid.
+        n_sigma: size in standard deviations.
+        n_vertices: vertices per ellipsoid, 4 or more; each then has 2·n_vertices − 4 faces.
+
+    Raises:
+        InvalidArgumentError: shapes disagree, values are not finite, n_sigma ≤ 0, or too few vertices.
+    """
+    mean, covariance = checked_components(means, covariances)
+    if not (math.isfinite(n_sigma) and n_sigma > 0):
+        raise InvalidArgumentError(
+            f"n_sigma={n_sigma} must be above zero; 2 contains 86 % of a 2D component."
+        )
+    if mean.shape[1] == 2:
+        mean, covariance = _embedded(mean, covariance)
+    sphere, triangles = (part.to(mean.device) for part in unit_sphere(n_vertices))
+    deviations, directions = principal_axes(covariance)
+    vertices = mean[:, None] + n_sigma * sphere @ (directions * deviations[:, None, :]).mT
+    offsets = torch.arange(len(mean), device=mean.device)[:, None, None] * n_vertices
+    colors = height_colours(mean[:, 2]).mul(255).to(torch.uint8).to(mean.device)
+    return EllipsoidMesh(
+        vertices.reshape(-1, 3),
+        (triangles + offsets).reshape(-1, 3),
+        colors.repeat_interleave(n_vertices, 0),
+    )
+
+
+@lru_cache
+def unit_sphere(n_vertices: int) -> tuple[Tensor, Tensor]:
+    """Returns the convex hull of a Fibonacci lattice on the unit sphere: vertices (V, 3) and faces (F, 3),
+    counter-clockwise from outside."""
+    from scipy.spatial import ConvexHull
+
+    index = torch.arange(check_whole("n_vertices", n_vertices, 4), dtype=torch.float64)
+    z = 1 - (2 * index + 1) / n_vertices
+    angle = index * math.pi * (3 - math.sqrt(5))
+    radius = (1 - z**2).sqrt()
+    vertices = torch.stack([radius * angle.cos(), radius * angle.sin(), z], 1)
+    faces = torch.from_numpy(ConvexHull(vertices.numpy()).simplices).long()
+    inward = torch.linalg.det(vertices[faces]) < 0
+    return vertices, torch.where(inward[:, None], faces[:, [0, 2, 1]], faces)
+
+
+def _embedded(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Converts 2D components to 3D ones in the plane z = 0, a tenth as thick as their minor axis."""
+    k = len(mean)
+    solid = covariance.new_zeros(k, 3, 3)
+    solid[:, :2, :2] = covariance
+    solid[:, 2, 2] = (_THINNESS * principal_axes(covariance)[0][:, 0]) ** 2
+    return torch.cat([mean, mean.new_zeros(k, 1)], 1), solid

@@ -1,0 +1,235 @@
+"""Figures of mixtures: 2σ ellipses over their points in 2D, shaded ellipsoids in 3D."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.report import style
+from gmmtorch.report.maps.regions import robust_bounds
+from gmmtorch.report.quantities import count_text
+from gmmtorch.report.scenes.cutaway import cut_away
+from gmmtorch.report.scenes.ellipsoids import (
+    checked_components,
+    checked_rows,
+    ellipse_outlines,
+    height_colours,
+)
+from gmmtorch.report.scenes.scene import (
+    SOUTH_WEST,
+    Ellipsoids,
+    balls,
+    canvas_around,
+    draw_scene,
+    height_bar,
+)
+from gmmtorch.report.scenes.scene_renderer import Canvas
+from gmmtorch.scan import ArrayLike
+
+MAX_POINTS = 20_000
+MAX_ELLIPSES = 5_000
+MAX_ELLIPSOIDS = 3_000
+
+_PANEL_WIDTH = 6.6  # inches, of each view of a 3D mixture
+_MARGIN = 0.04  # of the longest side of what is shown
+_POINT, _ELLIPSE, _ORIGIN = "#8a8a8a", style.PALETTE[0], style.PALETTE[1]
+_POINT_PIXELS = 1.2  # radius of a point in the view in space
+
+Corner = Sequence[float]
+
+
+def mixture_figure(
+    points: ArrayLike,
+    means: ArrayLike,
+    covariances: ArrayLike,
+    weights: ArrayLike,
+    origins: ArrayLike | None = None,
+    *,
+    seen_from: ArrayLike | None = None,
+    title: str = "Gaussian mixture",
+    max_components: int | None = None,
+) -> Figure:
+    """Draws the 2σ ellipses (2D) or ellipsoids (3D) of a mixture with the points that it was fitted to.
+
+    In 3D, draws a view in space and a view from above, both coloured by height. If there are more components
+    than `max_components`, draws those with the largest weights; the title states how many.
+
+    Args:
+        points: (N, D), metres; at most 20,000 are drawn.
+        means: (K, D), metres.
+        covariances: (K, D, D), m².
+        weights: (K,), on any positive scale.
+        origins: (S, D), sensor positions to mark, if given.
+        seen_from: (K, 3), a sensor origin that observed each component: the view in space then leaves out
+            ceilings and near walls, so that rooms are open. If None, it shows all components.
+        title: title of the figure; the numbers of components and points are added.
+        max_components: largest number to draw; if None, 5,000 in 2D and 3,000 in 3D.
+
+    Raises:
+        InvalidArgumentError: shapes disagree.
+    """
+    mean, covariance = (value.cpu() for value in checked_components(means, covariances))
+    dim = mean.shape[1]
+    cloud, weight = style.as_array(points).reshape(-1, dim), style.as_array(weights)
+    if weight.shape != (len(mean),):
+        raise InvalidArgumentError(
+            f"weights has shape {weight.shape}; expected ({len(mean)},), one per component."
+        )
+    places = checked_rows("seen_from", seen_from, mean)
+    marks = np.empty((0, dim)) if origins is None else style.as_array(origins).reshape(-1, dim)
+    limit = max_components or (MAX_ELLIPSES if dim == 2 else MAX_ELLIPSOIDS)
+    shown = torch.from_numpy(np.sort(np.argsort(-weight, kind="stable")[:limit]))
+    mean, covariance = mean[shown], covariance[shown]
+    low, high = robust_bounds(cloud if len(cloud) else mean, marks, margin=0.0)
+    margin = max(_MARGIN * max(b - a for a, b in zip(low, high, strict=True)), 0.05)
+    box = [a - margin for a in low], [b + margin for b in high]
+    cloud_shown = cloud[style.even_sample(len(cloud), MAX_POINTS)]
+    if dim == 2:
+        figure = _flat_figure(cloud_shown, mean, covariance, marks, box)
+    else:
+        figure = _solid_figure(
+            cloud_shown, mean, covariance, None if places is None else places[shown], marks, box
+        )
+    count = count_text(len(weight), "component")
+    if len(shown) < len(weight):
+        count = f"{len(shown):,} largest of {count}"
+    style.figure_title(figure, f"{title}: {count}, {count_text(len(cloud), 'point')}")
+    return figure
+
+
+def _flat_figure(
+    points: np.ndarray, mean: Tensor, covariance: Tensor, marks: np.ndarray, box: tuple[Corner, Corner]
+) -> Figure:
+    (x0, y0), (x1, y1) = box
+    shape = float(np.clip((y1 - y0) / (x1 - x0), 0.25, 4.0))
+    width = 8.2 / max(1.0, shape**0.5)
+    figure = style.new_figure(max(width + 0.8, 6.4), width * shape + 1.5)
+    axes = figure.subplots()
+    colours = np.tile(to_rgb(_ELLIPSE), (len(mean), 1))
+    _draw_from_above(axes, points, ellipse_outlines(mean, covariance), colours, marks, box)
+    style.label_axes(axes, "", "x [m]", "y [m]")
+    _mixture_legend(figure, "2σ ellipses", len(marks) > 0)
+    return figure
+
+
+def _solid_figure(
+    points: np.ndarray,
+    mean: Tensor,
+    covariance: Tensor,
+    seen_from: Tensor | None,
+    marks: np.ndarray,
+    box: tuple[Corner, Corner],
+) -> Figure:
+    low, high = box
+    canvas = canvas_around(low, high, SOUTH_WEST, int(_PANEL_WIDTH * style.SAVED_DPI))
+    tall = (canvas.top - canvas.bottom) / (canvas.right - canvas.left)
+    tall = max(tall, (high[1] - low[1]) / (high[0] - low[0]))
+    figure = style.new_figure(2 * _PANEL_WIDTH + 1.0, float(np.clip(_PANEL_WIDTH * tall, 4.0, 7.0)) + 1.4)
+    space, plan = figure.subplots(1, 2)
+    scale = Normalize(low[2], high[2], clip=True)
+    _draw_in_space(space, points, mean, covariance, seen_from, marks, box, canvas, scale)
+    order = torch.argsort(mean[:, 2], stable=True)  # higher components cover lower ones
+    mean, covariance = mean[order], covariance[order]
+    outlines = ellipse_outlines(mean[:, :2], covariance[:, :2, :2])
+    _draw_from_above(plan, points, outlines, height_colours(mean[:, 2], scale).numpy(), marks, box)
+    style.label_axes(plan, "from above", "x [m]", "y [m]")
+    height_bar(figure, plan, scale)
+    _mixture_legend(figure, "2σ ellipsoids", len(marks) > 0)
+    return figure
+
+
+def _draw_in_space(
+    axes: Axes,
+    points: np.ndarray,
+    mean: Tensor,
+    covariance: Tensor,
+    seen_from: Tensor | None,
+    marks: np.ndarray,
+    box: tuple[Corner, Corner],
+    canvas: Canvas,
+    scale: Normalize,
+) -> None:
+    """Draws the components and points inside the box, and the sensor positions; with `seen_from`, without the
+    components that hide the inside, and without points, which would stand where these were."""
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in box)
+    inside = ((mean >= low) & (mean <= high)).all(1)
+    cloud, top = torch.from_numpy(points), np.inf
+    if seen_from is None:
+        style.label_axes(axes, "in space")
+        cloud = cloud[((cloud >= low) & (cloud <= high)).all(1)]
+    else:
+        style.label_axes(axes, "in space, ceilings and near walls left out")
+        kept, top = cut_away(mean, covariance, seen_from, None, SOUTH_WEST)
+        inside, cloud = inside & kept, cloud[:0]
+    components = Ellipsoids(mean[inside], covariance[inside], height_colours(mean[inside, 2], scale), top)
+    grey = torch.tensor(to_rgb(_POINT), dtype=torch.float64)
+    dots = balls(cloud, _POINT_PIXELS / canvas.scale, grey)
+    draw_scene(axes, [components, dots], *box, SOUTH_WEST, canvas)
+    flat = SOUTH_WEST.project(torch.from_numpy(marks)).numpy()
+    axes.plot(flat[:, 0], flat[:, 1], "^", color=_ORIGIN, markeredgecolor="white", markersize=6, zorder=10)
+
+
+def _draw_from_above(
+    axes: Axes,
+    points: np.ndarray,
+    outlines: np.ndarray,
+    colours: np.ndarray,
+    marks: np.ndarray,
+    box: tuple[Corner, Corner],
+) -> None:
+    """Draws points, ellipses (K, C, 2) with colours (K, 3), and sensor positions in the x-y plane."""
+    size = float(np.clip(12000 / max(len(points), 1), 1.0, 14))
+    axes.scatter(points[:, 0], points[:, 1], s=size, color=_POINT, linewidths=0, rasterized=True)
+    opacity = _opacity(outlines)[:, None]
+    patches = PolyCollection(
+        list(outlines),
+        facecolors=np.hstack([colours, opacity]),
+        edgecolors=np.hstack([colours, np.minimum(2 * opacity, 1)]),
+        linewidths=1.2 if len(outlines) < 500 else 0.6,
+    )
+    axes.add_collection(patches, autolim=False)
+    size = 8 if len(marks) < 20 else 5
+    axes.plot(
+        marks[:, 0],
+        marks[:, 1],
+        "^",
+        color=_ORIGIN,
+        markeredgecolor="white",
+        markersize=size,
+        markeredgewidth=0.5,
+    )
+    low, high = box
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+
+
+def _opacity(outlines: np.ndarray) -> np.ndarray:
+    """Returns the opacity (K,) of ellipses: large ones are faint, so that small ones stay visible."""
+    x, y = outlines[..., 0], outlines[..., 1]
+    area = np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(1)) / 2
+    typical = np.median(area) if len(area) else 1.0
+    return np.clip(0.5 * np.sqrt(typical / np.maximum(area, 1e-300)), 0.04, 0.5)
+
+
+def _mixture_legend(figure: Figure, shapes: str, with_origins: bool) -> None:
+    """Draws the legend with marks large enough to see."""
+    entries: list[tuple[str, str, Literal["full", "none"], int, str]] = [
+        (_POINT, "o", "full", 5, "points"),
+        (_ELLIPSE, "o", "none", 10, shapes),
+    ]
+    if with_origins:
+        entries.append((_ORIGIN, "^", "full", 8, "sensor positions"))
+    handles = [
+        Line2D([], [], linestyle="", color=hue, marker=mark, fillstyle=fill, markersize=size, label=label)
+        for hue, mark, fill, size, label in entries
+    ]
+    style.legend_below(figure, handles)

@@ -1,0 +1,100 @@
+"""Labelled points of beams: where they are, how many, and what they are called."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gmmtorch.baselines.samples import beam_samples
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.scan import Scan
+
+
+def random_scan(n: int, m: int, dim: int, seed: int, offset: float = 0.0) -> Scan:
+    generator = torch.Generator().manual_seed(seed)
+    ends = 8 * torch.rand(n + m, dim, generator=generator, dtype=torch.float64) + offset
+    return Scan(ends[:n], torch.full((dim,), offset - 1.0, dtype=torch.float64), ends[n:])
+
+
+@given(
+    n=st.integers(0, 20),
+    m=st.integers(0, 20),
+    dim=st.integers(2, 3),
+    seed=st.integers(0, 10**6),
+    spacing=st.floats(0.05, 20),
+    gap=st.floats(0, 3),
+)
+def test_free_points_lie_on_their_beams_one_in_each_equal_piece(n, m, dim, seed, spacing, gap):
+    scan = random_scan(n, m, dim, seed)
+    points, is_hit = beam_samples(scan, spacing, gap=gap, generator=torch.Generator().manual_seed(seed))
+    assert torch.equal(points[is_hit], scan.points)
+    free = points[~is_hit]
+    start = 0
+    for beam, end in enumerate(torch.cat([scan.points, scan.no_return])):
+        length = float((end - scan.origin).norm()) - (gap if beam < n else 0)
+        count = max(0, math.ceil(length / spacing))
+        mine = free[start : start + count]
+        start += count
+        along = (mine - scan.origin) @ (end - scan.origin) / (end - scan.origin).norm()
+        apart = (mine - scan.origin - along[:, None] * (end - scan.origin) / (end - scan.origin).norm()).norm(
+            dim=1
+        )
+        assert float(apart.max() if count else 0) < 1e-9
+        assert (along * count / length if count else along).floor().tolist() == list(range(count))
+    assert start == len(free)
+
+
+def test_without_a_generator_free_points_are_in_the_middle_of_their_pieces():
+    scan = Scan([[4.0, 0.0]], [0.0, 0.0])
+    points, is_hit = beam_samples(scan, 1.0, gap=1.0)
+    assert points.tolist() == [[4, 0], [0.5, 0], [1.5, 0], [2.5, 0]]
+    assert is_hit.tolist() == [True, False, False, False]
+    assert beam_samples(scan, math.inf)[0].tolist() == [[4, 0], [2, 0]]
+
+
+def test_random_free_points_are_uniform_along_the_beam():
+    scan = Scan(torch.tensor([[5.0, 0.0]]).repeat(20_000, 1), [0.0, 0.0])
+    points, is_hit = beam_samples(scan, math.inf, generator=torch.Generator().manual_seed(0))
+    share = points[~is_hit, 0] / 5
+    assert abs(float(share.mean()) - 0.5) < 4 * (1 / 12 / 20_000) ** 0.5
+    expected = (torch.arange(20_000) + 0.5) / 20_000
+    assert float((share.sort().values - expected).abs().max()) < 1.95 / 20_000**0.5  # Kolmogorov, p = 0.001
+
+
+def test_beams_without_return_and_beams_of_no_length():
+    scan = Scan([[0.0, 0.0]], [0.0, 0.0], [[3.0, 0.0], [0.0, 0.0]])
+    points, is_hit = beam_samples(scan, 1.5)
+    assert points[is_hit].tolist() == [[0, 0]]
+    assert points[~is_hit].tolist() == [[0.75, 0], [2.25, 0]]
+    nothing = beam_samples(Scan(torch.empty(0, 3), torch.zeros(3)), 1.0)
+    assert nothing[0].shape == (0, 3)
+    assert nothing[1].shape == (0,)
+
+
+def test_thinned_ends_are_the_means_of_cubes():
+    scan = Scan([[4.1, 0.1], [4.3, 0.3], [4.1, 1.1]], [0.0, 0.0])
+    points, is_hit = beam_samples(scan, math.inf, thin=1.0)
+    torch.testing.assert_close(
+        points[is_hit].sort(dim=0).values, torch.tensor([[4.1, 0.2], [4.2, 1.1]], dtype=torch.float64)
+    )
+    assert int((~is_hit).sum()) == 2
+
+
+def test_far_from_the_origin_points_keep_their_digits():
+    near, far = (beam_samples(random_scan(50, 10, 3, 0, offset), 0.5)[0] for offset in (0.0, 2.0**19))
+    assert float((far - 2.0**19 - near).abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize("option", [{"spacing": 0}, {"spacing": math.nan}, {"gap": -1}, {"thin": 0.0}])
+def test_lengths_that_are_none_are_refused(option):
+    with pytest.raises(InvalidArgumentError, match=next(iter(option))):
+        beam_samples(random_scan(3, 0, 2, 0), **{"spacing": 1.0, **option})
+
+
+def test_more_points_than_fit_are_refused():
+    with pytest.raises(MemoryLimitError, match="spacing"):
+        beam_samples(random_scan(3, 0, 2, 0), 1e-9)
