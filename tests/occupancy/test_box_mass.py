@@ -49,7 +49,7 @@ def test_normal_mass_of_an_infinite_span_is_the_tail():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_mass_is_that_of_scipy(dim):
+def test_box_mass_equals_scipy(dim):
     generator = torch.Generator().manual_seed(dim)
     deviations = 10 ** uniform(generator, 20, dim, low=-2, high=0)
     covariance, mean = random_covariances(generator, deviations), normal(generator, 20, dim)
@@ -71,7 +71,7 @@ def test_mass_is_that_of_scipy(dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("ratio", [1e-6, 1e-3, 1.0, 1e3, 1e6])
-def test_boxes_from_a_millionth_of_a_component_to_a_million_times_it(dim, ratio):
+def test_box_mass_is_exact_from_1e_6_to_1e6_component_sizes(dim, ratio):
     """Along the axes of a component its mass is a product."""
     deviations = torch.tensor([[0.001, 0.2, 2.0][:dim]], dtype=torch.float64)
     mean = torch.full((1, dim), 0.3, dtype=torch.float64)
@@ -82,7 +82,7 @@ def test_boxes_from_a_millionth_of_a_component_to_a_million_times_it(dim, ratio)
     assert got == pytest.approx(expected, rel=1e-3, abs=1e-30)
 
 
-def test_masses_of_a_partition_add_up_and_are_never_negative():
+def test_masses_of_a_partition_sum_to_one_and_are_not_negative():
     generator = torch.Generator().manual_seed(0)
     covariance = random_covariances(generator, torch.tensor([[0.002, 0.3, 0.4]], dtype=torch.float64))
     steps = torch.arange(-12, 12).double() * 0.2
@@ -94,7 +94,7 @@ def test_masses_of_a_partition_add_up_and_are_never_negative():
     assert float((parts > 0).double().mean()) < 0.3
 
 
-def test_gradients_of_the_mass():
+def test_gradients_of_box_mass_equal_finite_differences():
     generator = torch.Generator().manual_seed(4)
     factor = safe_cholesky(random_covariances(generator, torch.tensor([[0.1, 0.2, 0.4]]).double()))
     mean, low = normal(generator, 1, 3), torch.zeros(1, 3, dtype=torch.float64)

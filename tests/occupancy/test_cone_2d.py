@@ -49,7 +49,7 @@ def wedge_share(p: float, nearest: float, first: float, last: float) -> float:
 
 
 @pytest.mark.parametrize(("p", "worst"), [(2.0, 0.134), (5.0, 0.051), (50.0, 0.0050)])
-def test_its_error_falls_with_distance_as_the_thesis_says(p, worst):
+def test_the_error_of_3_3_falls_with_distance(p, worst):
     """The largest error over cells that begin at r' and are seen from θ₁ to θ₂."""
     angles = [k * 0.5 / p for k in range(-7, 8) if abs(k * 0.5 / p) <= math.pi / 2] + [math.pi / 2]
     errors = []
@@ -87,7 +87,7 @@ def test_cells_behind_the_sensor_get_nothing_and_wide_ones_are_clipped():
     assert share(3.0, around, inside=True) == pytest.approx(everything, rel=1e-12)
 
 
-def test_at_long_range_it_is_the_exact_form():
+def test_cone_form_equals_the_exact_form_at_long_range():
     cones = one_cone((30.0, 10.0), [[0.3, 0.1], [0.1, 0.2]])
     low = torch.cartesian_prod(torch.arange(24.0, 36.0, 0.7), torch.arange(7.0, 13.0, 0.7)).double()
     high = low + 0.7
@@ -103,7 +103,7 @@ def test_at_long_range_it_is_the_exact_form():
     assert found == pytest.approx(float(angular_evidence(far, near - 1e-3, near)[1]), rel=0.01)
 
 
-def test_evidence_counts_rays_and_far_returns_are_misses_alone():
+def test_evidence_scales_with_counts_and_no_return_beams_give_only_misses():
     low, high = boxes((2.0, -0.5, 3.0, 0.5), (4.0, -0.5, 6.0, 0.5))
     one = cone_evidence(one_cone((5.0, 0.0), ROUND), low, high)
     many = cone_evidence(one_cone((5.0, 0.0), ROUND, count=40.0), low, high)
@@ -115,7 +115,7 @@ def test_evidence_counts_rays_and_far_returns_are_misses_alone():
     torch.testing.assert_close(free[1], many[1])
 
 
-def test_pairs_handed_in_are_the_only_ones_counted():
+def test_only_the_given_pairs_count():
     first = one_cone((5.0, 0.0), ROUND)
     both = Cones(*(torch.cat([part, part]) for part in first))
     low, high = boxes((2.0, -0.5, 3.0, 0.5), (3.0, -0.5, 4.0, 0.5))
@@ -126,7 +126,7 @@ def test_pairs_handed_in_are_the_only_ones_counted():
     torch.testing.assert_close(hits, torch.tensor([0.5, 0.0], dtype=torch.float64) * whole[0])
 
 
-def test_it_is_exactly_zero_outside_the_cone():
+def test_evidence_is_exactly_zero_outside_the_cone():
     cones = one_cone((10.0, 0.0), ROUND)
     tangent = 5 / math.sqrt(100 - 25)
     x = 8.0
@@ -150,7 +150,7 @@ def test_it_is_exactly_zero_outside_the_cone():
     origin=st.sampled_from([0.0, 5e5]),
     corner=st.sampled_from([0.0, 0.5, 1.0, -7.0]),
 )
-def test_it_is_finite_and_a_share_whatever_it_is_given(p, deviations, size, place, origin, corner):
+def test_shares_are_finite_and_in_0_1(p, deviations, size, place, origin, corner):
     covariance = [[deviations[0] ** 2, 0.0], [0.0, deviations[1] ** 2]]
     cones = one_cone((origin + p, -origin), covariance, (origin, -origin))
     low = torch.tensor([[origin + place * p, -origin]], dtype=torch.float64) - corner * size
@@ -159,7 +159,7 @@ def test_it_is_finite_and_a_share_whatever_it_is_given(p, deviations, size, plac
         assert 0 <= float(part) <= 1 + 1e-9
 
 
-def test_no_box_and_no_cone_are_no_evidence():
+def test_no_boxes_or_no_cones_give_no_evidence():
     empty = torch.empty(0, 2, dtype=torch.float64)
     hits, misses = cone_evidence(one_cone((5.0, 0.0), ROUND), empty, empty)
     assert hits.shape == misses.shape == (0,)
@@ -169,6 +169,6 @@ def test_no_box_and_no_cone_are_no_evidence():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -5.0])
-def test_boxes_that_are_none_are_refused(bad):
+def test_invalid_boxes_are_refused(bad):
     with pytest.raises(InvalidArgumentError, match="is no box"):
         cone_evidence(one_cone((5.0, 0.0), ROUND), *boxes((1.0, 0.0, bad, 1.0)))

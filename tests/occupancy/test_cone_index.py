@@ -39,7 +39,7 @@ def pairs_of(
     entries=st.sampled_from([1, 20, 200]),
     cutoff=st.sampled_from([1.0, 3.0, CUTOFF]),
 )
-def test_no_box_that_a_cone_meets_goes_without_it(dim, seed, extent, entries, cutoff):
+def test_candidates_contain_all_cones_that_meet_a_box(dim, seed, extent, entries, cutoff):
     cones = random_cones(dim, 12, seed)
     index = ConeIndex(cones, extent, cutoff, entries_per_cone=entries)
     places, which = places_on_rays(cones, 400, cutoff, seed)
@@ -52,14 +52,14 @@ def test_no_box_that_a_cone_meets_goes_without_it(dim, seed, extent, entries, cu
     assert all((box, int(cone)) in pairs for box, cone in enumerate(which))
 
 
-def test_boxes_far_from_every_ray_get_no_cone():
+def test_boxes_far_from_all_rays_have_no_candidates():
     cones = random_cones(3, 30, 0)
     index = ConeIndex(cones, 0.1)
     low = torch.tensor([[50.0, 0, 0], [-1e9, 0, 0], [float("inf"), 0, 0]], dtype=torch.float64)
     assert pairs_of(index, low, low + 0.1) == []
 
 
-def test_lists_are_short():
+def test_lists_contain_few_unneeded_cones():
     """Mean list length near what brute force finds at the very points."""
     cones = random_cones(3, 300, 1, room=True)
     index = ConeIndex(cones, 0.05)
@@ -68,7 +68,7 @@ def test_lists_are_short():
     assert float(length) < 0.45 * 300
 
 
-def test_pairs_come_once_in_order_whatever_the_portions():
+def test_pairs_occur_once_and_ascend_for_any_chunk_size():
     cones = random_cones(2, 20, 3)
     index = ConeIndex(cones, 0.1)
     places, _ = places_on_rays(cones, 200, CUTOFF, 0)
@@ -80,7 +80,7 @@ def test_pairs_come_once_in_order_whatever_the_portions():
     assert sum(map(len, portions)) == len(set().union(*portions))
 
 
-def test_cost_and_memory_follow_the_density_not_the_world():
+def test_cost_and_memory_do_not_depend_on_the_size_of_the_world():
     small, step = random_cones(3, 60, 4, room=True), 30.0
     large = tiled(small, 16, step)
     one, many = ConeIndex(small, 0.1), ConeIndex(large, 0.1)
@@ -93,7 +93,7 @@ def test_cost_and_memory_follow_the_density_not_the_world():
     assert float(there) < 1.5 * float(here)
 
 
-def test_two_maps_on_other_sides_of_the_earth_share_an_index():
+def test_two_distant_maps_share_an_index():
     small = random_cones(3, 10, 5)
     shift = torch.tensor([1.2e7, 0, 0], dtype=torch.float64)
     far = small._replace(means=small.means + shift, origins=small.origins + shift)
@@ -106,7 +106,7 @@ def test_two_maps_on_other_sides_of_the_earth_share_an_index():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_no_cones_list_nothing(dim):
+def test_an_index_without_cones_lists_nothing(dim):
     empty = Cones(*(field[:0] for field in random_cones(dim, 1, 0)))
     index = ConeIndex(empty, 0.1)
     places = torch.zeros(4, dim, dtype=torch.float64)
@@ -124,6 +124,6 @@ def test_a_box_larger_than_the_extent_is_refused():
 
 
 @pytest.mark.parametrize("extent", [0, -1, float("nan")])
-def test_an_extent_that_is_no_size_is_refused(extent):
+def test_an_invalid_extent_is_refused(extent):
     with pytest.raises(InvalidArgumentError):
         ConeIndex(random_cones(3, 3, 0), extent)

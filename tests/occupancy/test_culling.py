@@ -1,4 +1,4 @@
-"""Culling never drops what a cone reaches, and drops most of what it does not."""
+"""Culling keeps all cells and boxes that a cone meets, and drops most others."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_box_that_a_ray_meets_is_a_candidate(dim, seed, inside, size):
     assert torch.cat(met).tolist() == list(range(len(ends)))
 
 
-def test_most_boxes_that_no_ray_meets_are_not():
+def test_most_boxes_without_rays_are_no_candidates():
     cones = some_cones(3, 30, 0)
     low = GRIDS[3].centers() - 0.2
     pairs = [torch.stack(pair, 1) for pair in candidate_pairs(cones, low, low + 0.4, chunk_pairs=5000)]
@@ -97,7 +97,7 @@ def test_a_face_that_a_ray_crosses_is_visited(dim, seed):
             assert len(visited) < 0.5 * total
 
 
-def test_cells_around_the_ellipsoid_hold_every_end():
+def test_ball_rows_contain_all_ends():
     grid, cones = GRIDS[3], some_cones(3, 4, 2)
     cones = cones._replace(max_range=torch.tensor([False, True, False, False]))
     rows = ball_rows(cones, grid)
@@ -113,7 +113,7 @@ def test_cells_around_the_ellipsoid_hold_every_end():
 
 
 @pytest.mark.parametrize("size", [1, 7, 10**6])
-def test_chunks_hold_every_cell_once(size):
+def test_chunks_contain_each_cell_once(size):
     first = torch.tensor([[3, 0], [5, 5], [0, 2]])
     count = torch.tensor([[2, 3], [0, 4], [1, 2]])
     chunks = list(cells_in_chunks(first, count, size))
@@ -122,7 +122,7 @@ def test_chunks_hold_every_cell_once(size):
     assert listed == [(0, 3, 0), (0, 3, 1), (0, 3, 2), (0, 4, 0), (0, 4, 1), (0, 4, 2), (2, 0, 2), (2, 0, 3)]
 
 
-def test_reach_is_the_box_of_ellipsoid_and_sensor():
+def test_cone_bounds_is_the_box_around_ellipsoid_and_sensor_origin():
     cones = some_cones(3, 5, 1)
     low, high = cone_bounds(cones, 2.0)
     for i in range(5):
@@ -141,7 +141,7 @@ def test_reach_is_the_box_of_ellipsoid_and_sensor():
 
 
 @given(dim=st.sampled_from([2, 3]), seed=st.integers(0, 10**6))
-def test_what_is_called_outside_is(dim, seed):
+def test_outside_tests_never_exclude_a_cell_that_is_reached(dim, seed):
     """The bounds against a dense sample of each whitened cell."""
     generator = torch.Generator().manual_seed(seed)
     ray, mean = 3 * normal(generator, dim, 20), 6 * normal(generator, dim, 1)

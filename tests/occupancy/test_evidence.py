@@ -64,31 +64,31 @@ def test_theta_is_equation_3_9(hits, misses, prior):
 
 @pytest.mark.parametrize("prior", [0, 1e-300, 0.1, 1 / 3, 1, 7.7])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_what_was_never_seen_is_exactly_a_half(prior, dtype):
+def test_without_evidence_theta_is_exactly_half(prior, dtype):
     zero = torch.zeros(3, dtype=dtype)
     assert occupancy_probability(zero, zero, prior).tolist() == [0.5] * 3
 
 
-def test_without_a_prior_theta_is_the_share_of_hits():
+def test_with_prior_zero_theta_is_the_share_of_hits():
     theta = occupancy_probability(torch.tensor([3.0, 0.0, 2.0]), torch.tensor([1.0, 5.0, 0.0]), 0)
     assert theta.tolist() == [0.75, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("prior", [-1, float("nan"), float("inf")])
-def test_a_prior_that_is_no_count_is_refused(prior):
+def test_invalid_priors_are_refused(prior):
     with pytest.raises(InvalidArgumentError, match="prior"):
         occupancy_probability(torch.ones(1), torch.ones(1), prior)
 
 
 @pytest.mark.parametrize("theta", [0.0, 1e-12, 0.1, 0.5, 0.77, 1.0])
-def test_variance_and_entropy_are_those_of_a_coin(theta):
+def test_variance_and_entropy_equal_scipys_bernoulli(theta):
     value = torch.tensor([theta], dtype=torch.float64)
     assert float(bernoulli_variance(value)) == pytest.approx(bernoulli(theta).var(), abs=1e-15)
     expected = float(bernoulli(theta).entropy()) / math.log(2) if 0 < theta < 1 else 0.0
     assert float(bernoulli_entropy(value)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_the_grid_wide_forms_are_the_same_numbers():
+def test_methods_of_evidence_equal_the_functions():
     grid = GRIDS[2]
     generator = torch.Generator().manual_seed(0)
     evidence = Evidence(grid, *(5 * torch.rand(2, *grid.shape, generator=generator, dtype=torch.float64)))
@@ -119,7 +119,7 @@ def test_without_a_dead_band_only_a_half_is_unknown():
 
 
 @pytest.mark.parametrize("threshold", [0, -0.1, 0.26, float("nan")])
-def test_a_variance_that_no_coin_has_is_refused(threshold):
+def test_invalid_variance_thresholds_are_refused(threshold):
     with pytest.raises(InvalidArgumentError, match="variance_threshold"):
         classify(torch.tensor([0.5]), threshold)
 
@@ -128,7 +128,7 @@ def test_a_variance_that_no_coin_has_is_refused(threshold):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_rays_count_as_by_hand(dim):
+def test_rays_count_as_in_a_cell_by_cell_walk(dim):
     grid = GRIDS[dim]
     origins, ends = random_rays(grid, 300)
     generator = torch.Generator().manual_seed(1)
@@ -152,7 +152,7 @@ def test_without_weights_each_ray_counts_one_and_hits():
     assert (evidence.misses.numpy() == misses).all()
 
 
-def test_order_and_chunks_and_portions_do_not_matter():
+def test_counts_do_not_depend_on_order_chunks_and_portions():
     grid = GRIDS[3]
     origins, ends = random_rays(grid, 200)
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
@@ -164,7 +164,7 @@ def test_order_and_chunks_and_portions_do_not_matter():
     assert torch.equal(whole.misses, parts.misses)
 
 
-def test_rays_without_return_never_hit():
+def test_no_return_beams_never_hit():
     grid = GRIDS[2]
     origins, ends = random_rays(grid, 100)
     evidence = Evidence.empty(grid)
@@ -175,7 +175,7 @@ def test_rays_without_return_never_hit():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
-def test_weights_of_any_number_type_are_taken(dtype):
+def test_weights_can_have_any_number_type(dtype):
     grid = GRIDS[2]
     origins, ends = random_rays(grid, 50)
     one, other = Evidence.empty(grid), Evidence.empty(grid)
@@ -191,7 +191,7 @@ def test_no_rays_add_nothing():
     assert evidence.probability().unique().tolist() == [0.5]
 
 
-def test_a_look_up_reads_the_cell_and_a_half_outside():
+def test_lookup_reads_the_cell_and_is_half_outside():
     grid = GRIDS[2]
     evidence = Evidence.empty(grid)
     evidence.add_rays(*random_rays(grid, 200))

@@ -53,7 +53,7 @@ def evaluated(cones, low, high, **options):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_evidence_is_that_of_the_angular_form(dim, dtype):
+def test_flux_evidence_equals_the_angular_form(dim, dtype):
     n = 40 if dim == 2 else 16
     cones, low, high = cases(dim, n, seed=5, deviations=(0.01, 0.3), distances=(3.2, 10.0))
     parts = zip(cones.means, cones.covariances, cones.origins, low, high, strict=True)
@@ -68,7 +68,7 @@ def test_evidence_is_that_of_the_angular_form(dim, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_evidence_is_that_of_rays_from_a_millimetre_to_two_metres(dim, dtype):
+def test_flux_evidence_equals_sampled_rays_from_1_mm_to_2_m(dim, dtype):
     cones, low, high = cases(dim, 60, seed=7)
     counted = torch.tensor([count_rays(only(cones, i), low[i], high[i]) for i in range(len(low))])
     error = (evaluated(cones, low, high, dtype=dtype) - counted.double()).abs()
@@ -98,7 +98,7 @@ def test_a_thin_sheet_that_cuts_the_faces_is_integrated_exactly(incidence):
         assert float(misses) == pytest.approx(counted[1], abs=1e-4)
 
 
-def test_a_smaller_tolerance_is_more_exact():
+def test_a_smaller_tolerance_gives_a_smaller_error():
     cones, low, high = cases(3, 60, seed=3)
     finest = evaluated(cones, low, high, tolerance=1e-8)
     errors = [
@@ -122,7 +122,7 @@ def grid_case(dim: int, seed: int = 0) -> tuple[Cones, VoxelGrid]:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_grid_is_what_rays_through_it_count(dim):
+def test_grid_evidence_equals_counted_rays(dim):
     cones, grid = grid_case(dim)
     evidence, counted = flux_evidence(cones, grid), Evidence.empty(grid)
     counted.add_rays(*sample_rays(cones, 300_000))
@@ -132,7 +132,7 @@ def test_a_grid_is_what_rays_through_it_count(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_grid_is_its_cells_asked_one_by_one(dim):
+def test_grid_evidence_equals_box_evidence_of_its_cells(dim):
     cones, grid = grid_case(dim, seed=1)
     evidence = flux_evidence(cones, grid)
     low = grid.centers() - 0.5 * grid.resolution
@@ -142,7 +142,7 @@ def test_a_grid_is_its_cells_asked_one_by_one(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_cells_outside_every_cone_have_no_evidence_at_all(dim):
+def test_cells_outside_all_cones_have_zero_evidence(dim):
     cones, grid = grid_case(dim)
     cones = only(cones, 0)
     evidence = flux_evidence(cones, grid)
@@ -154,7 +154,7 @@ def test_cells_outside_every_cone_have_no_evidence_at_all(dim):
     assert float((evidence.misses.flatten()[~outside] == 0).double().mean()) > 0.3
 
 
-def test_rays_without_return_never_hit():
+def test_no_return_beams_never_hit():
     cones, grid = grid_case(3)
     evidence = flux_evidence(cones._replace(max_range=torch.ones(5, dtype=torch.bool)), grid)
     assert float(evidence.hits.max()) == 0
@@ -163,7 +163,7 @@ def test_rays_without_return_never_hit():
     assert float(box_flux(only(cones, 1), low, low + 0.2)[0].max()) == 0
 
 
-def test_no_cones_no_evidence():
+def test_no_cones_give_no_evidence():
     cones, grid = grid_case(3)
     none = Cones(*(part[:0] for part in cones))
     assert float(flux_evidence(none, grid).misses.abs().max()) == 0
@@ -172,7 +172,7 @@ def test_no_cones_no_evidence():
     assert [x.shape for x in box_flux(cones, low[:0], low[:0])] == [(0,), (0,)]
 
 
-def test_moving_everything_to_utm_coordinates_changes_nothing():
+def test_evidence_is_the_same_in_utm_coordinates():
     cones, grid = grid_case(3)
     shift = torch.tensor([5e5, 5.4e6, 100.0], dtype=torch.float64)
     moved = cones._replace(means=cones.means + shift, origins=cones.origins + shift)
@@ -188,7 +188,7 @@ def test_moving_everything_to_utm_coordinates_changes_nothing():
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("size", [1e-4, 0.1, 100.0])
 @pytest.mark.parametrize("spread", [1e-3, 0.1, 2.0])
-def test_a_cell_with_the_sensor_in_on_or_beside_it(dim, size, spread):
+def test_cells_at_the_sensor_origin_have_finite_evidence(dim, size, spread):
     """All positions −½ … 1½ of the sensor about a cell in half steps: corners, edges, faces, inside."""
     steps = torch.tensor(list(itertools.product((-0.5, 0.0, 0.5, 1.0, 1.5), repeat=dim)), dtype=torch.float64)
     low = -steps * size
@@ -211,7 +211,7 @@ def test_a_cell_with_the_sensor_in_on_or_beside_it(dim, size, spread):
     scale=st.sampled_from([1e-3, 1.0, 1e3]),
     inside=st.booleans(),
 )
-def test_never_more_rays_than_there_are(dim, seed, scale, inside):
+def test_evidence_is_at_most_the_number_of_rays(dim, seed, scale, inside):
     """Cells a thousand times larger and smaller than the component, sensors anywhere."""
     generator = torch.Generator().manual_seed(seed)
     deviations = 10 ** uniform(generator, 1, dim, low=-2, high=0)
@@ -225,14 +225,14 @@ def test_never_more_rays_than_there_are(dim, seed, scale, inside):
     assert float((hits + misses).max()) <= 1 + 1e-3
 
 
-def test_a_cell_behind_the_sensor_sees_no_ray():
+def test_a_cell_behind_the_sensor_has_no_evidence():
     mean = torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)
     cone = one_each(mean, 0.04 * torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3).double())
     low = torch.tensor([[-1.0, -0.5, -0.5], [-4.0, -0.1, -0.1]], dtype=torch.float64)
     assert [x.tolist() for x in box_flux(cone, low, low + 0.9)] == [[0, 0], [0, 0]]
 
 
-def test_a_whole_world_as_one_cell_holds_every_ray():
+def test_one_cell_around_everything_has_all_hits():
     cones, _ = grid_case(3)
     low = torch.full((1, 3), -1e3, dtype=torch.float64)
     hits, misses = box_flux(cones, low, -low)
@@ -249,13 +249,13 @@ def test_a_whole_world_as_one_cell_holds_every_ray():
         ([[0.0, 0.0]], [[1.0, 1.0]]),
     ],
 )
-def test_what_is_no_box_is_refused(low, high):
+def test_invalid_boxes_are_refused(low, high):
     cones, _ = grid_case(3)
     with pytest.raises(InvalidArgumentError, match="low"):
         box_flux(cones, torch.tensor(low), torch.tensor(high))
 
 
-def test_other_arguments_are_checked():
+def test_invalid_tolerances_and_dimensions_are_refused():
     cones, _ = grid_case(3)
     with pytest.raises(InvalidArgumentError, match="2-dimensional"):
         flux_evidence(cones, VoxelGrid((0, 0), 0.1, (3, 3)))
@@ -267,7 +267,7 @@ def test_other_arguments_are_checked():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_gradients_in_box_sensor_and_mixture(dim):
+def test_gradients_of_box_flux_equal_finite_differences(dim):
     cones, low, high = cases(dim, 2, seed=11, deviations=(0.1, 0.3), distances=(2.0, 3.0), sizes=(0.2, 0.4))
     pairs = [(torch.arange(2), torch.arange(2))]
 
@@ -282,7 +282,7 @@ def test_gradients_in_box_sensor_and_mixture(dim):
     assert torch.autograd.gradcheck(evidence, inputs, eps=1e-6, atol=1e-5)
 
 
-def test_gradients_reach_the_mixture_from_a_grid():
+def test_gradients_flow_from_a_grid_to_the_mixture():
     cones, grid = grid_case(2)
     means = cones.means.clone().requires_grad_()
     flux_evidence(cones._replace(means=means), grid).probability().sum().backward()

@@ -18,7 +18,7 @@ GRIDS = [VoxelGrid((-1.0, 2.0), 0.25, (4, 6)), VoxelGrid((0.1, -7.3, 500_000.0),
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_every_centre_lies_in_its_own_cell(grid):
+def test_cell_centres_have_their_own_flat_index(grid):
     cell, inside = grid.flat_index(grid.centers())
     assert bool(inside.all())
     assert cell.tolist() == list(range(grid.n_cells))
@@ -44,7 +44,7 @@ def test_cells_are_half_open():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e300])
-def test_points_that_are_nowhere_are_outside(value):
+def test_points_that_are_not_finite_are_outside(value):
     cell, inside = GRIDS[0].flat_index(torch.tensor([[value, 2.1], [-0.9, value]], dtype=torch.float64))
     assert not inside.any()
     assert cell.tolist() == [0, 0]
@@ -64,7 +64,7 @@ def test_covering_is_the_smallest_aligned_grid(sides, resolution):
     assert bool(grid.flat_index(torch.tensor([low, high], dtype=torch.float64))[1].all())
 
 
-def test_covering_takes_tensors_and_a_point():
+def test_covering_accepts_tensors_and_a_single_point():
     grid = VoxelGrid.covering(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 2.0]), 0.5)
     assert (grid.origin, grid.shape) == ((1.0, 2.0), (1, 1))
 
@@ -91,7 +91,7 @@ def test_a_grid_too_large_names_its_bytes_and_a_resolution_that_fits(low, high):
 
 
 @pytest.mark.parametrize("resolution", [0, -0.1, float("nan"), float("inf")])
-def test_a_resolution_that_is_none_is_refused(resolution):
+def test_invalid_resolutions_are_refused(resolution):
     with pytest.raises(InvalidArgumentError, match="resolution"):
         VoxelGrid((0.0, 0.0), resolution, (2, 2))
     with pytest.raises(InvalidArgumentError, match="resolution"):
@@ -110,7 +110,7 @@ def test_a_resolution_that_is_none_is_refused(resolution):
         ((0.0, float("inf")), (2, 2)),
     ],
 )
-def test_a_shape_or_origin_that_makes_no_grid_is_refused(origin, shape):
+def test_invalid_shapes_and_origins_are_refused(origin, shape):
     with pytest.raises(InvalidArgumentError, match=r"origin|shape"):
         VoxelGrid(origin, 0.1, shape)
 
@@ -118,7 +118,7 @@ def test_a_shape_or_origin_that_makes_no_grid_is_refused(origin, shape):
 @pytest.mark.parametrize(
     ("low", "high"), [([0, 0], [-1, 1]), ([0, float("nan")], [1, 1]), ([0, 0], [1, float("inf")])]
 )
-def test_a_box_that_is_none_is_refused(low, high):
+def test_invalid_boxes_are_refused(low, high):
     with pytest.raises(InvalidArgumentError, match=r"low|high"):
         VoxelGrid.covering(low, high, 0.1)
 

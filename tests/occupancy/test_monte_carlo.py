@@ -87,7 +87,7 @@ def missed_share(grid: VoxelGrid, mean: np.ndarray, covariance: np.ndarray, sens
 # -- the integrals -------------------------------------------------------------------------------------
 
 
-def test_hits_are_the_counts_share_of_the_density_in_2d():
+def test_hits_equal_the_mass_of_the_density_in_2d():
     grid = VoxelGrid((1.5, 0.0), 0.25, (12, 12))
     expected = 50 * box_probability(grid, MEAN_2D, COVARIANCE_2D)
     found = evidence_of(grid, one_cone(), 1 << 17).hits.numpy()
@@ -95,7 +95,7 @@ def test_hits_are_the_counts_share_of_the_density_in_2d():
     assert expected.max() > 2
 
 
-def test_hits_are_the_counts_share_of_the_density_in_3d():
+def test_hits_equal_the_mass_of_the_density_in_3d():
     mean, covariance = (
         np.array([2.0, 0.3, 0.1]),
         np.array([[0.2, 0.08, 0], [0.08, 0.1, 0.02], [0, 0.02, 0.15]]),
@@ -114,7 +114,7 @@ def test_misses_are_the_rays_that_leave_a_cell_and_end_beyond_it():
     np.testing.assert_allclose(found, expected, atol=50 * 2e-3)
 
 
-def test_a_component_seen_from_two_places_is_the_sum_of_its_cones():
+def test_a_component_with_two_origins_is_the_sum_of_its_cones():
     grid = VoxelGrid((0.0, 0.0), 0.4, (9, 6))
     other = np.array([1.1, 2.3])
     both = cones([MEAN_2D] * 2, [COVARIANCE_2D] * 2, [SENSOR_2D, other], [30.0, 20.0])
@@ -124,14 +124,14 @@ def test_a_component_seen_from_two_places_is_the_sum_of_its_cones():
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_every_kind_of_sampling_aims_at_the_same(sampling):
+def test_all_kinds_of_sampling_have_the_same_expectation(sampling):
     grid = VoxelGrid((1.5, 0.0), 0.5, (6, 6))
     expected = 50 * box_probability(grid, MEAN_2D, COVARIANCE_2D)
     mean = sum(evidence_of(grid, one_cone(), 4000, seed, sampling).hits.numpy() for seed in range(10)) / 10
     np.testing.assert_allclose(mean, expected, atol=50 * 5 * 0.5 / math.sqrt(40_000))  # five standard errors
 
 
-def test_sobol_points_are_less_noisy_than_independent_ones():
+def test_sobol_samples_have_less_variance_than_independent_ones():
     grid = VoxelGrid((1.5, 0.0), 0.25, (12, 12))
     expected = 50 * box_probability(grid, MEAN_2D, COVARIANCE_2D)
 
@@ -142,7 +142,7 @@ def test_sobol_points_are_less_noisy_than_independent_ones():
     assert error("sobol") < 0.6 * error("plain")
 
 
-def test_sharing_out_the_samples_is_less_noisy_than_drawing_the_component():
+def test_stratified_samples_have_less_variance_than_plain_ones():
     def first_count(sampling: str, seed: int) -> float:
         rays = sample_rays(three_cones(), 500, seeded(seed), sampling)
         return float(rays.weights[rays.ends[:, 0] > 1.5].sum())
@@ -169,12 +169,12 @@ def test_ends_follow_the_components_distribution(sampling):
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @pytest.mark.parametrize("n", [1, 10, 1000])
-def test_weights_add_up_to_the_count_of_points(sampling, n):
+def test_weights_sum_to_the_counts(sampling, n):
     assert float(sample_rays(three_cones(), n, seeded(), sampling).weights.sum()) == pytest.approx(100)
 
 
 @pytest.mark.parametrize("sampling", ["sobol", "stratified"])
-def test_each_cones_weights_add_up_to_its_own_count(sampling):
+def test_weights_of_each_cone_sum_to_its_count(sampling):
     what = three_cones()
     rays = sample_rays(
         what._replace(origins=torch.diag(torch.tensor([1.0, 2.0, 3.0])).double()), 333, seeded(), sampling
@@ -184,7 +184,7 @@ def test_each_cones_weights_add_up_to_its_own_count(sampling):
         assert float(rays.weights[own].sum()) == pytest.approx(float(what.counts[cone]))
 
 
-def test_samples_are_shared_in_proportion_and_each_cone_gets_one():
+def test_samples_are_proportional_to_counts_and_at_least_one():
     counts = torch.tensor([1000.0, 1.0, 0.0, 1e-6, 500.0])
     assert allocate_samples(counts, 15).tolist() == [10, 1, 0, 1, 5]
     assert allocate_samples(counts, 1).tolist() == [1, 1, 0, 1, 1]
@@ -193,7 +193,7 @@ def test_samples_are_shared_in_proportion_and_each_cone_gets_one():
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_rays_start_at_the_sensor_and_the_seed_decides(sampling):
+def test_rays_start_at_the_sensor_origin_and_depend_on_the_seed(sampling):
     first, again = (sample_rays(three_cones(), 64, seeded(4), sampling) for _ in range(2))
     other = sample_rays(three_cones(), 64, seeded(5), sampling)
     assert torch.equal(first.ends, again.ends)
@@ -202,7 +202,7 @@ def test_rays_start_at_the_sensor_and_the_seed_decides(sampling):
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_points_at_maximum_range_add_misses_and_no_hits(sampling):
+def test_no_return_components_add_only_misses(sampling):
     grid = VoxelGrid((0.0, 0.0), 0.4, (12, 8))
     end, surface = (evidence_of(grid, one_cone(max_range=m), 2000, 0, sampling) for m in (True, False))
     assert float(end.hits.max()) == 0
@@ -210,7 +210,7 @@ def test_points_at_maximum_range_add_misses_and_no_hits(sampling):
     assert torch.equal(end.misses, surface.misses)
 
 
-def test_only_the_flagged_of_several_components_add_no_hits():
+def test_only_no_return_components_add_no_hits():
     what = three_cones()._replace(max_range=torch.tensor([False, True, False]))
     rays = sample_rays(what, 300, seeded())
     assert float(rays.weights[rays.is_hit].sum()) == pytest.approx(80)
@@ -226,13 +226,13 @@ def test_a_flat_component_is_sampled_along_its_line(covariance):
 
 
 @pytest.mark.parametrize("covariance", [[[1.0, 0.0], [0.0, -1.0]], [[math.nan, 0.0], [0.0, 1.0]]])
-def test_what_is_no_covariance_is_refused(covariance):
+def test_invalid_covariances_are_refused(covariance):
     with pytest.raises(NumericalError, match=r"covariances\[0\]"):
         sample_rays(cones([[2.0, 3.0]], [covariance], [[0.0, 0.0]], [1.0]), 5, seeded())
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_components_that_count_nothing_cast_no_rays(sampling):
+def test_components_with_count_zero_cast_no_rays(sampling):
     rays = sample_rays(one_cone(count=0.0), 100, seeded(), sampling)
     assert float(rays.weights.sum()) == 0
 
@@ -244,7 +244,7 @@ def test_no_components_cast_no_rays(sampling):
     assert sample_rays(empty, 100, seeded(), sampling).ends.shape == (0, 2)
 
 
-def test_bad_arguments_are_named():
+def test_invalid_arguments_are_refused():
     with pytest.raises(InvalidArgumentError, match="n_samples=0"):
         sample_rays(one_cone(), 0, seeded())
     with pytest.raises(InvalidArgumentError, match="sampling='halton'"):

@@ -19,7 +19,7 @@ def square(low: float, high: float) -> tuple[torch.Tensor, torch.Tensor]:
     return corners[..., None], corners.roll(-1, 0)[..., None]
 
 
-def test_it_is_scipys_everywhere():
+def test_owens_t_equals_scipy():
     h = torch.cat([torch.zeros(1), torch.logspace(-5, 1.7, 150)]).double()
     a = torch.cat([torch.zeros(1), torch.logspace(-5, 12, 250)]).double()
     h, a = torch.cat([-h, h])[:, None], torch.cat([-a, a])
@@ -27,7 +27,7 @@ def test_it_is_scipys_everywhere():
     assert (owens_t(h, a) - expected).abs().max() < 1e-14
 
 
-def test_infinite_arguments_have_their_limits():
+def test_owens_t_has_its_limits_at_infinite_arguments():
     infinity = torch.tensor(math.inf, dtype=torch.float64)
     h = torch.tensor([0.0, 0.5, 2.0, math.inf], dtype=torch.float64)
     torch.testing.assert_close(owens_t(h, infinity), 0.25 * torch.special.erfc(h / math.sqrt(2)))
@@ -35,27 +35,27 @@ def test_infinite_arguments_have_their_limits():
     assert owens_t(infinity, h).abs().max() == 0
 
 
-def test_float32_keeps_its_digits(generator):
+def test_owens_t_in_float32_keeps_its_digits(generator):
     h, a = torch.randn(2, 1000, generator=generator) * 3
     assert owens_t(h, a).dtype == torch.float32
     assert (owens_t(h, a) - owens_t(h.double(), a.double())).abs().max() < 1e-6
 
 
 @given(st.floats(-6, 6), st.floats(-6, 6))
-def test_its_derivative_in_a_is_the_integrand(h, a):
+def test_the_derivative_of_owens_t_is_its_integrand(h, a):
     a_grad = torch.tensor(a, dtype=torch.float64, requires_grad=True)
     owens_t(torch.tensor(h, dtype=torch.float64), a_grad).backward()
     expected = math.exp(-0.5 * h * h * (1 + a * a)) / (1 + a * a) / (2 * math.pi)
     assert float(a_grad.grad) == pytest.approx(expected, abs=1e-10)
 
 
-def test_a_square_is_the_square_of_an_interval():
+def test_a_squares_probability_is_the_square_of_an_intervals():
     for low, high in ((-1.0, 1.0), (0.0, 2.0), (0.0, 40.0), (1.5, 1.5001), (-30.0, 1e9)):
         interval = 0.5 * (math.erf(high / math.sqrt(2)) - math.erf(low / math.sqrt(2)))
         assert float(polygon_probability(*square(low, high))) == pytest.approx(interval**2, abs=1e-12)
 
 
-def test_polygons_hold_their_share_of_four_million_samples(generator):
+def test_polygon_probability_equals_the_share_of_samples(generator):
     starts, ends = random_polygons(3, 4, generator)
     points = torch.randn(4_000_000, 2, generator=generator)
     shares = [
@@ -67,7 +67,7 @@ def test_polygons_hold_their_share_of_four_million_samples(generator):
 
 
 @given(st.integers(0, 2**31), st.floats(0, 6.3))
-def test_a_turned_polygon_and_a_cut_one_hold_the_same(seed, angle):
+def test_polygon_probability_is_invariant_under_rotation_and_division(seed, angle):
     starts, ends = random_polygons(4, 6, torch.Generator().manual_seed(seed))
     cosine, sine = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
@@ -80,7 +80,7 @@ def test_a_turned_polygon_and_a_cut_one_hold_the_same(seed, angle):
     assert (first + second - whole).abs().max() < 1e-13
 
 
-def test_edges_without_length_and_through_the_mean_add_nothing():
+def test_edges_of_zero_length_and_through_the_mean_add_nothing():
     starts, ends = square(0.0, 2.0)
     whole = polygon_probability(starts, ends)
     nothing = starts[:2]

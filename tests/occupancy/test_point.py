@@ -66,7 +66,7 @@ def by_quadrature(cones: Cones, x: np.ndarray, h: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("resolution", [0.02, 0.2, 1.0])
-def test_the_evidence_is_what_the_formulas_say(dim, resolution):
+def test_point_evidence_equals_quadrature_of_its_formulas(dim, resolution):
     cones = random_cones(dim, 6, 0)
     points = near_rays(cones, 30, 1, spread=0.5)
     found = point_evidence(cones, points, resolution, cutoff=9.0)
@@ -101,7 +101,7 @@ def simulated(cones: Cones, x: Tensor, h: float, n: int) -> tuple[float, float]:
         ((0.0, 4.0, 0.0), (0.5, 0.02, 0.5), (0.1, 4.0, 0.0), 0.3),  # a thin wall through the middle
     ],
 )
-def test_it_counts_the_rays_of_a_cube(mean, deviations, place, h):
+def test_point_evidence_approximates_simulated_rays_through_a_cube(mean, deviations, place, h):
     cones = one_cone(mean, [d * d for d in deviations], (0.0, 0.0, 0.0), count=1.0)
     x = torch.tensor([place], dtype=torch.float64)
     hits, misses = (float(value) for value in point_evidence(cones, x, h))
@@ -112,7 +112,7 @@ def test_it_counts_the_rays_of_a_cube(mean, deviations, place, h):
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.015, 0.0), (-0.01, 0.02)])
-def test_a_cone_narrower_than_the_cube_is_not_missed_by_the_centre(offset):
+def test_a_cone_narrower_than_the_cube_counts_beside_its_centre(offset):
     """Near the sensor every ray passes through one cell, wherever in it the centre lies."""
     cones = one_cone((4.0, 0.3, 0.2), (0.02**2, 0.05**2, 0.05**2), (0.0, 0.0, 0.0), count=1.0)
     x = torch.tensor([[0.4, 0.03 + offset[0], 0.02 + offset[1]]], dtype=torch.float64)
@@ -121,14 +121,14 @@ def test_a_cone_narrower_than_the_cube_is_not_missed_by_the_centre(offset):
     assert 0.5 < float(point_evidence(cones, x, 0.1).misses) <= 1
 
 
-def test_hits_add_up_to_the_count():
+def test_hits_of_all_cubes_sum_to_the_count():
     cones = one_cone((0.3, -0.2), (0.04, 0.0025), (-3.0, 0.0), count=70.0)
     axis = torch.arange(-40, 60, dtype=torch.float64) * 0.05
     points = torch.cartesian_prod(axis, axis)
     assert float(point_evidence(cones, points, 0.05).hits.sum()) == pytest.approx(70.0, rel=1e-4)
 
 
-def test_components_at_maximum_range_only_miss():
+def test_components_of_no_return_beams_give_only_misses():
     seen = one_cone((3.0, 0.0, 0.0), (0.04, 0.04, 0.04), (0.0, 0.0, 0.0))
     empty = seen._replace(max_range=torch.tensor([True]))
     points = near_rays(seen, 50, 0)
@@ -138,7 +138,7 @@ def test_components_at_maximum_range_only_miss():
     assert torch.equal(one.misses, other.misses)
 
 
-def test_a_hit_length_scales_hits_alone():
+def test_hit_length_scales_only_hits():
     cones = random_cones(3, 5, 0)
     points = near_rays(cones, 20, 0)
     form = PointForm(cones, 0.1)
@@ -170,7 +170,7 @@ def every_pair(form: PointForm, points: Tensor) -> PointEvidence:
     resolution=st.sampled_from([0.001, 0.05, 0.3, 2.0, 10.0]),
     cutoff=st.sampled_from([2.0, 5.0]),
 )
-def test_the_index_changes_nothing(dim, seed, resolution, cutoff):
+def test_evidence_does_not_depend_on_the_index(dim, seed, resolution, cutoff):
     cones = random_cones(dim, 10, seed)
     points = near_rays(cones, 150, seed, spread=3.0)
     points = torch.cat([points, cones.origins, cones.origins + 0.6 * resolution, cones.means])
@@ -182,7 +182,7 @@ def test_the_index_changes_nothing(dim, seed, resolution, cutoff):
     same(dense(points), expected)
 
 
-def test_order_and_portions_change_nothing():
+def test_point_evidence_does_not_depend_on_order_and_chunks():
     cones = random_cones(3, 60, 0, room=True)
     points = near_rays(cones, 2000, 0)
     form = PointForm(cones, 0.05)
@@ -208,7 +208,7 @@ def test_compiled_evidence_is_the_same():
     same(PointForm(cones, 0.05, compiled=True)(points), PointForm(cones, 0.05)(points))
 
 
-def test_counts_of_several_origins_add():
+def test_evidence_of_several_origins_sums():
     cones = random_cones(2, 8, 0)
     points = near_rays(cones, 100, 0)
     each = [point_evidence(Cones(*(field[i : i + 1] for field in cones)), points, 0.1) for i in range(8)]
@@ -218,7 +218,7 @@ def test_counts_of_several_origins_add():
 
 
 @pytest.mark.parametrize("shift", [5e5, -3e6])
-def test_far_from_the_origin_of_the_world(shift):
+def test_evidence_is_the_same_far_from_the_world_origin(shift):
     cones = random_cones(3, 20, 0)
     points = near_rays(cones, 200, 0)
     moved = cones._replace(means=cones.means + shift, origins=cones.origins + shift)
@@ -227,7 +227,7 @@ def test_far_from_the_origin_of_the_world(shift):
         torch.testing.assert_close(b, a, rtol=1e-4, atol=1e-6)
 
 
-def test_turning_the_world_by_right_angles_changes_nothing():
+def test_evidence_is_invariant_under_right_angle_rotations():
     cones = random_cones(3, 20, 0)
     points = near_rays(cones, 200, 0)
     turn = torch.tensor([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], dtype=torch.float64)
@@ -251,7 +251,7 @@ def test_turning_the_world_by_right_angles_changes_nothing():
     thinnest=st.sampled_from([1e-4, 1e-3, 1.0]),
     widest=st.sampled_from([1e-3, 1.0, 1e3]),
 )
-def test_no_cone_gives_more_than_its_rays(dim, seed, resolution, thinnest, widest):
+def test_hits_and_misses_of_a_cone_are_at_most_its_count(dim, seed, resolution, thinnest, widest):
     cones = random_cones(dim, 1, seed)._replace(max_range=torch.tensor([False]))
     values, axes = torch.linalg.eigh(cones.covariances)
     values[:, 0], values[:, 1:] = min(thinnest, widest) ** 2, widest**2
@@ -267,14 +267,14 @@ def test_no_cone_gives_more_than_its_rays(dim, seed, resolution, thinnest, wides
 
 
 @pytest.mark.parametrize("resolution", [0.001, 0.1, 10.0])
-def test_every_ray_begins_in_the_cube_that_holds_the_sensor(resolution):
+def test_all_rays_start_in_the_cube_of_the_sensor_origin(resolution):
     cones = one_cone((2.0, 1.0, 0.0), (0.01, 0.01, 0.01), (0.0, 0.0, 0.0), count=50.0)
     inside = torch.tensor([[0, 0, 0], [0.49, 0.49, 0.49], [-0.49, 0, 0.3]], dtype=torch.float64) * resolution
     hits, misses = point_evidence(cones, inside, resolution)
     torch.testing.assert_close(hits + misses, torch.full_like(hits, 50.0), rtol=1e-12, atol=0)
 
 
-def test_a_sensor_inside_its_component_is_no_trouble():
+def test_a_sensor_origin_inside_its_component_gives_finite_evidence():
     cones = one_cone((1.0, 1.0, 1.0), (0.09, 0.04, 0.01), (1.0, 1.0, 1.0))
     points = torch.cat([cones.origins, near_rays(cones, 50, 0)])
     hits, misses = point_evidence(cones, points, 0.1)
@@ -282,7 +282,7 @@ def test_a_sensor_inside_its_component_is_no_trouble():
     assert float(misses[0] + hits[0]) == pytest.approx(100)
 
 
-def test_outside_every_cutoff_nothing_is_known():
+def test_evidence_is_zero_beyond_the_cutoff():
     cones = one_cone((3.0, 0.0, 0.0), (0.01, 0.01, 0.01), (0.0, 0.0, 0.0))
     inf = float("inf")
     places = [[-1, 0, 0], [0, 1, 0], [4, 0, 0], [1.5, 0.5, 0], [1e300, 1, 1], [inf, 0, 0], [0, -inf, inf]]
@@ -292,7 +292,7 @@ def test_outside_every_cutoff_nothing_is_known():
         assert occupancy_probability(*evidence).tolist() == [0.5] * len(places)
 
 
-def test_evidence_has_no_edge_at_the_cutoff():
+def test_evidence_is_continuous_at_the_cutoff():
     cones = one_cone((3.0, 0.0), (0.01, 0.01), (0.0, 0.0), count=1e6)
     across = torch.linspace(0, 0.8, 200_001, dtype=torch.float64)
     for along in (1.5, 3.0):
@@ -305,7 +305,7 @@ def test_evidence_has_no_edge_at_the_cutoff():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_no_points_and_no_cones(dim):
+def test_no_points_or_no_cones_give_no_evidence(dim):
     cones = random_cones(dim, 3, 0)
     none = Cones(*(field[:0] for field in cones))
     for indexed in (True, False):
@@ -314,7 +314,7 @@ def test_no_points_and_no_cones(dim):
         assert found.hits.tolist() == found.misses.tolist() == [0, 0]
 
 
-def test_what_is_no_question_is_refused():
+def test_invalid_point_queries_are_refused():
     cones = random_cones(3, 3, 0)
     with pytest.raises(InvalidArgumentError, match="NaN"):
         point_evidence(cones, torch.full((1, 3), float("nan")), 0.1)
@@ -336,7 +336,7 @@ def test_what_is_no_question_is_refused():
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("round_component", [False, True])
-def test_gradients_of_occupancy(dim, indexed, round_component):
+def test_gradients_of_occupancy_equal_finite_differences(dim, indexed, round_component):
     cones = random_cones(dim, 3, 2)
     if round_component:  # eigenvectors have no gradient here
         cones = cones._replace(covariances=0.04 * torch.eye(dim, dtype=torch.float64).repeat(3, 1, 1))
@@ -356,7 +356,7 @@ def test_gradients_of_occupancy(dim, indexed, round_component):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("resolution", [0.001, 0.1, 10.0])
-def test_gradients_are_never_nan(dim, resolution):
+def test_gradients_are_finite(dim, resolution):
     cones = random_cones(dim, 5, 0)
     cones = cones._replace(origins=torch.cat([cones.means[:1], cones.origins[1:]]))
     points = torch.cat(

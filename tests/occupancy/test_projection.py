@@ -45,7 +45,7 @@ def of_each(cones: Cones, n: int) -> Cones:
 # -- polygons -------------------------------------------------------------------------------------
 
 
-def test_the_approximate_error_function_is_off_by_less_than_0_014():
+def test_the_approximate_error_function_has_an_error_below_0_014():
     x = torch.linspace(-6, 6, 20001, dtype=torch.float64)
     worst = float((approximate_erf(x) - torch.erf(x)).abs().max())
     assert 0.0135 < worst < 0.0145
@@ -81,14 +81,14 @@ def test_the_closed_form_is_the_integral_of_the_approximation(corners):
     )
 
 
-def test_the_approximation_is_off_by_up_to_a_hundredth_on_random_polygons(generator):
+def test_the_approximation_has_an_error_up_to_0_01_on_random_polygons(generator):
     starts, ends = random_polygons(3000, 6, generator)
     error = approximate_probability(Edges(starts, ends)) - polygon_probability(starts, ends)
     assert 0.008 < float(error.abs().max()) < 0.015
 
 
 @given(st.integers(0, 2**31), st.floats(-12, 12))
-def test_steep_edges_and_far_corners_are_as_near_to_the_exact_form(seed, exponent):
+def test_steep_edges_and_far_corners_keep_the_error_bound(seed, exponent):
     starts, ends = random_polygons(4, 5, torch.Generator().manual_seed(seed))
     stretch = torch.tensor([10.0**-exponent, 10.0**exponent], dtype=torch.float64)[:, None]
     near = approximate_probability(Edges(starts * stretch, ends * stretch))
@@ -100,7 +100,7 @@ def test_steep_edges_and_far_corners_are_as_near_to_the_exact_form(seed, exponen
 
 
 @given(st.integers(0, 2**31), st.tuples(*[st.sampled_from([-1, 0, 1])] * 3))
-def test_the_outline_is_the_hull_of_the_corners_seen(seed, region):
+def test_the_outline_is_the_convex_hull_of_the_projected_corners(seed, region):
     """From each of the 26 regions around a box, counter-clockwise as seen along the axis of depth."""
     g = torch.Generator().manual_seed(seed)
     side = 0.2 + torch.rand(3, generator=g).double()
@@ -124,7 +124,7 @@ def test_the_outline_is_the_hull_of_the_corners_seen(seed, region):
     assert np.linalg.norm(ends - starts, axis=1).sum() == pytest.approx(hull.area, rel=1e-9)
 
 
-def test_what_lies_behind_the_eye_is_clipped():
+def test_corners_behind_the_viewpoint_are_clipped():
     """Of a floor under the eye one sees, looking ahead, what is below the horizon."""
     corners, _ = outline(column(-5.0, -5.0, -2.0), column(5.0, 5.0, -1.0))
     ahead = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # y, z, depth x
@@ -149,7 +149,7 @@ def test_polygons_meet_a_disc_by_their_edges_or_around_it():
 
 
 @given(st.integers(0, 2**31))
-def test_facing_turns_the_third_axis(seed):
+def test_facing_rotates_the_third_axis_to_the_direction(seed):
     direction = torch.randn(3, 5, generator=torch.Generator().manual_seed(seed)).double()
     direction = direction / direction.norm(dim=0)
     turn = facing(direction).permute(2, 0, 1)
@@ -176,7 +176,7 @@ def test_a_thin_wall_far_away_has_the_exact_evidence(generator):
     assert errors[True] < 1e-3 < errors[False] < 0.01
 
 
-def test_a_small_far_wall_seen_squarely_is_matched_by_samples_to_1e_4(generator):
+def test_a_small_far_perpendicular_wall_equals_samples_to_1e_4(generator):
     cones = one_cone((0.0, 0.0, 100.0), (0.5, 0.4, 0.001))
     low = torch.tensor([[-0.3, -0.2, 90.0], [0.1, 0.1, 50.0]], dtype=torch.float64)
     _, misses = cone_evidence(cones, low, low + 0.4, exact=True)
@@ -189,14 +189,14 @@ def test_a_small_far_wall_seen_squarely_is_matched_by_samples_to_1e_4(generator)
         assert float(found) == pytest.approx(float((enter < leave).double().mean()), abs=1e-3 / 2)
 
 
-def test_the_plane_is_spanned_by_the_long_axes_and_faces_away():
+def test_the_plane_contains_the_long_axes_and_its_normal_points_away():
     planes = Planes.of(one_cone((-4.0, 1.0, 0.5), (0.01, 0.5, 0.3)))
     assert float(planes.mean[2]) == pytest.approx(4.0)
     torch.testing.assert_close(planes.deviation.squeeze(1), torch.tensor([0.5, 0.3, 0.01]).double())
     assert torch.linalg.det(planes.frame[..., 0]) == pytest.approx(1.0)
 
 
-def test_nothing_behind_the_sensor_beyond_the_wall_or_beside_the_cone():
+def test_evidence_is_zero_behind_the_sensor_beyond_the_wall_and_beside_the_cone():
     cones = one_cone((5.0, 0.0, 0.0), (0.05, 0.5, 0.5))
     tangent = 5 * 0.5 / 5.0
     low = torch.tensor(
@@ -214,7 +214,7 @@ def test_nothing_behind_the_sensor_beyond_the_wall_or_beside_the_cone():
         assert misses[3] > 0
 
 
-def test_the_voxel_of_the_sensor_is_left_by_all_rays_and_its_neighbours_share_them():
+def test_all_rays_leave_the_voxel_of_the_sensor_origin():
     cones = one_cone((3.0, 0.4, 0.2), (0.02, 0.3, 0.3))
     low = torch.full((1, 3), -0.1, dtype=torch.float64)
     assert float(cone_evidence(cones, low, low + 0.25)[1]) == pytest.approx(1.0)
@@ -225,7 +225,7 @@ def test_the_voxel_of_the_sensor_is_left_by_all_rays_and_its_neighbours_share_th
     assert (misses - truth).abs().max() < 2e-3
 
 
-def test_a_plane_through_the_sensor_gives_shares():
+def test_a_plane_through_the_sensor_origin_gives_valid_shares():
     """A floor that the sensor stands in: its image is a line, which no cell above or below is hidden by."""
     cones = one_cone((3.0, 0.0, 0.0), (0.5, 0.5, 0.01))
     low = torch.tensor([[1.0, -0.2, -0.2], [1.0, -0.2, 0.5], [-2.0, -0.2, -0.2]], dtype=torch.float64)
@@ -244,9 +244,7 @@ def test_a_plane_through_the_sensor_gives_shares():
     corner=st.sampled_from([0.0, 0.5, 1.0, -7.0]),
     exact=st.booleans(),
 )
-def test_it_is_finite_and_a_share_whatever_it_is_given(
-    distance, deviations, size, place, origin, corner, exact
-):
+def test_shares_are_finite_and_in_0_1(distance, deviations, size, place, origin, corner, exact):
     where = (origin + distance, -origin + 0.3 * distance, origin)
     cones = one_cone(where, deviations, (0.4, 0.7), origin=(origin, -origin, origin))
     low = cones.origins + place * (cones.means - cones.origins) - corner * size
@@ -254,7 +252,7 @@ def test_it_is_finite_and_a_share_whatever_it_is_given(
         assert 0 <= float(part) <= 1 + 1e-9
 
 
-def test_far_returns_are_misses_alone():
+def test_no_return_components_give_only_misses():
     low = torch.tensor([[2.0, -0.2, -0.2], [4.8, -0.2, -0.2]], dtype=torch.float64)
     solid = cone_evidence(one_cone((5.0, 0.0, 0.0), (0.05, 0.5, 0.5)), low, low + 0.4)
     free = cone_evidence(one_cone((5.0, 0.0, 0.0), (0.05, 0.5, 0.5), max_range=True), low, low + 0.4)

@@ -16,7 +16,7 @@ from gmmtorch.occupancy.ray_queries import expected_range, first_hit, hit_probab
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
-def test_first_hits_are_those_of_all_maps(occupancy):
+def test_first_hit_equals_enumeration_of_all_maps(occupancy):
     """Every map of the cells, weighted by its probability, says where the beam ends."""
     ends, none = [0.0] * len(occupancy), 0.0
     for cells in itertools.product([False, True], repeat=len(occupancy)):
@@ -74,14 +74,14 @@ def test_beams_end_where_a_simulated_scan_does(dim, distance):
     assert float((measured.T * near).sum(1).min()) > 0.99
 
 
-def test_before_the_wall_a_beam_ends_nowhere():
+def test_a_beam_does_not_end_before_the_wall():
     found = expected_range(wall(3, 3.0, 0.02), torch.zeros(9, 3), fan(3), 2.5, 0.1)
     assert float(found.no_hit.min()) > 0.98
     assert float((found.mean - 2.5).abs().max()) < 0.03
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_two_queries_agree_and_add_up(dim):
+def test_hit_probability_and_expected_range_agree(dim):
     cones = random_cones(dim, 30, 0)
     generator = torch.Generator().manual_seed(0)
     origins = 6 * torch.rand(40, dim, generator=generator, dtype=torch.float64)
@@ -96,7 +96,7 @@ def test_the_two_queries_agree_and_add_up(dim):
     torch.testing.assert_close(found.no_hit, hits.no_hit)
 
 
-def test_cells_are_those_of_the_point_form():
+def test_occupancy_along_a_beam_is_that_of_the_point_form():
     cones = random_cones(3, 20, 1)
     origin, direction = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.0, 3.0, 4.0]])
     hits = hit_probability(cones, origin, direction, 1.0, 0.25, prior=0.5)
@@ -108,7 +108,7 @@ def test_cells_are_those_of_the_point_form():
     torch.testing.assert_close(hits.no_hit[0], none)
 
 
-def test_unseen_space_stops_a_beam_half_the_time_a_cell():
+def test_unobserved_space_stops_a_beam_with_probability_half_per_cell():
     hits = hit_probability(random_cones(2, 1, 0), torch.full((1, 2), 1e6), torch.ones(1, 2), 0.4, 0.1)
     assert hits.probability[0].tolist() == pytest.approx([1 / 2, 1 / 4, 1 / 8, 1 / 16])
     assert float(hits.no_hit) == pytest.approx(1 / 16)
@@ -124,14 +124,14 @@ def test_expected_range_has_gradients():
     )
 
 
-def test_no_rays():
+def test_no_rays_give_empty_results():
     none = torch.zeros(0, 3)
     hits = hit_probability(random_cones(3, 2, 0), none, none, 1.0, 0.1)
     assert hits.probability.shape == (0, 10)
     assert expected_range(random_cones(3, 2, 0), none, none, 1.0, 0.1).mean.shape == (0,)
 
 
-def test_what_is_no_ray_is_refused():
+def test_invalid_rays_are_refused():
     cones, one = random_cones(3, 2, 0), torch.ones(1, 3)
     for origins, directions in ((one, 0 * one), (one / 0, one), (one, one * float("nan")), (one, one[:, :2])):
         with pytest.raises(InvalidArgumentError, match=r"direction|origin"):

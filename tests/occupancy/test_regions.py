@@ -90,7 +90,7 @@ def count_exits(cones: Cones, polygon: Tensor, height: float | None = None, n: i
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_square_and_a_cube_are_boxes(seed):
+def test_regions_that_are_boxes_equal_box_flux(seed):
     for dim in (2, 3):
         cone = cone_of(dim, seed)
         low, high = torch.zeros(1, dim).double(), torch.tensor([[1.0, 0.8, 0.6][:dim]]).double()
@@ -106,7 +106,7 @@ def test_a_square_and_a_cube_are_boxes(seed):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_horseshoe_counts_every_time_a_ray_leaves(seed, dtype):
+def test_a_nonconvex_polygon_counts_each_exit_of_a_ray(seed, dtype):
     cone = cone_of(2, seed)
     hits, misses = region_flux(cone, Boundary.of_polygon(HORSESHOE), dtype=dtype)
     counted = count_exits(cone, HORSESHOE)
@@ -114,14 +114,14 @@ def test_a_horseshoe_counts_every_time_a_ray_leaves(seed, dtype):
     assert float(misses) == pytest.approx(counted[1], abs=5e-4)
 
 
-def test_some_ray_leaves_a_horseshoe_twice():
+def test_some_rays_leave_the_nonconvex_polygon_twice():
     mean, origin = torch.tensor([[3.0, 0.7]]).double(), torch.tensor([[-3.0, 0.7]]).double()
     cone = one_each(mean, 1e-4 * torch.eye(2).double()[None], origin)
     assert float(region_flux(cone, Boundary.of_polygon(HORSESHOE))[1]) == pytest.approx(2, abs=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_mesh_that_is_not_convex_counts_as_rays_do(seed):
+def test_a_nonconvex_mesh_equals_counted_rays(seed):
     cone = cone_of(3, seed)
     boundary = Boundary.of_mesh(*prism_mesh(HORSESHOE, 0.7))
     hits, misses = region_flux(cone, boundary)
@@ -130,7 +130,7 @@ def test_a_mesh_that_is_not_convex_counts_as_rays_do(seed):
     assert float(misses) == pytest.approx(counted[1], abs=5e-4)
 
 
-def test_many_cones_add_up_and_far_ones_add_nothing():
+def test_evidence_of_cones_sums_and_far_cones_add_zero():
     boundary = Boundary.of_polygon(HORSESHOE)
     cones = [cone_of(2, seed) for seed in range(3)] + [cone_of(2, 0, at=100.0)]
     several = Cones(*(torch.cat(parts) for parts in zip(*cones, strict=True)))
@@ -145,14 +145,14 @@ def test_many_cones_add_up_and_far_ones_add_nothing():
     assert float(misses) == pytest.approx(float(several.counts @ alone[:, 1]), rel=1e-9)
 
 
-def test_either_way_round_a_polygon_is_the_same():
+def test_polygon_orientation_does_not_change_evidence():
     cone = cone_of(2, 1)
     one, other = (region_flux(cone, Boundary.of_polygon(p)) for p in (HORSESHOE, HORSESHOE.flip(0)))
     torch.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_gradients_in_the_vertices_and_the_sensor(dim):
+def test_gradients_of_region_flux_equal_finite_differences(dim):
     cone = cone_of(dim, 2)
 
     def evidence(vertices, origins):
@@ -188,7 +188,7 @@ def test_a_polygon_that_is_not_simple_is_refused(vertices, message):
 @pytest.mark.parametrize(
     "vertices", [[[0, 0], [1, 0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0], [1, 0], [math.nan, 1]]]
 )
-def test_what_are_no_vertices_is_refused(vertices):
+def test_invalid_vertices_are_refused(vertices):
     with pytest.raises(InvalidArgumentError, match="vertices"):
         Boundary.of_polygon(torch.tensor(vertices).double())
 

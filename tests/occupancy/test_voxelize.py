@@ -40,7 +40,7 @@ def clipped(triangle: np.ndarray, low: np.ndarray) -> float:
     )
 
 
-def test_a_cell_is_occupied_exactly_where_part_of_a_triangle_lies_in_it(generator):
+def test_a_cell_is_occupied_if_and_only_if_a_triangle_meets_it(generator):
     window = lattice((-2, -1, 0), (4, 5, 5))
     for size in (0.4, 1.5, 6.0):
         triangles = 4 * torch.rand(12, 1, 3, generator=generator, dtype=torch.float64)
@@ -52,7 +52,7 @@ def test_a_cell_is_occupied_exactly_where_part_of_a_triangle_lies_in_it(generato
                 assert bool(found[cell]) == (clipped(triangle.numpy(), low) > 1e-12), (cell, triangle)
 
 
-def test_points_drawn_on_a_mesh_lie_in_its_cells_and_its_cells_lie_at_it(generator):
+def test_points_on_a_mesh_lie_in_its_cells_and_its_cells_are_near_it(generator):
     mesh = torch.cat([ball((1.03, 0.95, 1.2), 0.87), box((0.31, 0.22, 0.13), (2.24, 1.93, 0.37))])
     window = lattice((0, 0, 0), (24, 24, 24))
     found = occupied_cells(mesh, 0.1, window)
@@ -67,7 +67,7 @@ def test_points_drawn_on_a_mesh_lie_in_its_cells_and_its_cells_lie_at_it(generat
     assert bool((room[~found] >= 0.05 - 1e-5).all())
 
 
-def test_a_floor_in_a_plane_of_the_lattice_counts_for_the_cells_above_it_alone():
+def test_a_floor_in_a_lattice_plane_counts_only_for_the_cells_above():
     floor = box((0, 0, -5.0), (2.0, 1.0, 0.6))[-4:-2]  # its top, as two triangles at z = 3 · 0.2
     assert bool((floor[..., 2] == 0.6).all())
     found = occupied_cells(floor, 0.2, lattice((-3, -3, -3), (15, 9, 9)))
@@ -79,7 +79,7 @@ def test_a_floor_in_a_plane_of_the_lattice_counts_for_the_cells_above_it_alone()
     assert len(cells) == 66
 
 
-def test_a_hall_of_fifty_metres_costs_its_surface_and_marks_one_layer_each():
+def test_a_hall_of_50_m_marks_one_layer_for_each_surface():
     nx, ny, nz = 250, 200, 40
     found = occupied_cells(box((0.1, 0.1, 0.1), (49.9, 39.9, 7.9)), 0.2, lattice((0, 0, 0), (nx, ny, nz)))
     shell = torch.ones(nx, ny, nz, dtype=torch.bool)
@@ -87,13 +87,13 @@ def test_a_hall_of_fifty_metres_costs_its_surface_and_marks_one_layer_each():
     assert torch.equal(found, shell)
 
 
-def test_a_plane_through_the_diagonals_marks_the_cells_that_it_halves_alone():
+def test_a_diagonal_plane_marks_only_the_cells_that_it_divides():
     corners = torch.tensor([[0.0, 0, 0.5], [4, 4, 0.5], [4, 4, 0.9]], dtype=torch.float64)
     found = occupied_cells(corners[None], 1.0, lattice((0, 0, 0), (4, 4, 1)))
     assert torch.equal(found[:, :, 0], torch.eye(4, dtype=torch.bool))
 
 
-def test_a_box_is_a_window_that_changes_no_cell(generator):
+def test_the_box_does_not_change_the_cells(generator):
     mesh = 5 * torch.rand(30, 3, 3, generator=generator, dtype=torch.float64)
     whole = occupied_cells(mesh, 0.3, lattice((-1, -1, -1), (20, 20, 20)))
     part = occupied_cells(mesh, 0.3, lattice((4, 2, 7), (9, 13, 12)))
@@ -101,7 +101,7 @@ def test_a_box_is_a_window_that_changes_no_cell(generator):
     assert not bool(occupied_cells(mesh, 0.3, lattice((50, 0, 0), (55, 5, 5))).any())
 
 
-def test_five_hundred_kilometres_away_the_cells_are_the_same(generator):
+def test_cells_are_the_same_500_km_away(generator):
     mesh = 3 * torch.rand(20, 3, 3, generator=generator, dtype=torch.float64)
     shift = torch.tensor([2_500_000, -1_000_000, 5])
     here = occupied_cells(mesh, 0.2, lattice((0, 0, 0), (16, 16, 16)))
@@ -120,7 +120,7 @@ def test_a_triangle_without_area_counts_as_its_line(end):
     assert torch.equal(found, expected)
 
 
-def test_nothing_and_nonsense():
+def test_no_triangles_mark_nothing_and_invalid_ones_are_refused():
     window = lattice((0, 0, 0), (3, 3, 3))
     nothing: Tensor = torch.zeros(0, 3, 3)
     assert not bool(occupied_cells(nothing, 0.2, window).any())
