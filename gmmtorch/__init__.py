@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from gmmtorch import sharing as sharing
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
     from gmmtorch.errors import GmmTorchError as GmmTorchError
+    from gmmtorch.localization.registration import register as register
+    from gmmtorch.mapping.components import Components as Components
     from gmmtorch.mapping.gaussian_map import GaussianMap as GaussianMap
     from gmmtorch.mapping.learning.rules import IncrementalRule as IncrementalRule
     from gmmtorch.mapping.learning.rules import NoveltyRule as NoveltyRule
@@ -49,6 +51,7 @@ except PackageNotFoundError:  # a bare checkout on the path
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "Components": "mapping.components",
         "DeconvolvedGaussianMixture": "mixture.estimators.deconvolved",
         "Evidence": "occupancy.evidence",
         "GaussianMap": "mapping.gaussian_map",
@@ -69,6 +72,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "fit_depth_image": "mixture.depth_image",
         "fit_stream": "mixture.streaming.stream_fit",
         "mixture": "",
+        "register": "localization.registration",
         "sharing": "",
     },
 )

@@ -1,4 +1,4 @@
-"""How far a robot's body is from a mixture's surfaces, and the chance that it touches a return."""
+"""Clearance of a robot's body from the surfaces of a map, and its probability of touching a return."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from gmmtorch.occupancy.forms.flux.box_mass import normal_mass
 from gmmtorch.occupancy.protocol import check_queries
 from gmmtorch.scan import ArrayLike
 
-_CUTOFF = 7.0  # deviations beyond which a component has no mass: 3e-12 of it is left out along an axis
-_NODES = 32  # of Gauss and Legendre, along each axis of a ball but the last
-_ITERATIONS = 80  # of bisection: down to rounding
-_CHUNK = 1 << 8  # pairs of point and component integrated at once
+_CUTOFF = 7.0  # Mahalanobis cutoff: leaves out 3e-12 of the mass along an axis
+_NODES = 32  # Gauss–Legendre nodes along each axis of a ball but the last
+_ITERATIONS = 80  # of bisection, to rounding
+_CHUNK = 1 << 8  # pairs of point and component integrated at a time
 
 
 def clearance(surfaces: Surfaces, points: ArrayLike, deviations: float = 2.0) -> Tensor:
-    """Distance (M,), metres, from points (M, D) to the surface of a mixture: that of its ellipsoids.
+    """Distance (M,), metres, from points (M, D) to the nearest ellipsoid of the components.
 
-    Of a component the surface is {x : (x − μ)ᵀ Σ⁻¹ (x − μ) = q²}, q = `deviations`, which holds 74 % (q = 2)
-    or 97 % (q = 3) of its returns in 3D. Outside of all ellipsoids the distance is exact, to the nearest.
-    Inside it is negative, the depth in the ellipsoid that holds the point deepest: how far one must at
-    least go to leave all of them. Infinite where there is no component. A body of radius r is clear while
-    clearance ≥ r; a path is where all of its points are.
+    The surface of a component is {x : (x − μ)ᵀ Σ⁻¹ (x − μ) = q²}, q = `deviations`; it encloses 74 % (q = 2)
+    or 97 % (q = 3) of the returns in 3D. Outside all ellipsoids the distance is exact. Inside it is negative:
+    the largest depth in an ellipsoid, a lower bound on the way out. It is infinite if there is no component.
+    A body of radius r is free if clearance ≥ r; a path is free if all of its points are.
 
-    Gradients flow to points that ask for them: away from the nearest surface, of length 1.
+    Differentiable in the points; the gradient points away from the nearest surface and has length 1.
 
     Raises `InvalidArgumentError` for another shape, NaN, or deviations that are not above zero.
     """
@@ -47,12 +46,12 @@ def clearance(surfaces: Surfaces, points: ArrayLike, deviations: float = 2.0) ->
     variances, axes = torch.linalg.eigh(mixture.covariances)
     semi_axes = deviations * variances.clamp_min(0).sqrt()
     least, largest = semi_axes[:, 0], semi_axes[:, -1]
-    # No nearest surface is farther than that of the component whose mean is nearest.
+    # The component with the nearest mean gives an upper bound of the distance.
     places = query.detach().cpu().numpy()
     _, nearest = cKDTree(mixture.means.cpu().numpy()).query(places)
     first = torch.from_numpy(np.asarray(nearest)).to(query.device)
     bound = (query.detach() - mixture.means[first]).norm(dim=1) - least[first]
-    # A little more, so that the component that the bound is of is found itself.
+    # A small margin, so that rounding does not exclude the component of the bound.
     reach = bound + 1e-9 * (1 + query.detach().abs().amax(1) + largest[first])
     for point, component in touching(mixture.means, largest, query, reach):
         offset = query[point] - mixture.means[component]
@@ -63,7 +62,7 @@ def clearance(surfaces: Surfaces, points: ArrayLike, deviations: float = 2.0) ->
 
 
 def _queries(points: ArrayLike, mixture: Parameters) -> Tensor:
-    """Points (M, D), float64, where the mixture is; infinite ones are far from everything."""
+    """Points (M, D), float64, on the device of the mixture; infinite points are allowed."""
     dim = mixture.means.shape[1] if len(mixture.weights) else None
     return check_queries(points, dim).to(mixture.means.device)
 
@@ -71,15 +70,15 @@ def _queries(points: ArrayLike, mixture: Parameters) -> Tensor:
 def _ellipsoid_distance(points: Tensor, semi_axes: Tensor) -> Tensor:
     """Signed distances (P,) of points (P, D) to axis-aligned ellipsoids about the origin, negative inside.
 
-    The nearest place is x_d = a_d² y_d/(a_d² + t), t the largest root of Σ (a_d y_d/(a_d² + t))² = 1 (Eberly,
+    The nearest point is x_d = a_d² y_d/(a_d² + t), t the largest root of Σ (a_d y_d/(a_d² + t))² = 1 (Eberly,
     *Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid*, 2013), found by bisection.
-    Where y lies on the plane of symmetry across the shortest axis, and deep enough, t = −a₁² is no root:
-    then x₁ closes the equation.
+    If y lies on the plane of symmetry across the shortest axis and is deep enough, t = −a₁² is not a root;
+    then x₁ is solved from the equation of the ellipsoid.
     """
     with torch.no_grad():
         y, squares = points.abs(), semi_axes.square()
         inside = (y / semi_axes).square().sum(1) < 1
-        # Shifted by −a₁²: next to the pole nothing cancels.
+        # Shifted by −a₁²: no cancellation next to the pole.
         apart = squares - squares[:, :1]
         low = semi_axes[:, 0] * y[:, 0]
         high = (semi_axes * y).norm(dim=1)
@@ -94,22 +93,21 @@ def _ellipsoid_distance(points: Tensor, semi_axes: Tensor) -> Tensor:
         pole = shifted[:, 0] <= 1e-12 * squares[:, 0]
         nearest[:, 0] = torch.where(pole, semi_axes[:, 0] * rest.clamp_min(0).sqrt(), nearest[:, 0])
         signed = torch.copysign(nearest, points)
-    # By the envelope theorem the nearest place may be held while the point is moved.
+    # Envelope theorem: the gradient treats the nearest point as constant.
     gap = (points - signed).square().sum(1)
     distance = torch.where(gap > 0, gap, 1.0).sqrt() * (gap > 0)
     return torch.where(inside, -distance, distance)
 
 
 def expected_returns(surfaces: Surfaces, points: ArrayLike, radius: float) -> Tensor:
-    """Returns n (M,) of a map that are expected in the ball of `radius` (m) about each point (M, D).
+    """Expected number n (M,) of returns in the ball of `radius` (m) about each point (M, D).
 
         n(x) = Σ_k N_k P(‖X_k − x‖ ≤ r),   X_k ~ N(μ_k, Σ_k)
 
-    N_k the supports (of a tuple its weights). The probability is that of a quadratic form in normals
-    (noncentral χ² where Σ = σ² I); here it is integrated over the ball in the component's principal axes:
-    the thinnest one outermost, the widest in closed form, others by Gauss–Legendre in an angle, in which
-    the ball's edge is smooth. Relative errors are below 1e-5. Components farther than seven deviations
-    count nothing.
+    N_k are the supports (for a tuple, its weights). The probability of the ball is integrated in the
+    principal axes of the component: the thinnest axis outermost, the widest in closed form, the others by
+    Gauss–Legendre in an angle, in which the edge of the ball is smooth. Relative errors are below 1e-5.
+    Components farther than seven deviations are ignored.
 
     Raises `InvalidArgumentError` for another shape, NaN, or a radius that is not above zero.
     """
@@ -134,14 +132,14 @@ def expected_returns(surfaces: Surfaces, points: ArrayLike, radius: float) -> Te
 
 
 def collision_probability(surfaces: Surfaces, points: ArrayLike, radius: float) -> Tensor:
-    """Chance (M,) that a ball of `radius` (m) about each point (M, D) touches a return of the map.
+    """Probability (M,) that a ball of `radius` (m) about each point (M, D) touches a return of the map.
 
         P(x) = 1 − exp(−n(x)),   n the `expected_returns` in the ball
 
-    which takes the returns as a Poisson process of intensity Σ N_k N(x | μ_k, Σ_k): a map says where
-    returns fall, not how surfaces go on between them. It is near 1 within a few deviations of any surface
-    that was seen often, and small where only a few returns (a speck of dust, a far glimpse) speak against
-    the place. Along a path the chance is at least that of its worst point, and at most 1 − Π(1 − P).
+    Returns are a Poisson process of intensity Σ N_k N(x | μ_k, Σ_k): a map describes where returns fall, not
+    the surface between them. P is near 1 within a few deviations of a surface with many returns, and small
+    near a few stray returns. Along a path the probability is at least that of its worst point, and at most
+    1 − Π(1 − P).
 
     Arguments and errors as for `expected_returns`.
     """
@@ -154,12 +152,12 @@ def _ball_mass(center: Tensor, sigma: Tensor, radius: float) -> Tensor:
     nodes, weights = nodes.to(center), weights.to(center)
 
     def sweep(axis: int, room: Tensor) -> Tensor:
-        """Mass within `room` (…, P) of the axes from `axis` on."""
+        """Mass within radius `room` (…, P) in the axes from `axis` on."""
         if axis == len(center) - 1:
             return normal_mass((-room - center[axis]) / sigma[axis], 2 * room / sigma[axis])
         low = torch.maximum(-room, center[axis] - _CUTOFF * sigma[axis])
         high = torch.minimum(room, center[axis] + _CUTOFF * sigma[axis])
-        # x = room sin θ: what is left beside x, room cos θ, is smooth up to the ball's edge.
+        # x = room sin θ: the remaining radius, room cos θ, is smooth up to the edge of the ball.
         safe = room.clamp_min(1e-300)
         first, last = torch.asin((low / safe).clamp(-1, 1)), torch.asin((high / safe).clamp(-1, 1))
         half = ((last - first) / 2).clamp_min(0)

@@ -1,4 +1,4 @@
-"""The surfaces of a map as a plain mixture, and which of many balls touch which."""
+"""The surfaces of a map as a plain mixture, and the search for pairs of touching balls."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Surfaces = Components | GaussianMap | tuple[ArrayLike, ArrayLike, ArrayLike]
 """A map, its components, or (means (K, D), covariances (K, D, D), weights (K,))."""
 
 MOST_PAIRS = 1 << 25
-"""Touching balls that are listed at once."""
+"""Largest number of touching balls that are listed at a time."""
 
-_PORTION = 1 << 12  # balls looked up at once
-_SMALLEST, _LARGEST_RATIO = 1e-12, 20  # of radii told apart, in octaves below the largest
+_PORTION = 1 << 12  # balls searched at a time
+_SMALLEST, _LARGEST_RATIO = 1e-12, 20  # octaves below the largest radius that are searched apart
 
 
 def surface_mixture(given: Surfaces, name: str) -> Parameters:
-    """Weights, means and covariances of what is a surface, float64; weights are supports in points.
+    """Weights (supports in points), means and covariances of the surfaces of a map, float64.
 
-    Components of beams without return (max_range) and of no weight are left out, so there may be none.
-    Raises `InvalidArgumentError` for shapes that disagree, NaN, negative weights, another dimension than
-    2 or 3; `NumericalError` for a covariance that is not positive definite.
+    `max_range` components and components without weight are left out, so the mixture may be empty. Raises
+    `InvalidArgumentError` for shapes that disagree, NaN, negative weights, or a dimension other than 2 or 3;
+    `NumericalError` for a covariance that is not positive definite. `name`: of the argument, for messages.
     """
     if isinstance(given, GaussianMap):
         given = given.components() if given.dim is not None else Components.empty(3)
@@ -41,10 +41,10 @@ def surface_mixture(given: Surfaces, name: str) -> Parameters:
         solid = ~given.max_range
         parts = given.means[solid], given.covariances[solid], given.support[solid]
     elif isinstance(given, tuple) and len(given) == 3:
-        try:  # not by way of float32, as lists would go
+        try:  # at once: lists would become float32 first
             parts = tuple(torch.as_tensor(part, dtype=torch.float64).detach() for part in given)  # type: ignore[assignment]
         except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidArgumentError(f"{name} holds what is no array of numbers: {error}.") from error
+            raise InvalidArgumentError(f"{name} is not an array of numbers: {error}.") from error
     else:
         raise InvalidArgumentError(
             f"{name} is a {type(given).__name__}; give a GaussianMap, Components, or a tuple "
@@ -73,10 +73,10 @@ def surface_mixture(given: Surfaces, name: str) -> Parameters:
 def touching(
     centers: Tensor, radii: Tensor, points: Tensor, reach: Tensor
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of points and of centres, |point − centre| ≤ reach + radius, in portions of the points.
+    """Pairs of rows of points and of centres with |point − centre| ≤ reach + radius, in portions of points.
 
-    By a k-d tree of the centres of each octave of radii, so that one large ball does not make all of
-    them large. Raises `MemoryLimitError` where a portion touches more than `MOST_PAIRS`.
+    Uses one k-d tree for each octave of radii, so that one large ball does not enlarge every search. Raises
+    `MemoryLimitError` if a portion has more than `MOST_PAIRS` pairs.
 
     Args:
         centers (K, D), radii (K,); points (M, D), reach (M,).
@@ -110,7 +110,7 @@ def _listed(
     if total > MOST_PAIRS:
         raise MemoryLimitError(
             f"{len(points)} places touch {total} components, more than {MOST_PAIRS} at once: "
-            "merge components first (gmmtorch.simplify), or ask with a smaller reach."
+            "merge components first (gmmtorch.simplify), or use a smaller reach."
         )
     lists = tree.query_ball_point(points, radius, return_sorted=True)
     flat = np.fromiter(itertools.chain.from_iterable(lists), np.int64, total)
