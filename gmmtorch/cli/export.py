@@ -1,4 +1,4 @@
-"""gmmtorch-export: a map or a mixture as a file of another program's."""
+"""gmmtorch-export: writes a map or a mixture in the format of another program."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd")
 _OF_COMPONENTS = ("csv", "npz", "mixture")
-_REACH = 3.0  # standard deviations around each component that the cells cover
+_EXTENT = 3.0  # standard deviations around each component that the cells cover
 
 
 def main() -> None:
@@ -36,7 +36,7 @@ def _guarded(config: DictConfig) -> None:
 
 
 def run(config: DictConfig) -> None:
-    """One export; prints what was written."""
+    """Run the command; prints the written files."""
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.report.progress import ProgressBars
 
@@ -49,26 +49,26 @@ def run(config: DictConfig) -> None:
     device = common.use_runtime(config.runtime)
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.format in _OF_COMPONENTS:
-            said = _export_components(config)
+            message = _export_components(config)
         else:
-            said = _export_space(config, _map(Path(config.path), device), bars)
-    print(said)
+            message = _export_space(config, _map(Path(config.path), device), bars)
+    print(message)
 
 
 # -- components -----------------------------------------------------------------------------------
 
 
 def _export_components(config: DictConfig) -> str:
-    """Weights, means and covariances; returns what to say of it."""
-    from gmmtorch.export import mixture_formats as interchange
+    """Write weights, means and covariances; returns a message."""
+    from gmmtorch.export import mixture_formats
     from gmmtorch.mixture import GaussianMixture
 
-    mixture = interchange.checked(_components(Path(config.path), config.n_points))
+    mixture = mixture_formats.checked(_components(Path(config.path), config.n_points))
     output = Path(config.output)
     if config.format == "csv":
-        interchange.write_gira_csv(output, mixture)
+        mixture_formats.write_gira_csv(output, mixture)
     elif config.format == "npz":
-        interchange.write_npz(output, mixture)
+        mixture_formats.write_npz(output, mixture)
     else:
         GaussianMixture.from_parameters(*mixture[:3]).save(output)
     k, dim = mixture.means.shape
@@ -76,20 +76,20 @@ def _export_components(config: DictConfig) -> str:
 
 
 def _components(path: Path, n_points: float | None) -> PlainMixture:
-    """The mixture in a file of any kind; of a map, the components that are surfaces."""
+    """The mixture in a file of any supported format; the surface components of a map."""
     from gmmtorch.errors import DataError
-    from gmmtorch.export import mixture_formats as interchange
+    from gmmtorch.export import mixture_formats
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mixture import GaussianMixture
 
     if path.suffix == ".csv":
-        return interchange.read_gira_csv(path, n_points)
+        return mixture_formats.read_gira_csv(path, n_points)
     if path.suffix == ".npz":
-        return interchange.read_npz(path)
+        return mixture_formats.read_npz(path)
     try:
         found = GaussianMap.load(path).components()
         surface = ~found.max_range
-        return interchange.PlainMixture.of_support(
+        return mixture_formats.PlainMixture.of_support(
             found.means[surface], found.covariances[surface], found.support[surface]
         )
     except DataError as error:
@@ -97,16 +97,16 @@ def _components(path: Path, n_points: float | None) -> PlainMixture:
     try:
         mixture = GaussianMixture.load(path)
     except DataError as error:
-        raise DataError(f"{path} holds no components to export. {no_map} {error}") from error
+        raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
     support = None if n_points is None else mixture.weights * n_points
-    return interchange.PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
+    return mixture_formats.PlainMixture(mixture.weights, mixture.means, mixture.covariances, support)
 
 
 # -- space ----------------------------------------------------------------------------------------
 
 
 def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
-    """The map in a file. Raises `DataError`, with what each reader said, if it is none."""
+    """The map in a file. Raises `DataError` with the errors of all readers if it contains no map."""
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
     from gmmtorch.errors import DataError
     from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -118,11 +118,11 @@ def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
     try:
         return OccupancyGrid.load(path)
     except DataError as error:
-        raise DataError(f"{path} is no map to export. {no_map} {error}") from error
+        raise DataError(f"{path} is not a map that can be exported. {no_map} {error}") from error
 
 
 def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
-    """Probabilities of cells; returns what to say of it."""
+    """Write the probabilities of cells; returns a message."""
     from gmmtorch.export import map_server
     from gmmtorch.export.octomap import write_octomap
     from gmmtorch.export.point_cloud import write_pcd, write_ply
@@ -132,7 +132,7 @@ def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_ev
     if config.format == "map_server":
         grid, theta = _dense(config, source, on_event)
         if grid.dim == 3:
-            grid, theta = map_server.highest_in_band(grid, theta)  # which `_dense` has cut out
+            grid, theta = map_server.highest_in_band(grid, theta)  # `_dense` returns only the band
         written = map_server.write_map_server(output, grid, theta, rule)
         size = " × ".join(map(str, grid.shape))
         return "\n".join(map(_size, written)) + f": {size} cells of {grid.resolution:g} m"
@@ -147,7 +147,7 @@ def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_ev
 
 
 def _cloud(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> CellCloud:
-    """The cells that something is known of; a grid's are at hand."""
+    """The observed cells with their probabilities; all cells of the box for a `GaussianMap`."""
     import torch
 
     from gmmtorch.export.point_cloud import CellCloud
@@ -157,14 +157,14 @@ def _cloud(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Ev
         return CellCloud.of_grid(*_dense(config, source, on_event))
     _resolution(config, source)
     observed = CellCloud.of_blocks(source.evidence())
-    theta = torch.as_tensor(source.occupancy(observed.centers))  # by its own rule: counts or log-odds
+    theta = torch.as_tensor(source.occupancy(observed.centers))  # by the grid's rule: counts or log-odds
     return CellCloud(observed.centers, theta, observed.resolution)
 
 
 def _dense(
     config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event
 ) -> tuple[VoxelGrid, Tensor]:
-    """Every cell of the box, or of its band, and its probability, of the grid's shape."""
+    """All cells of the box, limited to the height band, and their probabilities, with the grid's shape."""
     import torch
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -172,13 +172,13 @@ def _dense(
 
     resolution = _resolution(config, source)
     low, high = _box(config, source)
-    # A box that ends on a plane between cells ends with the cell before it.
+    # If the box ends on a plane between cells, the cells behind the plane are left out.
     high = [max(a, b - 1e-6 * resolution) for a, b in zip(low, high, strict=True)]
     grid = VoxelGrid.covering(low, high, resolution, config.runtime.memory_limit)
     method = config.method
     if isinstance(source, GaussianMap):
         method = source.method if method is None else method
-        if method != "point":  # the others answer for cells, all at once
+        if method != "point":  # the other forms compute the evidence of all cells together
             on_event(f"evidence by {method}", 0, None)
             return grid, source.evidence(grid, method).probability(source.query_options.prior)
 
@@ -193,7 +193,7 @@ def _dense(
 
 
 def _resolution(config: DictConfig, source: GaussianMap | OccupancyGrid) -> float:
-    """Of the cells (m). Raises `InvalidArgumentError` for one that a grid does not have."""
+    """Side of the cells (m). Raises `InvalidArgumentError` if a grid has another resolution."""
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.occupancy.grid import check_resolution
@@ -203,13 +203,13 @@ def _resolution(config: DictConfig, source: GaussianMap | OccupancyGrid) -> floa
     wanted = check_resolution(config.resolution)
     if isinstance(source, OccupancyGrid) and wanted != source.resolution:
         raise InvalidArgumentError(
-            f"resolution={wanted} m, but the cells of {config.path} are {source.resolution} m; leave it out."
+            f"resolution={wanted} m, but the cells of {config.path} are {source.resolution} m; remove it."
         )
     return wanted
 
 
 def _box(config: DictConfig, source: GaussianMap | OccupancyGrid) -> tuple[list[float], list[float]]:
-    """Lowest and highest corner (m): as asked for, else around what the map holds; cut to the band."""
+    """Lowest and highest corner (m): `bounds`, or the extent of the map; limited to the height band."""
     import torch
 
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
@@ -222,9 +222,9 @@ def _box(config: DictConfig, source: GaussianMap | OccupancyGrid) -> tuple[list[
     else:
         found = source.components()
         empty, dim = len(found) == 0, found.dim
-        reach = _REACH * found.covariances.diagonal(dim1=1, dim2=2).sqrt()
-        around = torch.cat([found.means - reach, found.means + reach, found.origins])
-        corners = [] if empty else [around.amin(0), around.amax(0)]
+        extent = _EXTENT * found.covariances.diagonal(dim1=1, dim2=2).sqrt()
+        points = torch.cat([found.means - extent, found.means + extent, found.origins])
+        corners = [] if empty else [points.amin(0), points.amax(0)]
     if config.bounds is not None:
         if len(config.bounds) != 2 * dim:
             raise InvalidArgumentError(
@@ -233,25 +233,25 @@ def _box(config: DictConfig, source: GaussianMap | OccupancyGrid) -> tuple[list[
             )
         low, high = list(config.bounds[:dim]), list(config.bounds[dim:])
     elif empty:
-        raise DataError(f"{config.path} holds nothing; give bounds, if an empty map is meant.")
+        raise DataError(f"{config.path} is an empty map; give bounds to export it.")
     else:
         low, high = (corner.tolist() for corner in corners)
     band = _band(config)
     if band is not None:
         if dim == 2:
             raise InvalidArgumentError(f"z_min={band[0]}, z_max={band[1]}: a 2D map has no heights.")
-        reached = (low[2], high[2])
+        heights = (low[2], high[2])
         low[2], high[2] = max(low[2], band[0]), min(high[2], band[1])
         if low[2] > high[2]:
             raise InvalidArgumentError(
-                f"z_min={band[0]}, z_max={band[1]} misses the map, which reaches from {reached[0]:.3g} to "
-                f"{reached[1]:.3g} m."
+                f"z_min={band[0]}, z_max={band[1]} is outside the map, which extends from "
+                f"{heights[0]:.3g} to {heights[1]:.3g} m."
             )
     return low, high
 
 
 def _band(config: DictConfig) -> tuple[float, float] | None:
-    """Heights (m) that are exported; None for all."""
+    """The height band (m) that is exported; None: all heights."""
     if config.z_min is None and config.z_max is None:
         return None
     return (

@@ -208,13 +208,13 @@ def test_a_fitted_mixture_is_written_as_csv(run, files, tmp_path):
         (["output=a.yaml"], "path is not set"),
         (["path={map_2}", "output=a", "format=dwg"], "format='dwg' is not one of map_server"),
         (["path=nowhere.safetensors", "output=a.yaml"], "nowhere.safetensors does not exist"),
-        (["path={mixture}", "output=a.yaml"], "is no map to export"),
-        (["path={grid_2}", "output=a.csv", "format=csv"], "holds no components to export"),
+        (["path={mixture}", "output=a.yaml"], "is not a map that can be exported"),
+        (["path={grid_2}", "output=a.csv", "format=csv"], "contains no components to export"),
         (["path={grid_2}", "output=a.yaml", "resolution=0.1"], "cells of .* are 0.25 m"),
         (["path={map_2}", "output=a.yaml", "method=guess"], "method='guess' is not one of"),
         (["path={map_2}", "output=a.yaml", "bounds=[0,1]"], "must be 4 numbers in 2D"),
         (["path={map_2}", "output=a.yaml", "z_min=0"], "a 2D map has no heights"),
-        (["path={map_3}", "output=a.yaml", "z_min=50"], "misses the map"),
+        (["path={map_3}", "output=a.yaml", "z_min=50"], "is outside the map"),
         (["path={map_3}", "output=a.yaml", "resolution=0.0001"], "above the limit of .* m or more fits"),
         (["path={map_2}", "output=a.yaml", "resolution=-1"], "resolution=-1"),
         (["path={map_2}", "output=a.txt", "format=octomap", "resolution=1"], r"must end in \.bt"),
@@ -237,7 +237,7 @@ def test_an_empty_map_needs_bounds(run, tmp_path):
     empty.insert(Scan(torch.empty(0, 2), torch.zeros(2)))
     empty.save(tmp_path / "empty.safetensors")
     done = run("path=empty.safetensors", "output=a.yaml")
-    assert "holds nothing; give bounds" in done.stderr
+    assert "is an empty map; give bounds" in done.stderr
     succeeded(run("path=empty.safetensors", "output=a.yaml", "bounds=[0,0,1,1]"))
     assert bool((read_map_image(tmp_path / "a.yaml").probability - 0.5).abs().max() <= 1 / 255)
 
