@@ -33,8 +33,7 @@ from gmmtorch.sharing.messages.record_messages import (
     pose_of,
 )
 from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, first_key
-from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
+from gmmtorch.sharing.replica.record_keys import first_key
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
@@ -96,8 +95,5 @@ def examples() -> list[bytes]:
     made += [encode_plan(2, 5, 12.0, 0.2, views(11).poses, views(3).poses)]
     made += [encode_announcements(1, 2, span(0, 0, 70) | span(3, 5, 7) | span(3, 900, 901))]
     made += [[encode_record(record)] for record in records()]
-    alive = np.array([first_key(2) + number for number in (0, 2, 5)])
-    checks = np.array([7, 0, 255])
-    made += [encode_views_held(1, bytes(range(8)), ViewsDetail(0, END, span(2, 0, 9), alive, 3, checks))]
     assert all(len(datagrams) == 1 for datagrams in made)
     return [datagrams[0] for datagrams in made]

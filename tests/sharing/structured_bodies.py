@@ -157,7 +157,7 @@ def _many(values: Quantized, k: int) -> Quantized:
         count=values.count[rows],
         max_range=values.max_range[rows],
         ids=numbered,
-        sightings=torch.full((k,), n),
+        n_viewpoints=torch.full((k,), n),
         seen_from=torch.arange(n).repeat(k),
         share=torch.zeros(k * n, dtype=torch.int64),
     )
@@ -327,21 +327,6 @@ def _correction(rng: Random) -> bytes:
     return writer.to_bytes()
 
 
-def _views_held(rng: Random) -> bytes:
-    writer = BitWriter()
-    _number(writer, rng, 1)
-    writer.fixed(np.array([rng.randrange(256) for _ in range(8)]), 8)
-    if rng.random() < 0.7:
-        for usual in (rng.randrange(8), 0, 0):
-            _number(writer, rng, usual)
-        writer.number(1)  # one interval, of all that comes, so that those alive are known
-        _number(writer, rng, 0)
-        _number(writer, rng, END - 1)
-        n = _ids(writer, rng)
-        writer.fixed(np.array([rng.randrange(256) for _ in range(min(n, 1000))], np.int64), 8)
-    return writer.to_bytes()
-
-
 _BODIES: dict[Kind, Callable[[Random], bytes]] = {
     Kind.COMPONENTS: _batch,
     Kind.FLOAT_COMPONENTS: _float_components,
@@ -356,5 +341,4 @@ _BODIES: dict[Kind, Callable[[Random], bytes]] = {
     Kind.SUPERSESSION: _supersession,
     Kind.COUNTERS: _totals,
     Kind.CORRECTION: _correction,
-    Kind.VIEWS_HELD: _views_held,
 }

@@ -11,12 +11,9 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.sharing import view_peers, view_set
 from gmmtorch.sharing.messages.announcements import AnnouncementMessage, encode_announcements
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
-    ViewsHeldMessage,
-    ViewsMessage,
     decode,
     encode_components,
 )
@@ -35,8 +32,6 @@ from gmmtorch.sharing.replica.counters import Counters
 from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import END, first_key, ids_of
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.view_announcements import ViewsDetail, encode_views_held
-from gmmtorch.sharing.view_set import ViewSet
 
 STRANGER, OWNER = 900, 901
 BURIED = first_key(OWNER)
@@ -244,62 +239,3 @@ def test_changes_that_nobody_asks_for_are_bounded():
     for _ in range(1 << 16):
         log.counted(np.zeros(0, np.int64))
     assert log._touched is None
-
-
-# -- views -------------------------------------------------------------------------------------------------
-
-
-def detail(number: int, n: int = 550) -> ViewsHeldMessage:
-    """Of a stranger of many, who knows of dead views, none next to another, that all are dead here."""
-    begin = BURIED + 2 * n * number
-    nothing = np.zeros(0, np.int64)
-    known = spread(begin, n)
-    return ViewsHeldMessage(
-        number % 5 + 1, bytes(8), ViewsDetail(begin, begin + 2 * n, known, nothing, 0, nothing)
-    )
-
-
-def buried_views(robot: int) -> ViewSet:
-    """It has heard that many are dead, which is on its way no more."""
-    views = ViewSet(robot, incarnation=1)
-    assert views.receive(dead(Intervals.span(BURIED, BURIED + (1 << 27))))
-    views.datagrams()
-    return views
-
-
-def dead(keys: Intervals) -> ViewsMessage:
-    none = torch.zeros(0, dtype=torch.float64)
-    return ViewsMessage(torch.zeros(0, 2, dtype=torch.int64), none.reshape(0, 4), none, none, keys)
-
-
-def test_details_of_views_without_end():
-    views = buried_views(0)
-    message = detail(2)
-    assert all(len(data) <= MAX_BYTES for data in encode_views_held(2, bytes(8), message.detail))
-    for number in range(view_peers.MOST_LACKED // 550 + 40):
-        assert views.receive(detail(number))
-    peers = views.state()["peers"]["peers"]
-    assert sum(len(row["lacks"]) // 2 for row in peers) <= view_peers.MOST_LACKED
-
-
-def test_what_of_views_is_due_is_bounded():
-    """Robots that find them gone ask for what their finder has buried."""
-    views = buried_views(OWNER)
-    most = view_set.MOST_VIEWS + view_set.MOST_INTERVALS
-    for number in range(most // 550 + 40):
-        assert views.receive(detail(number))
-    due = len(views.state()["due"]) // 2
-    assert most - 1100 < due <= most
-    key = views.add(torch.zeros(4), 1.0, 0.0)
-    other = ViewSet(7)
-    assert all(other.receive(decode(datagram)) for datagram in views.datagrams())
-    assert set(other.views) == {key}
-    assert other.digest() == views.digest()
-    assert not len(views.state()["due"])  # a whole interval is told where any of it is due
-
-
-def test_dead_views_that_come_again_are_on_their_way_in_bounded_memory():
-    views = buried_views(0)
-    for number in range(view_set.MOST_INTERVALS // 550 + 20):
-        assert views.receive(dead(spread(BURIED + 1100 * number, 550)))
-    assert len(views.state()["passing"]) // 2 <= view_set.MOST_INTERVALS

@@ -19,6 +19,7 @@ from sharing.message_examples import examples, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
+from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.mapping.codec import component_batch as batches
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
@@ -38,7 +39,6 @@ from gmmtorch.sharing.messages.message_registry import (
     PlanMessage,
     PointsMessage,
     SupersessionMessage,
-    ViewsHeldMessage,
     ViewsMessage,
     decode,
     encode_components,
@@ -49,8 +49,6 @@ from gmmtorch.sharing.messages.message_registry import (
 )
 from gmmtorch.sharing.messages.record_messages import encode_record
 from gmmtorch.sharing.replica.replica import Replica
-from gmmtorch.sharing.view_announcements import encode_views_held
-from gmmtorch.sharing.view_set import ViewSet
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +58,9 @@ def sound() -> list[bytes]:
 
 def test_every_kind_says_what_it_is(sound):
     kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
-    kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage, ViewsHeldMessage]
+    kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage]
     assert [type(decode(datagram)) for datagram in sound] == kinds
-    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 15)]
+    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 14)]
 
 
 def test_every_cut_flipped_bit_and_added_byte_is_noticed(sound):
@@ -137,8 +135,6 @@ def written_again(message: Message, kind: Kind) -> list[bytes]:
         return encode_plan(m.sender, m.number, m.time, m.step, m.path, m.views)
     if isinstance(message, AnnouncementMessage):
         return encode_announcements(message.sender, message.incarnation, message.held)
-    if isinstance(message, ViewsHeldMessage):
-        return encode_views_held(message.sender, message.digest, message.detail)
     return [encode_record(message)]
 
 
@@ -158,9 +154,6 @@ def content(message: Message) -> list[object]:
         return [message.sender, message.origin.tolist(), message.ends.tolist(), message.is_hit.tolist()]
     if isinstance(message, AnnouncementMessage):
         return [message.sender, message.incarnation, message.held.pairs()]
-    if isinstance(message, ViewsHeldMessage) and message.detail is not None:
-        d = message.detail
-        return [message.sender, message.digest, d.known.pairs(), d.alive.tolist(), d.byte, d.checks.tolist()]
     rows = vars(message).values()
     return [value.tolist() if hasattr(value, "tolist") else value for value in rows]
 
@@ -246,15 +239,17 @@ def test_float_components_that_are_none_are_refused(sound):
 # -- made up by who knows the format ---------------------------------------------------------------------
 
 
-class Bystanders:
-    """Who is told whatever can be read."""
+class Listeners:
+    """A replica and a view library that receive every valid message."""
 
     def __init__(self) -> None:
-        self.replica, self.views = Replica(0, incarnation=1, most_components=2000), ViewSet(0, incarnation=1)
+        self.replica = Replica(0, incarnation=1, most_components=2000)
+        self.library = ViewLibrary(0, incarnation=1)
 
     def hear(self, datagram: bytes, message: Message) -> None:
         self.replica.receive(datagram, message)
-        self.views.receive(message)
+        if isinstance(message, ViewsMessage):
+            self.library.receive(message, 0.0)
 
 
 @pytest.mark.parametrize("kind", list(Kind))
@@ -268,7 +263,7 @@ def test_structured_bodies_are_refused_or_sound_and_can_be_said_again(kind, rng)
         assert not Replica(0, incarnation=1).receive(datagram)
         return
     assert_sound(message)
-    Bystanders().hear(datagram, message)
+    Listeners().hear(datagram, message)
     again = [decode(each) for each in written_again(message, kind)]
     if len(again) == 1 or isinstance(message, ComponentsMessage):
         assert joined(again) == content(message)
@@ -276,16 +271,16 @@ def test_structured_bodies_are_refused_or_sound_and_can_be_said_again(kind, rng)
 
 def test_of_structured_bodies_many_are_read_and_many_are_not():
     """So that what is read, and what is refused, has been looked at; nobody raises, whatever came before."""
-    bystanders = Bystanders()
+    listeners = Listeners()
     for kind in Kind:
         found: Counter[bool] = Counter()
         for seed in range(60):
             datagram = structured(kind, Random(seed))
             found[try_decode(datagram)] += 1
             try:
-                bystanders.hear(datagram, decode(datagram))
+                listeners.hear(datagram, decode(datagram))
             except DataError:
-                assert not bystanders.replica.receive(datagram)
+                assert not listeners.replica.receive(datagram)
         assert min(found[True], found[False]) >= 5, (kind, found)
 
 

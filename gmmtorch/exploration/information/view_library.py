@@ -1,9 +1,12 @@
-"""View library: far views worth going to, known to the whole team as a set (thesis 4.3)."""
+"""ViewLibrary: camera poses worth visiting, which a team shares as best-effort hints (thesis 4.3)."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from typing import Any, NamedTuple
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,19 +14,53 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.sharing.messages.message_registry import MAX_BYTES, Message, ViewsMessage, quantized_poses
-from gmmtorch.sharing.replica.record_keys import first_key, robot_of
-from gmmtorch.sharing.view_set import ViewSet
+from gmmtorch.sharing.messages.fields import LATEST, TICKS
+from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
+from gmmtorch.sharing.messages.record_messages import check_size
+from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import (
+    LARGEST_INCARNATION,
+    LARGEST_ROBOT,
+    MOST_RECORDS,
+    first_key,
+    ids_of,
+    keys_of,
+    robot_of,
+)
 
 Id = tuple[int, int]
-"""(robot that found it, its number there), as of records: `gmmtorch.sharing.replica.record_keys`."""
+"""(robot that found the view, sequence), as of records: `gmmtorch.sharing.replica.record_keys`."""
 
-_HARDLY = 0.2  # of a value
-_AHEAD = 1.0  # seconds that clocks of a team are apart where they are one
+TIME_TO_LIVE = 1800.0
+"""Seconds after which a view is removed that no robot has valued again. Views far from all robots stay for
+the length of a mission."""
+REPEAT_AFTER, STAGGER = 60.0, 8.0
+"""Seconds without a message about a view until its finder repeats it; and the further wait of each next
+robot."""
+MOST_REPEATED = 4
+"""Views that are repeated in one call."""
+MOST_VIEWS = 1 << 14
+"""Views, and intervals of removed keys. More are not accepted from other robots."""
+MOST_DATAGRAMS = 8
+"""Datagrams of one call; the rest waits."""
+_RUN = 96
+"""Views, or intervals of removed keys, that are encoded together: about a datagram."""
+_SMALL_CHANGE = 0.2
+"""Change of a value, relative to it, that is not sent."""
+_LARGEST_VALUE = float(np.finfo(np.float16).max)
+
+
+class View(NamedTuple):
+    """stamp: seconds at which the value was found, by the clock of the robot that found it. Of two versions
+    of a view the greater tuple counts."""
+
+    stamp: float
+    value: float
+    pose: tuple[float, float, float, float]
 
 
 class Candidates(NamedTuple):
-    """Views that may be gone to: ids, poses (V, 4), values (V,)."""
+    """Views that a robot may visit: ids, poses (V, 4), values (V,)."""
 
     ids: list[Id]
     poses: Tensor
@@ -31,17 +68,25 @@ class Candidates(NamedTuple):
 
 
 class ViewLibrary:
-    """A set of views that a team shares, whatever its network loses: `gmmtorch.sharing.view_set.ViewSet`.
+    """Views by id, and the ids of removed views, which are never accepted again.
 
-    Each id holds its latest view, or is removed, for good. What is stored is what messages carry:
-    poses to the centimetre, values as float16, stamps in milliseconds; so all replicas hold the same.
+    The library is best-effort: a stale or missing view costs a detour, but never changes the map. Changes
+    made here are sent once, in the next `datagrams`. Against losses, and for robots that join late, views
+    of which no message
+    was heard for a minute are repeated: by their finder, or by another robot if the finder is gone. A robot
+    that hears a view that was removed here is told so. Views are stored as messages carry them: poses to 1
+    cm and 1/256 of a turn, values as float16, stamps in milliseconds. If nothing is lost, all libraries are
+    equal.
 
     Args:
-        robot: whose it is; names the views added here.
-        spacing: metres, and turn: radians: a view nearer than both to another is not added.
-        size: most views of this robot's own; the least valuable go.
-        incarnation: of this life of the robot. Where a robot may start again without its last state, each
-            life needs another (`record_ids.drawn_incarnation`), so that no id is given twice.
+        robot: id of the robot, which is part of the ids of its views.
+        spacing: metres, and turn: radians: a view is not added if another one is nearer than both.
+        size: largest number of this robot's own views; the least valuable are removed.
+        incarnation: of the robot's start (`record_keys.drawn_incarnation`), so that no id is given twice.
+        time_to_live: seconds after which a view is removed that no robot has valued again.
+
+    Attributes:
+        refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
     """
 
     def __init__(
@@ -52,38 +97,49 @@ class ViewLibrary:
         size: int = 256,
         *,
         incarnation: int = 0,
+        time_to_live: float = TIME_TO_LIVE,
     ) -> None:
-        for name, value in (("spacing", spacing), ("turn", turn)):
+        for name, value in (("spacing", spacing), ("turn", turn), ("time_to_live", time_to_live)):
             if not 0 <= value < math.inf:
                 raise InvalidArgumentError(f"{name}={value} must be finite, at least zero.")
-        self._set = ViewSet(robot, incarnation=incarnation)
-        self._robot = robot
-        self._size = check_whole("size", size, 1)
+        for name, number, most in (
+            ("robot", robot, LARGEST_ROBOT),
+            ("incarnation", incarnation, LARGEST_INCARNATION),
+        ):
+            if check_whole(name, number, 0) > most:
+                raise InvalidArgumentError(f"{name}={number} must be at most {most}.")
         self.spacing, self.turn = spacing, turn
-        # When a value was last found here; or heard, if it is of a clock that this one is far behind.
-        self._checked: dict[Id, float] = {}
-        self._cached: tuple[int, Candidates] | None = None
+        self.refused: Counter[str] = Counter()
+        self._robot, self._first = robot, first_key(robot, incarnation)
+        self._size, self._time_to_live = check_whole("size", size, 1), time_to_live
+        self._n = 0  # keys that were given
+        self._views: dict[int, View] = {}
+        self._removed = Intervals.empty()
+        self._valued_at: dict[int, float] = {}  # by this robot's clock: when a value was found or received
+        self._heard_at: dict[int, float] = {}  # when a view was last sent or received
+        self._due: set[int] = set()
+        self._removed_due = Intervals.empty()
+        self._cached: Candidates | None = None
 
     def __len__(self) -> int:
-        return len(self._set.views)
+        return len(self._views)
 
     def candidates(self) -> Candidates:
         """All views, by id."""
-        if self._cached is None or self._cached[0] != self.version:
-            keys = sorted(self._set.views)
-            ids = [_id(key) for key in keys]
-            views = [self._set.views[key] for key in keys]
+        if self._cached is None:
+            keys = sorted(self._views)
+            views = [self._views[key] for key in keys]
             poses = torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4)
             values = torch.tensor([view.value for view in views], dtype=torch.float64)
-            self._cached = self.version, Candidates(ids, poses, values)
-            self._checked = {key: self._checked[key] for key in ids if key in self._checked}
-        return self._cached[1]
+            self._cached = Candidates([_id(key) for key in keys], poses, values)
+        return self._cached
 
     # -- changes made here ------------------------------------------------------------------------
 
     def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[Id]:
-        """Take in views (N, 4) worth at least `least`, best first, `most` at a time; returns their ids."""
-        added: list[Id] = []
+        """Add views (N, 4) with values (N,) of at least `least`, best first, at most `most`; returns their
+        ids."""
+        added: list[int] = []
         rows, worth = quantized_poses(poses), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
         order = order[worth[order] >= max(least, 1e-6)]
@@ -93,51 +149,66 @@ class ViewLibrary:
                 break
             if bool(_is_near(rows[row], near, self.spacing, self.turn).any()):
                 continue
+            if self._n == MOST_RECORDS:
+                raise InvalidArgumentError(f"{MOST_RECORDS} views are the most of one incarnation.")
             near = torch.cat([near, rows[row][None]])
-            added.append(_id(self._set.add(rows[row], worth[row], now)))
-        views = self._set.views
-        own = sorted((view.value, key) for key, view in views.items() if robot_of(key) == self._robot)
-        self._set.remove(key for _, key in own[: max(0, len(own) - self._size)])
-        return [key for key in added if _key(key) in views]
+            x, y, z, yaw = rows[row].tolist()
+            added.append(self._first + self._n)
+            self._n += 1
+            self._put(added[-1], View(*_rounded(worth[row], now), (x, y, z, yaw)), now)
+        self._due.update(added)
+        own = sorted((view.value, key) for key, view in self._views.items() if robot_of(key) == self._robot)
+        self._remove(key for _, key in own[: max(0, len(own) - self._size)])
+        return [_id(key) for key in added if key in self._views]
 
     def revalue(self, ids: list[Id], values: Tensor, now: float, least: float) -> None:
-        """Give views their values of now; those worth less than `least` are removed.
+        """Set the values of views at the time `now` (s); those below `least` are removed.
 
-        A value that has hardly changed is not told: it would cost a message and change no plan.
+        A small change is not sent, because it changes no plan; but once in half the time to live the view
+        is, so that it is not removed.
         """
-        for name, value in zip(ids, values.tolist(), strict=True):
-            known = self._set.views.get(_key(name))
+        for key, value in zip(map(_key, ids), values.tolist(), strict=True):
+            known = self._views.get(key)
             if value < least:
-                self.remove([name], now)
+                self._remove([key])
             elif known is not None:
-                self._checked[name] = now
-                if abs(value - known.value) > _HARDLY * known.value:
-                    self._set.revalue(_key(name), value, now)
+                is_small = abs(value - known.value) <= _SMALL_CHANGE * known.value
+                if is_small and abs(now - known.stamp) <= self._time_to_live / 2:
+                    self._valued_at[key] = now
+                    continue
+                # Later than the known version, even if that comes from a clock that is ahead.
+                at, half = _rounded(value, now)
+                after = min(_milliseconds(known.stamp + 1 / TICKS), LATEST)
+                self._put(key, View(max(at, after), half, known.pose), now)
+                self._due.add(key)
 
     def remove(self, ids: list[Id], now: float) -> None:
-        """Views that are not worth going to, ever again."""
-        self._set.remove(_key(name) for name in ids)
+        """Remove views for good."""
+        self._remove(map(_key, ids))
 
     def visit(self, poses: Tensor, now: float, reach: float = 0.8, turn: float = math.pi / 5) -> None:
-        """Remove the views that a robot has looked from, near enough, at poses (N, 4)."""
+        """Remove the views that a robot at poses (N, 4) has observed from: nearer than `reach` (m) and
+        `turn`."""
         known = self.candidates()
         if known.ids:
             seen = _is_near(poses[:, None], known.poses, reach, turn).any(0)
             self.remove([known.ids[row] for row in seen.nonzero()[:, 0].tolist()], now)
 
     def covered(self, local_map: LocalMap, now: float, most: int, age: float = 10.0) -> list[Id]:
-        """Views in the window not valued for `age` seconds, the longest first, `most` at most."""
+        """Views in the local map that were not valued for `age` seconds, the longest first, at most
+        `most`."""
         known = self.candidates()
         if not known.ids:
             return []
         inside = local_map.is_passable(known.poses[:, :3]).tolist()
-        views = self._set.views
-        seen = ((self._checked.get(name, views[_key(name)].stamp), name) for name in known.ids)
-        due = sorted(pair for pair, there in zip(seen, inside, strict=True) if there and pair[0] <= now - age)
-        return [key for _, key in due[:most]]
+        valued = ((self._valued_at[_key(name)], name) for name in known.ids)
+        due = sorted(
+            pair for pair, there in zip(valued, inside, strict=True) if there and pair[0] <= now - age
+        )
+        return [name for _, name in due[:most]]
 
     def best(self, metres: Tensor, *, least: float = 0.0) -> int | None:
-        """Row of `candidates` of argmax value/(1 + metres to it), metres (V,); None if none is in reach."""
+        """Row of `candidates` that maximizes value / (1 + metres (V,) to it); None if no view is in reach."""
         known = self.candidates()
         score = torch.where(known.values >= least, known.values / (1 + metres), 0.0)
         if not len(score) or not float(score.max()) > 0:
@@ -146,55 +217,140 @@ class ViewLibrary:
 
     # -- the team ---------------------------------------------------------------------------------
 
-    @property
-    def version(self) -> int:
-        """Rises with every change."""
-        return self._set.version
-
-    @property
-    def differs(self) -> bool:
-        """Whether a teammate, when last heard, held other views."""
-        return self._set.differs
-
     def digest(self) -> bytes:
-        """8 bytes: equal for equal libraries."""
-        return self._set.digest()
+        """8 bytes, equal for equal views. Robots that lost messages may differ."""
+        digest = hashlib.blake2b(digest_size=8)
+        for key in sorted(self._views):
+            digest.update(repr((key, self._views[key])).encode())
+        return digest.digest()
 
-    def datagrams(self, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
-        """What has changed here, and what others lack: as `ViewSet.datagrams`."""
-        return self._set.datagrams(max_bytes, budget)
+    def datagrams(self, now: float, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
+        """Datagrams of changes made here, of removals that others lack, and of repeated views.
 
-    def announcements(self, max_bytes: int = MAX_BYTES) -> list[bytes]:
-        """What is held here, for others to send what is missing: as `ViewSet.announcements`."""
-        return self._set.announcements(max_bytes)
-
-    def receive(self, message: Message, now: float = math.inf) -> bool:
-        """Merge what others say, as `ViewSet.receive`; heard at `now` (s).
-
-        Stamps are of the clocks of others, which count from their own starts: those far ahead of `now` would
-        pass for fresh until this clock has come to them. What they say is as old as the hearing of it.
+        Args:
+            now: time (s) by this robot's clock.
+            max_bytes: largest size of a datagram, from 1000 to 1200.
+            budget: largest size of all together; None: no limit. The rest stays due, as does what exceeds
+                `MOST_DATAGRAMS`.
         """
-        ids = message.ids.tolist() if isinstance(message, ViewsMessage) else []
-        before = {(robot, number): self._set.views.get(_key((robot, number))) for robot, number in ids}
-        is_taken = self._set.receive(message)
-        for name, old in before.items():
-            view = self._set.views.get(_key(name))
-            if view is not None and view != old and view.stamp > now + _AHEAD:
-                self._checked[name] = now
-        return is_taken
+        check_size(max_bytes)
+        left = math.inf if budget is None else check_whole("budget", budget, 0)
+        self._expire(now)
+        removed = self._whole(self._removed_due)
+        keys = [*sorted(self._due), *self._repeated(now)]
+        sent: list[bytes] = []
+        begin, n = 0, _RUN
+        while begin < len(removed) + len(keys) and len(sent) < MOST_DATAGRAMS:
+            some = Intervals(removed.edges[2 * begin : 2 * (begin + n)])
+            views = keys[max(begin - len(removed), 0) : max(begin + n - len(removed), 0)]
+            written = encode_views(self._message(views, some), max_bytes)
+            if len(written) > 1 or len(written[0]) > left:
+                if n == 1:
+                    break
+                n //= 2
+                continue
+            sent += written
+            left -= len(written[0])
+            begin += n
+            self._removed_due -= some
+            self._due.difference_update(views)
+            self._heard_at.update(dict.fromkeys(views, now))
+        return sent
 
-    # -- keeping ----------------------------------------------------------------------------------
+    def receive(self, message: ViewsMessage, now: float) -> bool:
+        """Merge the views of another robot at the time `now` (s); returns whether they were accepted.
 
-    def state(self) -> dict[str, Any]:
-        alive = set(self.candidates().ids)
-        checked = [[*name, when] for name, when in sorted(self._checked.items()) if name in alive]
-        return {"set": self._set.state(), "checked": checked}
+        Never raises for a decoded message.
+        """
+        keys = keys_of(message.ids)
+        named = Intervals.of(keys) | message.removed
+        n_new = sum(key not in self._views for key in keys.tolist())
+        removed = self._removed | message.removed
+        reason = ""
+        if named & Intervals.span(self._first + self._n, self._first + MOST_RECORDS):
+            reason = "duplicate_id"  # only this robot gives keys of its incarnation
+        elif (n_new and len(self._views) + n_new > MOST_VIEWS) or len(removed) > max(
+            len(self._removed), MOST_VIEWS
+        ):
+            reason = "full"
+        if reason:
+            self.refused[reason] += 1
+            return False
+        self._removed = removed
+        self._drop([key for key in self._views if key in message.removed] if message.removed else [])
+        self._removed_due -= message.removed
+        rows = (message.stamps + 0.0, message.values + 0.0, message.poses + 0.0)  # −0 becomes 0
+        for key, stamp, value, pose in zip(keys.tolist(), *(row.tolist() for row in rows), strict=True):
+            view = View(stamp, value, tuple(pose))
+            if key in self._removed:
+                self._removed_due |= self._whole(Intervals.span(key, key + 1))
+                continue
+            known = self._views.get(key)
+            if known is None or view > known:
+                self._put(key, view, now)
+            if self._views[key] == view:
+                self._heard_at[key] = now
+                self._due.discard(key)
+        return True
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Raises `DataError` for a state that is damaged, or another robot's."""
-        self._set.restore(state["set"])
+    def _message(self, keys: list[int], removed: Intervals) -> ViewsMessage:
+        views = [self._views[key] for key in keys]
+        return ViewsMessage(
+            ids=ids_of(np.array(keys, np.int64)),
+            poses=torch.tensor([view.pose for view in views], dtype=torch.float64).reshape(-1, 4),
+            values=torch.tensor([view.value for view in views], dtype=torch.float64),
+            stamps=torch.tensor([view.stamp for view in views], dtype=torch.float64),
+            removed=removed,
+        )
+
+    def _repeated(self, now: float) -> list[int]:
+        """The keys to repeat, the longest unheard first. Robots wait for different times, the finder
+        least."""
+        n_robots = LARGEST_ROBOT + 1
+        silent = sorted(
+            (heard, key)
+            for key, heard in self._heard_at.items()
+            if now - heard >= REPEAT_AFTER + STAGGER * ((self._robot - robot_of(key)) % n_robots % 8)
+        )
+        return [key for _, key in silent if key not in self._due][:MOST_REPEATED]
+
+    def _expire(self, now: float) -> None:
+        """Remove the views that were not valued for the time to live."""
+        limit = now - self._time_to_live
+        self._remove([key for key, valued in self._valued_at.items() if valued < limit])
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _put(self, key: int, view: View, now: float) -> None:
+        self._views[key], self._valued_at[key] = view, now
+        self._heard_at.setdefault(key, now)
         self._cached = None
-        self._checked = {(int(r), int(n)): float(when) for r, n, when in state["checked"]}
+
+    def _remove(self, keys: Iterable[int]) -> None:
+        """Remove those of the keys that have views; others are told."""
+        known = [key for key in keys if key in self._views]
+        gone = Intervals.of(np.array(known, np.int64))
+        self._removed |= gone
+        self._removed_due |= gone
+        self._drop(known)
+
+    def _drop(self, keys: list[int]) -> None:
+        for key in keys:
+            del self._views[key], self._valued_at[key], self._heard_at[key]
+            self._due.discard(key)
+            self._cached = None
+
+    def _whole(self, keys: Intervals) -> Intervals:
+        """The intervals of removed keys that contain any of `keys`, as a whole.
+
+        This takes no more bytes, and repeats earlier removals, which may have been lost.
+        """
+        if not keys:
+            return keys
+        edges, begins = self._removed.edges.reshape(-1, 2), keys.edges[::2]
+        n_before, n_by_end = np.searchsorted(begins, edges).T
+        meets = keys.contains(edges[:, 0]) | (n_by_end > n_before)
+        return Intervals(edges[meets].reshape(-1))
 
 
 def _key(name: Id) -> int:
@@ -204,6 +360,20 @@ def _key(name: Id) -> int:
 def _id(key: int) -> Id:
     robot = robot_of(key)
     return robot, key - first_key(robot)
+
+
+def _rounded(value: float, now: float) -> tuple[float, float]:
+    """Time and value as messages carry them."""
+    if not (math.isfinite(value) and abs(now) <= LATEST):
+        raise InvalidArgumentError(
+            f"value={value} and now={now} s must be finite, the time up to {LATEST:g}."
+        )
+    half = float(np.float16(max(-_LARGEST_VALUE, min(value, _LARGEST_VALUE))))
+    return _milliseconds(now), half + 0.0  # −0 becomes 0
+
+
+def _milliseconds(seconds: float) -> float:
+    return round(seconds * TICKS) / TICKS
 
 
 def _is_near(one: Tensor, others: Tensor, spacing: float, turn: float) -> Tensor:

@@ -40,7 +40,6 @@ class Kind(IntEnum):
     SUPERSESSION = 11
     COUNTERS = 12
     CORRECTION = 13
-    VIEWS_HELD = 14
 
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})

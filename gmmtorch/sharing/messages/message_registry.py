@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.sharing import view_announcements
 from gmmtorch.sharing.messages import (
     announcements,
     component_messages,
@@ -26,7 +25,6 @@ from gmmtorch.sharing.messages.fields import quantized_poses
 from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
 from gmmtorch.sharing.messages.record_messages import CorrectionMessage, CountersMessage, SupersessionMessage
 from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
-from gmmtorch.sharing.view_announcements import ViewsHeldMessage
 
 __all__ = [
     "CODECS",
@@ -40,7 +38,6 @@ __all__ = [
     "PlanMessage",
     "PointsMessage",
     "SupersessionMessage",
-    "ViewsHeldMessage",
     "ViewsMessage",
     "decode",
     "encode_components",
@@ -62,7 +59,6 @@ Message = (
     | SupersessionMessage
     | CountersMessage
     | CorrectionMessage
-    | ViewsHeldMessage
 )
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
@@ -79,7 +75,6 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.SUPERSESSION: record_messages.read_supersession,
     Kind.COUNTERS: record_messages.read_counters,
     Kind.CORRECTION: record_messages.read_correction,
-    Kind.VIEWS_HELD: view_announcements.read_views_held,
 }
 
 
@@ -95,7 +90,6 @@ _NAMES: dict[Kind, str] = {
     Kind.VIEWS: "views",
     Kind.PLAN: "plans",
     Kind.ANNOUNCEMENT: "announcements",
-    Kind.VIEWS_HELD: "announcements",
     Kind.SUPERSESSION: "supersessions",
     Kind.CORRECTION: "corrections",
 }
