@@ -165,7 +165,7 @@ def _many(values: Quantized, k: int) -> Quantized:
 
 _OTHERS = {  # the first ones take as many bits to write as they are large
     "shear": [0, 1, -1, 9, 500],
-    "sightings": [0, 1, 2, 49, 1025],
+    "n_viewpoints": [0, 1, 2, 49, 1025],
     "axis_order": [0, 1, 5, 6, 7],
     "deviation": [0, 72, 80, 81, 160, -80, -81, -240],
     "mean": [*_WHOLE, 1 << 35, 1 << 45],

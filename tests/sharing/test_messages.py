@@ -505,6 +505,6 @@ def test_points_by_hand():
 def test_every_kind_has_a_name():
     """Named here in the order of their numbers, so that a new one cannot be forgotten."""
     names = ["components"] * 3 + ["counts"] * 3 + ["points", "views", "plans", "announcements"]
-    names += ["supersessions", "counts", "corrections", "announcements"]
+    names += ["supersessions", "counts", "corrections"]
     assert [kind_of(bytes([VERSION << 4 | kind])) for kind in sorted(Kind)] == names
     assert [kind_of(datagram) for datagram in examples()] == names

@@ -6,13 +6,13 @@ import hashlib
 import math
 from collections import Counter
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.sharing.messages.fields import LATEST, TICKS
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
@@ -47,6 +47,7 @@ _RUN = 96
 """Views, or intervals of removed keys, that are encoded together: about a datagram."""
 _SMALL_CHANGE = 0.2
 """Change of a value, relative to it, that is not sent."""
+_TIMES = ("_valued_at", "_heard_at")
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
 
 
@@ -87,7 +88,11 @@ class ViewLibrary:
 
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
+        version: rises with every change.
+        differs: False: no robot announces its views, as missing ones are repeated.
     """
+
+    differs = False
 
     def __init__(
         self,
@@ -110,6 +115,7 @@ class ViewLibrary:
                 raise InvalidArgumentError(f"{name}={number} must be at most {most}.")
         self.spacing, self.turn = spacing, turn
         self.refused: Counter[str] = Counter()
+        self.version = 0
         self._robot, self._first = robot, first_key(robot, incarnation)
         self._size, self._time_to_live = check_whole("size", size, 1), time_to_live
         self._n = 0  # keys that were given
@@ -119,6 +125,7 @@ class ViewLibrary:
         self._heard_at: dict[int, float] = {}  # when a view was last sent or received
         self._due: set[int] = set()
         self._removed_due = Intervals.empty()
+        self._now = 0.0  # of the last call
         self._cached: Candidates | None = None
 
     def __len__(self) -> int:
@@ -184,11 +191,13 @@ class ViewLibrary:
 
     def remove(self, ids: list[Id], now: float) -> None:
         """Remove views for good."""
+        self._now = now
         self._remove(map(_key, ids))
 
     def visit(self, poses: Tensor, now: float, reach: float = 0.8, turn: float = math.pi / 5) -> None:
         """Remove the views that a robot at poses (N, 4) has observed from: nearer than `reach` (m) and
         `turn`."""
+        self._now = now
         known = self.candidates()
         if known.ids:
             seen = _is_near(poses[:, None], known.poses, reach, turn).any(0)
@@ -224,17 +233,20 @@ class ViewLibrary:
             digest.update(repr((key, self._views[key])).encode())
         return digest.digest()
 
-    def datagrams(self, now: float, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
+    def datagrams(
+        self, now: float | None = None, max_bytes: int = MAX_BYTES, budget: int | None = None
+    ) -> list[bytes]:
         """Datagrams of changes made here, of removals that others lack, and of repeated views.
 
         Args:
-            now: time (s) by this robot's clock.
+            now: time (s) by this robot's clock; None: the time of the last call with one.
             max_bytes: largest size of a datagram, from 1000 to 1200.
             budget: largest size of all together; None: no limit. The rest stays due, as does what exceeds
                 `MOST_DATAGRAMS`.
         """
         check_size(max_bytes)
         left = math.inf if budget is None else check_whole("budget", budget, 0)
+        now = self._now if now is None else now
         self._expire(now)
         removed = self._whole(self._removed_due)
         keys = [*sorted(self._due), *self._repeated(now)]
@@ -257,11 +269,16 @@ class ViewLibrary:
             self._heard_at.update(dict.fromkeys(views, now))
         return sent
 
+    def announcements(self) -> list[bytes]:
+        """None: missing views are repeated."""
+        return []
+
     def receive(self, message: ViewsMessage, now: float) -> bool:
         """Merge the views of another robot at the time `now` (s); returns whether they were accepted.
 
         Never raises for a decoded message.
         """
+        self._now = now if math.isfinite(now) else self._now
         keys = keys_of(message.ids)
         named = Intervals.of(keys) | message.removed
         n_new = sum(key not in self._views for key in keys.tolist())
@@ -292,6 +309,34 @@ class ViewLibrary:
                 self._heard_at[key] = now
                 self._due.discard(key)
         return True
+
+    def state(self) -> dict[str, Any]:
+        """Everything, for a checkpoint of a mission."""
+        rows = vars(self._message(sorted(self._views), self._removed))
+        tables = {name: [[key, at] for key, at in getattr(self, name).items()] for name in _TIMES}
+        return {
+            **{name: value for name, value in rows.items() if name != "removed"},
+            "robot": self._robot,
+            "removed": self._removed.stored(),
+            "removed_due": self._removed_due.stored(),
+            "due": sorted(self._due),
+            "n": self._n,
+            **tables,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`. Raises `DataError` for another robot's."""
+        if state["robot"] != self._robot:
+            raise DataError(f"The views are of robot {state['robot']}, this is robot {self._robot}.")
+        fresh = ViewLibrary(self._robot)
+        fresh._n = MOST_RECORDS  # its own keys are accepted
+        rows = {name: state[name] for name in ("ids", "poses", "values", "stamps")}
+        fresh.receive(ViewsMessage(**rows, removed=Intervals.loaded(state["removed"])), 0.0)
+        self._views, self._removed, self._cached = fresh._views, fresh._removed, None
+        self._removed_due, self._due = Intervals.loaded(state["removed_due"]), set(state["due"])
+        self._n = int(state["n"])
+        for name in _TIMES:
+            setattr(self, name, {int(key): float(at) for key, at in state[name]})
 
     def _message(self, keys: list[int], removed: Intervals) -> ViewsMessage:
         views = [self._views[key] for key in keys]
@@ -324,6 +369,7 @@ class ViewLibrary:
     def _put(self, key: int, view: View, now: float) -> None:
         self._views[key], self._valued_at[key] = view, now
         self._heard_at.setdefault(key, now)
+        self.version += 1
         self._cached = None
 
     def _remove(self, keys: Iterable[int]) -> None:
@@ -338,6 +384,7 @@ class ViewLibrary:
         for key in keys:
             del self._views[key], self._valued_at[key], self._heard_at[key]
             self._due.discard(key)
+            self.version += 1
             self._cached = None
 
     def _whole(self, keys: Intervals) -> Intervals:

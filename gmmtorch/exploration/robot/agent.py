@@ -23,6 +23,7 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
     PlanMessage,
+    ViewsHeldMessage,
     ViewsMessage,
     encode_plan,
 )
@@ -34,6 +35,7 @@ _SEEDS = 1 << 10  # robots of a mission that draw differently
 _LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
 _TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
 _PATIENCE = 15  # plans in a row that lead nowhere: at a start, to find a way out takes up to six
+_OF_VIEWS = (ViewsMessage, ViewsHeldMessage)
 
 
 class Agent:
@@ -89,8 +91,8 @@ class Agent:
         return dict(self._timed.seconds)
 
     def digest(self) -> bytes:
-        """Equal for robots that hold the same map."""
-        return self.robot.mapper.digest()
+        """Equal for robots that hold the same map, and the same views."""
+        return self.robot.mapper.digest() + self.robot.library.digest()
 
     def keep_in(self, logbook: Logbook) -> None:
         """From now on keep what is said and heard of the map. What the logbook has restored of it is taken
@@ -122,10 +124,11 @@ class Agent:
         """What its map has for the team, and every while what it holds."""
         if not self.options.shares:
             return
-        mapper = self.robot.mapper
+        mapper, library = self.robot.mapper, self.robot.library
         datagrams = self.radio.within_budget(mapper.datagrams, now)
-        if self.radio.announces(now, (mapper.version,), mapper.is_behind):
-            datagrams += mapper.announcements()
+        urgent = mapper.is_behind or library.differs
+        if self.radio.announces(now, (mapper.version, library.version), urgent):
+            datagrams += [*mapper.announcements(), *library.announcements()]
         self.radio.tell(datagrams, now)
 
     def tell_views(self, now: float) -> None:
@@ -134,7 +137,7 @@ class Agent:
         with self._timed("sharing"):
             if self.options.shares:
                 views = self.radio.within_budget(
-                    lambda budget: library.datagrams(now, budget=budget), now, spare=MAX_BYTES
+                    lambda budget: library.datagrams(budget=budget), now, spare=MAX_BYTES
                 )
                 self.radio.tell(views, now)
 
@@ -145,11 +148,11 @@ class Agent:
         for item in heard:
             if isinstance(item.message, PlanMessage):
                 self._note_plan(item.sender, item.message, now)
-            elif isinstance(item.message, ViewsMessage):
+            elif isinstance(item.message, _OF_VIEWS):
                 self.robot.library.receive(item.message, now)
         with self._timed("mapping"):
             taken = self.robot.mapper.receive(
-                [item for item in heard if not isinstance(item.message, PlanMessage | ViewsMessage)]
+                [item for item in heard if not isinstance(item.message, (PlanMessage, *_OF_VIEWS))]
             )
             self.radio.keep(taken)
 

@@ -38,6 +38,7 @@ __all__ = [
     "PlanMessage",
     "PointsMessage",
     "SupersessionMessage",
+    "ViewsHeldMessage",
     "ViewsMessage",
     "decode",
     "encode_components",
@@ -60,6 +61,8 @@ Message = (
     | CountersMessage
     | CorrectionMessage
 )
+
+ViewsHeldMessage = ViewsMessage  # views are repeated, not announced
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.COMPONENTS: component_messages.read_quantized,
