@@ -327,8 +327,8 @@ def test_what_is_sent_is_booked_by_what_it_is(kind: str) -> None:
     assert all(sender == 2 for _, sender, _, _ in post.sent)
     expected = {
         "replica": {"components", "counts", "views", "plans", "announcements"},
-        "float": {"components", "counts", "views", "plans", "announcements"},
-        "grid_shared": {"points", "views", "plans", "announcements"},
+        "float": {"components", "counts", "views", "plans"},
+        "grid_shared": {"points", "views", "plans"},
         "grid_isolated": set(),
     }[kind]
     assert set(kinds) - {"supersessions"} == expected
@@ -347,7 +347,6 @@ def test_a_budget_bounds_what_is_said_of_the_map_in_every_span_of_time() -> None
         for end in range(begin, 40):
             size = sum(len(datagram) for now, datagram in said if begin <= now <= end)
             assert size <= 1500 * (end - begin) + 1500
-    assert post.of("announcements")
 
 
 def test_views_have_what_the_map_leaves_of_the_budget() -> None:
