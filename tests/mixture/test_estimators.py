@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from typing import Any, ClassVar
 
 from mixture.estimator_contract import MixtureContract
@@ -52,3 +54,13 @@ class TestVariationalGaussianMixtureWithDirichletWeights(MixtureContract):
     def make(self, n_components: int = 3, **options: Any) -> VariationalGaussianMixture:
         kind = {"weight_concentration_prior_type": "dirichlet_distribution"}
         return VariationalGaussianMixture(n_components, **{"random_state": 0, **kind, **options})
+
+
+def test_one_estimator_does_not_load_the_others():
+    code = (
+        "import sys, gmmtorch as gt; gt.GaussianMap; assert 'sklearn' not in sys.modules; gt.GaussianMixture;"
+        "assert 'sklearn.cluster' not in sys.modules;"
+        "print([name for name in sys.modules if name.startswith('gmmtorch.mixture.estimators.')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

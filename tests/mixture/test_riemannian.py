@@ -439,7 +439,7 @@ def test_n_init_keeps_the_best_start():
 
 @solvers
 def test_collapse_without_regularisation_is_an_error(solver):
-    points = np.concatenate([blobs(2), np.array([[40.0, 40.0], [40.0, 41.0]])])
+    points = np.concatenate([blobs(2, 60), np.array([[40.0, 40.0], [40.0, 41.0]])])
     with pytest.raises(NumericalError, match="reg_covar"):
         RiemannianGaussianMixture(
             5, reg_covar=0, tol=0, max_iter=400, init_params="random_points", random_state=1, solver=solver

@@ -350,7 +350,7 @@ def test_converges_to_the_result_of_em():
 # -- momentum --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("n_iter", "share"), [(10, 1.0), (30, 0.8), (100, 0.5)])
+@pytest.mark.parametrize(("n_iter", "share"), [(10, 1.0), (100, 0.5)])
 def test_momentum_converges_faster_than_em(n_iter, share):
     generator = torch.Generator().manual_seed(0)
     label = torch.rand(3000, 1, generator=generator, dtype=torch.float64) < 0.5
@@ -365,7 +365,7 @@ def test_momentum_converges_faster_than_em(n_iter, share):
     plain = em.run_em(step, parameters, tol=0.0, max_iter=n_iter)
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter
-    best = em.run_em(step, parameters, tol=0.0, max_iter=3000).lower_bounds[-1]
+    best = em.run_em(step, parameters, tol=0.0, max_iter=1500).lower_bounds[-1]
     assert best - plain.lower_bounds[-1] > 1e-5  # plain EM converges slowly
     assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
 
