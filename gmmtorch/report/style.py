@@ -157,7 +157,7 @@ def log_axis(axes: Axes, name: str, values: Iterable[float]) -> None:
     if sufficient:
         axis.set_major_locator(LogLocator(subs=sufficient[0]))
     else:
-        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=3))
         axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
     axis.set_minor_formatter(NullFormatter())

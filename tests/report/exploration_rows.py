@@ -1,4 +1,4 @@
-"""Trials of an exploration as they might come out: rows of results.json, made up but lifelike."""
+"""Synthetic rows of exploration trials with realistic values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FLOOR = {"gmm_shared": 0.045, "grid_shared": 0.04, "grid_isolated": 0.11}
 def trial(
     framework: str, seed: int, duration: float = 1600.0, n_robots: int = 3, **fields: Any
 ) -> dict[str, Any]:
-    """One trial: entropy falls as 1/(1 + (t/τ)^1.6) to a floor, with a pace of its own for each seed."""
+    """One trial: entropy falls as 1/(1 + (t/τ)^1.6) to a floor, at a different pace for each seed."""
     random = np.random.default_rng([seed, sorted(_PACE).index(framework)])
     times = np.arange(0.0, duration + 1, 10.0)
     pace = fields.pop("pace", _PACE[framework]) * math.exp(random.normal(0, 0.07))
@@ -31,7 +31,7 @@ def trial(
     left[0] = 1.0
     own = {"gmm_shared": 0.99, "grid_shared": 0.99, "grid_isolated": 0.6}[framework]
     robots = [1 - (1 - left) * own * (1 - 0.05 * i) for i in range(n_robots)]
-    found = 1 - left  # what is novel grows with what is learned, and a little with time
+    found = 1 - left  # novel points grow with the explored share, and slowly with time
     raw = 12 * (3.1e6 * found + 400 * times)
     sent = {"gmm_shared": raw / 58, "grid_shared": raw, "grid_isolated": 0 * raw}[framework]
     mixture = framework == "gmm_shared"
@@ -77,12 +77,12 @@ def trial(
 
 
 def protocol(n_seeds: int = 5, duration: float = 1600.0) -> list[dict[str, Any]]:
-    """Three frameworks, some seeds each."""
+    """Trials of three frameworks with several seeds each."""
     return [trial(framework, seed, duration) for seed in range(n_seeds) for framework in _PACE]
 
 
 def planner_variants(n_seeds: int = 5) -> list[dict[str, Any]]:
-    """The planners side by side, and the ablation of the planning prior."""
+    """Trials of all planners and planning priors."""
     variants = [
         ("mcts", "csqmi", 0.125, 330.0),
         ("mcts", "csqmi", 0.5, 380.0),
@@ -105,7 +105,7 @@ def flights(n_robots: int = 3, n: int = 600, seed: int = 0) -> list[np.ndarray]:
         turns = np.cumsum(random.normal(0, 0.1, n)) + 2 * math.pi * i / n_robots
         steps = 0.8 * np.stack([np.cos(turns), np.sin(turns)], 1)
         flat = np.array([4.0 + 2 * i, 4.0 + i]) + np.cumsum(steps, 0)
-        # Walls turn them back.
+        # Reflect at the walls.
         size = np.array([50.0, 40.0])
         flat = 1 + np.abs((flat % (2 * (size - 2))) - (size - 2))
         height = 2.5 + 1.2 * np.sin(np.arange(n) / 40 + i)
@@ -114,7 +114,7 @@ def flights(n_robots: int = 3, n: int = 600, seed: int = 0) -> list[np.ndarray]:
 
 
 def networks(n_seeds: int = 3, duration: float = 600.0) -> list[dict[str, Any]]:
-    """E0 where nothing is lost, where some is, and where it is cut in two for a minute."""
+    """Trials of E0 with a lossless network, with losses, and with a partition of one minute."""
     cut = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
     variants = [(0.0, []), (0.1, []), (0.3, []), (0.5, []), (0.0, [cut])]
     rows = []

@@ -1,4 +1,4 @@
-"""What a Board writes, TensorBoard's own reader finds."""
+"""Events written by `Board`, read back with TensorBoard's reader."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def tensor(events: EventAccumulator, tag: str) -> np.ndarray:
     return make_ndarray(events.Tensors(tag)[-1].tensor_proto)
 
 
-def test_scalars_are_the_finite_numbers_of_a_row(tmp_path):
+def test_board_writes_the_finite_numbers_of_a_row(tmp_path):
     row = {"auc": 0.5, "n": 3, "method": "x", "yes": True, "none": None, "nan": float("nan"), "list": [1.0]}
     with Board(tmp_path) as board:
         board.scalars(row, prefix="occupancy", step=0)
@@ -34,7 +34,7 @@ def test_scalars_are_the_finite_numbers_of_a_row(tmp_path):
     assert [(e.step, e.value) for e in events.Scalars("occupancy/auc")] == [(0, 0.5), (4, 0.75)]
 
 
-def test_figures_and_curves(tmp_path):
+def test_board_writes_figures_and_precision_recall_curves(tmp_path):
     labels = torch.tensor([0, 1, 1, 0, 1])
     with Board(tmp_path) as board:
         board.figure("maps", roc_figure({}))
@@ -54,7 +54,7 @@ def test_figures_and_curves(tmp_path):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_clouds_are_thinned_the_same_way_every_time(tmp_path, dim):
+def test_clouds_are_thinned_deterministically(tmp_path, dim):
     points = torch.arange(100 * dim, dtype=torch.float64).reshape(100, dim)
     colors = torch.full((100, 3), 300)
     for name in ("a", "b"):
@@ -74,7 +74,7 @@ def test_clouds_are_thinned_the_same_way_every_time(tmp_path, dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("k", "n_vertices"), [(3, 3 * 162), (20, 20 * 25), (200, 41 * 12), (0, None)])
-def test_ellipsoids_are_as_fine_as_the_limit_permits(tmp_path, dim, k, n_vertices):
+def test_ellipsoids_use_as_many_vertices_as_the_limit_permits(tmp_path, dim, k, n_vertices):
     with Board(tmp_path, max_points=500) as board:
         board.ellipsoids("mixture", torch.zeros(k, dim), torch.eye(dim).expand(k, dim, dim))
     events = read(tmp_path)
@@ -87,7 +87,7 @@ def test_ellipsoids_are_as_fine_as_the_limit_permits(tmp_path, dim, k, n_vertice
     assert tensor(events, "mixture_COLOR").shape == (1, n_vertices, 3)
 
 
-def test_hparams_stay_in_the_run(tmp_path):
+def test_hparams_are_written_to_the_same_run(tmp_path):
     config = {"seed": 0, "method": "point", "flag": True, "path": None, "kept": [1.0, 0.3]}
     with Board(tmp_path) as board:
         board.hparams(config, {"auc": 0.9, "missing": None})
@@ -102,7 +102,7 @@ def test_hparams_stay_in_the_run(tmp_path):
     assert start.hparams["flag"].number_value == 1
 
 
-def test_says_what_is_wrong(tmp_path):
+def test_board_errors_name_the_argument(tmp_path):
     with pytest.raises(InvalidArgumentError, match="max_points=0"):
         Board(tmp_path, max_points=0)
     with Board(tmp_path) as board:

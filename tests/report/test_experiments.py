@@ -1,4 +1,4 @@
-"""Figures of the experiments: what is drawn where."""
+"""Figures of fitting and of the studies of gmmtorch-fit."""
 
 from __future__ import annotations
 
@@ -33,9 +33,8 @@ def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]
 STUDY = [study_row(i, k, s) for s in (0, 1) for k in (8, 4) for i in ("random_points", "kmeans")]
 
 
-def test_the_four_panels_of_fig_2_1_have_a_line_a_start_with_means_and_range():
+def test_initialization_figure_draws_mean_and_range_of_each_initialization():
     figure = figures(STUDY)["initialization"]
-    figure.canvas.draw()
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == ["initialization time", "iterations of EM", "time of initialization and EM", "PSNR2"]
     assert "bunny, 5,000 points" in figure.get_suptitle()
@@ -53,16 +52,15 @@ def test_the_four_panels_of_fig_2_1_have_a_line_a_start_with_means_and_range():
     assert names == ["random points", "k-means"]
 
 
-def test_quality_is_drawn_against_the_first_start():
+def test_quality_is_relative_to_the_first_initialization():
     figure = figures(STUDY)["initialization_quality"]
-    figure.canvas.draw()
     assert "Gain over random points" in figure.get_suptitle()
     first, other = figure.axes[3].lines
     assert first.get_ydata() == pytest.approx([0.0, 0.0])
     assert other.get_ydata() == pytest.approx([0.5, 0.5])
 
 
-def test_what_could_not_be_measured_leaves_a_gap():
+def test_values_that_are_none_are_left_out():
     rows = [study_row("kmeans", k, 0, psnr2_db=None if k == 4 else 60.0) for k in (4, 8)]
     rows = [{**row, "held_out_psnr2_db": None, "held_out_log_likelihood": None} for row in rows]
     drawn = figures(rows)
@@ -88,9 +86,8 @@ def fit_row(method: str, seconds: float, **more: object) -> dict[str, object]:
     }
 
 
-def test_each_method_has_a_mark_against_its_seconds():
+def test_comparison_draws_a_mark_per_method_against_seconds():
     figure = comparison_figure([fit_row("em", 0.2), fit_row("scikit_learn", 11.0)])
-    figure.canvas.draw()
     left, right = figure.axes
     assert left.get_xscale() == right.get_xscale() == "log"
     marks = [(float(*line.get_xdata()), float(*line.get_ydata())) for line in left.lines]
@@ -102,21 +99,20 @@ def test_each_method_has_a_mark_against_its_seconds():
     assert "held-out" in left.get_title()
 
 
-def test_without_points_held_out_those_that_were_learned_from_are_shown():
+def test_comparison_uses_training_points_if_none_are_held_out():
     row = fit_row("em", 0.2, held_out_log_likelihood=None, held_out_psnr2_db=None, psnr2_db=None)
     figure = comparison_figure([row])
-    figure.canvas.draw()
     left, right = figure.axes
     assert "held-out" not in left.get_title()
     assert float(*left.lines[0].get_ydata()) == -1.0
     assert np.isnan(right.lines[0].get_ydata()).all()
 
 
-def test_no_rows_are_an_empty_figure():
+def test_comparison_of_no_rows_is_an_empty_figure():
     comparison_figure([]).canvas.draw()
 
 
-def test_variants_of_the_sensor_model_are_drawn_against_bytes():
+def test_sensor_model_figure_draws_variants_against_bytes():
     rows = [
         {
             "dataset": "hall",
@@ -132,7 +128,6 @@ def test_variants_of_the_sensor_model_are_drawn_against_bytes():
         for shift, variant in enumerate(("plain", "noise_planar"))
     ]
     figure = sensor_noise.figures(rows)["sensor_model"]
-    figure.canvas.draw()
     assert len(figure.axes) == 4
     for axes in figure.axes:
         assert axes.get_xlabel() == "map size [bytes]"
@@ -166,9 +161,8 @@ COUNTS = [
 ]
 
 
-def test_a_rule_is_marked_with_what_it_was_told_on_the_line_of_all_numbers():
+def test_component_count_marks_each_rule_with_its_setting():
     figure = count_figures(COUNTS)["component_count"]
-    figure.canvas.draw()
     psnr, likelihood, seconds, auc = figure.axes
     names = [line.get_label() for line in psnr.lines]
     assert names == ["fixed number", "flat pieces (multiple of the noise)", "lowest BIC"]
@@ -185,13 +179,12 @@ def test_a_rule_is_marked_with_what_it_was_told_on_the_line_of_all_numbers():
     assert len(seconds.lines) == 3
 
 
-def test_likelihoods_far_below_the_best_do_not_flatten_the_others():
+def test_component_count_limits_the_likelihood_axis():
     far = count_row("fixed", 64, 64, held_out_log_likelihood=-900.0)
     figure = count_figures([*COUNTS, far])["component_count"]
     assert -5 < figure.axes[1].get_ylim()[0] < -0.3
 
 
-def test_without_maps_there_is_no_panel_of_them():
+def test_component_count_hides_the_map_panel_without_maps():
     figure = count_figures(COUNTS[:6])["component_count"]
-    figure.canvas.draw()
     assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]

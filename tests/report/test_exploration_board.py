@@ -1,4 +1,4 @@
-"""What is written of an exploration, TensorBoard's own reader finds."""
+"""Trials in TensorBoard, read back with TensorBoard's reader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def read(directory) -> EventAccumulator:
     return events.Reload()
 
 
-def test_trials_and_figures(tmp_path):
+def test_trials_and_figures_are_written_with_their_tags(tmp_path):
     rows = [trial("gmm_shared", 0, duration=50), trial("grid_isolated", 1, duration=50)]
     with Board(tmp_path) as board:
         write_exploration_board(board, rows, {"entropy": entropy_figure(rows)})
@@ -36,7 +36,7 @@ def test_trials_and_figures(tmp_path):
     assert events.Tags()["images"] == ["figures/entropy"]
 
 
-def test_paths_are_points_of_all_robots(tmp_path):
+def test_paths_are_written_as_points_of_all_robots(tmp_path):
     paths = flights(2, 30)
     with Board(tmp_path) as board:
         for n in (1, 10, 30):
@@ -51,7 +51,7 @@ def test_paths_are_points_of_all_robots(tmp_path):
     assert not any("none" in tag for tag in events.Tags()["tensors"])
 
 
-def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
+def test_variants_of_one_seed_have_different_tags(tmp_path):
     rows = [trial("gmm_shared", 0, duration=20, planner=name) for name in ("mcts", "random")]
     with Board(tmp_path) as board:
         write_exploration_board(board, rows, {})
@@ -59,7 +59,7 @@ def test_variants_of_one_seed_have_tags_of_their_own(tmp_path):
     assert sum(tag.endswith("/entropy_left") for tag in tags) == 2
 
 
-def test_variants_that_differ_by_their_network_alone_have_tags_of_their_own(tmp_path):
+def test_variants_that_differ_only_in_their_network_have_different_tags(tmp_path):
     cut = {"begin": 60.0, "end": 120.5, "groups": [[0], [1, 2]]}
     networks = [(0.0, []), (0.3, []), (0.0, [cut]), (0.0, [{**cut, "groups": [[1], [0, 2]]}])]
     rows = [

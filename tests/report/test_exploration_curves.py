@@ -1,4 +1,4 @@
-"""Curves and bars of explorations show what the rows say."""
+"""Curves and bars of explorations, compared with their rows."""
 
 from __future__ import annotations
 
@@ -39,10 +39,9 @@ def lines(axes: Axes, colour: str, n_points: int) -> list[np.ndarray]:
     ]
 
 
-def test_entropy_is_the_mean_over_seeds_in_its_band():
+def test_entropy_figure_draws_mean_and_band_over_seeds():
     rows = protocol(n_seeds=4)
     figure = entropy_figure(rows)
-    figure.canvas.draw()
     axes = figure.axes[0]
     for place, framework in enumerate(FRAMEWORKS):
         left = [
@@ -60,7 +59,7 @@ def test_entropy_is_the_mean_over_seeds_in_its_band():
     assert "mean of 4 seeds" in figure.get_suptitle()
 
 
-def test_marks_are_at_the_mean_times_where_every_seed_has_one():
+def test_milestones_are_marked_only_if_every_seed_reached_them():
     rows = [trial("grid_shared", seed) for seed in range(3)]
     rows[0] |= {"t50": 100.0, "t90": None}
     rows[1] |= {"t50": 200.0, "t90": 700.0}
@@ -71,7 +70,7 @@ def test_marks_are_at_the_mean_times_where_every_seed_has_one():
     assert "t50 300 s, t90 in 2 of 3" in texts(axes)
 
 
-def test_a_single_trial_has_no_band_and_its_robots_lines():
+def test_a_single_trial_has_lines_of_its_robots_and_no_band():
     row = trial("grid_isolated", 0, n_robots=2)
     axes = entropy_figure([row]).axes[0]
     assert len(axes.collections) == 0
@@ -81,7 +80,7 @@ def test_a_single_trial_has_no_band_and_its_robots_lines():
         assert any(np.allclose(line, 100 * np.array(bits) / OBSERVABLE_BITS) for line in drawn)
 
 
-def test_bytes_are_labelled_with_their_total_and_their_ratio():
+def test_bandwidth_labels_give_total_and_ratio_to_e0():
     row = trial("gmm_shared", 0)
     final = {"bytes_over_time": 50e3, "raw_points_bytes_over_time": 2e6, "octree_bytes_over_time": 150e3}
     for field, total in final.items():
@@ -89,7 +88,6 @@ def test_bytes_are_labelled_with_their_total_and_their_ratio():
     row["draco_bytes_over_time"] = None
     alone = trial("grid_isolated", 0)
     figure = bandwidth_figure([row, alone])
-    figure.canvas.draw()
     said = texts(figure.axes[0])
     assert "E0, as sent\n50.0 kB" in said
     assert "E0's novel points, raw\n2.00 MB, 40.0× E0" in said
@@ -100,7 +98,7 @@ def test_bytes_are_labelled_with_their_total_and_their_ratio():
 
 
 @pytest.mark.parametrize("duration", [60.0, 1600.0])
-def test_the_axis_of_bytes_begins_where_the_first_were_sent(duration):
+def test_byte_axis_begins_at_the_first_bytes_sent(duration):
     rows = [trial(framework, 0, duration) for framework in ("gmm_shared", "grid_shared")]
     axes = bandwidth_figure(rows).axes[0]
     first = min(rows[0][f][1] for f in ("bytes_over_time", "octree_bytes_over_time"))
@@ -110,13 +108,13 @@ def test_the_axis_of_bytes_begins_where_the_first_were_sent(duration):
     assert bandwidth_figure(rows).axes[0].get_ylim()[0] > 10
 
 
-def test_draco_is_named_with_its_error():
+def test_draco_label_gives_its_error():
     rows = [trial("gmm_shared", 0)]
     assert "same points, Draco, 3 cm RMS\n" in texts(bandwidth_figure(rows).axes[0])
     assert "Draco, 2.5 cm RMS\n" in texts(bandwidth_figure(rows, draco_error=0.025).axes[0])
 
 
-def test_titles_say_what_is_drawn():
+def test_seeds_note_describes_seeds_and_missions():
     one, other = trial("gmm_shared", 3), trial("grid_shared", 3)
     assert seeds_note([one]) == "one mission of E0, seed 3"
     assert seeds_note([one, other]) == "one mission each, seed 3"
@@ -126,13 +124,13 @@ def test_titles_say_what_is_drawn():
     assert seeds_note([one, {**one, "seed": 4}, other]).startswith("mean of 1 to 2 seeds")
 
 
-def test_legends_lie_beneath_the_axes():
+def test_legends_are_below_the_axes():
     for figure in (entropy_figure([trial("gmm_shared", 0, 60.0)]), planner_comparison_figure(protocol(1))):
         figure.canvas.draw()
         assert figure.legends[0].get_window_extent().y1 < figure.axes[0].get_window_extent().y0
 
 
-def test_planners_are_measured_by_one_reference():
+def test_planners_share_one_reference_reduction():
     rows = planner_variants(n_seeds=2)
     for row in rows:  # by its own reduction even a poor planner reaches 90 %
         row["reference_bits"], row["t90"] = row["entropy_reduction_bits"], 1.0
@@ -144,7 +142,7 @@ def test_planners_are_measured_by_one_reference():
     assert "t90 1 s" not in said
 
 
-def test_variants_that_differ_by_planner_alone_are_named_by_it():
+def test_variants_that_differ_only_in_the_planner_are_named_by_it():
     rows = [trial("gmm_shared", 0, planner=name) for name in ("mcts", "frontier")]
     said = texts(planner_comparison_figure(rows).axes[0])
     assert "MCTS\n" in said
@@ -152,7 +150,7 @@ def test_variants_that_differ_by_planner_alone_are_named_by_it():
     assert "CSQMI" not in said
 
 
-def test_variants_that_differ_by_their_network_alone_have_lines_of_their_own():
+def test_variants_that_differ_only_in_their_network_have_separate_lines():
     rows = [trial("gmm_shared", seed, loss=loss, partitions=[]) for seed in (0, 1) for loss in (0.0, 0.3)]
     figure = planner_comparison_figure(rows)
     said = texts(figure.axes[0])
@@ -162,10 +160,9 @@ def test_variants_that_differ_by_their_network_alone_have_lines_of_their_own():
     assert "mean of 2 seeds" in figure.get_suptitle()
 
 
-def test_summary_has_a_dot_a_seed_and_paired_differences():
+def test_summary_draws_seeds_and_paired_differences():
     rows = protocol(n_seeds=3)
     figure = summary_bars(rows)
-    figure.canvas.draw()
     assert [axes.get_title() for axes in figure.axes[:4]] == [
         "bytes sent",
         "t90",
@@ -186,7 +183,7 @@ def test_summary_has_a_dot_a_seed_and_paired_differences():
     summary_bars([trial("grid_isolated", 0)]).canvas.draw()
 
 
-def test_summary_has_no_mean_of_the_lucky_seeds_alone():
+def test_summary_draws_no_mean_if_a_seed_has_no_value():
     rows = [trial(framework, seed) for framework in ("gmm_shared", "grid_shared") for seed in range(3)]
     rows[0]["t90"] = None
     above, beneath = (summary_bars(rows).axes[i] for i in (1, 5))
@@ -195,10 +192,9 @@ def test_summary_has_no_mean_of_the_lucky_seeds_alone():
     assert len(beneath.lines) == 1  # the line at zero
 
 
-def test_profile_is_in_milliseconds_a_simulated_second():
+def test_profile_is_in_milliseconds_per_simulated_second():
     stages = {"gmm_shared": {"sensing": 1.0, "mapping": 3.0}, "grid_shared": {"mapping": 2.0}}
     figure = profile_figure(stages, {"gmm_shared": 40.0, "grid_shared": 10.0})
-    figure.canvas.draw()
     axes = figure.axes[0]
     widths = [patch.get_width() for patch in axes.patches if patch.get_width() > 0]
     assert widths == pytest.approx([25, 75, 200])
@@ -212,7 +208,7 @@ def test_profile_is_in_milliseconds_a_simulated_second():
     )
 
 
-def test_labels_keep_apart_in_their_order_and_inside():
+def test_line_end_labels_keep_order_and_do_not_overlap():
     figure = new_figure(6, 4)
     axes = figure.subplots()
     axes.set(xlim=(0, 1), ylim=(0, 100))
@@ -226,7 +222,7 @@ def test_labels_keep_apart_in_their_order_and_inside():
     assert heights["a"] + heights["b"] + heights["c"] == pytest.approx(3 * 0.4966, abs=1e-2)
 
 
-def test_frameworks_have_one_name_and_colour():
+def test_frameworks_have_fixed_names_and_colours():
     assert [framework_colour(name) for name in FRAMEWORKS] == list(PALETTE[:3])
     assert framework_name("gmm_shared") == "E0 shared mixtures"
     assert framework_name("another_one") == "another one"
@@ -234,7 +230,7 @@ def test_frameworks_have_one_name_and_colour():
     entropy_figure(rows).canvas.draw()
 
 
-def test_says_what_is_wrong():
+def test_curve_errors_name_the_argument():
     for draw in (entropy_figure, bandwidth_figure, planner_comparison_figure, summary_bars, stage_means):
         with pytest.raises(InvalidArgumentError, match="rows is empty"):
             draw([])

@@ -1,4 +1,4 @@
-"""Explorations from above and in space: pixels are cells, and ellipsoids are where rays meet them."""
+"""Figures of explorations from above and in space, and the renderer against ray intersections."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def components(k: int, size: float = 0.5) -> tuple[torch.Tensor, torch.Tensor]:
 # -- from above -----------------------------------------------------------------------------------
 
 
-def test_top_view_is_the_highest_of_what_is_known_within_the_band():
+def test_highest_occupancy_uses_known_cells_within_the_band():
     theta = torch.full((2, 2, 4), 0.5)
     theta[0, 0] = torch.tensor([0.9, 0.1, 0.2, 0.5])
     theta[0, 1] = torch.tensor([0.5, 0.5, 0.505, 0.8])
@@ -48,7 +48,7 @@ def test_top_view_is_the_highest_of_what_is_known_within_the_band():
     assert truth.image.tolist() == [[1, 1], [1, 0]]
 
 
-def test_coverage_is_shaded_where_it_is():
+def test_coverage_is_shaded_by_the_number_of_robots():
     world = MapImage(torch.zeros(6, 4, dtype=torch.bool), (-1.0, 0.0), 0.5)
     world.image[5, 0] = True
     coverage = torch.zeros(6, 4, dtype=torch.int64)
@@ -69,7 +69,7 @@ def test_coverage_is_shaded_where_it_is():
 
 
 @pytest.mark.parametrize(("n_robots", "n_poses"), [(0, 5), (1, 0), (1, 1), (16, 5)])
-def test_any_number_of_robots_and_poses(n_robots, n_poses):
+def test_figures_accept_any_number_of_robots_and_poses(n_robots, n_poses):
     world = MapImage(torch.rand(5, 9), (0.0, 0.0), 1.0)
     coverage = torch.randint(0, n_robots + 1, (5, 9))
     paths = [path[:n_poses] for path in flights(n_robots, max(n_poses, 1))]
@@ -81,7 +81,7 @@ def test_any_number_of_robots_and_poses(n_robots, n_poses):
     assert named == [f"robot {i}" for i in range(min(n_robots, 7))]
 
 
-def test_team_map_outlines_the_components_of_the_layer():
+def test_team_map_outlines_components_within_the_band():
     view = highest_occupancy(torch.rand(8, 8, 6), (0, 0, 0), 0.5, (0.5, 2.0))
     means, covariances = components(40)
     snapshots = [
@@ -103,7 +103,7 @@ def test_team_map_outlines_the_components_of_the_layer():
     assert "between z = 0.5 m and 2 m" in figure.get_suptitle()
 
 
-def test_cells_are_called_what_the_belief_calls_them():
+def test_team_map_classifies_cells_by_the_belief_rule():
     view = MapImage(torch.tensor([[0.1, 0.3, 0.5, 0.6, 0.7]]), (0.0, 0.0), 1.0)
     free, unknown, occupied = (1.0, 1.0, 1.0), to_rgb(UNKNOWN), to_rgb("#2b2b2b")
     usual = [free, unknown, unknown, unknown, occupied]
@@ -116,7 +116,7 @@ def test_cells_are_called_what_the_belief_calls_them():
 
 
 @pytest.mark.parametrize(("height", "said"), [(1.0, []), (3.0, ["path above or below these heights"])])
-def test_paths_above_the_heights_shown_look_it(height, said):
+def test_paths_outside_the_band_have_a_white_core(height, said):
     world = MapImage(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
     poses = np.array([[1.0, 1, 1.0, 0], [3, 1, height, 0], [5, 1, 1.0, 0]])
     figure = trajectories_figure(world, [poses])
@@ -133,7 +133,7 @@ def test_paths_above_the_heights_shown_look_it(height, said):
     assert "path above or below these heights" in [t.get_text() for t in below.legends[0].get_texts()]
 
 
-def test_paths_between_poses_are_those_that_were_flown():
+def test_smooth_paths_follow_the_flown_trajectory():
     dynamics = Dynamics()
     library = Primitives(dynamics)
     state = torch.zeros(1, 7, dtype=torch.float64)
@@ -157,7 +157,7 @@ def test_paths_between_poses_are_those_that_were_flown():
     assert path[:, 2].max() == kept[:, 2].max()
 
 
-def test_paths_against_the_heading_or_without_one_are_straight():
+def test_smooth_paths_without_forward_heading_are_straight():
     poses = np.array([[0.0, 0, 1, math.pi], [2, 0, 1, math.pi], [2, 2, 1, 0]])
     for path in (smooth_path(poses[:, :2]), smooth_path(poses)):
         assert np.minimum(np.abs(path[:, 0] - 2), np.abs(path[:, 1])).max() < 1e-12
@@ -166,7 +166,7 @@ def test_paths_against_the_heading_or_without_one_are_straight():
 
 
 @pytest.mark.parametrize("n_robots", [1, 16])
-def test_legends_of_one_panel_fit(n_robots):
+def test_legends_fit_the_figure_width(n_robots):
     view = MapImage(torch.rand(12, 30), (0.0, 0.0), 1.0, (0.8, 1.8))
     paths = flights(n_robots, 30)
     for figure in (
@@ -178,7 +178,7 @@ def test_legends_of_one_panel_fit(n_robots):
         assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
-def test_maps_say_what_is_wrong():
+def test_map_errors_name_the_argument():
     world = MapImage(torch.zeros(3, 3), (0.0, 0.0), 1.0)
     with pytest.raises(InvalidArgumentError, match="coverage has shape"):
         trajectories_figure(world, [], torch.zeros(2, 3))
@@ -205,7 +205,7 @@ def test_camera_axes_are_a_right_handed_frame():
     assert Camera(0, 45).project(torch.tensor([0.0, 0.0, 1.0]))[1] > 0  # up is up
 
 
-def test_depth_is_where_rays_meet_the_nearest_quadric():
+def test_depth_matches_ray_quadric_intersection():
     means, covariances = components(12)
     camera = Camera(-70, 35)
     canvas = Canvas(-6.0, 6.0, -6.0, 6.0, 8.0)
@@ -233,7 +233,7 @@ def test_depth_is_where_rays_meet_the_nearest_quadric():
     assert float(error.quantile(0.95)) < 0.15  # steep rims
 
 
-def test_the_nearer_one_hides_the_other_and_light_comes_from_above():
+def test_nearer_ellipsoids_hide_farther_ones_and_light_comes_from_above():
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
     covariances = torch.eye(3).expand(2, 3, 3) * 0.25
     colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -248,7 +248,7 @@ def test_the_nearer_one_hides_the_other_and_light_comes_from_above():
     assert torch.equal(aside[0], torch.ones(80))  # background
 
 
-def test_flat_needle_like_and_point_like_components_are_drawn():
+def test_singular_components_are_visible():
     means = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [3.0, 3.0, 0.0]])
     covariances = torch.diag_embed(
         torch.tensor([[0.2, 0.2, 0.0], [1e-9, 1e-9, 0.3], [0.0, 0.0, 0.0], [0.0, 0.2, 0.2]])
@@ -261,7 +261,7 @@ def test_flat_needle_like_and_point_like_components_are_drawn():
         assert bool(torch.isfinite(picture.depth[row - 1 : row + 2, column - 1 : column + 2]).any())
 
 
-def test_what_hides_the_inside_is_left_out():
+def test_cutaway_removes_ceilings_and_near_walls():
     # A room seen from within: floor, ceiling, near and far wall, and a ball that has no side.
     means = torch.tensor([[0.0, 0, 0], [0, 0, 4], [2, 0, 2], [-2, 0, 2], [0, 0, 2]], dtype=torch.float64)
     thin = torch.tensor([[1, 1, 0.001], [1, 1, 0.001], [0.001, 1, 1], [0.001, 1, 1], [0.1, 0.1, 0.1]])
@@ -280,7 +280,7 @@ def test_what_hides_the_inside_is_left_out():
     assert "3 of 5 components" in figure.get_suptitle()
 
 
-def test_what_is_at_what_is_left_out_goes_with_it():
+def test_cutaway_removes_components_attached_to_removed_walls():
     # A near wall at x = 4 and a far one at −4, of ten flat pieces each, with a blob at each of them; and a
     # long bar from one to the other.
     z = torch.linspace(0.5, 3.5, 10, dtype=torch.float64)
@@ -295,7 +295,7 @@ def test_what_is_at_what_is_left_out_goes_with_it():
     assert ceiling == math.inf  # nothing is overhead
 
 
-def test_a_level_ceiling_is_cut_off_and_a_sloping_one_is_not():
+def test_cutaway_cuts_level_ceilings_only():
     x = torch.linspace(-8, 8, 40, dtype=torch.float64)
     floor, roof = (torch.stack([x, 0 * x, torch.full_like(x, z)], 1) for z in (0.0, 5.0))
     covariances = torch.diag_embed(torch.tensor([0.2, 0.2, 0.001], dtype=torch.float64)).expand(80, 3, 3)
@@ -308,7 +308,7 @@ def test_a_level_ceiling_is_cut_off_and_a_sloping_one_is_not():
         assert ceiling == pytest.approx(cut)
 
 
-def test_nothing_is_drawn_above_where_it_is_cut_off():
+def test_ellipsoids_are_cut_off_at_their_top():
     means = torch.tensor([[0.0, -2.0, 0.0], [0.0, 2.0, 0.0]])
     covariances = torch.eye(3).expand(2, 3, 3) * 0.25
     camera, canvas = Camera(0, 30), Canvas(-4.0, 4.0, -2.0, 2.0, 20.0)
@@ -323,7 +323,7 @@ def test_nothing_is_drawn_above_where_it_is_cut_off():
 
 
 @pytest.mark.parametrize("k", [0, 1, 30])
-def test_scene_by_height_and_by_robot(k):
+def test_scene_figure_accepts_any_number_of_components(k):
     means, covariances = components(k)
     figure = mixture_scene_figure(means, covariances, trajectories=flights(2, 20), max_pixels=300)
     figure.canvas.draw()
@@ -332,7 +332,7 @@ def test_scene_by_height_and_by_robot(k):
     assert named.get_suptitle() == "mine"
 
 
-def test_scene_is_the_same_every_time_and_far_from_the_origin():
+def test_rendering_is_deterministic_and_accurate_far_from_the_origin():
     means, covariances = components(20)
     far = means + torch.tensor([500e3, -500e3, 100.0])
     canvas = Canvas(-3.0, 3.0, -3.0, 3.0, 20.0)
@@ -348,7 +348,7 @@ def test_scene_is_the_same_every_time_and_far_from_the_origin():
     assert float((away.rgb[:100, :100] - first.rgb[:100, :100]).abs().mean()) < 1e-3
 
 
-def test_scene_says_what_is_wrong():
+def test_scene_errors_name_the_argument():
     means, covariances = components(3)
     with pytest.raises(InvalidArgumentError, match=r"a scene needs \(K, 3\)"):
         mixture_scene_figure(means[:, :2], covariances[:, :2, :2])

@@ -1,4 +1,4 @@
-"""What a recording says, rerun's own reader finds; without rerun, a clear error."""
+"""Recordings for rerun, read back with rerun's reader."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reas
 
 
 @needs_rerun
-def test_records_robots_map_mixture_and_curves(tmp_path):
+def test_recording_contains_robots_map_mixture_and_curves(tmp_path):
     from rerun.chunk import RrdReader
 
     covariances = torch.eye(3).expand(2, 3, 3) * 0.01
@@ -46,7 +46,7 @@ def test_records_robots_map_mixture_and_curves(tmp_path):
     assert "/world/robots/2" not in found
 
 
-def test_robots_are_numbered_from_zero():
+def test_recorded_robots_are_numbered_from_zero():
     stream = MagicMock()
     _log_robot(MagicMock(), stream, 0, flights(1, 3)[0], 1.0)
     names = {call.args[0] for call in stream.log.call_args_list}
@@ -54,11 +54,11 @@ def test_robots_are_numbered_from_zero():
 
 
 @needs_rerun
-def test_nothing_to_record_is_a_recording(tmp_path):
+def test_empty_recordings_are_written(tmp_path):
     assert record_rerun(tmp_path / "empty.rrd", [np.empty((0, 4))]).is_file()
 
 
-def test_says_what_is_wrong(tmp_path, monkeypatch):
+def test_recording_errors_name_the_argument(tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match=r"must end in \.rrd"):
         record_rerun(tmp_path / "mission.bag", [])
     with pytest.raises(InvalidArgumentError, match="period=0"):

@@ -1,4 +1,4 @@
-"""Figures of mixtures and of results."""
+"""Figures of mixtures and of classification results, and saving them."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize(("n", "k"), [(200, 5), (1, 1), (0, 0), (5, 0), (0, 3)])
-def test_mixture_figure(dim, n, k):
+def test_mixture_figure_states_the_numbers_drawn(dim, n, k):
     points = torch.randn(n, dim, generator=torch.Generator().manual_seed(1))
     figure = mixture_figure(points, *mixture(k, dim), origins=torch.zeros(1, dim))
-    figure.canvas.draw()
     title = figure.get_suptitle()
     assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}, {n} point{'s' * (n != 1)}"
     plane = figure.axes[dim - 2]
@@ -36,7 +35,7 @@ def test_mixture_figure(dim, n, k):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_of_many_components_the_heaviest_are_drawn_and_the_title_says_so(dim):
+def test_mixture_figure_draws_the_components_with_the_largest_weights(dim):
     means, covariances, _ = mixture(6, dim)
     weights = torch.tensor([0.1, 0.3, 0.0, 0.2, 0.3, 0.1])
     figure = mixture_figure(means, means, covariances, weights, max_components=3)
@@ -47,12 +46,12 @@ def test_of_many_components_the_heaviest_are_drawn_and_the_title_says_so(dim):
     np.testing.assert_allclose(centres, np.sort(means[[1, 3, 4], 0].numpy()), atol=1e-9)
 
 
-def test_a_mixture_of_arrays_and_of_identical_points():
+def test_mixture_figure_accepts_arrays_and_identical_points():
     points = np.ones((10, 2))
     mixture_figure(points, points[:1], np.zeros((1, 2, 2)), np.ones(1)).canvas.draw()
 
 
-def test_mixture_figure_says_what_is_wrong():
+def test_mixture_figure_errors_name_the_argument():
     means, covariances, weights = mixture(3, 2)
     with pytest.raises(InvalidArgumentError, match="weights has shape"):
         mixture_figure(means, means, covariances, weights[:2])
@@ -60,18 +59,16 @@ def test_mixture_figure_says_what_is_wrong():
         mixture_figure(means, means, covariances[:2], weights)
 
 
-def test_roc_figure():
+def test_roc_legend_gives_the_auc():
     curve = (np.array([0.0, 0.2, 1.0]), np.array([0.0, 0.9, 1.0]), 0.85)
     figure = roc_figure({"monte_carlo": curve, "grid": curve}, "lab")
-    figure.canvas.draw()
     texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert texts == ["chance, AUC 0.5", "monte carlo, AUC 0.8500", "grid, AUC 0.8500"]
     roc_figure({}).canvas.draw()
 
 
-def test_convergence_figure():
+def test_convergence_draws_each_fit():
     figure = convergence_figure({"fit": [-3.0, -2.0, -1.5], "none": [], "one": [-1.0]})
-    figure.canvas.draw()
     assert [len(line.get_xdata()) for line in figure.axes[0].lines] == [3, 1, 1, 1]
     convergence_figure({}).canvas.draw()
 
@@ -81,7 +78,7 @@ def row(method: str, resolution: float, kept: float, auc: float | None, **more: 
     return {**facts, "kept": kept, "auc": auc, **more}
 
 
-def test_auc_against_kept_has_a_panel_a_resolution_and_a_line_a_method():
+def test_auc_against_kept_draws_a_panel_per_resolution_and_a_line_per_method():
     rows = [
         row(method, resolution, kept, 0.9 * kept**0.1, auc_low=0.5, auc_high=0.95)
         for method in ("monte_carlo", "occupancy_grid")
@@ -89,7 +86,6 @@ def test_auc_against_kept_has_a_panel_a_resolution_and_a_line_a_method():
         for kept in (0.1, 1.0, 0.3)
     ]
     figure = auc_against_kept_figure([*rows, row("broken", 0.1, 0.5, None)], "lab")
-    figure.canvas.draw()
     assert [axes.get_title() for axes in figure.axes] == ["cells of 0.1 m", "cells of 0.02 m"]
     axes = figure.axes[0]
     assert axes.get_xscale() == "log"
@@ -100,14 +96,14 @@ def test_auc_against_kept_has_a_panel_a_resolution_and_a_line_a_method():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["monte carlo", "occupancy grid"]
 
 
-def test_auc_against_kept_tells_datasets_and_removals_apart():
+def test_auc_against_kept_separates_datasets_and_removals():
     rows = [row("a", 0.1, 1.0, 0.9), {**row("a", 0.1, 1.0, 0.8), "dataset": "hall", "removal": "scans"}]
     titles = [axes.get_title() for axes in auc_against_kept_figure(rows).axes]
     assert titles == ["hall, scans removed, cells of 0.1 m", "lab, beams removed, cells of 0.1 m"]
     auc_against_kept_figure([]).canvas.draw()
 
 
-def test_figures_are_saved_whole_or_not_at_all(tmp_path):
+def test_save_figure_writes_atomically_and_checks_the_suffix(tmp_path):
     figure = roc_figure({})
     path = save_figure(figure, tmp_path / "new" / "roc.png")
     assert path.read_bytes().startswith(b"\x89PNG")
@@ -137,6 +133,6 @@ assert "matplotlib.pyplot" not in sys.modules
 
 
 @pytest.mark.slow
-def test_pyplot_is_never_imported_and_nothing_before_it_is_used(tmp_path):
+def test_figures_never_import_pyplot(tmp_path):
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Labels beside what they name: on no mark, on no line, on no other label, and inside of the axes."""
+"""Placement of labels beside marks."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def is_under(points: np.ndarray, box) -> bool:
     return bool(((points > box.min) & (points < box.max)).all(1).any())
 
 
-@given(st.lists(st.floats(0, 1), min_size=4, max_size=6), st.booleans())
-@settings(max_examples=8)
-def test_there_is_room_for_labels_along_two_lines(heights, has_legend):
+@given(st.lists(st.floats(0, 1), min_size=4, max_size=5), st.booleans())
+@settings(max_examples=4)
+def test_labels_do_not_overlap_marks_lines_or_labels(heights, has_legend):
     figure = new_figure(7.0, 5.0)
     axes = figure.subplots()
     x = np.arange(1.0, len(heights) + 1)
@@ -52,7 +52,7 @@ def test_there_is_room_for_labels_along_two_lines(heights, has_legend):
         assert np.abs((box.min + box.max) / 2 - mark).max() < 60  # beside its own mark
 
 
-def test_where_nothing_is_free_the_least_is_covered():
+def test_labels_are_drawn_without_free_space():
     figure = new_figure(3.0, 3.0)
     axes = figure.subplots()
     axes.set(xlim=(0, 1), ylim=(0, 1))

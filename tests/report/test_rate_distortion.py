@@ -1,4 +1,4 @@
-"""Leads of curves whose crossings are known, and the figure."""
+"""Leads of curves with known crossings, and the figure of codecs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rows_of(curves: dict[str, list[tuple[float, float]]], dataset: str = "room")
     ]
 
 
-def test_a_crossing_is_found_where_the_lines_cross():
+def test_lead_ends_at_the_crossing_of_curves():
     # In log2 bytes: ours 50 + 2 (x − 5), the other 44 + 4 (x − 5): equal at x = 8.
     curves = {"ours": [(32, 50.0), (1024, 60.0)], "octree": [(32, 44.0), (1024, 64.0)]}
     lead = leads(rows_of(curves), "psnr2_db")
@@ -35,7 +35,7 @@ def test_a_crossing_is_found_where_the_lines_cross():
     assert lead.ended_by == "octree"
 
 
-def test_the_best_of_the_others_counts_and_who_is_left_out_does_not():
+def test_lead_compares_with_the_best_codec_that_is_not_left_out():
     curves = {
         "ours": [(100, 50.0), (800, 80.0)],
         "raw": [(12_000, math.inf)],
@@ -51,7 +51,7 @@ def test_the_best_of_the_others_counts_and_who_is_left_out_does_not():
     assert leads(rows_of(curves), "psnr2_db", left_out=("octree", "draco")).most == pytest.approx(120)
 
 
-def test_settings_that_a_smaller_one_beats_are_no_part_of_a_curve():
+def test_curves_skip_settings_that_a_smaller_one_beats():
     curves = {
         "ours": [(100, 50.0), (150, 40.0), (800, 80.0)],
         "octree": [(300, 50.0), (350, 45.0), (900, 80.0)],
@@ -60,7 +60,7 @@ def test_settings_that_a_smaller_one_beats_are_no_part_of_a_curve():
     assert leads(rows_of(curves), "auc") == leads(rows_of(without), "auc")
 
 
-def test_other_ways_to_write_our_components_are_no_rivals():
+def test_lead_ignores_other_encodings_of_our_components():
     curves = {"ours": [(100, 50.0), (800, 80.0)], "ours_without_counts": [(90, 50.0), (700, 80.0)]}
     with pytest.raises(InvalidArgumentError, match="no other codec"):
         leads(rows_of(curves), "auc")
@@ -69,7 +69,7 @@ def test_other_ways_to_write_our_components_are_no_rivals():
     assert leads(rows_of({**curves, "thesis": [(700, 50.0), (5600, 80.0)]}), "auc").most == pytest.approx(7)
 
 
-def test_bytes_for_a_quality_are_straight_in_their_logarithm():
+def test_bytes_for_a_quality_interpolate_logarithms():
     rows = rows_of({"octree": [(100, 50.0), (200, 60.0), (300, 55.0), (800, 70.0)]})
     for value, expected in ((40, 100), (50, 100), (55, 100 * 2**0.5), (60, 200), (65, 400), (70, 800)):
         assert bytes_for(rows, "octree", "auc", value) == pytest.approx(expected)
@@ -84,7 +84,7 @@ points = st.lists(
 
 @settings(max_examples=60)
 @given(ours=points, octree=points, draco=points)
-def test_within_a_lead_no_setting_of_another_is_both_smaller_and_as_good(ours, octree, draco):
+def test_no_other_setting_is_smaller_and_as_good_within_a_lead(ours, octree, draco):
     """Point by point: a setting of another within the lead, better than our curve there, contradicts it."""
     lead = leads(rows_of({"ours": ours, "octree": octree, "draco": draco}), "auc")
     if not lead.octaves:
@@ -103,7 +103,7 @@ def _slope(bytes_: np.ndarray, quality: np.ndarray) -> float:
     return float((np.diff(quality) / np.diff(bytes_)).max() * (bytes_[-1] - bytes_[0]) / 399)
 
 
-def test_the_figure_has_a_line_for_each_codec_and_shades_the_lead():
+def test_rate_distortion_draws_codecs_and_shades_the_lead():
     curves = {
         "ours": [(100, 50.0), (800, 80.0)],
         "octree": [(400, 50.0), (900, 90.0)],

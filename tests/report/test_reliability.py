@@ -13,7 +13,7 @@ from gmmtorch.report.style import save_figure
 CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
 
 
-def test_a_line_a_method_in_both_panels_with_its_error_in_the_legend():
+def test_reliability_draws_each_method_in_both_panels():
     curves = {"point": CURVE, "occupancy_grid": CURVE._replace(observed=CURVE.predicted)}
     figure = reliability_figure(curves, title="Kinect, 0.05 m")
     upper, lower = figure.axes
@@ -27,7 +27,7 @@ def test_a_line_a_method_in_both_panels_with_its_error_in_the_legend():
     assert figure.get_suptitle() == "Kinect, 0.05 m"
 
 
-def test_fuller_bins_have_larger_markers():
+def test_reliability_markers_grow_with_the_share_of_points():
     figure = reliability_figure({"point": CURVE})
     (markers,) = [c for c in figure.axes[0].collections if len(c.get_sizes()) == 3]
     sizes = markers.get_sizes()
@@ -35,13 +35,13 @@ def test_fuller_bins_have_larger_markers():
 
 
 @pytest.mark.parametrize("n_methods", [1, 9])
-def test_any_number_of_methods_can_be_saved(n_methods, tmp_path):
+def test_reliability_accepts_any_number_of_methods(n_methods, tmp_path):
     single = Reliability(np.array([0.5]), np.array([1.0]), np.array([7]))
     figure = reliability_figure({f"method_{i}": single for i in range(n_methods)})
     path = save_figure(figure, tmp_path / "reliability.png")
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_no_curve_is_an_error():
+def test_reliability_needs_a_curve():
     with pytest.raises(InvalidArgumentError, match="curves is empty"):
         reliability_figure({})

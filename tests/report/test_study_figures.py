@@ -1,4 +1,4 @@
-"""Figures of the occupancy studies: what they draw, and the regions they choose."""
+"""Figures of the occupancy studies, and the regions they select."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def memory_rows() -> list[dict]:
     ]
 
 
-def test_every_method_has_a_line_through_its_sizes():
+def test_auc_memory_draws_each_method_through_its_sizes():
     (figure,) = auc_memory.figures(memory_rows()).values()
     (axes,) = figure.axes
     lines = {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
@@ -40,7 +40,7 @@ def test_every_method_has_a_line_through_its_sizes():
     assert axes.get_xscale() == "log"
 
 
-def test_thresholds_are_drawn_a_line_a_size():
+def test_variance_threshold_draws_a_line_per_number_of_components():
     rows = [
         {
             "dataset": "hall",
@@ -62,7 +62,7 @@ def test_thresholds_are_drawn_a_line_a_size():
     assert all(len(line.get_ydata()) == 0 for line in thin.lines)
 
 
-def test_cells_are_those_that_the_threshold_calls_occupied(generator):
+def test_cells_figure_shows_cells_classified_occupied(generator):
     def occupancy(points: torch.Tensor) -> torch.Tensor:
         return torch.where(points[:, 2] < 0.5, 0.99, 0.8).double()  # variances 0.0099 and 0.16
 
@@ -78,7 +78,7 @@ def test_cells_are_those_that_the_threshold_calls_occupied(generator):
         assert {"x [m]", "y [m]"} < {text.get_text() for text in axes.texts}
 
 
-def test_the_closest_look_is_where_most_thin_points_are():
+def test_closest_look_contains_the_most_thin_points():
     thin = torch.tensor([[x, 9.0, 1.0] for x in torch.linspace(8.2, 9.8, 50)] + [[1.0, 1.0, 1.0]])
     hits = torch.cat([thin, torch.tensor([[9.0, 9.0, 3.0]])]).double()
     low, high = variance_threshold.closest_look(thin.double(), hits, side=4.0)
@@ -88,7 +88,7 @@ def test_the_closest_look_is_where_most_thin_points_are():
     assert high[2] > 2.5
 
 
-def test_busy_regions_hold_the_most_surface_and_lie_apart(generator):
+def test_busiest_regions_contain_the_most_surface_and_are_not_adjacent(generator):
     def uniform(n: int) -> torch.Tensor:
         return torch.rand(n, 2, generator=generator, dtype=torch.float64)
 

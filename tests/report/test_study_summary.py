@@ -1,4 +1,4 @@
-"""The summary of a study, beside means and Student's intervals worked out by hand."""
+"""The summary of a study against means and intervals from scipy."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def cells(text, title):
     return [cell.strip() for cell in line.strip("|").split("|")][1:]
 
 
-def test_means_ranges_and_how_many_have_a_value():
+def test_summary_gives_means_ranges_and_numbers_of_values():
     first = study_summary(rows()).split("\n\n")[0]
     assert first.splitlines()[0] == "| 3 seeds: mean (range) | E0 | E1 |"
     assert cells(first, "AUC, all observable cells") == ["0.978 (0.976 to 0.980)", "0.977 (0.975 to 0.979)"]
@@ -42,7 +42,7 @@ def test_means_ranges_and_how_many_have_a_value():
     assert "overlap" not in first
 
 
-def test_differences_are_those_of_pairs():
+def test_summary_differences_are_paired_intervals():
     second = study_summary(rows()).split("\n\n", 1)[1]
     difference = np.subtract(AUC["gmm_shared"], AUC["grid_shared"])
     low, high = stats.t.interval(0.95, 2, difference.mean(), stats.sem(difference))
@@ -53,21 +53,21 @@ def test_differences_are_those_of_pairs():
     assert cells(second, "collisions") == ["0"]
 
 
-def test_seeds_are_paired_whatever_their_order():
+def test_summary_pairs_seeds_in_any_order():
     shuffled = rows()
     assert cells(study_summary(shuffled[::-1]).split("\n\n", 1)[1], "AUC, all observable cells") != []
     one, other = study_summary(shuffled), study_summary([*shuffled[2::-1], *shuffled[3:]])
     assert one == other
 
 
-def test_many_variants_are_compared_with_the_first():
+def test_summary_compares_many_variants_with_the_first():
     lossy = [row for loss in (0.0, 0.1, 0.3, 0.5) for row in rows(("gmm_shared",), loss=loss)]
     text = study_summary(lossy)
     heads = [line for line in text.splitlines() if "−" in line and line.startswith("|  |")]
     assert heads == ["|  | 10 % lost − lossless | 30 % lost − lossless | 50 % lost − lossless |"]
 
 
-def test_a_name_does_not_divide_its_column():
+def test_summary_escapes_vertical_bars_in_names():
     cut = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
     text = study_summary([*rows(("gmm_shared",), partitions=[]), *rows(("gmm_shared",), partitions=[cut])])
     head, rule = text.splitlines()[:2]
@@ -75,10 +75,10 @@ def test_a_name_does_not_divide_its_column():
     assert head.replace("\\|", "").count("|") == rule.count("|")
 
 
-def test_one_seed_has_nothing_to_compare():
+def test_summary_of_one_seed_has_no_differences():
     assert "Differences" not in study_summary([row for row in rows() if row["seed"] == 1])
 
 
-def test_no_row_is_refused():
+def test_summary_needs_a_row():
     with pytest.raises(InvalidArgumentError, match="rows"):
         study_summary([])

@@ -1,4 +1,4 @@
-"""The picture of a team of processes: what its lines and bars say."""
+"""The figure of a team of processes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def row(robot: int, explores: bool = True, **changes: Any) -> dict[str, Any]:
     return {**made, **changes}
 
 
-def test_robots_in_a_world_have_lines_of_the_entropy_left():
+def test_team_run_draws_remaining_entropy_of_exploring_robots():
     left, right = team_run_figure([row(0), row(3)]).axes
     assert "remaining entropy" in left.get_ylabel()
     assert left.lines[1].get_xdata().tolist() == [0.0, 10.0, 20.0]
@@ -38,13 +38,13 @@ def test_robots_in_a_world_have_lines_of_the_entropy_left():
     assert [label.get_text() for label in right.get_yticklabels()] == ["robot 0", "robot 3"]
 
 
-def test_others_have_lines_of_their_records():
+def test_team_run_draws_records_of_other_robots():
     left, _ = team_run_figure([row(0), row(1, explores=False)]).axes
     assert left.get_ylabel() == "number of records"
     assert left.lines[1].get_ydata().tolist() == [0.0, 50.0, 81.0]
 
 
-def test_bars_end_where_the_bytes_do_and_kinds_that_nobody_sent_are_left_out():
+def test_team_run_stacks_bytes_by_kind_without_empty_kinds():
     figure = team_run_figure([row(0), row(1)])
     _, right = figure.axes
     components, plans = right.containers
@@ -62,12 +62,12 @@ def test_bars_end_where_the_bytes_do_and_kinds_that_nobody_sent_are_left_out():
         ([row(0), row(1, digest="cd")], "2 robots with different maps"),
     ],
 )
-def test_the_title_says_what_it_is_of(rows, title):
+def test_team_run_title_compares_the_maps(rows, title):
     assert team_run_figure(rows).get_suptitle() == title
     assert team_run_figure(rows, "Mine").get_suptitle() == "Mine"
 
 
-def test_any_team_can_be_drawn(tmp_path):
+def test_team_run_accepts_silent_and_large_teams(tmp_path):
     silent = row(0, bytes_by_kind={}, times=[0.0], entropy_bits=[200.0])
     save_figure(team_run_figure([silent]), tmp_path / "silent.png")
     generator = np.random.default_rng(0)

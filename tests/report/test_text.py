@@ -1,4 +1,4 @@
-"""Tables, byte by byte, and progress bars on standard error."""
+"""Tables, byte texts and progress bars."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_table_is_aligned():
     ]
 
 
-def test_columns_are_chosen_and_ordered_and_gaps_are_dashes():
+def test_table_selects_columns_and_shows_missing_values_as_dashes():
     rows = [{"b": 1, "a": "x"}, {"a": "longer"}]
     assert format_table(rows, ["a", "b", "c"]) == ("a       b  c\n------  -  -\nx       1  -\nlonger  -  -")
     assert format_table(rows).splitlines()[0] == "b  a"
@@ -46,7 +46,7 @@ def test_columns_are_chosen_and_ordered_and_gaps_are_dashes():
         ("path", "two\nlines", "two lines"),
     ],
 )
-def test_values(name, value, text):
+def test_values_are_formatted_by_their_column(name, value, text):
     assert format_value(name, value) == text
 
 
@@ -63,11 +63,11 @@ def test_values(name, value, text):
         (5e15, "5000 TB"),
     ],
 )
-def test_bytes(n_bytes, text):
+def test_bytes_have_si_units(n_bytes, text):
     assert byte_text(n_bytes) == text
 
 
-def test_bytes_of_ticks_and_ratios():
+def test_tick_bytes_and_ratios_have_few_digits():
     assert [byte_text(v, digits=1) for v in (1e4, 1e6, 1e8)] == ["10 kB", "1 MB", "100 MB"]
     assert [ratio_text(v) for v in (58.04, 3.0, 123.4, 0.5, 0)] == [
         "58.0×",
@@ -78,7 +78,7 @@ def test_bytes_of_ticks_and_ratios():
     ]
 
 
-def test_bars_open_and_close_with_their_stages(capsys):
+def test_progress_bars_open_and_close_with_stages(capsys):
     with ProgressBars() as progress:
         progress("fit", 0, 3)
         progress("query", 1, None)
@@ -95,7 +95,7 @@ def test_bars_open_and_close_with_their_stages(capsys):
     assert "fit" in captured.err
 
 
-def test_bars_close_on_an_error_and_are_quiet_when_disabled(capsys):
+def test_progress_bars_close_on_errors_and_can_be_disabled(capsys):
     progress = ProgressBars()
 
     def work():
