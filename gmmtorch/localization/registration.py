@@ -1,4 +1,4 @@
-"""Registration: the rigid motion that lays one mixture over another, without points or correspondences."""
+"""Registration: the rigid motion that aligns one mixture with another, without points or correspondences."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.overlap import Motions
-from gmmtorch.localization.overlap_ascent import Ascent, deviations, log_self_overlap
+from gmmtorch.localization.overlap import Ascent, Motions, deviations, log_self_overlap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.merge import simplify
@@ -30,19 +29,19 @@ _AMBIGUOUS = 0.9  # share of the best score
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What `register` found.
+    """The result of `register`.
 
     transform: (D+1, D+1), target ← source.
     score: S(T) = ∫ f(T⁻¹x) g(x) dx of the mixtures, weights adding up to one, m⁻ᴰ.
     overlap: S over the geometric mean of both mixtures' own, 0 to 1 (Cauchy–Schwarz).
     hessian: (F, F), −∇² log S (approximate, see `Overlap`) in a shift v (m, F = D + D(D−1)/2) and a turn ω
         (rad) of the moved source about its mean. Its inverse is the shape of the peak, not a covariance of
-        the error: how much of two scans is the same surface it does not know.
+        the error, because it does not depend on how much of both scans is the same surface.
     width: metres that the source can slide, or turn at its radius, in its loosest direction before S falls
         to 61 % (1/√ of the least eigenvalue of the Hessian).
     n_iterations: evaluations of the score, over all levels.
     converged: whether the last step was below the tolerance.
-    reliable: whether none of `doubts` was found; they say what speaks against the result.
+    doubts: reasons against the result; it is `reliable` if there are none.
     """
 
     transform: Tensor
@@ -74,23 +73,23 @@ def register(
 
         S(T) = Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j + s² I)
 
-    Coarse to fine: s falls from `coarsest` by halves to `finest`, and on each level components that look
-    alike under its blur are merged first, so that coarse levels are small. A level climbs log S by Newton's
-    steps on SE(3) or SE(2), by Fisher's where the Hessian is indefinite, each cut until the score rises.
-    Pairs beyond four deviations are left out.
+    Coarse to fine: s is halved from `coarsest` to `finest`. On each level, components that are similar under
+    the blur are merged first, so coarse levels are small. A level climbs log S by Newton's steps on SE(3) or
+    SE(2), by Fisher's steps if the Hessian is indefinite; each is cut until the score rises. Pairs beyond
+    four deviations are left out.
 
     Args:
-        source, target: maps, components, or (means, covariances, weights). Components of beams without
-            return are left out.
-        initial: (D+1, D+1), or (B, D+1, D+1) to try several starts at once, of which the best wins (see
-            `yaw_starts`); the identity if not given.
-        coarsest: s at first (m): about how far the initial pose may be off. None: an eighth of the
+        source, target: maps, components, or (means, covariances, weights). `max_range` components are left
+            out.
+        initial: (D+1, D+1), or (B, D+1, D+1) for several starts, of which the best wins (see `yaw_starts`).
+            None: the identity.
+        coarsest: first s (m), about the error of the initial pose. None: an eighth of the
             smaller mixture's radius (root mean square).
-        finest: s at last (m). None: the least deviation that half of the components exceed.
+        finest: last s (m). None: the median of the components' smallest deviations.
         max_iterations: of a level.
         tolerance: metres, also of a turn at the mixture's radius, below which a step ends a level.
         weighting: π by "area", √(λ₁λ₂) of the largest eigenvalues (√λ₁ in 2D), or by "support", the points
-            that each stands for. Points crowd near the sensor, and would lay sensor on sensor.
+            of each. Points are densest near the sensor, so supports would put sensor on sensor.
 
     Raises:
         InvalidArgumentError: no component with a surface; 2D against 3D; an initial pose that is not
@@ -108,7 +107,7 @@ def register(
             check_number(name, value, above=name != "finest")
     check_whole("max_iterations", max_iterations, 1)
     start = _starts(initial, dim).to(f.means.device)
-    # Both are worked on about their own means: near the origin, wherever in the world they are.
+    # Both are centred on their means, so that numbers stay small anywhere in the world.
     (f, here), (g, there) = _centered(f), _centered(g)
     motions = _between(start, here, there)
     radius = min(_radius(f), _radius(g))
@@ -117,7 +116,7 @@ def register(
     n_evaluated, climbed = 0, motions
     for number, blur in enumerate(blurs):
         if len(start) == 1 and number == _SECOND_CHANCE:
-            climbed = climbed.joined(motions)  # should a coarser level have led astray
+            climbed = climbed.joined(motions)  # in case a coarser level climbed a wrong peak
         last = number == len(blurs) - 1
         ascent = Ascent(_level(f, blur), _level(g, blur), radius)
         accuracy = tolerance if last else max(tolerance, _COARSELY * blur)
@@ -209,7 +208,7 @@ def _blurs(
 
 
 def _level(mixture: Parameters, blur: float) -> Parameters:
-    """Half of s² I added to every covariance, and then merged what looks alike."""
+    """The mixture with ½ s² I added to every covariance, and similar components merged."""
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
     blurred = mixture._replace(covariances=mixture.covariances + 0.5 * blur**2 * eye)
     return simplify(blurred, max_cost=_ALIKE, cost="hellinger", most_exact=0).parameters
@@ -252,7 +251,9 @@ def _world(motions: Motions, here: Tensor, there: Tensor) -> Tensor:
 
 
 def _promising(motions: Motions, log_score: Tensor, radius: float, apart: float) -> Tensor:
-    """Few motions by falling score, none within `apart` (m) of a better one or far below the best."""
+    """The best motions by falling score, without those within `apart` (m) of a better one or far below
+    the best.
+    """
     order = log_score.argsort(descending=True, stable=True)
     rotations, translations = motions.at(order)
     turn = torch.linalg.matrix_norm(rotations[:, None] - rotations) / math.sqrt(2)
@@ -271,7 +272,7 @@ def _width(hessian: Tensor, scale: Tensor) -> float:
 
 
 def _doubts(share: Tensor, width: float, radius: float, converged: bool) -> tuple[str, ...]:
-    """What speaks against a result; shares (B,) are the overlaps of the poses reached, the best first."""
+    """Reasons against a result; shares (B,) are the overlaps of the final poses, best first."""
     doubts = []
     if not converged:
         doubts.append("the last step was longer than the tolerance, or no component was near another")

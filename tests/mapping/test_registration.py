@@ -15,8 +15,7 @@ from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.overlap import Motions, Pairs, generators, overlap
-from gmmtorch.localization.overlap_ascent import Ascent
+from gmmtorch.localization.overlap import Ascent, Motions, Pairs, generators, overlap
 from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -1,21 +1,21 @@
-"""A component's mean and covariance on a lattice that fits its own shape.
+"""Rounding of means and covariances to a lattice that follows the shape of each component.
 
-Error is measured in a component's own deviations, so that a sheet 1 m wide and 5 mm thick keeps its
-place to a millimetre across and to decimetres along, whichever way it lies. With the axes ordered by
+Errors are measured in a component's own deviations: a sheet 1 m wide and 5 mm thick keeps its place to a
+millimetre across and to decimetres along, in any orientation. With the axes ordered by
 falling deviation (pivoting), Σ = L diag(d²) Lᵀ, L unit lower triangular with |L_ij| ≤ 1, d₁ ≥ d₂ ≥ d₃.
 Then, with p = `PRECISION`:
 
 - each d_i is a power of 2^(1/`PER_OCTAVE`), and off by half a step at most;
 - each L_ij is a multiple of a power of two in (½, 1] 2⁻ᵖ d_i/d_j. A row is rounded given the rounded rows
-  above it, so that errors do not build up;
+  above it, so errors do not accumulate;
 - the mean on axis i is a multiple of a power of two in (½, 1] 2⁻ᵖ d_i. An axis is rounded given the
-  rounded ones before it: where a mean moves along a sheet, it moves on the sheet.
+  rounded axes before it: a mean that moves along a sheet stays on the sheet.
 
 So, in the rounded component's deviations, a mean is off by at most 2⁻ᵖ⁻¹ along each of D axes
 (`MEAN_ERROR`), and so is L below its diagonal (`SHEAR_ERROR`; L₃₁ by up to 2⁻²ᵖ⁻² more). The deviation in
 any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, whatever the component's shape.
-What is restored is positive definite by construction. The lattice is anchored in the world: what a
-component becomes depends neither on its company nor on a frame, and rounding again changes nothing.
+Restored covariances are positive definite by construction. The lattice is fixed in the world frame: the
+result depends on the component only, and rounding again changes nothing.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ LARGEST_DEVIATION = 20 * PER_OCTAVE
 LEAST_DEVIATION = -20 * PER_OCTAVE
 """Steps: 2⁻²⁰ m, a micrometre. Smaller ones become this."""
 LARGEST_RATIO = 20 * PER_OCTAVE
-"""Steps: deviations less than 2⁻²⁰ of the component's largest become that, as double precision tells
-smaller ones from none no more."""
+"""Steps: deviations below 2⁻²⁰ of the component's largest are raised to it; double precision cannot
+represent smaller ones."""
 LARGEST_VARIANCE = 4.0 ** (LARGEST_DEVIATION / PER_OCTAVE)
 """m², along each axis of the world."""
 FARTHEST = 2.0**27
 """Metres from the world's origin to a mean on each axis, at most."""
 STEEPEST = 2
-"""|L_ij| at most; 1 up to rounding where a covariance is definite."""
+"""Largest |L_ij|; 1 up to rounding if the covariance is definite."""
 
 AXIS_ORDERS = {dim: torch.tensor(list(itertools.permutations(range(dim)))) for dim in (2, 3)}
 
-# Literals, and of powers of two exact ones: the same bits on every machine.
+# Literals and exact powers of two: the same bits on every machine.
 _ROOTS = torch.tensor([1.0, 1.189207115002721, 1.4142135623730951, 1.6817928305074292], dtype=torch.float64)
 _EXP2 = torch.tensor([2.0**e for e in range(-256, 256)], dtype=torch.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Places on the lattice, int64: axis_order (K,), an index into `AXIS_ORDERS`; and by falling
-    deviation deviation (K, D), log2 in steps; shear (K, D(D−1)/2): L₂₁, L₃₁, L₃₂; mean (K, D)."""
+    """Points of the lattice, int64: axis_order (K,), an index into `AXIS_ORDERS`; then, by falling deviation,
+    deviation (K, D), log2 in steps; shear (K, D(D−1)/2): L₂₁, L₃₁, L₃₂; mean (K, D)."""
 
     axis_order: Tensor
     deviation: Tensor
@@ -86,8 +86,8 @@ class Lattice:
         return Lattice(self.axis_order[rows], self.deviation[rows], self.shear[rows], self.mean[rows])
 
     def is_valid(self) -> Tensor:
-        """Which (K,) are within bounds: deviations that do not rise, shears that are not too steep, and no
-        mean or variance along the world's axes that is too large."""
+        """Which rows (K,) are within bounds: deviations that do not rise, shears up to `STEEPEST`, and
+        means and variances within the largest ones along the world axes."""
         falling = (self.deviation[:, 1:] <= self.deviation[:, :-1]).all(1)
         ratio = self.deviation[:, 0] - self.deviation[:, -1] <= LARGEST_RATIO
         inside = (self.deviation[:, 0] <= LARGEST_DEVIATION) & (self.deviation[:, -1] >= LEAST_DEVIATION)
@@ -118,7 +118,7 @@ class Lattice:
 
 
 def nearest(means: Tensor, covariances: Tensor) -> Lattice:
-    """Where means (K, D) and covariances (K, D, D), float64 on the CPU, go on the lattice.
+    """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU.
 
     Covariances that are not quite positive definite become so. Raises `InvalidArgumentError` beyond
     `FARTHEST` and `LARGEST_DEVIATION`, or where rounding leads there: what is returned `is_valid`.
@@ -129,8 +129,8 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
         return exact
     order = _pivots(covariances)
     rounded = _rounded(means, covariances, order)
-    # Of several axis orders that restore the same component the first is taken, whatever order the
-    # component came in with: so the bytes of what was rounded before are the same again.
+    # If several axis orders restore the same component, the first is used, so that rounding a rounded
+    # component gives the same bytes.
     earlier = _exact(*rounded.restored(), before=order)
     return _within_bounds(_replaced(_replaced(rounded, *earlier), exact, rows), means, covariances)
 
@@ -168,7 +168,7 @@ def _check(means: Tensor, covariances: Tensor) -> None:
 
 
 def _within_bounds(places: Lattice, means: Tensor, covariances: Tensor) -> Lattice:
-    """The places, if they are within bounds: what they stand for is, but perhaps only just."""
+    """The lattice points, if they are within bounds; rounding may exceed a bound."""
     bad = ~places.is_valid()
     if bool(bad.any()):
         first = int(bad.nonzero()[0])
@@ -181,10 +181,10 @@ def _within_bounds(places: Lattice, means: Tensor, covariances: Tensor) -> Latti
 
 
 def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> tuple[Lattice, Tensor]:
-    """Those components that are on the lattice as they are, in the first axis order in which they are; and
-    their rows (J,), rising. Only axis orders before some (K,) are tried, if they are given."""
+    """The components that are exactly on the lattice, in their first possible axis order, and their rows
+    (J,) in rising order. `before` (K,): try only axis orders before these."""
     k, dim = means.shape
-    # The first axis of such an order has a variance that the lattice has: of most components few do.
+    # The variance of the first axis must be a lattice value: this excludes most orders.
     variances = covariances.diagonal(dim1=1, dim2=2)
     least, largest = LEAST_DEVIATION, LARGEST_DEVIATION
     steps = (torch.log2(variances.clamp_min(1e-300)) * (PER_OCTAVE / 2)).round().long().clamp(least, largest)
@@ -212,7 +212,7 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
     variances, shears = _factors(covariances[_pairs(axes)])
     steps = (torch.log2(variances) * (PER_OCTAVE / 2)).round().long()
     steps = torch.maximum(steps, steps[:, :1] - LARGEST_RATIO).clamp_min(LEAST_DEVIATION)
-    steps = steps.cummin(1).values  # of two that are equal the second may be the larger by a rounding error
+    steps = steps.cummin(1).values  # equal deviations may differ by a rounding error
     blank = Lattice(axis_order, steps, steps.new_zeros(len(mean), shears.shape[1]), torch.zeros_like(steps))
 
     e = shear_exponents(steps)
@@ -236,7 +236,9 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
 
 
 def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
-    """d² (K, D) and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances; d² at least what the lattice has."""
+    """d² (K, D) and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances; d² is at least the smallest of the
+    lattice.
+    """
     least = 4.0 ** (LEAST_DEVIATION / PER_OCTAVE)
     v1 = ordered[:, 0, 0].clamp_min(least)
     floor = (v1 * 4.0 ** (-LARGEST_RATIO / PER_OCTAVE)).clamp_min(least)
@@ -251,14 +253,14 @@ def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _replaced(places: Lattice, others: Lattice, rows: Tensor) -> Lattice:
-    """The places with those of these rows (J,) replaced."""
+    """The lattice points with rows (J,) replaced by others."""
     return Lattice(
         *(getattr(places, f.name).index_copy(0, rows, getattr(others, f.name)) for f in fields(Lattice))
     )
 
 
 def _pivots(covariances: Tensor) -> Tensor:
-    """The axis order (K,) of complete pivoting: always the axis of which most is unexplained yet."""
+    """The axis order (K,) of complete pivoting: next is the axis with the largest remaining variance."""
     k, dim = covariances.shape[:2]
     rows = torch.arange(k)
     variances = covariances.diagonal(dim1=1, dim2=2)
@@ -277,10 +279,10 @@ def _to_steps(values: Tensor, exponents: Tensor) -> Tensor:
 
 
 def _to_shears(values: Tensor, exponents: Tensor) -> Tensor:
-    """Shears in whole steps, none steeper than `STEEPEST`: those of covariances that are not definite."""
+    """Shears in whole steps, limited to `STEEPEST`; only indefinite covariances exceed it."""
     return _to_steps(values.clamp(-STEEPEST, STEEPEST), exponents).long()
 
 
 def _pairs(axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Index that puts rows and columns of (K, D, D) in the order of axes (K, D)."""
+    """Index that reorders rows and columns of (K, D, D) by axes (K, D)."""
     return torch.arange(len(axes))[:, None, None], axes[:, :, None], axes[:, None, :]

@@ -1,8 +1,8 @@
 """The thesis's message (4.2): one for each component and sensor position, 57 bytes in 3D, 37 in 2D.
 
 Little-endian: id (uint32: robot · 2²⁴ + sequence), num_points (float32), sensor_loc (D float32), mean
-(D float32), covariance (D(D+1)/2 float32, upper triangle by rows), max_range (uint8). A component seen
-from several places takes a message for each. An update of a count is 8 bytes: id, num_points.
+(D float32), covariance (D(D+1)/2 float32, upper triangle by rows), max_range (uint8). A component with
+several viewpoints takes a message for each. An update of a count is 8 bytes: id, num_points.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.mapping.components import Components
 
 FARTHEST = 2.0**14
-"""Metres from the origin: beyond, float32 takes steps of more than a millimetre."""
+"""Metres from the origin: beyond it, steps of float32 exceed a millimetre."""
 _ROBOT_BITS, _SEQUENCE_BITS = 8, 24
 
 
@@ -41,10 +41,10 @@ UPDATE_TYPE = np.dtype([("id", "<u4"), ("num_points", "<f4")])
 
 
 def encode_thesis(components: Components) -> bytes:
-    """Messages of the components, one for each sighting.
+    """Messages of the components, one for each viewpoint.
 
     Raises `InvalidArgumentError` for ids that do not fit into 8 bits of robot and 24 of sequence, and
-    for positions so far out that float32 would blur them.
+    for positions beyond `FARTHEST`.
     """
     c = components
     for name, value in (("means", c.means), ("origins", c.origins)):
@@ -64,7 +64,7 @@ def encode_thesis(components: Components) -> bytes:
 
 
 def decode_thesis(data: bytes, dim: int) -> Components:
-    """Components of messages; those with the same id are one component, which the first describes.
+    """Components of messages; those with the same id are one component, described by the first message.
 
     Raises `DataError` when the length is not that of whole messages, or the numbers are no components.
     """
@@ -91,7 +91,7 @@ def decode_thesis(data: bytes, dim: int) -> Components:
 
 
 def encode_thesis_updates(ids: Tensor, counts: Tensor) -> bytes:
-    """Updates: the counts (J,) that components with these ids (J, 2) have now."""
+    """Updates: the current counts (J,) of components with these ids (J, 2)."""
     updates = np.zeros(len(ids), UPDATE_TYPE)
     updates["id"] = _id_numbers(ids)
     updates["num_points"] = counts.cpu().numpy()
@@ -130,5 +130,5 @@ def _ids(numbers: Tensor) -> Tensor:
 
 
 def _doubles(values: NDArray[Any]) -> Tensor:
-    with np.errstate(invalid="ignore"):  # some NaNs signal when they are cast; any are refused later
+    with np.errstate(invalid="ignore"):  # signalling NaNs warn when cast; NaNs are refused later
         return torch.from_numpy(values.astype(np.float64))

@@ -1,1 +1,1 @@
-"""Rays drawn from the components of a map."""
+"""Rays drawn from the components of a map, and a spatial index of its batches."""

@@ -1,7 +1,8 @@
-"""Rays of components: the same ones for a component each time, in whatever company it is asked for."""
+"""Rays drawn from components. A component gets the same rays in every batch, box and order."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,6 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_draws import normals
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
@@ -21,7 +21,9 @@ from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
 
 _EFFECTIVE_AREA = 4 * math.pi
 _THINNING = 4
-_MOST_DRAWS = 1 << 19  # at a time: they take some 250 bytes each meanwhile
+_MOST_DRAWS = 1 << 19  # draws at a time, about 250 bytes each
+_RADII = 4096  # steps of the table of truncated radii
+_FARTHEST_DRAW = 11.0  # deviations: an upper bound of every draw, because quantiles end at 6.4 on an axis
 
 
 def component_rays(
@@ -33,22 +35,22 @@ def component_rays(
     most: int = 512,
     cutoff: float = 2.5,
 ) -> RayBundle:
-    """Rays from where components were seen to points that they stand for (thesis 3.2.3).
+    """Rays from the sensor origins of components to points drawn from the components (thesis 3.2.3).
 
-    A sighting gets about `rays_per_cell` rays for each cell that its component hides from the sensor,
-    where 4π √|Σ₂| is what a Gaussian hides (∫p² of its shadow p, inverted), Σ₂ its covariance across
-    the view; each carries its share of the sighting's count. The points are the first of one Sobol
+    A viewpoint gets about `rays_per_cell` rays for each cell that its component hides from the sensor. A
+    Gaussian hides the area 4π √|Σ₂| (the inverse of ∫p² of its shadow p), Σ₂ its covariance across the view.
+    Each ray has an equal share of the viewpoint's count. End points are the first points of one Sobol
     sequence, rotated on the unit cube by a hash of the component's id (Cranley and Patterson 1976), and
-    turned into normal draws whose radius is that of a Gaussian cut off at `cutoff` deviations. So a
-    component's rays depend on nothing but itself: not on its company, nor on the order, nor on what
-    was drawn before, and those of more than one batch can be added or left out one by one.
+    transformed to normal draws truncated at the radius `cutoff` (deviations). The rays of a component
+    therefore depend only on the component, and the rays of several batches can be added or removed one by
+    one.
 
     Args:
-        components: in three dimensions. Those without a count get no rays.
+        components: in 3D. Viewpoints without a count get no rays.
         resolution: side (m) of the cells.
-        least, most: bounds on the rays of a sighting.
+        least, most: bounds on the number of rays of a viewpoint.
 
-    Raises `InvalidArgumentError` for components in the plane, or numbers that are out of range.
+    Raises `InvalidArgumentError` for components in 2D, or numbers out of range.
     """
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
@@ -69,18 +71,18 @@ def component_evidence(
     hits_per_ray: int = 1,
     thinned: bool = False,
 ) -> CellEvidence:
-    """Evidence of components in the cells of a box, by their rays: see `component_rays`.
+    """Evidence of components in the cells of a box, from their rays: see `component_rays`.
 
-    Sightings whose rays cannot reach the box are left out before any is drawn, which changes nothing. Of
-    very many some are drawn at a time, which bounds the memory that they take.
+    Viewpoints whose rays cannot reach the box are skipped, which does not change the result. Rays are
+    drawn in portions, which bounds the memory.
 
-    shell: cells. A component knows its surface, as a grid of rays does not: within that distance of it
-        a ray says nothing of free space. Without that, rays that come in flat call the very cells free
-        that the surface lies in (of a floor most are crossed more often than hit). 0 is the thesis's.
-    hits_per_ray: points drawn for each ray that is followed. To draw one costs little beside following
-        its ray, and it is hits, few to a cell, that are noisy.
-    thinned: rays that are dense enough where they end crowd on their way. In its first half only a fourth of
-        a sighting's are followed, each for four: as dense there as at the end, at half the work.
+    shell: cells. Within this distance of its component's surface a ray adds no misses. Otherwise rays at flat
+        angles add misses to the cells that contain the surface, and most cells of a floor become free. 0
+        is the thesis's choice.
+    hits_per_ray: number of points drawn for each ray. Points are cheap compared with ray traversal, and the
+        hits, few for each cell, are the noisy part.
+    thinned: in the first half of the way, follow only a quarter of a viewpoint's rays, with four times the
+        weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
     """
     check_whole("hits_per_ray", hits_per_ray, 1)
     if not 0 <= shell < math.inf:
@@ -88,7 +90,7 @@ def component_evidence(
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
     seen = seen[_in_reach(components, seen, box, density)]
-    # Where a component's own points cannot be in the box, only rays that pass are wanted.
+    # If a component's points cannot be in the box, only its passing rays matter.
     ends_here = (
         _in_reach(components, seen, box, density, ends_only=True)
         & ~components.max_range[components.seen_by[seen]]
@@ -103,7 +105,9 @@ def component_evidence(
 
 
 def _portions(draws: Tensor) -> Iterator[slice]:
-    """Sightings (C,) in a row of `_MOST_DRAWS` draws at most, or one by itself; of none an empty one."""
+    """Consecutive viewpoints (C,) with at most `_MOST_DRAWS` draws, or a single one; one empty slice if C
+    = 0.
+    """
     so_far, begin = torch.cumsum(draws, 0), 0
     while begin < len(draws) or begin == 0:
         room = int(so_far[begin] - draws[begin]) + _MOST_DRAWS if len(draws) else 0
@@ -122,35 +126,37 @@ def _evidence(
     shell: float,
     thinned: bool,
 ) -> CellEvidence:
-    """`component_evidence` of sightings `seen` (C,), by `number` (C,) of rays and `times` (C,) the hits."""
+    """`component_evidence` of the viewpoints `seen` (C,), with `number` (C,) rays and `times` as many
+    hits.
+    """
     resolution = density.resolution
-    drawn, sighting, followed = _rays(components, seen, density, number, times)
-    rays, sighting = RayBundle(*(field[followed] for field in drawn)), sighting[followed]
-    stops, weights = rays.ends, rays.weights * times[sighting]
+    drawn, viewpoint, followed = _rays(components, seen, density, number, times)
+    rays, viewpoint = RayBundle(*(field[followed] for field in drawn)), viewpoint[followed]
+    stops, weights = rays.ends, rays.weights * times[viewpoint]
     if shell > 0:
-        stops = _before_surface(components, components.seen_by[seen][sighting], rays, shell * resolution)
+        stops = _before_surface(components, components.seen_by[seen][viewpoint], rays, shell * resolution)
     starts = rays.origins
     if thinned:
-        starts, stops, weights = _thinned(starts, stops, weights, sighting)
+        starts, stops, weights = _thinned(starts, stops, weights, viewpoint)
     passing = torch.zeros_like(weights, dtype=torch.bool)
     struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
     return cast_evidence(starts, stops, passing, resolution, box, weights, hit_places=struck)
 
 
 def _thinned(
-    starts: Tensor, stops: Tensor, weights: Tensor, sighting: Tensor
+    starts: Tensor, stops: Tensor, weights: Tensor, viewpoint: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The second halves of rays (R,), those of a sighting in a row, and the first halves of a fourth of them.
+    """The second halves of rays (R,), sorted by viewpoint, and the first halves of a quarter of them.
 
-    A half ends where the other begins, in a cell that only the second leaves.
+    The first half ends where the second begins, in a cell that only the second half counts as left.
     """
-    n_each = torch.bincount(sighting)
+    n_each = torch.bincount(viewpoint)
     n_some = (n_each + _THINNING - 1) // _THINNING
-    number = torch.arange(len(sighting), device=sighting.device)
-    number = number - (torch.cumsum(n_each, 0) - n_each)[sighting]
-    # The first ones of a Sobol sequence fill the cube; every fourth would fill one corner of it.
-    some = (number < n_some[sighting]).nonzero().squeeze(1)
-    for_how_many = (n_each / n_some.clamp_min(1))[sighting[some]]
+    number = torch.arange(len(viewpoint), device=viewpoint.device)
+    number = number - (torch.cumsum(n_each, 0) - n_each)[viewpoint]
+    # The first points of a Sobol sequence fill the cube; every fourth point would fill one corner.
+    some = (number < n_some[viewpoint]).nonzero().squeeze(1)
+    for_how_many = (n_each / n_some.clamp_min(1))[viewpoint[some]]
     middle = starts + 0.5 * (stops - starts)
     return (
         torch.cat([middle, starts[some]]),
@@ -160,8 +166,8 @@ def _thinned(
 
 
 def _before_surface(components: Components, of: Tensor, rays: RayBundle, distance: float) -> Tensor:
-    """Where rays of components (R,) come within `distance` (m) of the surface that they end on, (R, 3):
-    the plane through their end across the direction in which their component is thinnest."""
+    """Points (R, 3) where rays of components `of` (R,) come within `distance` (m) of the surface of their
+    end: the plane through the end, normal to the thinnest direction of the component."""
     used, row = torch.unique(of, return_inverse=True)
     thinnest = torch.linalg.eigh(components.covariances[used].double()).eigenvectors[:, :, 0]
     way = rays.ends - rays.origins
@@ -172,7 +178,7 @@ def _before_surface(components: Components, of: Tensor, rays: RayBundle, distanc
 
 @dataclass(frozen=True)
 class _Density:
-    """How densely rays are drawn: see `component_rays`."""
+    """The density of rays, see `component_rays`."""
 
     resolution: float
     rays_per_cell: float
@@ -190,7 +196,7 @@ class _Density:
 
 
 def _counted(components: Components, resolution: float) -> Tensor:
-    """The sightings (C,) of sound components that have a count."""
+    """The viewpoints (C,) that have a count. Checks the components."""
     if components.dim != 3:
         raise InvalidArgumentError(f"components have {components.dim} dimensions; their rays need 3.")
     to_lattice(components.means, resolution, "means")
@@ -201,31 +207,31 @@ def _counted(components: Components, resolution: float) -> Tensor:
 def _in_reach(
     components: Components, seen: Tensor, box: Box, density: _Density, ends_only: bool = False
 ) -> Tensor:
-    """Which sightings (C,), of those `seen` (C,), may have rays that reach the box, or that end there."""
+    """Which of the viewpoints `seen` (C,) may have rays that reach the box, or that end in it."""
     by = components.seen_by[seen]
     spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
     low, high = components.means.double() - spread, components.means.double() + spread
     origins = components.origins.double()[components.seen_from[seen]]
     scale = 1 / density.resolution
-    # Half a cell more than the box covers the rounding of what is drawn.
+    # The margin of half a cell covers the rounding of the draws.
     first, last = near_interval(origins * scale, low[by] * scale, high[by] * scale, box)
     return (first <= last) & (last >= 1) if ends_only else first <= last
 
 
 def _numbers(components: Components, seen: Tensor, density: _Density) -> Tensor:
-    """How many rays (C,) the density asks for of each of the sightings `seen` (C,)."""
+    """Number of rays (C,) of each of the viewpoints `seen` (C,)."""
     by, whence = components.seen_by[seen], components.seen_from[seen]
     toward = components.means[by].double() - components.origins[whence].double()
     hidden = _hidden_area(toward, components.covariances[by].double()) / density.resolution**2
-    wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused where rays are drawn
+    wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
     return wanted.clamp(density.least, density.most).long()
 
 
 def _rays(
     components: Components, seen: Tensor, density: _Density, once: Tensor, times: Tensor
 ) -> tuple[RayBundle, Tensor, Tensor]:
-    """Rays of the sightings `seen` (C,), `times` (C,) the number `once` (C,) of each; which of the sightings
-    each ray (R,) is of; and which rays (F,) would be all of them once."""
+    """`times` · `once` rays of each viewpoint `seen` (C,); the viewpoint (R,) of each ray; and the rows
+    (F,) of the first `once` rays of each viewpoint."""
     used, by = torch.unique(components.seen_by[seen], return_inverse=True)
     mean, covariance = components.means[used].double(), components.covariances[used].double()
     origin, count = (
@@ -234,13 +240,13 @@ def _rays(
     )
     factor = safe_cholesky(covariance)
     number = once * times
-    sighting = torch.repeat_interleave(number)
+    viewpoint = torch.repeat_interleave(number)
     first = torch.cumsum(number, 0) - number
-    draw = torch.arange(len(sighting), device=seen.device) - first[sighting]
-    component = by[sighting]
+    draw = torch.arange(len(viewpoint), device=seen.device) - first[viewpoint]
+    component = by[viewpoint]
     longest = density.most * (int(times.max()) if len(times) else 1)
-    normal = normals(components.ids[used], component, draw, longest, density.cutoff)
-    # Row by row, by sums and products alone: a matrix product may round differently in other company.
+    normal = _normals(components.ids[used], component, draw, longest, density.cutoff)
+    # Sums and products of single columns: a matrix product may round differently in another batch.
     ends = []
     for row in range(3):
         place = mean[:, row][component]
@@ -248,16 +254,16 @@ def _rays(
             place = place + factor[:, row, column][component] * normal[column]
         ends.append(place)
     rays = RayBundle(
-        origin[sighting],
+        origin[viewpoint],
         torch.stack(ends, 1),
-        (count / number)[sighting],
+        (count / number)[viewpoint],
         ~components.max_range[used][component],
     )
-    return rays, sighting, (draw < once[sighting]).nonzero().squeeze(1)
+    return rays, viewpoint, (draw < once[viewpoint]).nonzero().squeeze(1)
 
 
 def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
-    """Area (C,), m², that Gaussians hide of what is behind them; `toward` (C, 3): from sensor to mean.
+    """Area (C,), m², that Gaussians hide from the sensor; `toward` (C, 3): from the sensor to the mean.
 
     The determinant of the covariance across a unit direction d is dᵀ adj(Σ) d.
     """
@@ -271,6 +277,86 @@ def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
     mixed = x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz)
     length = x * x + y * y + z * z
     along = (a * x * x + b * y * y + c * z * z + 2 * mixed) / length
-    # Seen from its very mean a component has no direction: as large as it can look.
+    # From the mean itself there is no direction: take an upper bound of the area.
     determinant = torch.where(length > 0, along, a + b + c).clamp_min(0)
     return _EFFECTIVE_AREA * scale * determinant.sqrt()
+
+
+# -- draws -----------------------------------------------------------------------------------------
+
+
+def _normals(ids: Tensor, component: Tensor, draw: Tensor, n: int, cutoff: float) -> list[Tensor]:
+    """Draws from a standard normal truncated at a radius: three coordinates, (R,) each.
+
+    Points of one Sobol sequence, rotated on the unit cube by a hash of the component's id.
+
+    Args:
+        ids: (K, 2). component: (R,), row of the id. draw: (R,), number of the draw, below n.
+        cutoff: radius in deviations.
+    """
+    shifts = _shifts(ids)
+    points = _sobol(n).to(shifts.device)
+    normal, square = [], torch.zeros((), dtype=torch.float64, device=shifts.device)
+    for axis in range(3):
+        cube = points[axis][draw] + shifts[:, axis][component]
+        cube = torch.where(cube >= 1, cube - 1, cube)
+        normal.append(torch.special.ndtri(cube.clamp(2.0**-33, 1 - 2.0**-33)))
+        square = square + normal[-1] * normal[-1]
+    table = _shrinkage(cutoff).to(shifts.device)
+    position = square.sqrt() * (_RADII / _FARTHEST_DRAW)
+    step = position.long()
+    below = table[step]
+    shrunk = below + (position - step) * (table[step + 1] - below)
+    return [coordinate * shrunk for coordinate in normal]
+
+
+def _shifts(ids: Tensor) -> Tensor:
+    """A pseudo-random point (K, 3) of the unit cube for each id (K, 2)."""
+    key = _scrambled(_scrambled(ids[:, 0]) ^ ids[:, 1])
+    words = torch.stack([_scrambled(key + axis) for axis in range(1, 4)], 1)
+    return ((words >> 11) & (2**53 - 1)).double() * 2.0**-53
+
+
+def _scrambled(word: Tensor) -> Tensor:
+    """Bijective hash of int64 words: the finalizer of SplitMix64 (Steele, Lea and Flood 2014)."""
+    word = word + _signed(0x9E3779B97F4A7C15)
+    word = (word ^ _shifted(word, 30)) * _signed(0xBF58476D1CE4E5B9)
+    word = (word ^ _shifted(word, 27)) * _signed(0x94D049BB133111EB)
+    return word ^ _shifted(word, 31)
+
+
+def _shifted(word: Tensor, bits: int) -> Tensor:
+    """Logical shift to the right; the shift of torch keeps the sign."""
+    return (word >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _signed(word: int) -> int:
+    return word - (1 << 64) if word >= 1 << 63 else word
+
+
+@functools.cache
+def _sobol(n: int) -> Tensor:
+    """The first n points of the Sobol sequence, (3, n) float64."""
+    points: Tensor = torch.quasirandom.SobolEngine(3).draw(n, dtype=torch.float64)
+    return points.T.contiguous()
+
+
+@functools.cache
+def _shrinkage(cutoff: float) -> Tensor:
+    """Factors (_RADII + 2,) that truncate a normal draw of radius r, in even steps from 0, at `cutoff`:
+    F⁻¹(F(r) F(cutoff))/r, with F the distribution function of χ₃."""
+    radius = torch.arange(_RADII + 2, dtype=torch.float64) * (_FARTHEST_DRAW / _RADII)
+    target = _chi3(radius) * _chi3(torch.tensor(cutoff, dtype=torch.float64))
+    low, high = torch.zeros_like(radius), radius.clamp_max(cutoff)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = _chi3(middle) > target
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    shrunk = low / radius.clamp_min(1e-9)
+    shrunk[:8] = shrunk[8]  # F loses its digits near 0, where the factor is constant
+    return shrunk
+
+
+def _chi3(radius: Tensor) -> Tensor:
+    """Mass of a standard normal in 3D within a radius."""
+    return torch.erf(radius * math.sqrt(0.5)) - math.sqrt(2 / math.pi) * radius * torch.exp(-0.5 * radius**2)

@@ -1,4 +1,4 @@
-"""MixtureTiles: a robot's whole mixture, found again by where its rays went."""
+"""MixtureTiles: a spatial index over batches of components, by the box around their rays."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 
-_REACH = 3.0  # deviations around the means that count as near
-_MOST_TILES = 4096  # a batch that lies in more is looked at in every search
+_REACH = 3.0  # deviations around the means that belong to the box
+_MOST_TILES = 4096  # a batch in more tiles is tested in every search
 
 
 class _Batch(NamedTuple):
@@ -27,9 +27,9 @@ class _Batch(NamedTuple):
 
 
 class MixtureTiles:
-    """Batches of components, each of one message or frame, hashed in cubes by the box around their rays.
+    """Batches of components, each of one message or frame, hashed into cubes by the box around their rays.
 
-    A search costs in proportion to what lies near, not to what there is. Batches never change.
+    The time of a search grows with the number of near batches, not of all. Batches never change.
 
     Args:
         tile: side (m) of the cubes.
@@ -41,7 +41,7 @@ class MixtureTiles:
         self.tile = tile
         self._batches: list[_Batch] = []
         self._keys: set[Hashable] = set()
-        self._tiles: dict[tuple[int, ...], list[int]] = {}  # the batches in each, as they came
+        self._tiles: dict[tuple[int, ...], list[int]] = {}  # rows of the batches in each cube
         self._everywhere: list[int] = []
 
     def __len__(self) -> int:
@@ -51,16 +51,16 @@ class MixtureTiles:
         return key in self._keys
 
     def items(self) -> Iterator[tuple[Hashable, Components]]:
-        """All batches in the order in which they came."""
+        """All batches, in the order of `add`."""
         return ((batch.key, batch.components) for batch in self._batches)
 
     def all(self) -> Components:
-        """All components, in that order."""
+        """All components, in the order of `add`."""
         return Components.concatenate([batch.components for batch in self._batches] or [Components.empty(3)])
 
     def add(self, key: Hashable, components: Components) -> None:
-        """Enter a batch; raises `InvalidArgumentError` for a key that is taken, components that are not in
-        three dimensions, and means, covariances or origins that are not finite."""
+        """Adds a batch. Raises `InvalidArgumentError` for a key that exists, components that are not in 3D,
+        and means, covariances or origins that are not finite."""
         if key in self._keys:
             raise InvalidArgumentError(f"key={key!r} already names a batch, and batches do not change.")
         if components.dim != 3:
@@ -81,9 +81,9 @@ class MixtureTiles:
         self._batches.append(_Batch(key, components, low, high))
 
     def near(self, box: Box, resolution: float) -> list[tuple[Hashable, Components]]:
-        """Batches with rays that may come to a box of cells of side `resolution` (m), as they came.
+        """Batches whose rays may reach a box of cells of side `resolution` (m), in the order of `add`.
 
-        Rays that end within three deviations of their means: those of `component_rays` do.
+        Rays must end within three deviations of their means, as those of `component_rays` do.
         """
         low = [x * resolution for x in box.low.tolist()]
         high = [x * resolution for x in box.high.tolist()]
@@ -92,7 +92,7 @@ class MixtureTiles:
         if math.prod(map(len, spans)) < len(self._tiles):
             for place in itertools.product(*spans):
                 found.update(self._tiles.get(place, ()))
-        else:  # fewer tiles hold anything
+        else:  # the box has more tiles than are in use
             for place, numbers in self._tiles.items():
                 if all(x in span for x, span in zip(place, spans, strict=True)):
                     found.update(numbers)
@@ -117,10 +117,9 @@ def regenerate(
     tiles: MixtureTiles,
     evidence: Callable[[Components, float, Box], CellEvidence] = component_evidence,
 ) -> None:
-    """Fill boxes of the window that were uncovered, and are empty, from the mixture (thesis Fig 4.2).
+    """Fills empty boxes that the window has uncovered with the evidence of the mixture (thesis Fig 4.2).
 
-    Rays are trimmed to the boxes, so that nothing is counted twice. `evidence` of components, at a
-    resolution, in a box.
+    Rays are clipped to the boxes, so nothing is counted twice. `evidence(components, resolution, box)`.
     """
     for box in boxes:
         near = [components for _, components in tiles.near(box, sliding.resolution)]
