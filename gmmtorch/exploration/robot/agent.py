@@ -91,8 +91,8 @@ class Agent:
         return dict(self._timed.seconds)
 
     def digest(self) -> bytes:
-        """Equal for robots that hold the same map, and the same views."""
-        return self.robot.mapper.digest() + self.robot.library.digest()
+        """Equal for robots that hold the same map."""
+        return self.robot.mapper.digest()
 
     def keep_in(self, logbook: Logbook) -> None:
         """From now on keep what is said and heard of the map. What the logbook has restored of it is taken
