@@ -25,9 +25,9 @@ from pathlib import Path
 
 import torch
 
+from gmmtorch.exploration.mission.clocks import Stopwatch
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.report.table import format_table
@@ -62,10 +62,10 @@ def _fly(options: argparse.Namespace, team: str) -> list[dict[str, object]]:
     mission = assemble(_world(options), about, Stopwatch(time.process_time))
     rows = []
     for half in (1, 2):
-        before, memory = dict(mission.stages), _resident_bytes()
+        before, memory = dict(mission.watch.seconds), _resident_bytes()
         begin, stop = time.process_time(), half * options.duration / 2
-        while mission.now < stop - 1e-9:
-            mission.step()
+        while mission.elapsed < stop - 1e-9:
+            mission.tick(mission.elapsed)
         row = _row(mission, half, before, time.process_time() - begin, options.duration / 2)
         grown = _resident_bytes() - memory
         row["grown_mb"] = grown / 1e6
@@ -79,11 +79,11 @@ def _row(
 ) -> dict[str, object]:
     """Milliseconds of each stage for a robot and a simulated second."""
     scale = 1e3 / (simulated * len(mission.robots))
-    spent = {name: (total - before.get(name, 0.0)) * scale for name, total in mission.stages.items()}
+    spent = {name: (total - before.get(name, 0.0)) * scale for name, total in mission.watch.seconds.items()}
     return {
         "team": mission.options.framework,
         "half": half,
-        "entropy_left": mission.union.entropy_bits / mission.union.observable_bits,
+        "entropy_left": mission.score.union.entropy_bits / mission.score.union.observable_bits,
         **spent,
         "all": seconds * scale,
         "simulated_per_core_second": simulated / seconds,

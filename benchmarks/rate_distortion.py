@@ -26,6 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import joblib
 import torch
 from frames import RESOLUTIONS, SEED, Frame, material
 from tables import ROOT, hardware, markdown, publish
@@ -45,7 +46,6 @@ from gmmtorch.evaluation.codecs.point_codecs import (
 )
 from gmmtorch.evaluation.metrics import psnr_terms, roc
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
-from gmmtorch.evaluation.worker_pool import worker_pool
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components
@@ -335,12 +335,12 @@ def main() -> None:
     torch.set_num_threads(1)
     tasks = [task for name in options.names for task in tasks_of(name, options.data, options.frames)]
     rows, seconds = [], 0.0
-    with worker_pool(options.jobs) as pool:
-        for found, taken in pool.map(measure, tasks):
-            rows += found
-            seconds += taken
-            for r in found:
-                print(printed(r), flush=True)
+    parallel = joblib.Parallel(n_jobs=options.jobs, batch_size=1, return_as="generator")
+    for found, taken in parallel(joblib.delayed(measure)(task) for task in tasks):
+        rows += found
+        seconds += taken
+        for r in found:
+            print(printed(r), flush=True)
     if options.rows:
         write_bytes(options.rows, json.dumps(rows, indent=1).encode())
     print(f"{seconds / 60:.1f} minutes of the processor")

@@ -34,10 +34,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.evaluation.codecs.point_codecs import Draco, Octree, PointCodec
+from gmmtorch.exploration.mission.clocks import SimulatedClock
+from gmmtorch.exploration.mission.driver import drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.team_setup import assemble, coordination_of
+from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.robot.mapper import FrameUpdate
+from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.world import open_world
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
@@ -60,29 +63,21 @@ Rows = NDArray[np.float64]
 Distances = dict[str, Rows]
 
 
-class Recorded(Mission):
-    """Keeps what codecs are given of each frame: novel returns, and ends of the novel beams without one."""
+class Recorder:
+    """Keeps the novel returns, and the ends of novel no-return beams, of each frame of a mission."""
 
     def __init__(self, mission: Mission) -> None:
         self.returns: list[Tensor] = []
         self.ends: list[Tensor] = []
-        options = mission.options
-        super().__init__(
-            mission.world,
-            mission.agents,
-            mission.union,
-            mission.network,
-            coordination_of(options),
-            options,
-            mission.watch,
-        )
+        self._note = mission.score.note
+        mission.score.note = self.note  # type: ignore[method-assign]
 
-    def _encoded(self, frame: DepthFrame, sensed: FrameUpdate) -> dict[str, int]:
+    def note(self, robot: Robot, frame: DepthFrame, update: FrameUpdate) -> None:
         for kept, kind in ((self.returns, frame.is_hit), (self.ends, ~frame.is_hit)):
-            ends = frame.ends[sensed.novel & kind]
+            ends = frame.ends[update.novel & kind]
             if len(ends):
                 kept.append(ends)
-        return super()._encoded(frame, sensed)
+        self._note(robot, frame, update)
 
 
 class Truth:
@@ -197,23 +192,23 @@ def main() -> None:
     torch.set_num_threads(1)
     world = open_world("warehouse")
     options = TeamOptions(size=given.robots, duration=given.duration, seed=given.seed)
-    mission = Recorded(assemble(world, options))
-    while not mission.is_over:
-        mission.step()
+    mission = assemble(world, options)
+    recorder = Recorder(mission)
+    drive(mission, SimulatedClock())
     mixture = mission.robots[0].mapper.components()
     assert mixture is not None
     surfaces = mixture.selected((~mixture.max_range).nonzero().squeeze(1))
-    frames = [frame.numpy() for frame in mission.returns]
+    frames = [frame.numpy() for frame in recorder.returns]
     truth, n_points = Truth(world.mesh, warehouse(), frames), sum(map(len, frames))
     kinds = mission.network.bytes_by_kind
     print(
-        f"{n_points:,} novel returns and {sum(map(len, mission.ends)):,} ends of beams without one, "
+        f"{n_points:,} novel returns and {sum(map(len, recorder.ends)):,} ends of beams without one, "
         f"{len(frames)} frames\n{len(surfaces):,} components of surfaces, "
         f"{len(mixture) - len(surfaces):,} of empty beams, {kinds['components']:,} B; "
         f"{sum(kinds.values()):,} B were sent in all",
         flush=True,
     )
-    n_raw = 12 * sum(map(len, (*mission.returns, *mission.ends)))
+    n_raw = 12 * sum(map(len, (*recorder.returns, *recorder.ends)))
     distances = truth.distances(np.concatenate(frames), truth.across(frames))
     seen = Found("points as seen", 0, n_raw, 12 * n_points, distances)
     n_bytes = kinds["components"]
@@ -223,8 +218,8 @@ def main() -> None:
     for family, codecs in RIVALS.items():
         tried = []
         for metres, codec in codecs.items():
-            of_returns, decoded = sent_and_decoded(codec, mission.returns)
-            n_bytes = of_returns + sent_and_decoded(codec, mission.ends)[0]
+            of_returns, decoded = sent_and_decoded(codec, recorder.returns)
+            n_bytes = of_returns + sent_and_decoded(codec, recorder.ends)[0]
             distances = truth.distances(np.concatenate(decoded), truth.across(decoded))
             tried.append(Found(family, metres, n_bytes, of_returns, distances))
         rows += [found.row() for found in tried]

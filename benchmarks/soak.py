@@ -39,7 +39,7 @@ from typing import Any
 import torch
 
 from gmmtorch.errors import DataError
-from gmmtorch.evaluation.worker_pool import end_with_parent
+from gmmtorch.evaluation.processes import end_with_parent
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.report.table import format_table
 from gmmtorch.sharing.messages.envelope import Kind

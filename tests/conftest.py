@@ -54,15 +54,15 @@ def real_data() -> Path:
 
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The ticks that missions of this process step from."""
+    """The numbers of ticks done, at the start of every tick of missions in this process."""
     from gmmtorch.exploration.mission.mission import Mission
 
     ticks: list[int] = []
-    step = Mission.step
+    tick = Mission.tick
 
-    def noted(mission: Mission) -> None:
-        ticks.append(mission.tick)
-        step(mission)
+    def noted(mission: Mission, now: float) -> None:
+        ticks.append(mission.n_ticks)
+        tick(mission, now)
 
-    monkeypatch.setattr(Mission, "step", noted)
+    monkeypatch.setattr(Mission, "tick", noted)
     return ticks

@@ -40,7 +40,7 @@ def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any
     A job of a sweep that runs in its own process ends if the sweep's process ends.
     """
     from gmmtorch.errors import GmmTorchError
-    from gmmtorch.evaluation.worker_pool import end_with_parent
+    from gmmtorch.evaluation.processes import end_with_parent
 
     end_with_parent()
     try:

@@ -1,4 +1,4 @@
-"""What gmmtorch-explore shows: a mission as it goes, and at its end, and several side by side."""
+"""The pictures of gmmtorch-explore: of one mission, and of several side by side."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ if TYPE_CHECKING:
     from gmmtorch.report.exploration.mission_maps import TeamSnapshot
     from gmmtorch.report.maps.map_images import MapImage
 
-_HALF_BAND = 0.6  # metres above and below the robots' first height that maps from above show
+_HALF_BAND = 0.6  # metres above and below the first robot's start that maps from above show
 
 
 class MissionRecorder:
-    """Notes what the pictures of one mission need while it runs, and draws them at its end.
+    """Records what the pictures of one mission need while it runs, and draws them at its end.
 
-    Numbers go to TensorBoard as they come; those of before a checkpoint, where a mission went on from one,
-    at once. What the team knew is in `album`, and shown at the end.
+    Scalars go to TensorBoard while the mission runs.
+
+    Attributes:
+        snapshots: of the team's map; to be updated after each tick.
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
@@ -35,30 +37,26 @@ class MissionRecorder:
 
         self._config, self._folder, self._world = config, folder, world
         self._board = Board(folder / "tensorboard") if config.report.tensorboard else None
-        self._n_told = 0  # samples
         self._components: Components | None = None  # at the mission's end
-        self.album = Snapshots(self._content)
+        self.snapshots = Snapshots(self._content)
 
     def sample(self, mission: Mission) -> None:
-        """Take note of a mission that has just noted its own numbers."""
+        """Records a mission whose curves have just grown."""
         if self._board is not None:
-            curves = dict(mission.samples)
+            curves = dict(mission.score.samples)
             times, robots = curves.pop("times"), curves.pop("entropy_bits_per_robot")
             curves |= {f"robot_{number}/entropy_bits": curve for number, curve in enumerate(robots)}
-            for i in range(self._n_told, len(times)):
-                numbers = {name: curve[i] for name, curve in curves.items()}
-                self._board.scalars(numbers, "mission", step=int(times[i]))
-            self._n_told = len(times)
+            step = int(times[-1])
+            self._board.scalars({name: curve[-1] for name, curve in curves.items()}, "mission", step=step)
             paths = {f"robot_{robot.number}/path_length": robot.path_length for robot in mission.robots}
-            self._board.scalars(paths, "mission", step=int(mission.now))
+            self._board.scalars(paths, "mission", step=step)
         if mission.is_over:
             self._components = mission.robots[0].mapper.components()
 
     def finish(self, mission: Mission, row: dict[str, Any]) -> None:
-        """Draw everything, save the mixture, and close TensorBoard.
+        """Draws everything, saves the mixture, and closes TensorBoard.
 
-        The mixture is that of the mission's end, as its row is: since then robots may have told one another
-        more.
+        The mixture is that of the mission's end, as in the row; robots may have exchanged more since then.
         """
         import torch
 
@@ -74,12 +72,12 @@ class MissionRecorder:
         figures = self._figures(mission, row, paths, components)
         common.save_figures(self._config, figures, self._folder)
         if self._board is not None:
-            for moment in self.album.chosen():
-                seconds = moment.tick * mission.options.tick_seconds
-                if "means" in moment.content:
-                    mixture = (moment.content["means"], moment.content["covariances"])
-                    self._board.ellipsoids("mixture", *mixture, step=int(seconds))
-                self._board.paths("paths", [path[: moment.tick + 1] for path in paths], step=int(seconds))
+            for snapshot in self.snapshots.chosen():
+                seconds = int(snapshot.tick * mission.tick_seconds)
+                if "means" in snapshot.content:
+                    mixture = (snapshot.content["means"], snapshot.content["covariances"])
+                    self._board.ellipsoids("mixture", *mixture, step=seconds)
+                self._board.paths("paths", [path[: snapshot.tick + 1] for path in paths], step=seconds)
             write_exploration_board(self._board, [row], figures)
             self._board.close()
         if self._config.report.recording:
@@ -88,26 +86,22 @@ class MissionRecorder:
             record_rerun(
                 self._folder / "mission.rrd",
                 paths,
-                period=mission.options.tick_seconds,
+                period=mission.tick_seconds,
                 maps=[
                     RecordedMap(
-                        moment.tick * mission.options.tick_seconds,
-                        moment.content["cells"],
-                        moment.content.get("means", ()),
-                        moment.content.get("covariances", ()),
+                        snapshot.tick * mission.tick_seconds,
+                        snapshot.content["cells"],
+                        snapshot.content.get("means", ()),
+                        snapshot.content.get("covariances", ()),
                     )
-                    for moment in self.album.moments
-                    if "cells" in moment.content  # those of before a checkpoint may have been without
+                    for snapshot in self.snapshots.taken
                 ],
                 resolution=self._world.resolution,
                 row=row,
             )
 
     def _content(self, mission: Mission) -> dict[str, Any]:
-        """What the team knows, for pictures: from above, as components, and for the recording as cells.
-
-        Single precision is enough to draw from, and halves the checkpoints.
-        """
+        """The team's map for pictures: seen from above, as components, and as cells for the recording."""
         content = {"image": _team_view(mission).image.float()}
         surfaces = _surfaces(mission.robots[0].mapper.components())
         if surfaces is not None:
@@ -115,28 +109,27 @@ class MissionRecorder:
             content["covariances"] = surfaces.covariances.float()
             content["owners"] = surfaces.ids[:, 0]
         if self._config.report.recording:
-            stored = mission.union.grid.cells()
-            occupied = (
-                mission.union.rule.probability(stored.hits, stored.misses) > mission.union.rule.occupied
-            )
+            stored = mission.score.union.grid.cells()
+            rule = mission.score.union.rule
+            occupied = rule.probability(stored.hits, stored.misses) > rule.occupied
             content["cells"] = stored.cells[occupied].int()
         return content
 
-    def _snapshot(self, mission: Mission, moment: Snapshot, paths: list[Tensor]) -> TeamSnapshot:
-        """A moment as the picture of the team's map shows it: components within the band of heights."""
+    def _snapshot(self, mission: Mission, snapshot: Snapshot, paths: list[Tensor]) -> TeamSnapshot:
+        """A snapshot for the picture of the team's map, with the components in the band of heights."""
         from gmmtorch.report.exploration.mission_maps import TeamSnapshot
 
         shown: dict[str, Any] = {}
-        if "means" in moment.content:
+        if "means" in snapshot.content:
             low, high = _band(mission)
-            heights = moment.content["means"][:, 2]
+            heights = snapshot.content["means"][:, 2]
             within = (heights > low) & (heights < high)
-            shown = {name: moment.content[name][within] for name in ("means", "covariances", "owners")}
+            shown = {name: snapshot.content[name][within] for name in ("means", "covariances", "owners")}
         return TeamSnapshot(
-            moment.tick * mission.options.tick_seconds,
-            _team_view(mission)._replace(image=moment.content["image"]),
-            [path[: moment.tick + 1] for path in paths],
-            caption=f"{100 * moment.bits / mission.union.observable_bits:.0f} % of the entropy gone",
+            snapshot.tick * mission.tick_seconds,
+            _team_view(mission)._replace(image=snapshot.content["image"]),
+            [path[: snapshot.tick + 1] for path in paths],
+            caption=f"{100 * snapshot.bits / mission.score.union.observable_bits:.0f} % of the entropy gone",
             **shown,
         )
 
@@ -155,8 +148,8 @@ class MissionRecorder:
             "entropy": entropy_figure([row]),
             "trajectories": trajectories_figure(_world_view(mission), paths, _coverage(mission)),
             "team_map": team_map_figure(
-                [self._snapshot(mission, moment, paths) for moment in self.album.chosen()],
-                belief=mission.union.rule,
+                [self._snapshot(mission, snapshot, paths) for snapshot in self.snapshots.chosen()],
+                belief=mission.score.union.rule,
             ),
             "profile": profile_figure(*stage_means([row])),
         }
@@ -174,11 +167,11 @@ class MissionRecorder:
 
 
 def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
-    """A study's summary, and its pictures: curves with bands over seeds, and bars.
+    """Writes a study's summary and pictures: curves with bands over seeds, and bars.
 
-    Where teams are flown on several networks, these are one picture, and all others are of the first.
+    If teams ran on several networks, one picture compares these, and all others show the first network.
     """
-    from gmmtorch.exploration.mission.variants import NETWORK, differing
+    from gmmtorch.exploration.mission.results import NETWORK, differing
     from gmmtorch.files import write_bytes
     from gmmtorch.report.exploration.loss_figures import loss_figure
     from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
@@ -211,11 +204,10 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
 
 
 def _by_networks(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Of each framework the rows on the first network that it was flown on; and, of those that were flown
-    on several, all rows."""
-    from gmmtorch.exploration.mission.variants import NETWORK, variant_of
+    """The rows of each framework on its first network; and all rows of the frameworks that ran on several."""
+    from gmmtorch.exploration.mission.results import NETWORK, variant_of
 
-    networks: dict[str, dict[Any, None]] = {}  # in the order they come
+    networks: dict[str, dict[Any, None]] = {}  # as an ordered set
     for row in rows:
         networks.setdefault(row["framework"], {})[variant_of(row, NETWORK)] = None
     on_first = [row for row in rows if variant_of(row, NETWORK) == next(iter(networks[row["framework"]]))]
@@ -223,27 +215,27 @@ def _by_networks(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list
 
 
 def _surfaces(components: Components | None) -> Components | None:
-    """The components that stand for surfaces; None if there are none."""
+    """The components of surfaces; None if there are none."""
     if components is None or not bool((~components.max_range).any()):
         return None
     return components.selected((~components.max_range).nonzero().squeeze(1))
 
 
 def _save_mixture(components: Components, resolution: float, path: Path) -> None:
-    """The mixture as a map that the other commands read."""
+    """Saves the mixture as a map that the other commands read."""
     from gmmtorch.mapping.gaussian_map import GaussianMap
 
     GaussianMap.of(components, resolution=resolution, codec="quantized").save(path)
 
 
 def _band(mission: Mission) -> tuple[float, float]:
-    """Heights (m) that maps from above show: around that at which the robots began."""
+    """Heights (m) that maps from above show, around the first robot's start."""
     height = float(mission.trajectories[0][0][2])
     return height - _HALF_BAND, height + _HALF_BAND
 
 
 def _layers(mission: Mission) -> tuple[int, int]:
-    """The same as layers of the world's box, from the first up to but without the last."""
+    """The same as a range of layers of the world's box; the end is exclusive."""
     world = mission.world
     first, last = (round(z / world.resolution - float(world.box.low[2])) for z in _band(mission))
     return max(0, first), min(world.box.shape[2], max(first + 1, last))
@@ -258,18 +250,18 @@ def _view(mission: Mission, probability: Any) -> MapImage:
 
 
 def _team_view(mission: Mission) -> MapImage:
-    """The team's map from above, in the band of heights that the robots began in."""
+    """The team's map from above, in the band of heights."""
     from gmmtorch.occupancy.voxels.boxes import Box
 
     box, (first, last) = mission.world.box, _layers(mission)
     low, high = box.low.clone(), box.high.clone()
     low[2], high[2] = box.low[2] + first, box.low[2] + last
-    hits, misses = mission.union.grid.dense(Box(low, high))
-    return _view(mission, mission.union.rule.probability(hits, misses))
+    hits, misses = mission.score.union.grid.dense(Box(low, high))
+    return _view(mission, mission.score.union.rule.probability(hits, misses))
 
 
 def _world_view(mission: Mission) -> MapImage:
-    """The true world from above, in the same band: occupied, free, or unseen by anybody ever."""
+    """The true world from above, in the same band: occupied, free, or not observable."""
     first, last = _layers(mission)
     world = mission.world
     truth = world.occupied[:, :, first:last].float()
@@ -277,11 +269,11 @@ def _world_view(mission: Mission) -> MapImage:
 
 
 def _coverage(mission: Mission) -> Any:
-    """How many robots saw each column (nx, ny) in the band."""
+    """The number of robots that saw each column (nx, ny) in the band."""
     import torch
 
     first, last = _layers(mission)
-    seen = mission.seen_by.view(mission.world.box.shape)[:, :, first:last]
+    seen = mission.score.seen_by.view(mission.world.box.shape)[:, :, first:last]
     bits = torch.zeros(seen.shape[:2], dtype=torch.int64)
     for robot in mission.robots:
         bits += ((seen >> robot.number) & 1).any(2)

@@ -1,10 +1,9 @@
-"""The networks that the options `link.*` describe."""
+"""The network of a robot from the options `transport` and `link.*`."""
 
 from __future__ import annotations
 
 import os
 import socket
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,16 +33,14 @@ _UDP_NAMES = {
     "interface": "link.interface",
     "ttl": "link.ttl",
 }
-"""Options by the names of the arguments that they become."""
-_PATIENCE = 10.0  # seconds for robots of this machine to find one another
-_PAUSE = 0.02
+"""Options by the arguments that they become, for error messages."""
 
 
 def open_link(config: DictConfig, robot: int) -> FramedTransport:
     """A robot's end of the network of `transport` and `link.*`."""
     link = _opened(config, robot)
-    # What the others call it by, should they hear two of this number.
-    common.logger.info("Robot %d speaks over %s in session %s.", robot, config.transport, link.session.hex())
+    # Other robots name this session if they meet two robots with this id.
+    common.logger.info("Robot %d uses %s in session %s.", robot, config.transport, link.session.hex())
     return link
 
 
@@ -60,8 +57,8 @@ def _opened(config: DictConfig, robot: int) -> FramedTransport:
     with common.naming(_UDP_NAMES):
         if link["group"] is None and not link["peers"] and config.team.size > 1:
             common.logger.warning(
-                "link.peers=[]: robot %d of team.size=%d speaks to nobody. Say where the others listen, "
-                "or give all the same link.group.",
+                "link.peers=[]: robot %d of team.size=%d sends to no other robot. List the addresses of the "
+                "others, or give all the same link.group.",
                 robot,
                 config.team.size,
             )
@@ -97,19 +94,8 @@ def _udp(robot: int, link: dict[str, Any], key: TeamKey | None) -> FramedTranspo
     return UdpTransport.unicast(robot, listen, peers, key=key, insecure=insecure)
 
 
-def await_team(transport: FramedTransport, n_others: int) -> None:
-    """Wait until so many are connected; not for long, and only where there are connections."""
-    from gmmtorch.sharing.transport.zenoh_transport import ZenohTransport
-
-    end = time.monotonic() + _PATIENCE
-    while (
-        isinstance(transport, ZenohTransport) and transport.n_neighbours < n_others and time.monotonic() < end
-    ):
-        time.sleep(_PAUSE)
-
-
 def team_key(path: str | None) -> TeamKey | None:
-    """The team's key: of the file, or of the environment where there is one."""
+    """The team's key, from a file or else from the environment; None without either."""
     from gmmtorch.sharing.transport.security import TeamKey
     from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
 
@@ -119,7 +105,7 @@ def team_key(path: str | None) -> TeamKey | None:
 
 
 def address(name: str, text: str, least_port: int = 0) -> tuple[str, int]:
-    """host:port as an address; port 0 is any that is free, where nobody else has to know it."""
+    """The address of a text host:port. Port 0 stands for any free port."""
     from gmmtorch.errors import InvalidArgumentError
 
     host, colon, port = str(text).rpartition(":")
@@ -134,7 +120,7 @@ def address(name: str, text: str, least_port: int = 0) -> tuple[str, int]:
 
 
 def free_addresses(n: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[str]:
-    """So many addresses on loopback that nobody uses now."""
+    """Addresses of `n` free ports on loopback."""
     sockets = [socket.socket(socket.AF_INET, kind) for _ in range(n)]
     try:
         for one in sockets:

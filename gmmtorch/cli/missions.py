@@ -1,9 +1,9 @@
-"""The missions that options describe: their world, their team, and the variants of a study."""
+"""Missions from options: the world, the team, and the variants of a study."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 OF_ROBOTS = {"announce": "announce_every", "budget": "budget"}
-"""Options of the network that are not of its links, and the arguments that they become."""
+"""Arguments of robots by the options of `network.*` that they come from; the others are of the links."""
 NAMES = {
     "rate": "sensor.rate",
     "horizontal_fov": "sensor.horizontal_fov",
@@ -34,15 +34,15 @@ NAMES = {
     **{argument: f"network.{option}" for option, argument in OF_ROBOTS.items()},
     "sample_every": "evaluation.every",
 }
-"""Options by the names of the arguments that they become."""
+"""Options by the arguments that they become, for error messages."""
 
 
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
-    """The variants of `study.variants`; raises `InvalidArgumentError` for what a variant may not set."""
+    """The variants of a study. Raises `InvalidArgumentError` for options that a variant cannot set."""
     from gmmtorch.errors import InvalidArgumentError
 
     if config.study.name != "trials":
-        raise InvalidArgumentError(f"study.name={config.study.name!r} is not known; known is trials.")
+        raise InvalidArgumentError(f"study.name={config.study.name!r} is not one of trials.")
     variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
     known = {"team", "planner", "information", "coordination", "planning_prior", "codec", *config.network}
     for variant in variants:
@@ -54,7 +54,7 @@ def variants_of(config: DictConfig) -> list[dict[str, Any]]:
         for key in ("planning_prior", *OF_ROBOTS):
             value = variant.get(key, 0.0)
             if not (isinstance(value, int | float) or (key == "budget" and value is None)):
-                raise InvalidArgumentError(f"study.variants has {key}={value!r}, which is no number.")
+                raise InvalidArgumentError(f"study.variants has {key}={value!r}, which is not a number.")
     if not variants or not config.study.seeds:
         raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
     return variants
@@ -63,48 +63,19 @@ def variants_of(config: DictConfig) -> list[dict[str, Any]]:
 def trial_of(
     config: DictConfig, folder: Path, variant: dict[str, Any] | None = None, seed: int | None = None
 ) -> Trial:
-    """A trial of the mission that the options describe, but for what a variant sets.
-
-    The jobs of a sweep may share `checkpoint.folder`: each mission has a folder of its own there, and finds
-    it again.
-    """
+    """A trial of the mission that the options describe, with the changes of a variant, and a folder in
+    `folder`."""
     from gmmtorch.exploration.mission.trials import Trial
 
-    home = Path(config.checkpoint.folder) if config.checkpoint.folder else folder
     seed = config.seed if seed is None else seed
     chosen = {"team": config.team.name, "planner": config.planner.name} if variant is None else variant
     about = "_".join(f"{key}-{_short(value)}" for key, value in chosen.items())
-    trial = Trial(
-        world=world_options(config),
-        team=team_options(config, seed, variant or {}),
-        checkpoint_every=config.checkpoint.every,
-    )
-    return replace(trial, folder=home / "trials" / f"{about}_seed-{seed}_{trial.digest}")
-
-
-def tell_what_begins_anew(config: DictConfig, trials: Sequence[Trial]) -> None:
-    """Warn of missions that `checkpoint.folder` does not hold, though it holds one of their name."""
-    from gmmtorch.exploration.mission.trials import is_begun
-
-    def has_a_namesake(folder: Path) -> bool:
-        name, _, _ = folder.name.rpartition("_")
-        return any(other.name.startswith(f"{name}_") and is_begun(other) for other in folder.parent.iterdir())
-
-    if not config.checkpoint.folder:
-        return
-    folders = [trial.folder for trial in trials if trial.folder is not None]
-    anew = [f for f in folders if f.parent.is_dir() and not is_begun(f) and has_a_namesake(f)]
-    if anew:
-        common.logger.warning(
-            "checkpoint.folder=%s holds missions named as %d of these, but with other options; these begin "
-            "at their start.",
-            config.checkpoint.folder,
-            len(anew),
-        )
+    trial = Trial(world=world_options(config), team=team_options(config, seed, variant or {}))
+    return replace(trial, folder=folder / "trials" / f"{about}_seed-{seed}_{trial.digest}")
 
 
 def _short(value: Any) -> str:
-    """A value in the name of a folder: lists are too long for one."""
+    """A value for the name of a folder; a checksum of a list, which would be too long."""
     return f"{zlib.crc32(repr(value).encode()):08x}" if isinstance(value, list) else str(value)
 
 
@@ -125,16 +96,16 @@ def world_options(config: DictConfig) -> WorldOptions:
 
 
 def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = None) -> World:
-    """The world, for this team; errors call what is wrong with either what the user does."""
+    """The world for this team; errors name options."""
     from gmmtorch.evaluation.events import ignore
 
-    of_the_world = {name: f"world.{name}" for name in ("path", "bounds", "size", "seed")}
-    with common.naming({**NAMES, **of_the_world}):
+    names = {name: f"world.{name}" for name in ("path", "bounds", "size", "seed")}
+    with common.naming({**NAMES, **names}):
         return world.open(team, on_event or ignore)
 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
-    """The team that the options describe, but for what a variant sets."""
+    """The team that the options describe, with the changes of a variant."""
     from gmmtorch.exploration.mission.options import TeamOptions
     from gmmtorch.exploration.planning.primitives import Dynamics
     from gmmtorch.exploration.robot.gmm_mapper import FrameRule
@@ -181,19 +152,19 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
 
 
 def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: Any) -> T:
-    """What the options of a group make, and others with them."""
+    """The value that `make` builds from the options of a group, and from others; errors name options."""
     with common.naming({name: f"{group}.{name}" for name in options}):
         return make(**options, **others)
 
 
 def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
-    """What `TeamOptions` has of the network; errors call it what the user does."""
+    """The fields of `TeamOptions` for the network; errors name options."""
     from gmmtorch.sharing.transport.link_conditions import LinkConditions
 
     given = {key: value for key, value in common.as_options(config.network).items() if key not in OF_ROBOTS}
     names = {key: f"study.variants: {key}" if key in variant else f"network.{key}" for key in given}
     given |= {key: variant[key] for key in given if key in variant}
-    if "delay" in given:  # which a real network has, whatever anybody says
+    if "delay" in given:  # a real network has its own
         given["latency"], names["latency"] = given.pop("delay"), names.pop("delay")
     conditions = LinkConditions(**given, names=names)
     conditions.check_team(config.team.size, names)
@@ -201,7 +172,7 @@ def _network(config: DictConfig, variant: dict[str, Any]) -> dict[str, Any]:
 
 
 def _poses(start: Any) -> tuple[tuple[float, ...], ...]:
-    """Start poses as they are given; raises `InvalidArgumentError` unless they are four numbers each."""
+    """Start poses as tuples. Raises `InvalidArgumentError` unless each has four numbers."""
     from gmmtorch.errors import InvalidArgumentError
 
     try:

@@ -1,4 +1,4 @@
-"""What a robot shows of itself: a status line, numbers in TensorBoard, and numbers over time for its row."""
+"""How a robot's process shows its robot: a status line, scalars in TensorBoard, and curves for its row."""
 
 from __future__ import annotations
 
@@ -15,91 +15,93 @@ from gmmtorch.cli import common
 from gmmtorch.cli.status_line import StatusLine
 
 if TYPE_CHECKING:
-    from gmmtorch.exploration.mission.node import Node
+    from gmmtorch.exploration.mission.robot_view import RobotView
 
-_EVERY = 1.0  # seconds of the robot's time between what is shown
-_SERIES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
-
-
-_COMPARE = "; compare link.key_file, or $GMMTORCH_TEAM_KEY, of all robots"
+_PERIOD = 1.0
+"""Seconds of the robot's time between two updates of the displays."""
+_CURVES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
+"""Fields of the row by the scalars whose values over time they hold."""
+_COMPARE_KEYS = "; compare link.key_file, or $GMMTORCH_TEAM_KEY, of all robots"
 
 
 class _Display(Protocol):
-    """Where a robot is shown. All may raise `OSError`."""
+    """Shows scalars. Both methods may raise `OSError`.
+
+    option: the option that switches it on.
+    """
 
     option: str
-    """That it is there for."""
 
-    def show(self, now: float, numbers: dict[str, float]) -> None: ...
+    def show(self, now: float, scalars: dict[str, float]) -> None: ...
     def close(self) -> None: ...
 
 
 class RobotReport:
-    """Shows a robot as `report.*` want it. Called with the robot's time, as often as one likes.
+    """Shows a robot as the options `report.*` say. Call it with the robot's time (s) as often as you like.
 
-    What can no longer be written is switched off, which the log says once; the robot goes on.
+    A display that fails is closed, which the log says once; the robot continues.
 
     Attributes:
-        series: of the robot's row: "times" (s), at least `evaluation.every` apart, and numbers then.
+        series: fields of the robot's row: "times" (s), at least `evaluation.every` apart, and scalars then.
     """
 
-    def __init__(self, config: DictConfig, node: Node, folder: Path) -> None:
-        self._node, self._every = node, config.evaluation.every
-        self._shown_until = self._noted_until = 0.0
+    def __init__(self, config: DictConfig, view: RobotView, folder: Path) -> None:
+        self._view, self._sample_every = view, config.evaluation.every
+        self._next_show = self._next_sample = 0.0
         self.series: dict[str, list[float]] = {"times": []}
         self._displays: list[_Display] = []
-        if config.report.progress and sys.stderr is not None:  # as it is where it was closed
-            self._displays.append(_Line(node))
+        if config.report.progress and sys.stderr is not None:  # it is None if the process has closed it
+            self._displays.append(_StatusDisplay(view))
         if config.report.tensorboard:
             try:
-                self._displays.append(_Events(folder / "tensorboard"))
+                self._displays.append(_BoardDisplay(folder / "tensorboard"))
             except OSError as error:
-                _tell_off(_Events.option, error)
+                _log_failure(_BoardDisplay.option, error)
 
     def __call__(self, now: float) -> None:
-        """Show and note what there is at the time `now` (s), if there has been nothing for a while."""
-        if now >= self._shown_until:
-            self._shown_until = now + _EVERY
+        """Updates the displays and the series at the time `now` (s), if it is time to."""
+        if now >= self._next_show:
+            self._next_show = now + _PERIOD
             self._show(now)
-        if now >= self._noted_until - 1e-9:
-            self._noted_until = now + self._every
-            self._note(now)
+        if now >= self._next_sample - 1e-9:
+            self._next_sample = now + self._sample_every
+            self._sample(now)
 
     def finish(self, now: float) -> None:
-        """Show and note what there is in the end, in place of what was noted a moment ago."""
+        """Updates the displays and the series for the last time. A sample of a moment ago is replaced."""
         self._show(now)
         times = self.series["times"]
-        if times and now - times[-1] < min(_EVERY, self._every):
+        if times and now - times[-1] < min(_PERIOD, self._sample_every):
             for values in self.series.values():
                 values.pop()
-        self._note(now)
+        self._sample(now)
 
     def _show(self, now: float) -> None:
-        numbers = self._node.scalars()
+        scalars = self._view.scalars()
         for display in list(self._displays):
             try:
-                display.show(now, numbers)
+                display.show(now, scalars)
             except OSError as error:
                 self._displays.remove(display)
-                with contextlib.suppress(OSError):  # as it has just said
+                with contextlib.suppress(OSError):
                     display.close()
-                _tell_off(display.option, error)
+                _log_failure(display.option, error)
 
-    def _note(self, now: float) -> None:
-        numbers = self._node.scalars()
+    def _sample(self, now: float) -> None:
+        scalars = self._view.scalars()
         self.series["times"].append(now)
-        for name, title in _SERIES.items():
-            if name in numbers:
-                self.series.setdefault(title, []).append(numbers[name])
+        for name, field in _CURVES.items():
+            if name in scalars:
+                self.series.setdefault(field, []).append(scalars[name])
 
     def close(self) -> None:
-        """End the line, and the file."""
+        """Closes the displays."""
         while self._displays:
             display = self._displays.pop()
             try:
                 display.close()
             except OSError as error:
-                _tell_off(display.option, error)
+                _log_failure(display.option, error)
 
     def __enter__(self) -> RobotReport:
         return self
@@ -110,26 +112,26 @@ class RobotReport:
         self.close()
 
 
-class _Line:
-    """The status line, and the log above it."""
+class _StatusDisplay:
+    """A status line on standard error, with the log above it."""
 
     option = "report.progress"
 
-    def __init__(self, node: Node) -> None:
-        self._node, self._line = node, StatusLine()
-        common.logger.addHandler(self._line)  # before those of the root, which Hydra has set up
+    def __init__(self, view: RobotView) -> None:
+        self._view, self._line = view, StatusLine()
+        common.logger.addHandler(self._line)  # runs before the handlers of the root logger
 
-    def show(self, now: float, numbers: dict[str, float]) -> None:
-        refused = f", {numbers['refused']:,.0f} refused" if numbers["refused"] else ""
-        self._line.show(f"robot {self._node.robot}  {now:6.0f} s  {self._node.status()}{refused}")
+    def show(self, now: float, scalars: dict[str, float]) -> None:
+        refused = f", {scalars['refused']:,.0f} refused" if scalars["refused"] else ""
+        self._line.show(f"robot {self._view.robot}  {now:6.0f} s  {self._view.status()}{refused}")
 
     def close(self) -> None:
         common.logger.removeHandler(self._line)
         self._line.end()
 
 
-class _Events:
-    """TensorBoard's."""
+class _BoardDisplay:
+    """Scalars in TensorBoard."""
 
     option = "report.tensorboard"
 
@@ -138,22 +140,22 @@ class _Events:
 
         self._board = Board(folder)
 
-    def show(self, now: float, numbers: dict[str, float]) -> None:
-        # Milliseconds, so that all robots of a team have one axis.
-        self._board.scalars(numbers, prefix="robot", step=round(1000 * now))
+    def show(self, now: float, scalars: dict[str, float]) -> None:
+        # Steps are milliseconds, so that all robots of a team have the same axis.
+        self._board.scalars(scalars, prefix="robot", step=round(1000 * now))
 
     def close(self) -> None:
         self._board.close()
 
 
-def _tell_off(option: str, error: OSError) -> None:
-    common.logger.warning("%s is switched off, and the robot goes on: %s", option, error)
+def _log_failure(option: str, error: OSError) -> None:
+    common.logger.warning("%s is switched off, and the robot continues: %s", option, error)
 
 
 def print_refusals(rows: Sequence[dict[str, Any]]) -> None:
-    """A line for each robot, by its row, that has refused what came over the network: why, and how often."""
+    """Prints, for each row of a robot that refused frames, how many and why."""
     for row in rows:
         if counts := row["refused"]:
-            told = ", ".join(f"{n:,} {reason}" for reason, n in counts.items())
-            remedy = _COMPARE if "wrong_key" in counts else ""
-            print(f"robot {row['robot']} refused {sum(counts.values()):,} frames: {told}{remedy}")
+            reasons = ", ".join(f"{n:,} {reason}" for reason, n in counts.items())
+            remedy = _COMPARE_KEYS if "wrong_key" in counts else ""
+            print(f"robot {row['robot']} refused {sum(counts.values()):,} frames: {reasons}{remedy}")

@@ -273,7 +273,9 @@ class ExploreEvaluation(RobotEvaluation):
 
 @dataclass
 class CheckpointOptions:
-    every: float = 60.0
+    """Removed; `explore` says what to do instead."""
+
+    every: float | None = None
     folder: str | None = None
 
 

@@ -1,4 +1,4 @@
-"""A line on standard error that says how things are."""
+"""StatusLine: one line of status on standard error."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import sys
 
 
 class StatusLine(logging.Handler):
-    """On a terminal each line takes the place of the last one; in a file it stands below it.
+    """On a terminal, each status line replaces the last; in a file it is appended.
 
-    While it is shown it also hears the log: a record ends the line, and so has one of its own.
+    As a handler of the log it ends the status line before each record, so that records have their own lines.
     """
 
     def __init__(self) -> None:
@@ -17,8 +17,8 @@ class StatusLine(logging.Handler):
         self._width = 0  # of the line that the terminal's cursor is on
 
     def show(self, line: str) -> None:
-        """Show a line. Raises `OSError` where standard error cannot be written."""
-        self.acquire()  # others may log meanwhile
+        """Shows a line. Raises `OSError` if standard error cannot be written."""
+        self.acquire()  # other threads may log
         try:
             if sys.stderr.isatty():
                 sys.stderr.write("\r" + line.ljust(self._width))
@@ -30,7 +30,7 @@ class StatusLine(logging.Handler):
             self.release()
 
     def end(self) -> None:
-        """Go to a new line, if a line is there. Raises `OSError`."""
+        """Starts a new line if there is a status line. Raises `OSError`."""
         if self._width:
             self._width = 0
             sys.stderr.write("\n")

@@ -1,4 +1,4 @@
-"""gmmtorch-team: the robots of a team, each a process on this machine, and what they leave, collected."""
+"""gmmtorch-team: the robots of a team, each in a process on this machine, and their results together."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ if TYPE_CHECKING:
 _TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_length collisions digest"
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
+"""Options that each robot gets from this command."""
 _STAGE = "seconds"
-_CONVERGENCE = 120.0  # simulated seconds after a mission, for maps to become the same
 _PAUSE = 0.2
-_TURN = 2.0  # seconds that a robot's status is shown for
+"""Seconds between checks of the processes."""
+_TURN = 2.0
+"""Seconds for which a robot's status is shown."""
 
 
 def main() -> None:
@@ -43,19 +45,19 @@ def _guarded(config: DictConfig) -> None:
 
 
 def run(config: DictConfig) -> None:
-    """One run of a team."""
+    """Runs a team until all its robots have ended."""
     from gmmtorch.cli.robot_report import print_refusals
     from gmmtorch.report.progress import ProgressBars
 
-    config.clock = config.clock or ("lockstep" if config.source == "world" else "wall")
+    config.clock = config.clock or "wall"
     check_options(config)
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars, ExitStack() as stack:
         _prepare(config, bars)
         robots = _started(config, folder, stack)
-        about = _in_step(config, robots, bars) if config.clock == "lockstep" else _by_the_clock(robots, bars)
+        _wait(robots, bars)
         rows = [robot.row() for robot in robots]
-    summary = {**_summary(rows), **about}
+    summary = _summary(rows)
     outputs = Outputs(folder)
     outputs.written("results.json", lambda _: common.write_results("team", config, [summary, *rows], folder))
     _show(config, rows, outputs)
@@ -69,7 +71,7 @@ def run(config: DictConfig) -> None:
 
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
-    """What all robots would otherwise make, each for itself at the same time; and errors, said once."""
+    """Computes the world's properties once for all robots, and raises errors of the options once."""
     from gmmtorch.exploration.mission.team_setup import start_poses
 
     if config.source == "world":
@@ -82,22 +84,20 @@ def _prepare(config: DictConfig, bars: ProgressBars) -> None:
 
 def _started(config: DictConfig, folder: Path, stack: ExitStack) -> list[RobotProcess]:
     """The processes of all robots; they end with the stack."""
-    given = _given()
-    where = _endpoints(config)
-    # Whoever ends this process, its robots end with it.
+    given, addresses = _given_options(), _addresses(config)
+    # SIGTERM ends this process like Ctrl-C, so that the stack ends the robots.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     stack.callback(signal.signal, signal.SIGTERM, before)
     robots: list[RobotProcess] = []
     stack.callback(end_all, robots)
     for number in range(config.team.size):
-        own = [*given, *where[number], f"id={number}", f"clock={config.clock}", "report.figures=false"]
-        place = (folder / f"robot_{number}").resolve()
-        robots.append(RobotProcess(number, own, place, in_step=config.clock == "lockstep"))
+        own = [*given, *addresses[number], f"id={number}", "report.figures=false"]
+        robots.append(RobotProcess(number, own, (folder / f"robot_{number}").resolve()))
     return robots
 
 
-def _given() -> list[str]:
-    """The options of this run that its robots have, too, as they were given."""
+def _given_options() -> list[str]:
+    """The options of this run, as they were given, that all its robots get."""
     from hydra.core.hydra_config import HydraConfig
 
     from gmmtorch.errors import InvalidArgumentError
@@ -106,17 +106,17 @@ def _given() -> list[str]:
     for item in given:
         if item.split("=")[0] in _OWN:
             raise InvalidArgumentError(
-                f"{item} is for gmmtorch-robot: gmmtorch-team gives each of its robots its own."
+                f"{item} is an option of gmmtorch-robot: gmmtorch-team chooses it for each robot."
             )
     return [item for item in given if not item.startswith("clock=")]
 
 
-def _endpoints(config: DictConfig) -> list[list[str]]:
-    """Where each robot listens, and whom it sends to: overrides of each."""
+def _addresses(config: DictConfig) -> list[list[str]]:
+    """The options of each robot that say where it listens, and where it sends to."""
     n = config.team.size
     if config.transport == "zenoh":
         free = links.free_addresses(n, socket.SOCK_STREAM)
-        # Each knows those before it: one link between any two.
+        # Each connects to those before it: one link between any two.
         return [
             [
                 f"link.listen_endpoints=[tcp/{free[k]}]",
@@ -133,51 +133,25 @@ def _endpoints(config: DictConfig) -> list[list[str]]:
     ]
 
 
-# -- its time -------------------------------------------------------------------------------------
-
-
-def _in_step(config: DictConfig, robots: list[RobotProcess], bars: ProgressBars) -> dict[str, Any]:
-    """Fly the mission, tick by tick."""
-    from gmmtorch.exploration.mission.lockstep import RemotePilot, RobotLostError
-    from gmmtorch.exploration.mission.team_flight import TeamFlight
-
-    pilots: list[RemotePilot] = []
-    for robot in robots:
-        pilots.append(RemotePilot(robot.number, *robot.pipes, pilots))
-    try:
-        flight = TeamFlight(pilots, missions.team_options(config, config.seed, {}))
-        while not flight.is_over:
-            flight.step()
-            bars(_STAGE, round(flight.now), round(config.duration))
-            bars.note(_STAGE, _status(robots))
-        converged = flight.converge(_CONVERGENCE)
-        flight.finish()
-    except RobotLostError as error:
-        robots[error.robot].explain()
-        raise
-    return {"encounters": flight.encounters, "converged_after": converged}
-
-
-def _by_the_clock(robots: list[RobotProcess], bars: ProgressBars) -> dict[str, Any]:
-    """Wait until all have ended."""
+def _wait(robots: list[RobotProcess], bars: ProgressBars) -> None:
+    """Returns when all robots have ended. Raises `GmmTorchError` if one failed."""
     begin = time.monotonic()
-    while working := [robot for robot in robots if robot.is_at_work()]:
+    while running := [robot for robot in robots if robot.is_running()]:
         bars(_STAGE, round(time.monotonic() - begin))
-        bars.note(_STAGE, _status(working))
+        bars.note(_STAGE, _status(running))
         time.sleep(_PAUSE)
-    return {}
 
 
 def _status(robots: Sequence[RobotProcess]) -> str:
-    """Of one robot after the other."""
-    return robots[int(time.monotonic() / _TURN) % len(robots)].status()
+    """The status of one robot after the other."""
+    return robots[int(time.monotonic() / _TURN) % len(robots)].last_line()
 
 
-# -- what comes of it -----------------------------------------------------------------------------
+# -- the results ----------------------------------------------------------------------------------
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of the team as a whole."""
+    """The row of the whole team."""
     return {
         "n_robots": len(rows),
         "same_map": len({row["digest"] for row in rows}) == 1,
@@ -187,7 +161,7 @@ def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> None:
-    """The picture of the run: as a file, and in TensorBoard."""
+    """Writes the figure of the run, as a file and for TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.report.exploration.team_figures import team_run_figure
@@ -196,14 +170,14 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
 
     figure = team_run_figure(rows)
 
-    def show(folder: Path) -> None:
+    def write_board(folder: Path) -> None:
         with Board(folder) as board:
             board.figure("figures/run", figure)
 
     if config.report.figures:
         outputs.written("run.png", functools.partial(save_figure, figure))
     if config.report.tensorboard:
-        outputs.written("team", show)
+        outputs.written("team", write_board)
 
 
 if __name__ == "__main__":

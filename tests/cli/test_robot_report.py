@@ -1,4 +1,4 @@
-"""What a robot shows of itself, and that it does without where that cannot be shown."""
+"""RobotReport: displays that fail are switched off."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gmmtorch.files import write_bytes
 
 
 class Toy:
-    """A robot of which there is little to say."""
+    """A robot view with fixed values."""
 
     robot = 3
 
@@ -52,10 +52,10 @@ def report(folder: Path, *options: str) -> RobotReport:
     return RobotReport(composed("robot", "evaluation.every=1", *options), toy, folder)
 
 
-def test_a_record_of_the_log_has_a_line_of_its_own(log, tmp_path, monkeypatch):
+def test_log_records_have_their_own_lines(log, tmp_path, monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    written = logging.StreamHandler(terminal)  # as a terminal shows both
+    written = logging.StreamHandler(terminal)  # a terminal shows both
     logging.getLogger().addHandler(written)
     handlers = list(common.logger.handlers)
     try:
@@ -72,20 +72,20 @@ def test_a_record_of_the_log_has_a_line_of_its_own(log, tmp_path, monkeypatch):
     assert common.logger.handlers == handlers
 
 
-def test_a_terminal_that_is_gone_is_done_without(log, tmp_path, monkeypatch):
+def test_a_terminal_that_fails_is_switched_off(log, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stderr", Broken())
     with report(tmp_path, "report.tensorboard=false") as shown:
         for now in range(4):
             shown(float(now))
         shown.finish(4.0)
     assert [record.getMessage() for record in log.records] == [
-        "report.progress is switched off, and the robot goes on: [Errno 28] No space left on device"
+        "report.progress is switched off, and the robot continues: [Errno 28] No space left on device"
     ]
     assert shown.series["records_over_time"] == [5.0] * 5
 
 
 @pytest.mark.parametrize("when", ["at the start", "in between", "in the end"])
-def test_what_tensorboard_cannot_write_is_told_once(when, log, tmp_path, capsys):
+def test_a_failing_tensorboard_is_logged_once(when, log, tmp_path, capsys):
     if when == "at the start":
         (tmp_path / "tensorboard").write_text("no folder")
     with Disk() as disk, terse(), report(tmp_path, "report.progress=false") as shown:
@@ -98,19 +98,19 @@ def test_what_tensorboard_cannot_write_is_told_once(when, log, tmp_path, capsys)
             disk.fill()
             shown.finish(30.0)
     (record,) = log.records
-    assert record.getMessage().startswith("report.tensorboard is switched off, and the robot goes on: ")
+    assert record.getMessage().startswith("report.tensorboard is switched off, and the robot continues: ")
     assert len(shown.series["times"]) >= 30
     assert capsys.readouterr().err == ""
 
 
-def test_without_standard_error_there_is_no_line(log, tmp_path, monkeypatch):
+def test_without_standard_error_there_is_no_status_line(log, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stderr", None)
     with report(tmp_path, "report.tensorboard=false") as shown:
         shown(0.0)
     assert not log.records
 
 
-def test_refusals_are_told_with_their_reasons(capsys):
+def test_refusals_are_printed_with_their_reasons(capsys):
     rows = [
         {"robot": 0, "refused": {}},
         {"robot": 1, "refused": {"wrong_key": 1200, "replayed": 2}},
@@ -123,7 +123,7 @@ def test_refusals_are_told_with_their_reasons(capsys):
     assert two == "robot 2 refused 1 frames: 1 foreign"
 
 
-def test_every_file_is_tried_and_what_is_missing_told(tmp_path):
+def test_every_file_is_written_and_failures_are_named(tmp_path):
     (tmp_path / "taken").mkdir()
 
     def fails(path: Path) -> None:

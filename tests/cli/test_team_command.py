@@ -1,4 +1,4 @@
-"""gmmtorch-team: robots as processes fly what one process flies, replay logs, and do not outlive it."""
+"""gmmtorch-team: robots as processes share one map, and end with the process of the team."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_runs import COMMANDS, QUIET, Disk, Finished, refused, run_here, succeeded
+from exploration.test_map_publisher import everything
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from test_robot_command import LOG, SMALL, room
 
-from gmmtorch.cli import missions, robot_process, team
+from gmmtorch.cli import robot_process, team
+from gmmtorch.cli.robot import facts_of
 from gmmtorch.cli.robot_process import RobotProcess
-from gmmtorch.exploration.mission.team_setup import assemble
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
 
 Run = Callable[..., Finished]
@@ -36,75 +38,56 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     return run_command
 
 
-# -- in step --------------------------------------------------------------------------------------
+# -- a team in a world ----------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """Two robots in a room for four seconds, with everything that is shown."""
-    folder = tmp_path_factory.mktemp("team")
-    options = ["world=mesh", f"world.path={room(folder / 'room.obj')}", *SMALL, "team.size=2"]
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setitem(COMMANDS, "team", team)
-        monkeypatch.delenv(KEY_VARIABLE, raising=False)
-        options += ["duration=4", "evaluation.every=2"]
-        return succeeded(run_here(monkeypatch, "team", folder / "run", *options))
-
-
-def test_it_is_the_mission_that_one_process_flies(flown):
-    results = flown.results()
-    config: Any = OmegaConf.create(results["config"])
-    options = replace(missions.team_options(config, config.seed, {}), latency=0.0)
-    mission = assemble(missions.world_options(config).open(options), options)
-    while not mission.is_over:
-        mission.step()
-    mission.converge(config.settle)
-    summary, *rows = results["rows"]
-    for row, agent, entropy in zip(
-        rows, mission.agents, mission.samples["entropy_bits_per_robot"], strict=True
-    ):
-        assert row["digest"] == agent.robot.mapper.digest().hex()
-        assert row["views_digest"] == agent.robot.library.digest().hex()
-        assert row["path_length"] == agent.robot.path_length
-        assert row["bytes_sent"] == mission.network.traffic(agent.number).bytes > 0
-        assert row["datagrams"] == mission.network.traffic(agent.number).datagrams
-        assert row["times"] == mission.samples["times"] == [0.0, 2.0, 4.0]
-        assert row["entropy_bits"] == pytest.approx(entropy, rel=1e-12)
-        assert row["late"] == 0
-        assert row["socket_datagrams"] == row["datagrams"]
-        assert row["socket_bytes"] + 28 * row["socket_datagrams"] == row["wire_bytes"]
+@pytest.mark.slow
+def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypatch):
+    monkeypatch.setitem(COMMANDS, "team", team)
+    monkeypatch.delenv(KEY_VARIABLE, raising=False)
+    options = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, "team.size=2"]
+    options += ["duration=4", "speed=2", "settle=4", "evaluation.every=2", "network.announce=0.5"]
+    done = succeeded(run_here(monkeypatch, "team", tmp_path / "run", *options))
+    assert done.results()["config"]["clock"] == "wall"
+    summary, *rows = done.results()["rows"]
+    observer = Replica(9, dim=3)
+    facts = facts_of(OmegaConf.create(done.results()["config"]))
+    for number in (0, 1):
+        one = Replica(number, dim=3)
+        with Store(done.folder / f"robot_{number}" / f"robot_{number}.sqlite", number, facts) as store:
+            store.restore(one)
+        for datagram in everything(one):
+            observer.receive(datagram)
+    assert {row["digest"] for row in rows} == {observer.digest().hex()}
     assert summary["same_map"] is True
-    assert summary["path_length"] > 0
-    assert summary["bytes_sent"] == mission.network.n_bytes
-    assert summary["n_robots"] == 2
-    assert summary["encounters"] == summary["collisions"] == 0
+    assert (summary["n_robots"], summary["collisions"]) == (2, 0)
+    assert summary["path_length"] == sum(row["path_length"] for row in rows) > 0
+    assert summary["bytes_sent"] == sum(row["bytes_sent"] for row in rows) > 0
+    for row in rows:
+        assert row["n_components"] > 0
+        assert row["stopped"] is False
+        assert row["ticks_late"] <= 4
+        assert row["socket_bytes"] + 28 * row["socket_datagrams"] == row["wire_bytes"]
 
-
-def test_everything_is_where_it_is_said_to_be(flown):
-    assert flown.results()["config"]["clock"] == "lockstep"
-    files = flown.files()
+    files = done.files()
     for number in (0, 1):
         here = f"robot_{number}/"
-        assert {
-            here + "results.json",
-            here + "map.safetensors",
-            here + "trajectory.npz",
-            here + "output.log",
-        } <= files
+        names = ("results.json", "map.safetensors", "trajectory.npz", "output.log")
+        assert {here + name for name in names} <= files
         assert any(name.startswith(here + "tensorboard/events") for name in files)
         assert here + "run.png" not in files
-        assert not any(name.startswith(here + "journal") for name in files)
-        assert "% of the entropy left" in (flown.folder / here / "output.log").read_text()
+        assert "% of the entropy left" in (done.folder / here / "output.log").read_text()
     assert "run.png" in files
     assert any(name.startswith("team/events") for name in files)
-    assert "2 robots: all hold the same map" in flown.stdout
-    assert f"browse    tensorboard --logdir {flown.folder}\n" in flown.stdout
+    assert "2 robots: all hold the same map" in done.stdout
+    assert f"browse    tensorboard --logdir {done.folder}\n" in done.stdout
 
 
-# -- by the clock ---------------------------------------------------------------------------------
+# -- a team that replays a log --------------------------------------------------------------------
 
 
-def test_a_log_is_replayed_by_all_and_each_ends_with_all_of_it(run):
+@pytest.mark.slow
+def test_a_team_replays_a_log_and_all_robots_end_with_all_records(run):
     options = ["log.rate=20", "settle=8", "network.announce=0.3", "network.loss=0.2"]
     done = succeeded(run(*LOG, *options))
     summary, *rows = done.results()["rows"]
@@ -117,16 +100,16 @@ def test_a_log_is_replayed_by_all_and_each_ends_with_all_of_it(run):
 
 
 class Done:
-    """A robot that works while it is asked so often, and has refused something."""
+    """A robot that runs for some checks, and has refused something."""
 
-    def __init__(self, number: int, n_asked: int, disk: Disk | None = None) -> None:
-        self.number, self._left, self._disk = number, n_asked, disk
+    def __init__(self, number: int, n_checks: int, disk: Disk | None = None) -> None:
+        self.number, self._left, self._disk = number, n_checks, disk
 
-    def is_at_work(self) -> bool:
+    def is_running(self) -> bool:
         self._left -= 1
         return self._left >= 0
 
-    def status(self) -> str:
+    def last_line(self) -> str:
         return f"robot {self.number} {'works' if self._left >= 0 else 'has ended'}"
 
     def row(self) -> dict[str, Any]:
@@ -136,7 +119,7 @@ class Done:
         return {"robot": self.number, "digest": "12", "n_records": 5, "refused": refused}
 
 
-def test_those_that_still_work_are_shown(monkeypatch):
+def test_the_status_is_of_robots_that_run(monkeypatch):
     notes: list[str] = []
 
     class Bars:
@@ -149,13 +132,13 @@ def test_those_that_still_work_are_shown(monkeypatch):
     monkeypatch.setattr(team, "_PAUSE", 0.0)
     monkeypatch.setattr(team.time, "monotonic", lambda: next(times))
     robots: Any = [Done(0, 2), Done(1, 12)]
-    team._by_the_clock(robots, Bars())  # type: ignore[arg-type]
+    team._wait(robots, Bars())  # type: ignore[arg-type]
     assert set(notes) == {"robot 0 works", "robot 1 works"}
     assert len(notes) == 12
     assert set(notes[2:]) == {"robot 1 works"}
 
 
-def test_what_a_full_disk_does_not_take_is_told_below_the_table(run, monkeypatch):
+def test_files_that_a_full_disk_rejects_are_named_below_the_table(run, monkeypatch):
     with Disk() as disk:
         monkeypatch.setattr(team, "_started", lambda *_: [Done(k, 0, disk) for k in range(2)])
         done = run(*LOG)
@@ -173,7 +156,7 @@ def test_what_a_full_disk_does_not_take_is_told_below_the_table(run, monkeypatch
 
 @pytest.fixture
 def robots(monkeypatch) -> list[RobotProcess]:
-    """Those that are started."""
+    """The robots that are started."""
     started: list[RobotProcess] = []
 
     class Noted(RobotProcess):
@@ -186,7 +169,7 @@ def robots(monkeypatch) -> list[RobotProcess]:
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
-    """Robots that do nothing but this, in which `number` is theirs."""
+    """Replaces the robots' program; `number` is the robot's id in it."""
     find = (
         "import sys, os, time, signal\nnumber = int([a for a in sys.argv if a.startswith('id=')][-1][3:])\n"
     )
@@ -212,32 +195,22 @@ time.sleep(600)
 
 
 @pytest.mark.parametrize(
-    ("source", "code", "words"),
+    ("code", "words"),
     [
-        ("log", FAILS + WAITS, "Robot 1 has ended: no more of this (its output"),
-        ("log", HYDRA + WAITS, "Robot 1 has ended: ImportError: no module named radio (its output"),
-        ("log", "if number == 1: os.kill(os.getpid(), signal.SIGKILL)\n" + WAITS, "ended by SIGKILL"),
-        ("log", "", "Robot 0 has left no results"),
-        (
-            "world",
-            FAILS + "print('{\"sent\": 0}', flush=True)\n" + WAITS,
-            "Robot 1 has ended: no more of this",
-        ),
-        ("world", "print('hello', flush=True)\n" + WAITS, "Robot 0 is lost: it answers 'hello"),
+        (FAILS + WAITS, "Robot 1 has ended: no more of this (its output"),
+        (HYDRA + WAITS, "Robot 1 has ended: ImportError: no module named radio (its output"),
+        ("if number == 1: os.kill(os.getpid(), signal.SIGKILL)\n" + WAITS, "ended by SIGKILL"),
+        ("", "Robot 0 has left no results"),
     ],
 )
-def test_a_robot_that_fails_ends_the_others_and_is_told_of(
-    source, code, words, run, robots, monkeypatch, tmp_path
-):
+def test_a_robot_that_fails_is_reported_and_ends_the_others(code, words, run, robots, monkeypatch):
     pretend(monkeypatch, code)
-    monkeypatch.setattr(robot_process, "_GRACE", 1.0 if "hello" in code else 20.0)
-    world = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL]
-    assert words in refused(run(*(LOG if source == "log" else world)))
+    assert words in refused(run(*LOG))
     assert len(robots) == 2
     assert all(robot._process.returncode is not None for robot in robots)
 
 
-def test_robots_that_will_not_end_are_killed(run, robots, monkeypatch):
+def test_robots_that_ignore_signals_are_killed(run, robots, monkeypatch):
     monkeypatch.setattr(robot_process, "_PATIENCE", 0.3)
     pretend(monkeypatch, DEAF)
     refused(run(*LOG))
@@ -245,7 +218,7 @@ def test_robots_that_will_not_end_are_killed(run, robots, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_told_to_stop_it_ends_all_robots(name, run, robots, monkeypatch):
+def test_a_signal_ends_all_robots(name, run, robots, monkeypatch):
     pretend(monkeypatch, WAITS)
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(team, "_status", lambda _: os.kill(os.getpid(), getattr(signal, name)))
@@ -268,18 +241,17 @@ def test_told_to_stop_it_ends_all_robots(name, run, robots, monkeypatch):
             "link.connect_endpoints gmmtorch-robot",
         ),
         ("clock=sun", "clock='sun'"),
-        ("clock=lockstep source=log", "clock=lockstep source=world"),
-        ("journal.folder=kept", "journal.folder=kept clock=wall"),
-        ("speed=2", "speed=2.0 clock=wall"),
-        ("settle=-1 clock=wall", "settle=-1.0"),
+        ("clock=lockstep", "clock=lockstep clock=wall speed=2"),
+        ("speed=0", "speed=0.0"),
+        ("settle=-1", "settle=-1.0"),
         ("team.size=0", "team.size=0"),
         ("team.size=40", "team.size=40"),
         ("runtime.device=meta", "runtime.device=meta"),
     ],
 )
-def test_a_bad_value_is_named_before_a_robot_is_started(options, words, run, robots, tmp_path, monkeypatch):
+def test_bad_values_are_named_before_a_robot_is_started(options, words, run, robots, tmp_path, monkeypatch):
     if "settle" in options:
-        monkeypatch.setattr(team, "_prepare", None)  # nor is the world worked out
+        monkeypatch.setattr(team, "_prepare", None)  # nor is the world opened
     line = refused(run("world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, *options.split()))
     for word in words.split():
         assert word in line
@@ -287,6 +259,6 @@ def test_a_bad_value_is_named_before_a_robot_is_started(options, words, run, rob
 
 
 @pytest.mark.parametrize("name", ["plain", "with space", "it's, [a] (strange) {place}=x", "ö"])
-def test_any_folder_is_a_value_for_hydra(name):
+def test_every_folder_name_is_quoted_for_hydra(name):
     text = f"hydra.run.dir={robot_process._quoted(Path('/tmp') / name)}"
     assert OverridesParser.create().parse_override(text).value() == f"/tmp/{name}"

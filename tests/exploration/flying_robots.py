@@ -1,4 +1,4 @@
-"""A small team in a small room, whose robots talk over UDP on loopback."""
+"""A small team in a small room, whose robots run in missions of their own and talk over UDP on loopback."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from gmmtorch.exploration.mission.flying import FlyingNode
+from gmmtorch.exploration.mission.clocks import Stopwatch
+from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
 from gmmtorch.exploration.world.world import World
@@ -26,14 +27,14 @@ TEAM = TeamOptions(
 
 
 def small_room() -> World:
-    """7 by 6 by 3 metres, its walls half a cell off the lattice."""
+    """A room of 7 by 6 by 3 metres, whose walls lie half a cell off the lattice."""
     walls = box((0.1, 0.1, 0.1), (7.1, 6.1, 3.1))
     return World.from_mesh(walls, start=(2.0, 2.0, 1.3), cache=False, name="room")
 
 
 @contextmanager
 def transports(n: int, **options: Any) -> Iterator[list[UdpTransport]]:
-    """Of robots that all know one another."""
+    """Transports that all send to one another."""
     with ExitStack() as stack:
         made = [stack.enter_context(UdpTransport.unicast(k, **options)) for k in range(n)]
         for one in made:
@@ -41,9 +42,10 @@ def transports(n: int, **options: Any) -> Iterator[list[UdpTransport]]:
         yield made
 
 
-def flying(
+def mission_of(
     number: int, world: World, options: TeamOptions, transport: UdpTransport, **about: Any
-) -> FlyingNode:
-    """A robot that is ready to fly. about: an incarnation."""
-    agent = make_agent(number, start_poses(world, options)[number], world, options, transport, **about)
-    return FlyingNode(agent, world, options, transport)
+) -> Mission:
+    """The mission of one robot. about: an incarnation."""
+    watch, pose = Stopwatch(), start_poses(world, options)[number]
+    agent = make_agent(number, pose, world, options, transport, watch=watch, **about)
+    return Mission(world, [agent], options, watch)

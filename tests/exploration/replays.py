@@ -1,14 +1,16 @@
-"""What tests of replaying robots share: a clock, logs, and what maps say."""
+"""Helpers for tests of robots that replay logs: a clock, a driver of several robots, logs, map contents."""
 
 from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import torch
 
 from gmmtorch.datasets import load
+from gmmtorch.exploration.mission.clocks import WallClock
+from gmmtorch.exploration.mission.driver import Drivable, Run, drive, never, settle
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -17,13 +19,13 @@ from gmmtorch.scan import Scan
 
 RULES = {
     "per_scan": WindowedRule(window=1, max_origins=1),
-    "windowed": WindowedRule(window=4, max_origins=2),  # which draws the origins that it keeps
-    "incremental": IncrementalRule(window=3, n_components=40),  # which merges what was published
+    "windowed": WindowedRule(window=4, max_origins=2),  # draws the origins that it keeps
+    "incremental": IncrementalRule(window=3, n_components=40),  # merges published components
 }
 
 
-class Clock:
-    """Stands still but for sleep."""
+class FakeTime:
+    """A system clock that only `sleep` advances."""
 
     def __init__(self) -> None:
         self.time = 100.0
@@ -37,20 +39,62 @@ class Clock:
         self.time += seconds
 
 
-@functools.cache
-def log(n_scans: int) -> list[Scan]:
-    """Scans of a laser in a simulated office; every sixth beam."""
+class Together:
+    """Several missions in one thread, as one mission."""
 
+    def __init__(self, *missions: Drivable) -> None:
+        self._missions = missions
+        self.tick_seconds = missions[0].tick_seconds
+
+    @property
+    def is_over(self) -> bool:
+        return all(mission.is_over for mission in self._missions)
+
+    def tick(self, now: float) -> None:
+        for mission in self._missions:
+            (mission.exchange if mission.is_over else mission.tick)(now)
+
+    def exchange(self, now: float) -> None:
+        for mission in self._missions:
+            mission.exchange(now)
+
+    def content(self) -> Hashable:
+        return tuple(mission.content() for mission in self._missions)
+
+
+def run(
+    *missions: Drivable,
+    quiet: float = 0.0,
+    clock: WallClock | None = None,
+    stop: Callable[[], bool] = never,
+    on_step: Callable[[], object] = lambda: None,
+) -> Run:
+    """Drives missions together, by a fake clock unless one is given, then lets them settle."""
+    fake = FakeTime()
+    clock = WallClock(clock=fake, sleep=fake.sleep) if clock is None else clock
+    together = Together(*missions)
+    done = drive(together, clock, stop=stop, on_step=on_step)
+    settle(together, clock, quiet, on_step=on_step)
+    return done
+
+
+def log(n_scans: int) -> list[Scan]:
+    """The first scans, at most 32, of a laser in a simulated office, with every sixth beam."""
+    return _scans()[:n_scans]
+
+
+@functools.cache
+def _scans() -> list[Scan]:
     def thinned(scan: Scan) -> Scan:
         keep = torch.zeros(scan.n_beams, dtype=torch.bool)
         keep[::6] = True
         return scan.select(keep)
 
-    return [thinned(scan) for scan in load("synthetic_building_2d", n_scans=n_scans)]
+    return [thinned(scan) for scan in load("synthetic_building_2d", n_scans=32)]
 
 
 def mapped(rule: str, scans: Sequence[Scan]) -> GaussianMap:
-    """The map of a robot that is alone, and never killed."""
+    """The map of a single robot that is never killed."""
     made = GaussianMap(RULES[rule])
     for scan in scans:
         made.insert(scan)
@@ -58,7 +102,7 @@ def mapped(rule: str, scans: Sequence[Scan]) -> GaussianMap:
 
 
 def content(*maps: Components) -> Counter[tuple[object, ...]]:
-    """What components say, to the bit, whatever their ids and order, and how often."""
+    """How often each content occurs among components, to the bit; independent of ids and order."""
     found: Counter[tuple[object, ...]] = Counter()
     for components in maps:
         c = quantized(components)

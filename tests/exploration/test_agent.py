@@ -1,4 +1,4 @@
-"""An agent and its radio: what it makes of whatever comes, and when it says what."""
+"""Agent and Radio: how they treat messages of any kind, and when they send."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from sharing.message_examples import examples, frame_of_components, views
 from gmmtorch.errors import DataError
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.exploration.mission.clocks import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
@@ -50,7 +49,7 @@ MAPS = ("replica", "float", "grid_shared", "grid_isolated")
 
 
 class Post:
-    """A network that notes what it is given, and delivers what it is told to."""
+    """A network that records what is sent, and delivers what the test puts into `coming`."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[float, int, bytes, str]] = []
@@ -68,17 +67,11 @@ class Post:
 
 
 class Ahead:
-    """A planner of one plan: to fly on."""
+    """A planner whose only plan is to fly ahead."""
 
     def plan(self, task: PlanningTask) -> Plan:
         path = PRIMITIVES.rollout(task.state[None])[0, int(PRIMITIVES.commands[:, 0].argmax())]
         return Plan(path, PRIMITIVES.braking(path[-1]), path[-1:, :4], 1.0, "explore")
-
-    def state(self) -> dict[str, Any]:
-        return {}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        pass
 
 
 def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent, Post]:
@@ -100,7 +93,7 @@ def hear(one: Agent, post: Post, *pairs: tuple[int, bytes], now: float = 0.0) ->
 
 
 def learned(number: int, kind: str = "replica", places: Sequence[Any] = PLACES) -> list[bytes]:
-    """All that an agent says that looks around."""
+    """All datagrams of an agent that looks around."""
     one, post = agent(number, kind)
     for seed, place in enumerate(places):
         one.learn(frame(*place, seed=seed), float(3 * seed))
@@ -112,11 +105,11 @@ def sayings() -> list[list[bytes]]:
     return [learned(number, places=(PLACES[number:] * 5)[:10]) for number in (1, 2)]
 
 
-# -- what comes ---------------------------------------------------------------------------------------
+# -- messages ----------------------------------------------------------------------------------------
 
 
 def odd() -> list[bytes]:
-    """Sound datagrams of all kinds, that no teammate has reason to send."""
+    """Sound datagrams of all kinds that no teammate would send."""
     teammate = Replica(5, dim=3, incarnation=3)
     ids = teammate.add(frame_of_components(6))
     teammate.count({(5, int(ids[0, 1])): 4.0})
@@ -151,11 +144,11 @@ AGENTS = {kind: agent(kind=kind) for kind in ("replica", "float", "grid_shared")
 @given(noise=st.lists(damaged, min_size=1, max_size=4), sender=st.integers(0, 40))
 def test_damaged_datagrams_are_counted_and_dropped(kind: str, noise: list[bytes], sender: int) -> None:
     one, post = AGENTS[kind]
-    before = (one.radio.n_heard, one.radio.n_damaged, one.digest(), one.robot.mapper.belief.entropy_bits)
+    before = (one.radio.n_received, one.radio.n_damaged, one.digest(), one.robot.mapper.belief.entropy_bits)
     n_damaged = sum(map(is_damaged, noise))
     assert n_damaged == len(noise)
     hear(one, post, *((sender, datagram) for datagram in noise))
-    assert one.radio.n_heard == before[0] + len(noise)
+    assert one.radio.n_received == before[0] + len(noise)
     assert one.radio.n_damaged == before[1] + n_damaged
     assert (one.digest(), one.robot.mapper.belief.entropy_bits) == before[2:]
 
@@ -169,25 +162,25 @@ def is_damaged(datagram: bytes) -> bool:
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_whatever_is_sound_is_taken_as_it_is(kind: str) -> None:
+def test_all_sound_datagrams_are_accepted(kind: str) -> None:
     one, post = agent(kind=kind)
     one.learn(frame(*PLACES[0]), 0.0)
     for number, datagram in enumerate([*SOUND, *SOUND[::-1]]):
         hear(one, post, (number % 4, datagram), now=1.0 + number)
     assert one.radio.n_damaged == 0
-    assert one.radio.n_heard == 2 * len(SOUND)
+    assert one.radio.n_received == 2 * len(SOUND)
     belief = one.robot.mapper.belief
     for part in belief.grid.dense(BOX):
         assert bool(part.isfinite().all())
         assert bool((part >= 0).all())
     one.learn(frame(*PLACES[1]), 1e3)
-    one.survey(1e3)
+    one.begin_planning(1e3)
     one.propose(1e3, [0, 1, 2, 900], PeerTrajectories.of([]))
-    one.tell_plan(1e3, 1)
+    one.send_plan(1e3, 1)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_order_in_which_things_come_makes_no_other_map(sayings: list[list[bytes]], seed: int) -> None:
+def test_the_map_does_not_depend_on_the_order_of_arrival(sayings: list[list[bytes]], seed: int) -> None:
     said = [(number, datagram) for number, some in enumerate(sayings, 1) for datagram in some]
     order = torch.randperm(len(said), generator=torch.Generator().manual_seed(seed)).tolist()
     (one, post), (other, its_post) = agent(), agent()
@@ -200,7 +193,7 @@ def test_the_order_in_which_things_come_makes_no_other_map(sayings: list[list[by
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
 
 
-def test_who_was_quicker_makes_no_difference_to_the_last_bit(sayings: list[list[bytes]]) -> None:
+def test_evidence_is_equal_to_the_bit_whichever_sender_was_faster(sayings: list[list[bytes]]) -> None:
     one, other = sayings
     found = []
     for first, second in ((1, 2), (2, 1)):
@@ -216,13 +209,13 @@ def test_who_was_quicker_makes_no_difference_to_the_last_bit(sayings: list[list[
 
 
 def plan_datagram(number: int, x: float, sender: int = 1, steps: int = 10) -> bytes:
-    """To stand at x for `steps` fifths of a second."""
+    """A plan to stay at x for `steps` steps of 0.2 s."""
     poses = torch.tensor([[x, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(steps, 4)
     (datagram,) = encode_plan(sender, number, float(number), 0.2, poses, poses[:1])
     return datagram
 
 
-def test_a_plan_that_was_overtaken_is_late() -> None:
+def test_an_overtaken_plan_is_ignored() -> None:
     one, post = agent()
     said = {number: plan_datagram(number, float(number)) for number in range(1, 9)}
     latest = 0
@@ -235,7 +228,7 @@ def test_a_plan_that_was_overtaken_is_late() -> None:
     assert list(one.robot.plans) == [1]
 
 
-def test_a_robot_that_began_anew_is_believed() -> None:
+def test_a_much_lower_plan_number_is_accepted() -> None:
     one, post = agent()
     hear(one, post, (1, plan_datagram(400, 1.0)), (2, plan_datagram(7, 3.0, sender=2)))
     hear(one, post, (1, plan_datagram(0, 2.0)))
@@ -244,7 +237,7 @@ def test_a_robot_that_began_anew_is_believed() -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1, 4])
-def test_a_robot_that_began_anew_early_is_believed_once_its_last_path_is_flown(number: int) -> None:
+def test_a_lower_plan_number_is_accepted_once_the_last_path_is_flown(number: int) -> None:
     one, post = agent()
     hear(one, post, (1, plan_datagram(4, 1.0)), now=8.0)
     hear(one, post, (1, plan_datagram(number, 2.0)), now=9.9)  # two seconds of it
@@ -254,7 +247,7 @@ def test_a_robot_that_began_anew_early_is_believed_once_its_last_path_is_flown(n
     assert one.heard_at[1] == 10.0
 
 
-def test_plans_are_of_teammates_who_speak_for_themselves() -> None:
+def test_plans_of_strangers_and_under_another_id_are_ignored() -> None:
     one, post = agent(number=1)
     hear(one, post, *((sender, plan_datagram(0, 1.0, 2)) for sender in (0, 1, 3, 900)))  # of another
     hear(one, post, (1, plan_datagram(0, 1.0, 1)))  # its own
@@ -268,15 +261,15 @@ def test_plans_are_of_teammates_who_speak_for_themselves() -> None:
 
 
 def fly(one: Agent, now: float, number: int, rests: bool) -> None:
-    one.robot.rests = lambda now: rests  # type: ignore[method-assign]
-    one.survey(now)
+    one.robot.should_rest = lambda now: rests  # type: ignore[method-assign]
+    one.begin_planning(now)
     one.propose(now, [], PeerTrajectories.of([]))
-    one.settle()
-    one.tell_plan(now, number)
+    one.follow()
+    one.send_plan(now, number)
     one.robot.advance(0, 100)
 
 
-def test_a_robot_at_rest_tells_its_plan_every_tenth_time() -> None:
+def test_a_resting_robot_sends_one_plan_in_ten() -> None:
     one, post = agent()
     for number in range(25):
         fly(one, 2.0 * number, number, rests=True)
@@ -284,43 +277,37 @@ def test_a_robot_at_rest_tells_its_plan_every_tenth_time() -> None:
     assert [plan.number for plan in plans if isinstance(plan, PlanMessage)] == [0, 10, 20]
 
 
-def test_a_robot_that_moves_tells_every_plan_and_where_it_comes_to_rest(tmp_path: Any) -> None:
+def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
     one, post = agent()
     local = one.robot.mapper.local  # where all is free, nothing keeps it from flying
     local.add(CellEvidence.from_dense(local.box.low, torch.zeros(local.shape), torch.full(local.shape, 50.0)))
     rests = [False] * 2 + [True] * 16 + [False] + [True] * 4
-    told: list[int] = []
     for number, at_rest in enumerate(rests):
-        if number == 9:  # it goes on after a break as without one
-            told = [decode(datagram).number for _, datagram in post.of("plans")]
-            (twin, its_post), state = agent(), one.state()
-            twin.restore(load_checkpoint(save_checkpoint(tmp_path / "agent", state)))
-            one, post = twin, its_post
         fly(one, 2.0 * number, number, at_rest)
-    told += [decode(datagram).number for _, datagram in post.of("plans")]
-    # Coming to rest from flight it moves, and once it stands it says so.
+    told = [decode(datagram).number for _, datagram in post.of("plans")]
+    # The plan that comes to rest still moves; the next one is the first at rest.
     assert told == [0, 1, 2, 3, 13, 18, 19, 20]
 
 
-def test_a_plan_needs_a_survey() -> None:
+def test_a_proposal_needs_a_snapshot_of_the_map() -> None:
     one, _ = agent()
-    with pytest.raises(RuntimeError, match="survey"):
+    with pytest.raises(RuntimeError, match="begin_planning"):
         one.propose(0.0, [], PeerTrajectories.of([]))
-    one.settle()
-    one.tell_plan(0.0, 1)
+    one.follow()
+    one.send_plan(0.0, 1)
 
 
-# -- what it says -----------------------------------------------------------------------------------------
+# -- what it sends ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_what_is_sent_is_booked_by_what_it_is(kind: str) -> None:
+def test_datagrams_are_sent_under_their_kind(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)
     for seed in range(5):
         for place in PLACES[:2]:
             one.learn(frame(*place, seed=seed), float(seed))
     one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
-    one.tell_views(5.0)
+    one.send_views(5.0)
     fly(one, 5.0, 1, rests=False)
     kinds = Counter(kind for _, _, _, kind in post.sent)
     assert all(kind_of(datagram) == kind for _, _, datagram, kind in post.sent)
@@ -334,22 +321,22 @@ def test_what_is_sent_is_booked_by_what_it_is(kind: str) -> None:
     assert set(kinds) - {"supersessions"} == expected
 
 
-def test_a_budget_bounds_what_is_said_of_the_map_in_every_span_of_time() -> None:
+def test_a_budget_bounds_the_map_bytes_in_every_interval() -> None:
     one, post = agent(kind="grid_shared", budget=1500.0, announce_every=1.0)
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
     for tick in range(40):
-        one.send(float(tick))
+        one.send_map(float(tick))
     said = post.of("points")
     assert sum(len(datagram) for _, datagram in said) > 10_000
-    assert one.robot.mapper.datagrams() == []  # all has gone in the end
+    assert one.robot.mapper.shared.datagrams() == []  # everything was sent in the end
     for begin in range(40):
         for end in range(begin, 40):
             size = sum(len(datagram) for now, datagram in said if begin <= now <= end)
             assert size <= 1500 * (end - begin) + 1500
 
 
-def test_views_have_what_the_map_leaves_of_the_budget() -> None:
+def test_views_use_what_the_map_leaves_of_the_budget() -> None:
     rate, said = 1300.0, []
     one, post = agent(kind="grid_shared", budget=rate, announce_every=1e6)
     generator = torch.Generator().manual_seed(0)
@@ -358,8 +345,8 @@ def test_views_have_what_the_map_leaves_of_the_budget() -> None:
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
     for tick in range(400):  # ten times a second
-        one.send(tick / 10)
-        one.tell_views(tick / 10)
+        one.send_map(tick / 10)
+        one.send_views(tick / 10)
     said = [(now, len(datagram), kind) for now, _, datagram, kind in post.sent]
     for begin in range(0, 400, 7):
         for end in range(begin, 400, 7):
@@ -367,26 +354,25 @@ def test_views_have_what_the_map_leaves_of_the_budget() -> None:
             assert size <= rate * (end - begin) / 10 + rate + 1
     last_of_map = max(now for now, _, kind in said if kind == "points")
     assert last_of_map > 5.0
-    # Where records wait, views go only where a whole datagram's bytes are left.
+    # While records wait, views are sent only if a whole datagram fits.
     before = [n for now, n, kind in said if kind == "views" and now < last_of_map]
     assert sum(before) <= rate
-    other, its_post = agent(kind="grid_shared")  # who has no limit tells as much, at once
+    other, its_post = agent(kind="grid_shared")  # without a limit all views are sent together
     other.robot.library.add(places, torch.ones(200), 0.0, 0.0, most=200)
     for _ in range(9):
-        other.tell_views(0.0)
+        other.send_views(0.0)
     told = [decode(datagram) for _, datagram in post.of("views")]
     free = [decode(datagram) for _, datagram in its_post.of("views")]
     assert sum(len(m.ids) for m in told) == sum(len(m.ids) for m in free) == len(one.robot.library) > 50
 
 
-def test_announcements_do_not_wait_for_the_budget_and_become_seldom() -> None:
+def test_announcements_ignore_the_budget_and_become_rare() -> None:
     one, post = agent(budget=1e-3, announce_every=2.0)
-    assert one.radio._budget is not None
-    one.radio._budget.take(1000)  # of the 1200 that are there to begin with
+    assert one.radio.within_budget(lambda budget: [bytes(1000)], 0.0)  # of the 1200 bytes at the start
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
     for tick in range(40):
-        one.send(float(tick))
+        one.send_map(float(tick))
     assert sum(len(datagram) for _, datagram in post.of("components")) <= 200
-    assert one.robot.mapper.datagrams()  # the rest is due still
+    assert one.robot.mapper.shared.datagrams()  # the rest is still due
     assert sorted({now for now, _ in post.of("announcements")}) == [2.0, 6.0, 14.0, 30.0]

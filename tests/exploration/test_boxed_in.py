@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +13,6 @@ from exploration.furnished_room import SMALL
 from exploration.voxel_worlds import PRIMITIVES, Explorer, hollow
 from torch import Tensor
 
-from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
@@ -95,40 +94,30 @@ def shut_in(agent: Agent, until: float) -> None:
     propose = agent.propose
 
     def boxed(
-        now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
+        now: float, final: Collection[int], peers: PeerTrajectories, since: float | None = None
     ) -> Plan:
-        return propose(now, fixed, around(agent.robot.position) if now < until else peers, since)
+        return propose(now, final, around(agent.robot.position) if now < until else peers, since)
 
     agent.propose = boxed  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize("planner", ["mcts", "frontier"])
-def test_shut_in_for_longer_than_the_window_and_let_out_it_flies(
-    world: World, planner: str, tmp_path: Path
-) -> None:
+def test_shut_in_for_longer_than_the_window_and_let_out_it_flies(world: World, planner: str) -> None:
     mission = assemble(world, replace(OPTIONS, planner=planner))
     shut_in(mission.agents[0], SHUT)
-    while mission.now < SHUT / 2:
-        mission.step()
-    mission = gone_on(mission, tmp_path)  # after a break, too
-    shut_in(mission.agents[0], SHUT)
-    while mission.now < SHUT:
-        mission.step()
+    advance(mission, SHUT)
     (robot,) = mission.robots
-    assert not robot.returns.rests
+    assert not robot.stopping.rests
     assert robot.path_length == 0
     assert robot.state[3] != mission.trajectories[0][0][3]
-    while not mission.is_over:
-        mission.step()
+    advance(mission)
     assert robot.path_length > 1
     assert robot.collisions == 0
 
 
-def gone_on(mission: Mission, folder: Path) -> Mission:
-    path = save_checkpoint(folder / "half.safetensors", mission.state())
-    resumed = assemble(mission.world, mission.options)
-    resumed.restore(load_checkpoint(path))
-    return resumed
+def advance(mission: Mission, until: float = math.inf) -> None:
+    while not mission.is_over and mission.elapsed < until:
+        mission.tick(mission.elapsed)
 
 
 def test_who_could_have_flown_rests(world: World) -> None:
@@ -137,13 +126,11 @@ def test_who_could_have_flown_rests(world: World) -> None:
     agent = mission.agents[0]
 
     def stand(
-        now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
+        now: float, final: Collection[int], peers: PeerTrajectories, since: float | None = None
     ) -> Plan:
         path = agent.robot.state[None].repeat(PRIMITIVES.dynamics.n_steps, 1)
-        agent._plan = Plan(path, path[-1:], path[-1:, :4], 0.0, "explore")
-        return agent._plan
+        return Plan(path, path[-1:], path[-1:, :4], 0.0, "explore")
 
     agent.propose = stand  # type: ignore[method-assign]
-    while not mission.is_over:
-        mission.step()
-    assert agent.robot.returns.rests
+    advance(mission)
+    assert agent.robot.stopping.rests

@@ -92,14 +92,7 @@ def test_frontier_planner_flies_through_the_door():
     assert explorer.flown > 5
 
 
-def test_plans_are_safe_and_restored_planners_go_on_alike():
-    one, other = (Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi)) for _ in range(2))
-    first = make_planner("frontier", PRIMITIVES, EVALUATOR)
-    for plans in (explore(first, one, 6), explore(make_planner("frontier", PRIMITIVES, EVALUATOR), other, 6)):
-        for plan in plans:
-            assert one.clearance(torch.cat([plan.path, plan.braking])[:, :3]) > 0.3
-    second = make_planner("frontier", PRIMITIVES, EVALUATOR)
-    second.restore(first.state())
-    for a, b in zip(explore(first, one, 4), explore(second, other, 4), strict=True):
-        assert torch.equal(a.path, b.path)
-        assert a.kind == b.kind
+def test_plans_are_safe():
+    explorer = Explorer.at(corridor(), (1.2, 1.2, 1.2, math.pi))
+    for plan in explore(make_planner("frontier", PRIMITIVES, EVALUATOR), explorer, 8):
+        assert explorer.clearance(torch.cat([plan.path, plan.braking])[:, :3]) > 0.3

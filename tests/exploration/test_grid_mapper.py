@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _recent
+from gmmtorch.exploration.robot.grid_mapper import MOST_INTERVALS, GridMapper, _bounded
 from gmmtorch.exploration.robot.mapper import Memo
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
@@ -99,7 +99,7 @@ def test_who_is_isolated_sends_nothing() -> None:
     alone = mapper(shared=False)
     for seed in range(3):
         alone.sense(frame(seed))
-    assert alone.datagrams() == alone.announcements() == []
+    assert alone.shared.datagrams() == alone.shared.announcements() == []
 
 
 def test_only_novel_beams_are_sent() -> None:
@@ -108,7 +108,7 @@ def test_only_novel_beams_are_sent() -> None:
     for number in range(12):
         view = frame(number % 2)
         sensed = one.sense(view)
-        messages = [decode(datagram) for datagram in one.datagrams()]
+        messages = [decode(datagram) for datagram in one.shared.datagrams()]
         ends = [m.ends for m in messages if isinstance(m, PointsMessage)]
         assert len(ends) == len(messages)
         for message in messages:
@@ -127,7 +127,7 @@ def test_a_frame_without_beams_says_nothing() -> None:
     for shared in (False, True):
         one = mapper(shared=shared)
         sensed = one.sense(frame(0, n=0))
-        assert one.datagrams() == []
+        assert one.shared.datagrams() == []
         assert sensed.novel.shape == (0,)
         assert float(believed(one).sum()) == 0
 
@@ -171,7 +171,7 @@ def test_who_hears_all_that_is_novel_has_what_was_novel() -> None:
     parts = []
     for view in views:
         sensed = speaker.sense(view)
-        datagrams = speaker.datagrams()
+        datagrams = speaker.shared.datagrams()
         assert listener.receive(heard(*datagrams)) == datagrams
         parts.append((view.origin, view.ends[sensed.novel], view.is_hit[sensed.novel]))
     torch.testing.assert_close(believed(listener), dense_of(parts))
@@ -193,8 +193,7 @@ def test_points_of_nobody_in_the_team_are_dropped_and_counted() -> None:
     one, view = mapper(robot=3), frame(0, n=5)
     for sender in (3, 31, 32, 65535):
         assert one.receive(heard(*said(view, sender=sender))) == []
-    assert one.refused == {"stranger": 4}
-    assert one._come == {}
+    assert one.shared.refused == {"stranger": 4}
     assert float(believed(one).sum()) == 0
     assert one.receive(heard(*said(view, sender=30))) != []
 
@@ -205,7 +204,7 @@ def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", most)
         kept = Intervals.of(np.array(numbers, np.int64))
-        bounded = _recent(kept)
+        bounded = _bounded(kept)
     pairs = kept.pairs()
     expected = set(numbers)
     if len(pairs) > most:  # all up to the last gap that is one too many
@@ -219,10 +218,9 @@ def test_memory_is_bounded_whatever_frames_are_invented(monkeypatch: pytest.Monk
     one, view = mapper(), frame(0, n=1)
     datagrams = [said(view, number=7 * k)[0] for k in range(60)]
     assert one.receive(heard(*datagrams)) == datagrams
-    assert {sender: len(come) for sender, come in one._come.items()} == {1: 20}
     assert one.receive(heard(*said(view, number=3))) == []  # a gap that was closed
     assert one.receive(heard(*said(view, number=7 * 59 - 1))) != []  # and one that is open
-    assert one.refused == {"repeated": 1}
+    assert one.shared.refused == {"repeated": 1}
     assert MOST_INTERVALS > 3 * 1600  # three parts of each frame of a mission lost
 
 
@@ -230,16 +228,16 @@ def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
     free, bound = mapper(), mapper()
     for one in (free, bound):
         one.sense(frame(0))
-    due = free.datagrams()
+    due = free.shared.datagrams()
     assert len(due) > 3
-    assert bound.datagrams(0) == bound.datagrams(len(due[0]) - 1) == []
+    assert bound.shared.datagrams(budget=0) == bound.shared.datagrams(budget=len(due[0]) - 1) == []
     got: list[bytes] = []
     for budget in (len(due[0]), len(due[1]) + len(due[2]) + 5, 10**6):
-        sent = bound.datagrams(budget)
+        sent = bound.shared.datagrams(budget=budget)
         assert 0 < sum(map(len, sent)) <= budget
         got += sent
     assert got == due
-    assert bound.datagrams() == []
+    assert bound.shared.datagrams() == []
 
 
 def test_other_messages_are_ignored() -> None:
@@ -269,28 +267,3 @@ def test_a_sliding_window_is_that_of_a_cast_from_scratch() -> None:
         expected = in_window(beams(*views), one)
         torch.testing.assert_close(torch.stack(one.local.evidence()), expected)
     assert float(expected.sum()) > 100
-
-
-def test_a_restored_mapper_goes_on_alike() -> None:
-    one, twin = mapper(), mapper()
-    for seed in range(3):
-        one.sense(frame(seed))
-    one.receive(heard(*said(frame(7))[1:]))
-    one.datagrams(3000)
-    twin.restore(one.state())
-    for each in (one, twin):
-        each.receive(heard(*said(frame(7))))  # of which most have come already
-    there = torch.tensor([1.2, 0.0, 0.0], dtype=torch.float64)
-    for seed in range(3, 6):
-        for each in (one, twin):
-            each.center_on(there)
-        view = frame(seed, origin=there)
-        a, b = one.sense(view), twin.sense(view)
-        sent = one.datagrams()
-        assert sent == twin.datagrams()
-        assert sent
-        assert torch.equal(a.novel, b.novel)
-    assert torch.equal(believed(one), believed(twin))
-    for a, b in zip(one.local.evidence(), twin.local.evidence(), strict=True):
-        assert torch.equal(a, b)
-    assert one.belief.entropy_bits == twin.belief.entropy_bits

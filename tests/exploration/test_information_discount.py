@@ -48,13 +48,3 @@ def test_note_counts_once_for_each_time():
     assert fatigue.weights(window((0, 0, 0))).tolist() == [0.5] * 18
     fatigue.note(window((0, 0, 0)), torch.ones(18), 4.0)
     assert fatigue.weights(window((0, 0, 0))).tolist() == [0.25] * 18
-
-
-def test_restored_it_answers_as_before():
-    fatigue, other = Fatigue(), Fatigue()
-    fatigue.note(window((0, 4, 8)), torch.linspace(0, 1, 18), 2.0)
-    other.restore(fatigue.state())
-    for one in (fatigue, other):
-        one.note(window((4, 4, 8)), torch.linspace(1, 0, 18), 2.0)  # no news
-        one.note(window((4, 4, 8)), torch.linspace(1, 0, 18), 4.0)
-    assert torch.equal(fatigue.weights(window((0, 0, 0))), other.weights(window((0, 0, 0))))

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, clear_of
+from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, clear_of, predicted_path
 from gmmtorch.exploration.world.collisions import collides, meets_others
+from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 from gmmtorch.simulation.worlds.solids import box
 
@@ -146,3 +147,46 @@ def test_meets_others_flags_overlapping_bodies():
             assert bool(found[i, s]) == (min(near) < 0.6)
     assert 0 < int(found.sum()) < 200
     assert not bool(meets_others(positions[:1], 0.3).any())
+
+
+# -- plans that were heard --------------------------------------------------------------------------------
+
+
+def plan(n: int, step: float) -> PlanMessage:
+    """A plan of n poses along x, one metre apart."""
+    path = torch.zeros(n, 4, dtype=torch.float64)
+    path[:, 0] = torch.arange(1, n + 1)
+    return PlanMessage(1, 0, 0.0, step, path, torch.zeros(0, 4))
+
+
+def test_a_predicted_path_is_the_rest_of_a_plan() -> None:
+    def xs(age: float, step: float = 0.2, of: float = 0.2) -> list[float]:
+        ahead = predicted_path(plan(6, of), age, step)
+        assert (ahead[:, 1:] == 0).all()
+        return ahead[:, 0].tolist()
+
+    assert xs(0.0) == [1, 2, 3, 4, 5, 6]
+    assert xs(0.4) == [3, 4, 5, 6]
+    assert xs(0.45) == [3, 4, 5, 6]  # 3.25 steps after its start
+    assert xs(0.55) == [4, 5, 6, 6]
+    assert xs(1.2) == xs(7.0) == xs(1e9) == [6]
+    assert xs(0.0, step=0.4) == [2, 4, 6]
+    assert xs(0.1, step=0.2, of=0.4) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6]
+
+
+@given(
+    n=st.integers(1, 40),
+    of=st.floats(0.01, 2.0),
+    step=st.floats(0.05, 1.0),
+    age=st.floats(0.0, 30.0),
+)
+def test_a_predicted_path_is_at_most_half_a_step_off(n: int, of: float, step: float, age: float) -> None:
+    ahead = predicted_path(plan(n, of), age, step)[:, 0]
+    times = age + step * torch.arange(1, len(ahead) + 1)
+    assert (times[-1] >= n * of - 1e-6) or len(ahead) == 1000
+    flown = times <= n * of  # from then on it is at rest
+    first = times < of
+    off = (ahead.double() * of - times).abs()
+    assert (off[flown & ~first] <= of / 2 + 1e-6).all()
+    assert (ahead[first] == 1).all()
+    assert (ahead[~flown & (times > (n + 0.5) * of)] == n).all()

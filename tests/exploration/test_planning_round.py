@@ -1,4 +1,4 @@
-"""A team that plans together: who is asked what, and when, by pilots that write it down."""
+"""plan_together: the order of calls to recording agents."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
+from gmmtorch.exploration.mission.planning_round import plan_together
 from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
 from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
-from gmmtorch.exploration.planning.planning_round import take_turns
 
 N, NOW, NUMBER = 5, 40.0, 20
 OPTIONS = TeamOptions(size=N, latency=0.02, jitter=0.004, margin=0.25)
@@ -29,7 +29,7 @@ def states(n: int, x: float) -> Tensor:
 
 
 class Recorder:
-    """A pilot whose n-th plan, of robot r, is at x = 100 r + n, its braking ½ further on."""
+    """An agent whose n-th plan is at x = 100 r + n for robot r, and its braking 0.5 further."""
 
     def __init__(self, number: int, log: list[tuple[str, int, Any]], values: list[float]) -> None:
         self.number, self._log, self._values = number, log, values
@@ -42,34 +42,34 @@ class Recorder:
     def listen(self, now: float) -> None:
         self._note("listen", now)
 
-    def survey(self, now: float) -> None:
-        self._note("survey", now)
+    def begin_planning(self, now: float) -> None:
+        self._note("begin_planning", now)
 
-    def propose(self, now: float, fixed: Collection[int], peers: PeerTrajectories) -> Plan:
-        self._note("propose", now, sorted(fixed))
+    def propose(self, now: float, final: Collection[int], peers: PeerTrajectories) -> Plan:
+        self._note("propose", now, sorted(final))
         self.peers.append(peers)
         x = 100.0 * self.number + len(self.peers)
         return Plan(states(3, x), states(1, x + 0.5), states(1, x)[:, :4], self._values.pop(0), "explore")
 
-    def settle(self) -> None:
-        self._note("settle")
+    def follow(self) -> None:
+        self._note("follow")
 
-    def tell_plan(self, now: float, number: int) -> None:
-        self._note("tell_plan", now, number)
+    def send_plan(self, now: float, number: int) -> None:
+        self._note("send_plan", now, number)
 
-    def tell_views(self, now: float) -> None:
-        self._note("tell_views", now)
+    def send_views(self, now: float) -> None:
+        self._note("send_views", now)
 
 
 def taken(
     name: str, seed: int, options: TeamOptions = OPTIONS
-) -> tuple[list[Recorder], list[tuple[str, int, Any]], dict[int, Plan]]:
+) -> tuple[list[Any], list[tuple[str, int, Any]], dict[int, Plan]]:
     log: list[tuple[str, int, Any]] = []
     drawn = torch.rand(N, 3, generator=torch.Generator().manual_seed(seed)).tolist()
-    pilots = [Recorder(number, log, values) for number, values in enumerate(drawn)]
+    agents: list[Any] = [Recorder(number, log, values) for number, values in enumerate(drawn)]
     generator = torch.Generator().manual_seed(seed)
-    plans = take_turns(pilots, Coordination(name, 3), options, NOW, NUMBER, generator)
-    return pilots, log, plans
+    plans = plan_together(agents, Coordination(name, 3), options, NOW, NUMBER, generator)
+    return agents, log, plans
 
 
 def calls(log: list[tuple[str, int, Any]], name: str) -> list[tuple[int, Any]]:
@@ -78,30 +78,30 @@ def calls(log: list[tuple[str, int, Any]], name: str) -> list[tuple[int, Any]]:
 
 @every_coordination
 @seeds
-def test_all_look_before_anybody_plans_and_tell_views_when_all_have(name: str, seed: int) -> None:
+def test_all_look_before_anybody_plans_and_send_views_when_all_have(name: str, seed: int) -> None:
     _, log, plans = taken(name, seed)
-    assert log[:N] == [("survey", robot, (NOW,)) for robot in range(N)]
-    assert log[-N:] == [("tell_views", robot, (NOW,)) for robot in range(N)]
-    assert calls(log, "settle") == [(robot, ()) for robot in plans]
+    assert log[:N] == [("begin_planning", robot, (NOW,)) for robot in range(N)]
+    assert log[-N:] == [("send_views", robot, (NOW,)) for robot in range(N)]
+    assert calls(log, "follow") == [(robot, ()) for robot in plans]
     last = max(row for row, (what, *_) in enumerate(log) if what == "propose")
-    assert min(row for row, (what, *_) in enumerate(log) if what == "settle") > last
+    assert min(row for row, (what, *_) in enumerate(log) if what == "follow") > last
     assert len(log) == 4 * N + 2 * len(calls(log, "propose"))
 
 
 @every_coordination
 @seeds
-def test_plans_are_told_once_and_before_those_listen_who_plan_after_them(name: str, seed: int) -> None:
+def test_a_plan_is_sent_once_and_before_later_robots_listen(name: str, seed: int) -> None:
     _, log, plans = taken(name, seed)
     assert sorted(plans) == list(range(N))
-    assert calls(log, "tell_plan") == [(robot, (NOW, NUMBER)) for robot in plans]
-    told: list[int] = []
+    assert calls(log, "send_plan") == [(robot, (NOW, NUMBER)) for robot in plans]
+    sent: list[int] = []
     for (what, robot, about), after in itertools.pairwise(log):
-        if what == "tell_plan":
-            told.append(robot)
+        if what == "send_plan":
+            sent.append(robot)
         elif what == "listen":
             then, who, (now, fixed) = after
-            assert (then, who, now) == ("propose", robot, NOW)  # nothing comes between
-            assert fixed == sorted(told)  # those whose plans it could hear, and no others
+            assert (then, who, now) == ("propose", robot, NOW)  # the next call
+            assert fixed == sorted(sent)  # exactly those whose plans it could hear
             assert robot not in fixed
             assert about == (pytest.approx(NOW + len(fixed) * OPTIONS.plan_slack),)
     assert OPTIONS.plan_slack > 2 * OPTIONS.latency
@@ -109,13 +109,13 @@ def test_plans_are_told_once_and_before_those_listen_who_plan_after_them(name: s
 
 @every_coordination
 @seeds
-def test_everybody_follows_the_last_plan_that_it_proposed(name: str, seed: int) -> None:
-    pilots, _, plans = taken(name, seed)
+def test_each_robot_follows_its_last_proposal(name: str, seed: int) -> None:
+    agents, _, plans = taken(name, seed)
     for robot, plan in plans.items():
-        assert plan.path[0, 0] == 100 * robot + len(pilots[robot].peers)
+        assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
-def test_who_plans_after_whom() -> None:
+def test_final_plans_known_to_each_robot() -> None:
     def fixed(name: str, seed: int = 0) -> list[tuple[int, list[int]]]:
         return [(robot, about[1]) for robot, about in calls(taken(name, seed)[1], "propose")]
 
@@ -128,16 +128,16 @@ def test_who_plans_after_whom() -> None:
         expected += [(robot, sorted(before)) for robot in together]
         before += together
     assert fixed("random_partition", 1) == expected
-    # Of five, two are settled, then two, then the last.
+    # Of five plans, two become final, then two, then the last.
     found = fixed("distributed_greedy")
     assert [len(others) for _, others in found] == [0] * 5 + [2] * 3 + [4]
 
 
 @every_coordination
 @seeds
-def test_traffic_is_where_the_others_may_be(name: str, seed: int) -> None:
-    """On what they settled on; on what they proposed, or as before while that may change; or as before."""
-    pilots, log, _ = taken(name, seed)
+def test_peers_are_where_the_others_may_be(name: str, seed: int) -> None:
+    """On the final plan; on the proposed plan, and braking while it may change; or braking without a plan."""
+    agents, log, _ = taken(name, seed)
     n_proposed = dict.fromkeys(range(N), 0)
     for robot, (_, fixed) in calls(log, "propose"):
         expected = []
@@ -149,7 +149,7 @@ def test_traffic_is_where_the_others_may_be(name: str, seed: int) -> None:
                 expected.append([planned] * 3 + [planned + 0.5])
             if not n_proposed[other] or (name == "distributed_greedy" and other not in fixed):
                 expected.append([braking] * 2)
-        peers = pilots[robot].peers[n_proposed[robot]]
+        peers = agents[robot].peers[n_proposed[robot]]
         assert len(peers) == len(expected)
         for path, xs in zip(peers.paths[:, :, 0].tolist(), expected, strict=True):
             assert path == xs + [xs[-1]] * (len(path) - len(xs))
@@ -157,15 +157,22 @@ def test_traffic_is_where_the_others_may_be(name: str, seed: int) -> None:
         n_proposed[robot] += 1
 
 
-def test_a_slow_network_is_not_waited_for() -> None:
+def test_robots_do_not_wait_for_a_slow_network() -> None:
     _, log, _ = taken("greedy", 0, TeamOptions(size=N, latency=0.4))
     assert {about for _, about in calls(log, "listen")} == {(NOW,)}
 
 
-def test_a_robot_alone_plans_and_tells() -> None:
+def test_a_single_robot_plans_and_sends() -> None:
     log: list[tuple[str, int, Any]] = []
-    pilot = Recorder(0, log, [1.0])
-    plans = take_turns([pilot], Coordination("greedy"), OPTIONS, NOW, 3, torch.Generator())
-    assert [what for what, *_ in log] == ["survey", "listen", "propose", "settle", "tell_plan", "tell_views"]
+    agent: Any = Recorder(0, log, [1.0])
+    plans = plan_together([agent], Coordination("greedy"), OPTIONS, NOW, 3, torch.Generator())
+    assert [what for what, *_ in log] == [
+        "begin_planning",
+        "listen",
+        "propose",
+        "follow",
+        "send_plan",
+        "send_views",
+    ]
     assert list(plans) == [0]
-    assert len(pilot.peers[0]) == 0
+    assert len(agent.peers[0]) == 0

@@ -1,4 +1,4 @@
-"""ReplayNode: the team's map is what each robot would make of its scans alone, whatever happens to it."""
+"""ReplayMission: the team's map holds what each robot learns from its scans, whatever happens to robots."""
 
 from __future__ import annotations
 
@@ -7,225 +7,226 @@ import logging
 import os
 import random
 import resource
+import shutil
+import sqlite3
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from exploration.replays import RULES, Clock, content, log, mapped
+from exploration.replays import RULES, FakeTime, Together, content, log, mapped, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.mission.node import TwinError, check_number, run_paced
-from gmmtorch.exploration.mission.replay import ReplayNode
+from gmmtorch.exploration.mission.clocks import WallClock
+from gmmtorch.exploration.mission.driver import settle
+from gmmtorch.exploration.mission.replay import ReplayMission
+from gmmtorch.exploration.mission.robot_view import DuplicateIdError, ReplayingRobotView
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.scan import Scan
-from gmmtorch.sharing.journal import Journal
 from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.link_conditions import LinkConditions
 from gmmtorch.sharing.transport.security import TeamKey
 from gmmtorch.sharing.transport.simulated_network import Network
 from gmmtorch.sharing.transport.udp import UdpTransport
 
 N_KILLS = 4
-"""`python -m exploration.kill_replay` has more."""
+"""`python -m exploration.kill_replay` takes more."""
 
 
 def part(k: int, n: int, n_scans: int = 24) -> DatasetShard:
     return DatasetShard(log(n_scans), shard_indices(n_scans, k, n))
 
 
-def robot(number: int, scans, transport, rule: str = "windowed", **options) -> ReplayNode:
-    return ReplayNode(Replica(number), scans, transport, lambda: GaussianMap(RULES[rule]), **options)
+def robot(number: int, scans: Any, transport: Any, rule: str = "windowed", **options: Any) -> ReplayMission:
+    made = {"rate": 10.0, **options}
+    return ReplayMission(Replica(number), scans, transport, lambda: GaussianMap(RULES[rule]), **made)
 
 
-def kept(folder: Path, scans, transport, rule: str = "windowed", number: int = 0, **options) -> ReplayNode:
-    """A robot with a journal and a folder."""
-    replica = Replica(number)
-    return ReplayNode(
-        replica,
-        scans,
-        transport,
-        lambda: GaussianMap(RULES[rule]),
-        journal=Journal(folder / "journal", replica),
-        folder=folder,
-        **options,
+def stored(folder: Path, scans: Any, transport: Any, rule: str = "windowed", **options: Any) -> ReplayMission:
+    """A robot 0 with a store, which is left open."""
+    replica, store = Replica(0), Store(folder / "robot.sqlite", 0)
+    store.restore(replica)
+    return ReplayMission(
+        replica, scans, transport, lambda: GaussianMap(RULES[rule]), rate=10.0, store=store, **options
     )
 
 
-def run(*nodes: ReplayNode, settle: float = 0.0, **options):
-    clock = Clock()
-    return run_paced(nodes, 10.0, settle=settle, clock=clock, sleep=clock.sleep, **options)
+def killed(folder: Path) -> Path:
+    """The files that the death of a robot's process leaves."""
+    copy = folder.with_name(f"{folder.name}+")
+    shutil.copytree(folder, copy)
+    return copy
 
 
-def kill(node: ReplayNode) -> None:
-    """All that the death of its process does to it."""
-    node._logbook._journal.close()  # which writes nothing
+def n_missing(mission: ReplayMission) -> int:
+    return mission.replica.missing.size
+
+
+def until(condition: Callable[[], bool], *missions: ReplayMission) -> None:
+    """Lets robots exchange messages in real time, for at most a minute without news."""
+    settle(Together(*missions), WallClock(), 60.0, stop=condition)
+    assert condition()
 
 
 # -- a team ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rule", sorted(RULES))
-def test_all_hold_what_each_would_have_learned_alone(rule):
+def test_all_robots_hold_what_each_would_learn_alone(rule):
     network = Network(3)
-    nodes = [robot(k, part(k, 3), network, rule) for k in range(3)]
-    done = run(*nodes, settle=1.0)
-    assert (done.ticks, done.late) == (8, 0)
-    assert len({node.replica.digest() for node in nodes}) == 1
-    alone = [mapped(rule, part(k, 3)).components() for k in range(3)]
-    assert content(nodes[1].replica.components()) == content(*alone)
-    assert all(node.is_over and node.n_missing == 0 for node in nodes)
+    parts = [part(k, 3, 15) for k in range(3)]
+    team = [robot(k, parts[k], network, rule) for k in range(3)]
+    done = run(*team, quiet=1.0)
+    assert (done.ticks, done.late) == (5, 0)
+    assert len({mission.replica.digest() for mission in team}) == 1
+    alone = [mapped(rule, one).components() for one in parts]
+    assert content(team[1].replica.components()) == content(*alone)
+    assert all(mission.is_over and n_missing(mission) == 0 for mission in team)
 
 
 @pytest.mark.parametrize("budget", [None, 2000.0])
-def test_what_a_bad_network_loses_comes_again(budget):
+def test_losses_of_the_network_are_repaired(budget):
     network = Network(3, LinkConditions(loss=0.3, duplication=0.1, latency=0.05, jitter=0.1), seed=3)
-    nodes = [robot(k, part(k, 3), network, "incremental", budget=budget) for k in range(3)]
-    run(*nodes, settle=20.0)
+    parts = [part(k, 3, 12) for k in range(3)]
+    team = [robot(k, parts[k], network, "incremental", budget=budget) for k in range(3)]
+    run(*team, quiet=20.0)
     assert network.reception().lost > 10
-    assert len({node.replica.digest() for node in nodes}) == 1
-    alone = [mapped("incremental", part(k, 3)).components() for k in range(3)]
-    assert content(nodes[0].replica.components()) == content(*alone)
+    assert len({mission.replica.digest() for mission in team}) == 1
+    alone = [mapped("incremental", one).components() for one in parts]
+    assert content(team[0].replica.components()) == content(*alone)
 
 
-def test_a_budget_holds_and_delays_only():
+def test_a_budget_bounds_records_and_loses_none():
     network, rate = Network(2), 300.0
-    node = robot(0, part(0, 1), network, "per_scan", budget=rate)
-    clock = Clock()
+    mission, listener = robot(0, log(8), network, "per_scan", budget=rate), robot(1, [], network)
+    fake = FakeTime()
+    clock = WallClock(clock=fake, sleep=fake.sleep)
 
-    def spent(_, now):
+    def check() -> None:
         records = network.traffic(0).bytes - network.traffic(0, "announcements").bytes
-        assert records <= 1200 + rate * now
+        assert records <= 1200 + rate * clock.now()
 
-    options = {"clock": clock, "sleep": clock.sleep, "status_every": 0.1, "on_status": spent}
-    run_paced([node, robot(1, [], network)], 10.0, settle=3.0, **options)
-    listener = robot(1, [], network)
-    run(node, listener, settle=60.0)
-    assert listener.replica.digest() == node.replica.digest()
+    run(mission, listener, quiet=60.0, clock=clock, on_step=check)
+    assert listener.replica.digest() == mission.replica.digest()
 
 
-def test_a_window_is_published_when_its_components_are_final():
-    network = Network(2)
-    node = robot(0, part(0, 1, 6), network)  # windows of four
+def test_a_window_is_published_once_its_components_are_final():
+    mission = robot(0, part(0, 1, 6), Network(2))  # windows of four
     counts = []
     for tick in range(7):
-        node.tick(tick / 10)
-        counts.append(node.replica.n_components)
-        assert node.is_over == (tick >= 5)
+        mission.tick(tick / 10)
+        counts.append(mission.replica.n_components)
+        assert mission.is_over == (tick >= 5)
     assert counts[:3] == [0, 0, 0]
     assert 0 < counts[3] == counts[4] < counts[5] == counts[6]
-    assert content(node.replica.components()) == content(mapped("windowed", part(0, 1, 6)).components())
+    assert content(mission.replica.components()) == content(mapped("windowed", part(0, 1, 6)).components())
 
 
 @pytest.mark.parametrize("n_scans", [0, 1, 5])
-def test_a_stream_of_unknown_length_is_mapped_as_a_list_is(n_scans):
-    node = robot(0, iter(log(5)[:n_scans]), Network(1))
-    assert node.n_scans is None
-    assert "/?" in node.status()
-    assert run(node).ticks == n_scans + 1  # the last one finds that it is over
-    assert (node.n_scans, node.position) == (n_scans, n_scans)
+def test_a_stream_of_unknown_length_gives_the_map_of_a_list(n_scans):
+    network = Network(1)
+    mission = robot(0, iter(log(5)[:n_scans]), network)
+    assert mission.n_scans is None
+    assert "/?" in ReplayingRobotView(mission, network).status()
+    assert run(mission).ticks == n_scans + 1  # the last tick finds the end
+    assert (mission.n_scans, mission.position) == (n_scans, n_scans)
     expected = mapped("windowed", log(5)[:n_scans])
-    assert content(node.replica.components()) == (content(expected.components()) if n_scans else content())
+    assert content(mission.replica.components()) == (content(expected.components()) if n_scans else content())
 
 
-def test_one_that_starts_late_catches_up_after_the_others_work_is_over():
+def test_a_late_robot_catches_up_after_the_others_have_finished():
     network = Network(2)
-    first = robot(0, part(0, 2), network)
-    run(first, settle=1.0)
-    network.deliver(1, 1e9)  # nobody was there
-    late = robot(1, part(1, 2), network)
-    run(late, first, settle=10.0)
+    first = robot(0, part(0, 2, 10), network)
+    run(first, quiet=1.0)
+    network.deliver(1, 1e9)  # lost: robot 1 did not run
+    late = robot(1, part(1, 2, 10), network)
+    run(late, first, quiet=10.0)
     assert late.replica.digest() == first.replica.digest()
     assert {int(i) for i in late.replica.components().ids[:, 0]} == {0, 1}
 
 
-def test_what_others_have_told_and_has_not_come_is_missing():
+def test_announced_records_that_have_not_arrived_are_missing():
     network = Network(2)
     talker, listener = robot(0, part(0, 1, 8), network), robot(1, [], network)
     run(talker)
-    assert network.deliver(1, 1e3)  # the records, which are lost; then it says that it has them
+    assert network.deliver(1, 1e3)  # the records are lost
     network.send(0, talker.replica.announcements(), 1e3, "announcements")
-    listener.listen(2e3)
-    assert listener.n_missing == talker.replica.held.size > 0
-    run(talker, listener, settle=5.0)
-    assert listener.n_missing == 0
+    listener.exchange(2e3)
+    assert n_missing(listener) == talker.replica.held.size > 0
+    run(talker, listener, quiet=5.0)
+    assert n_missing(listener) == 0
 
 
 # -- over sockets ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", [None, TeamKey(bytes(range(32)))])
-def test_over_udp(key):
+def test_robots_share_over_udp(key):
     transports = [UdpTransport.unicast(k, key=key) for k in range(3)]
     for transport in transports:
         transport.peers = [other.address for other in transports if other is not transport]
-    nodes = [robot(k, part(k, 3, 18), transports[k], announce_every=0.1) for k in range(3)]
-    run_paced(nodes, 100.0, settle=0.5)
-    end = time.monotonic() + 60
-    while len({node.replica.digest() for node in nodes}) > 1 and time.monotonic() < end:
-        run_paced(nodes, 100.0, settle=0.1)
-    assert len({node.replica.digest() for node in nodes}) == 1
-    alone = [mapped("windowed", part(k, 3, 18)).components() for k in range(3)]
-    assert content(nodes[2].replica.components()) == content(*alone)
-    for node in nodes:
-        row = node.row()
+    parts = [part(k, 3, 12) for k in range(3)]
+    team = [robot(k, parts[k], transports[k], announce_every=0.1, rate=100.0) for k in range(3)]
+    run(*team, clock=WallClock())
+    until(lambda: len({mission.replica.digest() for mission in team}) == 1, *team)
+    alone = [mapped("windowed", one).components() for one in parts]
+    assert content(team[2].replica.components()) == content(*alone)
+    for mission, transport in zip(team, transports, strict=True):
+        row = ReplayingRobotView(mission, transport).row()
         assert json.loads(json.dumps(row, allow_nan=False)) == row
         assert row["socket_datagrams"] == 2 * row["datagrams"]
         assert 2 * row["wire_bytes"] == row["socket_bytes"] + 28 * row["socket_datagrams"]
         assert row["refused"] == row["failures"] == {}
-        node.close()
-        node.close()
+        transport.close()
 
 
-def test_without_a_network_it_goes_on_alone_and_catches_up_later():
+def test_a_robot_without_network_continues_and_catches_up_later():
     transports = [UdpTransport.unicast(k) for k in range(2)]
-    nodes = [robot(k, part(k, 2, 8), transports[k], announce_every=0.05) for k in range(2)]
-    transports[0].peers = [("127.0.0.1", 9)]  # where nobody listens
-    run_paced(nodes, 200.0)
-    assert all(node.is_over for node in nodes)
-    assert nodes[0].replica.digest() != nodes[1].replica.digest()
+    team = [robot(k, part(k, 2, 8), transports[k], announce_every=0.05, rate=200.0) for k in range(2)]
+    transports[0].peers = [("127.0.0.1", 9)]  # no process listens there
+    run(*team, clock=WallClock())
+    assert all(mission.is_over for mission in team)
+    assert team[0].replica.digest() != team[1].replica.digest()
     transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
-    end = time.monotonic() + 60
-    while nodes[0].replica.digest() != nodes[1].replica.digest() and time.monotonic() < end:
-        run_paced(nodes, 200.0, settle=0.1)
-    assert nodes[0].replica.digest() == nodes[1].replica.digest()
-    for node in nodes:
-        node.close()
+    until(lambda: team[0].replica.digest() == team[1].replica.digest(), *team)
+    for transport in transports:
+        transport.close()
 
 
-def test_two_robots_of_one_number_over_udp():
+def has_duplicate(view: ReplayingRobotView) -> bool:
+    try:
+        view.check_id()
+    except DuplicateIdError:
+        return True
+    return False
+
+
+def test_duplicate_ids_are_detected_over_udp(monkeypatch):
+    monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.1)
     transports = [UdpTransport.unicast(5) for _ in range(2)]
-    nodes = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05) for k in range(2)]
-    assert [node.twin for node in nodes] == [None, None]
+    team = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05, rate=200.0) for k in range(2)]
+    views = [ReplayingRobotView(*pair) for pair in zip(team, transports, strict=True)]
+    assert not any(map(has_duplicate, views))
     transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
-    end = time.monotonic() + 60
-    while not all(node.twin for node in nodes) and time.monotonic() < end:
-        run_paced(nodes, 200.0, settle=0.1)
-    for node, other in zip(nodes, reversed(transports), strict=True):
-        with pytest.raises(TwinError, match=f"robot 5.*{other.address[1]}.*folder"):
-            check_number(node)
-        assert "another robot 5" in node.status()
-        assert list(node.row()["namesakes"]) == ["5"]
-        node.close()
+    until(lambda: all(map(has_duplicate, views)), *team)
+    for view, transport, other in zip(views, transports, reversed(transports), strict=True):
+        with pytest.raises(DuplicateIdError, match=f"robot 5.*{other.address[1]}.*folder"):
+            view.check_id()
+        assert "another robot has id 5" in view.status()
+        assert list(view.row()["namesakes"]) == ["5"]
+        transport.close()
 
 
-def test_two_robots_of_one_number_where_nobody_looks_at_senders():
-    """As seen by what they say: relayed by a third, say."""
-    network = Network(2)
-    nodes = [ReplayNode(Replica(5), part(k, 2, 8), _Renamed(network, k), GaussianMap) for k in range(2)]
-    run(*nodes, settle=5.0)
-    assert all(node.twin and node.replica.conflicts[5] for node in nodes)
-    assert nodes[0].row()["conflicts"].keys() == {"5"}
-
-
-class _Renamed(Network):
-    """A network in which a robot is known by its place."""
+class _ByPlace(Network):
+    """A network that identifies robots by their place, whatever their ids."""
 
     def __init__(self, network: Network, place: int) -> None:
         super().__init__(6)
@@ -238,146 +239,138 @@ class _Renamed(Network):
         return self._network.deliver(self._place, now)
 
 
-# -- killed, and started again -----------------------------------------------------------------------------
+def test_duplicate_ids_are_detected_from_records_alone():
+    network = Network(2)
+    places = [_ByPlace(network, k) for k in range(2)]
+    team = [ReplayMission(Replica(5), part(k, 2, 8), places[k], GaussianMap, rate=10.0) for k in range(2)]
+    run(*team, quiet=5.0)
+    views = [ReplayingRobotView(*pair) for pair in zip(team, places, strict=True)]
+    assert all(map(has_duplicate, views))
+    assert views[0].row()["conflicts"].keys() == {"5"}
+
+
+# -- killed and restarted ----------------------------------------------------------------------------------
 
 
 @settings(max_examples=3)
 @given(rule=st.sampled_from(sorted(RULES)), seed=st.integers(0, 10**6))
-def test_killed_between_any_two_ticks_its_map_is_that_of_one_that_lived(tmp_path_factory, rule, seed):
-    rng, folder, network = random.Random(seed), tmp_path_factory.mktemp("robot"), Network(2)
+def test_a_robot_killed_between_any_ticks_ends_with_the_map_of_one_that_lived(tmp_path_factory, rule, seed):
+    rng, folder, network = random.Random(seed), tmp_path_factory.mktemp("robot") / "0", Network(2)
     listener, now, lives = robot(1, [], network), 0.0, 0
-    expected = content(mapped(rule, log(24)).components())
     while True:
-        node = kept(folder, log(24), network, rule, keep_every=5)
+        mission = stored(folder, log(16), network, rule, keep_every=5)
         left = rng.randint(1, 12)
         lives += 1
-        while left and not node.is_over:
-            node.tick(now)
+        while left and not mission.is_over:
+            mission.tick(now)
             if rng.random() < 0.7:
-                listener.listen(now)
+                listener.exchange(now)
             now, left = now + 0.1, left - 1
-        if node.is_over:
+        if mission.is_over:
             break
-        kill(node)
-        assert lives < 60  # each goes on where it was, to within five scans and a window
+        folder = killed(folder)
+        assert lives < 60  # each life reads at most five scans and a window again
     assert lives > 1
     for _ in range(100):
         now += 0.5
-        node.listen(now)
-        listener.listen(now)
-    assert content(node.replica.components()) == expected
-    assert listener.replica.digest() == node.replica.digest()
-    kill(node)
+        mission.exchange(now)
+        listener.exchange(now)
+    assert content(mission.replica.components()) == content(mapped(rule, log(16)).components())
+    assert listener.replica.digest() == mission.replica.digest()
 
 
-def test_while_it_catches_up_what_it_said_still_counts(tmp_path):
-    """Its map is older than what it said: it says nothing before it is as far as it was."""
+def test_published_components_stay_while_a_restarted_robot_catches_up(tmp_path):
+    """Its saved map is older than what it published: it publishes nothing before it is as far as it was."""
     network, options = Network(1), {"rule": "incremental", "keep_every": 9}  # windows of three
-    first = kept(tmp_path, log(24), network, **options)
+    first = stored(tmp_path / "0", log(24), network, **options)
     for tick in range(17):
         first.tick(tick / 10)
-    kill(first)
-    node = kept(tmp_path, log(24), network, **options)
-    assert node.resumed_at == node.row()["resumed_at"] == 9
-    assert node.row()["incarnation"] != first.row()["incarnation"]
+    mission = stored(killed(tmp_path / "0"), log(24), network, **options)
+    assert mission.resumed_at == 9
+    assert mission.replica.incarnation != first.replica.incarnation
+    expected = {n: content(mapped("incremental", log(24)[:n]).components()) for n in (15, 18)}
     for position in range(10, 20):
-        node.tick(position / 10)
-        learned = 15 if position < 18 else 18
-        assert content(node.replica.components()) == content(
-            mapped("incremental", log(24)[:learned]).components()
-        )
-    kill(node)
+        mission.tick(position / 10)
+        assert content(mission.replica.components()) == expected[15 if position < 18 else 18]
 
 
-def test_if_the_newest_map_has_rotted_the_one_before_will_do(tmp_path):
-    first = kept(tmp_path, log(24), Network(1), "incremental", keep_every=6)
+def test_if_the_last_progress_is_damaged_the_one_before_is_used(tmp_path):
+    first = stored(tmp_path / "0", log(24), Network(1), "incremental", keep_every=6)
     for tick in range(17):
         first.tick(tick / 10)
-    kill(first)
-    (tmp_path / "map-00000012.state").write_bytes(b"rotten")
-    node = kept(tmp_path, log(24), Network(1), "incremental", keep_every=6)
-    assert node.resumed_at == 6
-    said = content(mapped("incremental", log(24)[:15]).components())
+    left = killed(tmp_path / "0")
+    with sqlite3.connect(left / "robot.sqlite") as db:
+        db.execute("UPDATE progress SET state = x'00' WHERE scans = 12")
+    db.close()
+    mission = stored(left, log(24), Network(1), "incremental", keep_every=6)
+    assert mission.resumed_at == 6
+    published = content(mapped("incremental", log(24)[:15]).components())
     for position in range(7, 18):
-        node.tick(position / 10)
-        assert content(node.replica.components()) == said
-    run(node)
-    assert content(node.replica.components()) == content(mapped("incremental", log(24)).components())
-    kill(node)
+        mission.tick(position / 10)
+        assert content(mission.replica.components()) == published
+    run(mission)
+    assert content(mission.replica.components()) == content(mapped("incremental", log(24)).components())
 
 
-def test_one_that_lost_its_disk_begins_anew_and_nothing_is_lost_or_there_twice_in_the_end(tmp_path):
+def test_a_robot_that_lost_its_disk_starts_again_and_its_records_come_back(tmp_path):
     network = Network(2)
-    first, teammate = kept(tmp_path / "a", log(24), network, "incremental"), robot(1, [], network)
-    run(first, teammate, settle=1.0, duration=1.6)
-    kill(first)
-    said = content(teammate.replica.components())
-    assert said == content(mapped("incremental", log(24)[:15]).components())
-    node = kept(tmp_path / "b", log(24), network, "incremental", announce_every=0.2)
-    run(teammate, node, settle=3.0, duration=0.0)
-    assert content(node.replica.components()) == said  # what it said comes back
+    first, teammate = stored(tmp_path / "a", log(24), network, "incremental"), robot(1, [], network)
+    for tick in range(16):
+        first.tick(tick / 10)
+        teammate.exchange(tick / 10)
+    published = content(teammate.replica.components())
+    assert published == content(mapped("incremental", log(24)[:15]).components())
+    mission = stored(tmp_path / "b", log(24), network, "incremental", announce_every=0.2)
+    for step in range(100):
+        mission.exchange(3.0 + step / 10)
+        teammate.exchange(3.0 + step / 10)
+    assert content(mission.replica.components()) == published
     now = 100.0
-    while not node.is_over:
+    while not mission.is_over:
         now += 0.1
-        node.tick(now)
-        here = content(node.replica.components())
-        assert node.position > 15 or not said - here
-        assert node.map.n_pending or not content(node.map.components()) - here
-    run(node, teammate, settle=5.0)
-    for each in (node, teammate):
-        assert content(each.replica.components()) == content(mapped("incremental", log(24)).components())
-    kill(node)
+        mission.tick(now)
+        here = content(mission.replica.components())
+        assert mission.position > 15 or not published - here
+        assert mission.map.n_pending or not content(mission.map.components()) - here
+    run(mission, teammate, quiet=5.0)
+    expected = content(mapped("incremental", log(24)).components())
+    assert content(mission.replica.components()) == content(teammate.replica.components()) == expected
 
 
-@pytest.mark.parametrize("over", [False, True])
-def test_stopped_and_started_again_it_goes_on(tmp_path, over):
-    node = kept(tmp_path, log(6), Network(1), "per_scan", keep_every=1)
-    run(node, duration=None if over else 0.3)
-    node.close()
-    again = kept(tmp_path, log(6), Network(1), "per_scan", keep_every=1)
-    assert again.resumed_at == (6 if over else 3)
-    assert again.replica.digest() == node.replica.digest()
+@pytest.mark.parametrize("n_ticks", [3, 6])
+def test_a_stopped_robot_continues(tmp_path, n_ticks):
+    mission = stored(tmp_path / "0", log(6), Network(1), "per_scan", keep_every=1)
+    for tick in range(n_ticks):
+        mission.tick(tick / 10)
+    again = stored(killed(tmp_path / "0"), log(6), Network(1), "per_scan", keep_every=1)
+    assert again.resumed_at == n_ticks
+    assert again.replica.digest() == mission.replica.digest()
     run(again)
     assert content(again.replica.components()) == content(mapped("per_scan", log(6)).components())
-    assert (again.replica.digest() == node.replica.digest()) == over  # nothing is said again
-    again.close()
+    assert (again.replica.digest() == mission.replica.digest()) == (n_ticks == 6)  # nothing is repeated
 
 
-def test_a_stream_goes_on_where_it_was(tmp_path):
-    node = kept(tmp_path, iter(log(9)), Network(1), "per_scan", keep_every=2)
-    run(node, duration=0.5)
-    node.close()
-    again = kept(tmp_path, iter(log(9)), Network(1), "per_scan", keep_every=2)
+def test_a_stream_continues_where_it_was(tmp_path):
+    mission = stored(tmp_path / "0", iter(log(9)), Network(1), "per_scan", keep_every=2)
+    for tick in range(5):
+        mission.tick(tick / 10)
+    again = stored(killed(tmp_path / "0"), iter(log(9)), Network(1), "per_scan", keep_every=2)
     assert again.resumed_at == 4
     run(again)
     assert content(again.replica.components()) == content(mapped("per_scan", log(9)).components())
-    again.close()
 
 
-def test_to_go_on_with_another_log_rule_or_number_is_refused(tmp_path):
-    run(node := kept(tmp_path, log(6), Network(1), facts={"dataset": "intel"}))
-    node.close()
-
-    def opened(scans=None, rule="windowed", number=0, dataset="intel"):
-        replica = Replica(number)
-        options = {"folder": tmp_path, "facts": {"dataset": dataset}}
-        return ReplayNode(replica, scans or log(6), Network(9), lambda: GaussianMap(RULES[rule]), **options)
-
-    opened()
-    for options, named in (
-        ({"scans": log(7)}, "n_scans"),
-        ({"rule": "per_scan"}, "learning"),
-        ({"number": 3}, "robot"),
-        ({"dataset": "aces"}, "dataset"),
-    ):
-        with pytest.raises(DataError, match=named):
-            opened(**options)
-    with pytest.raises(DataError, match="robot 0"):
-        Journal(tmp_path / "journal", Replica(3))
+def test_progress_of_another_log_or_rule_is_rejected(tmp_path):
+    run(stored(tmp_path / "0", log(6), Network(1)))
+    for name, scans, rule in (("n_scans", log(7), "windowed"), ("learning", log(6), "per_scan")):
+        with pytest.raises(DataError, match=rf"\({name} differ\)"):
+            stored(killed(tmp_path / "0"), scans, Network(1), rule)
+        shutil.rmtree(tmp_path / "0+")
 
 
-def test_the_real_process_is_killed():
-    """In a process of its own, as it forks; see `kill_replay`."""
+@pytest.mark.slow
+def test_the_process_of_a_robot_is_killed():
+    """In its own process, as it forks; see `kill_replay`."""
     done = subprocess.run(
         [sys.executable, "-m", "exploration.kill_replay", str(N_KILLS)],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"},
@@ -394,127 +387,129 @@ def test_the_real_process_is_killed():
 # -- trouble -----------------------------------------------------------------------------------------------
 
 
-def test_a_full_disk_is_said_once_and_all_is_kept_again_when_there_is_room(tmp_path, caplog):
-    """The kernel refuses what would make a file longer."""
+def test_a_full_disk_is_logged_once_and_everything_is_kept_once_there_is_room(tmp_path, caplog):
     network = Network(2)
-    node, listener = kept(tmp_path, log(24), network, "per_scan", keep_every=2), robot(1, [], network)
+    mission = stored(tmp_path / "0", log(24), network, "per_scan", keep_every=2)
+    listener = robot(1, [], network)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, limits[1]))  # the kernel refuses to let files grow
     try:
         with caplog.at_level(logging.WARNING):
-            run(node, listener, settle=1.0, duration=1.0)
+            for tick in range(10):
+                mission.tick(tick / 10)
+                listener.exchange(tick / 10 + 0.09)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert listener.replica.digest() == node.replica.digest()
-    assert node.row()["unkept"] > 3
-    assert caplog.text.count("no longer kept") == 1
-    assert caplog.text.count("how far it is") == 1
-    run(node, listener, settle=1.0)
-    assert "kept on disk again" in caplog.text
-    kill(node)
-    again = kept(tmp_path, log(24), Network(1), "per_scan", keep_every=2)
-    assert again.replica.digest() == node.replica.digest()
+    assert listener.replica.digest() == mission.replica.digest()
+    assert ReplayingRobotView(mission, network).row()["unkept"] > 3
+    assert caplog.text.count("is no longer written") == 1
+    run(mission, listener, quiet=1.0)
+    assert "is written again" in caplog.text
+    again = stored(killed(tmp_path / "0"), log(24), Network(1), "per_scan", keep_every=2)
+    assert again.replica.digest() == mission.replica.digest()
     assert again.resumed_at == 24
-    again.close()
 
 
-def test_a_scan_that_cannot_be_read_is_left_out_and_said_once(caplog):
+def test_a_scan_that_cannot_be_read_is_left_out_and_logged_once(caplog):
     class Damaged(DatasetShard):
         def __getitem__(self, index):
             if index in (2, 5):
                 raise DataError(f"scan {index} is damaged")
             return super().__getitem__(index)
 
-    node = robot(0, Damaged(log(8), range(8)), Network(1), "per_scan")
-    run(node)
-    assert (node.row()["unread"], node.row()["scans"]) == (2, 8)
+    mission = robot(0, Damaged(log(8), range(8)), Network(1), "per_scan")
+    run(mission)
+    assert (mission.n_unread, mission.position) == (2, 8)
     assert caplog.text.count("is damaged") == 1
     whole = [scan for index, scan in enumerate(log(8)) if index not in (2, 5)]
-    assert content(node.replica.components()) == content(mapped("per_scan", whole).components())
+    assert content(mission.replica.components()) == content(mapped("per_scan", whole).components())
 
 
-def test_scans_that_are_no_neighbours_are_an_error():
-    node = robot(0, [*log(4), Scan([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0])], Network(1), "per_scan")
+def test_a_scan_of_another_dimension_is_an_error():
+    mission = robot(0, [*log(4), Scan([[1.0, 2.0, 3.0]], [0.0, 0.0, 0.0])], Network(1), "per_scan")
     with pytest.raises(InvalidArgumentError, match="3-dimensional"):
-        run(node)
-    assert content(node.replica.components()) == content(mapped("per_scan", log(4)).components())
+        run(mission)
+    assert content(mission.replica.components()) == content(mapped("per_scan", log(4)).components())
 
 
-def test_datagrams_that_say_nothing_are_counted():
+def test_damaged_datagrams_are_counted():
     network = Network(2)
-    node = robot(0, log(4), network)
+    mission = robot(0, log(4), network)
     network.send(1, [b"", b"nonsense", b"\x11" * 1200], 0.0, "noise")
     network.send(1, robot(1, [], network).replica.announcements(), 0.0, "announcements")
-    run(node)
-    assert (node.row()["heard"], node.row()["damaged"]) == (4, 3)
+    run(mission)
+    assert (mission.radio.n_received, mission.radio.n_damaged) == (4, 3)
 
 
-def test_clocks_that_jump_change_nothing_that_is_learned():
+def test_jumping_clocks_do_not_change_the_map():
     network, rng = Network(2), random.Random(0)
-    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    team = [robot(k, part(k, 2, 8), network) for k in range(2)]
     for _ in range(60):
         now = rng.choice([0.0, 1e9, rng.uniform(0, 100)])
-        for node in nodes:
-            node.tick(now) if not node.is_over else node.listen(now)
+        for mission in team:
+            (mission.exchange if mission.is_over else mission.tick)(now)
     for tick in range(200):
-        for node in nodes:
-            node.listen(1e9 + tick)
-    assert nodes[0].replica.digest() == nodes[1].replica.digest()
+        for mission in team:
+            mission.exchange(1e9 + tick)
+    assert team[0].replica.digest() == team[1].replica.digest()
 
 
-@pytest.mark.parametrize("options", [{"announce_every": 0.0}, {"budget": 0.0}, {"keep_every": 0}])
-def test_bad_options(options):
+@pytest.mark.parametrize(
+    "options", [{"announce_every": 0.0}, {"budget": 0.0}, {"keep_every": 0}, {"rate": 0.0}]
+)
+def test_bad_options_are_rejected_by_name(options):
     with pytest.raises(InvalidArgumentError, match=next(iter(options))):
         robot(0, [], Network(1), **options)
 
 
-# -- what it leaves ----------------------------------------------------------------------------------------
+# -- the view of the robot ---------------------------------------------------------------------------------
 
 
-def test_its_books_are_those_of_the_network():
+def test_row_and_scalars_agree_with_the_network():
     network = Network(2, LinkConditions(loss=0.2))
-    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
-    run(*nodes, settle=3.0)
-    for k, node in enumerate(nodes):
-        row, scalars, sent = node.row(), node.scalars(), network.traffic(k)
+    team = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    run(*team, quiet=3.0)
+    for k, mission in enumerate(team):
+        view, sent = ReplayingRobotView(mission, network), network.traffic(k)
+        row, scalars = view.row(), view.scalars()
         assert row["bytes_sent"] == scalars["bytes_sent"] == sent.bytes
         assert sum(row["bytes_by_kind"].values()) == sent.bytes
         assert row["wire_bytes"] == scalars["wire_bytes_sent"] == sent.bytes + 28 * sent.datagrams
         assert row["heard"] == network.reception(k).datagrams
-        assert row["digest"] == node.replica.digest().hex()
-        assert row["n_components"] == scalars["components"] == len(node.replica.components())
+        assert row["digest"] == mission.replica.digest().hex()
+        assert row["n_components"] == scalars["components"] == len(mission.replica.components())
         assert json.loads(json.dumps(row, allow_nan=False)) == row
         assert all(isinstance(value, float) for value in scalars.values())
-        assert "scan 4/4" in node.status()
+        assert "scan 4/4" in view.status()
 
 
-def test_its_maps_are_files(tmp_path):
+def test_files_are_the_team_map_and_the_own_map(tmp_path):
     network = Network(2)
-    nodes = [robot(k, part(k, 2, 8), network) for k in range(2)]
-    run(*nodes, settle=2.0)
-    paths = {name: tmp_path / file for name, (file, _) in nodes[0].files().items()}
-    for name, (_, write) in nodes[0].files().items():
+    team = [robot(k, part(k, 2, 8), network) for k in range(2)]
+    run(*team, quiet=2.0)
+    files = ReplayingRobotView(team[0], network).files()
+    paths = {name: tmp_path / file for name, (file, _) in files.items()}
+    for name, (_, write) in files.items():
         write(paths[name])
-    assert content(GaussianMap.load(paths["map"]).components()) == content(nodes[1].replica.components())
-    assert content(GaussianMap.load(paths["own_map"]).components()) == content(nodes[0].map.components())
-    assert robot(0, [], Network(1)).files() == {}
+    assert content(GaussianMap.load(paths["map"]).components()) == content(team[1].replica.components())
+    assert content(GaussianMap.load(paths["own_map"]).components()) == content(team[0].map.components())
+    assert ReplayingRobotView(robot(0, [], Network(1)), Network(1)).files() == {}
 
 
 @pytest.mark.real_data
-def test_a_real_log(real_data, tmp_path):
+def test_a_real_log(real_data):
     scans = load("carmen", real_data / "laser2d" / "intel.log.gz")
-    network = Network(3, LinkConditions(loss=0.3))
-    rule, parts = (
-        IncrementalRule(window=5),
-        [DatasetShard(scans, list(shard_indices(30, k, 3))) for k in range(3)],
-    )
-    nodes = [ReplayNode(Replica(k), parts[k], network, lambda: GaussianMap(rule)) for k in range(3)]
-    run(*nodes, settle=15.0)
-    assert len({node.replica.digest() for node in nodes}) == 1
+    network, rule = Network(3, LinkConditions(loss=0.3)), IncrementalRule(window=5)
+    parts = [DatasetShard(scans, list(shard_indices(30, k, 3))) for k in range(3)]
+    team = [
+        ReplayMission(Replica(k), parts[k], network, lambda: GaussianMap(rule), rate=10.0) for k in range(3)
+    ]
+    run(*team, quiet=15.0)
+    assert len({mission.replica.digest() for mission in team}) == 1
     alone = []
     for scans_of_one in parts:
         made = GaussianMap(rule)
         for scan in scans_of_one:
             made.insert(scan)
         alone.append(made.components())
-    assert content(nodes[0].replica.components()) == content(*alone)
+    assert content(team[0].replica.components()) == content(*alone)

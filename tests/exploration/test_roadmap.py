@@ -130,19 +130,6 @@ def test_roadmap_works_far_from_the_origin():
     assert 2 < float(roadmap.route(ends[0], ends[1:]).metres[0]) < 5
 
 
-def test_restored_it_answers_as_before():
-    roadmap = seen_through_windows(maze(), step=12)
-    other = Roadmap()
-    other.restore(roadmap.state())
-    points = torch.tensor([[1.1, 1.3, 1.7], [10.0, 7.3, 1.7], [3.0, 4.0, 1.0]], dtype=torch.float64)
-    one, two = (r.route(points[0], points) for r in (roadmap, other))
-    assert torch.equal(one.metres, two.metres)
-    assert torch.equal(one.path(1), two.path(1))
-    shut = surroundings_from(torch.zeros(WINDOW, dtype=torch.bool))
-    roadmap.update(shut)
-    assert len(roadmap) < len(other)  # nothing is shared
-
-
 def test_at_the_rim_selects_points_near_the_border():
     here: LocalMap = surroundings_from(torch.ones(10, 10, 10, dtype=torch.bool), (5, 5, 5))
     points = torch.tensor(

@@ -1,4 +1,4 @@
-"""A robot: what it has flown, where it fits, and what a checkpoint keeps of it."""
+"""Robot: its path, its trail, and its local map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from sharing.message_examples import assert_same
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
@@ -22,7 +21,6 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.messages.message_registry import PlanMessage
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
@@ -30,19 +28,10 @@ START = torch.tensor([3.1, 3.1, 1.5, 0.3], dtype=torch.float64)
 
 
 class Idle:
-    """A planner without anything to remember but a number."""
-
-    def __init__(self) -> None:
-        self.number = 0
+    """A planner that must not be called."""
 
     def plan(self, task: Any) -> Plan:
-        raise AssertionError("A robot does not ask its planner; the mission does.")
-
-    def state(self) -> dict[str, Any]:
-        return {"number": self.number}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.number = state["number"]
+        raise AssertionError("A robot does not call its planner; its agent does.")
 
 
 def robot(start_radius: float = 0.0) -> Robot:
@@ -170,7 +159,7 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     wall = torch.tensor([[4.5, 3.1, 1.5], [4.5, 3.3, 1.5]], dtype=torch.float64)
     thin = torch.tensor([[2.1, 3.1, 1.5]], dtype=torch.float64)  # the end of an empty beam
     ends, is_hit = torch.cat([wall, thin]), torch.tensor([True, True, False])
-    one._remember(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
+    one._remember_returns(DepthFrame(START[:3], ends, is_hit, torch.arange(3)))
     found = one.local_map(0.125, 0.3)
     taken = free.free & ~found.free
     cells = (wall / 0.2).floor().long()
@@ -183,11 +172,11 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     # After twelve frames more it is forgotten; frames without returns do not count.
     nothing = DepthFrame(START[:3], ends[2:], is_hit[2:], torch.arange(1))
     for _ in range(20):
-        one._remember(nothing)
+        one._remember_returns(nothing)
     assert not bool(one.local_map(0.125, 0.3).is_passable(wall).any())
     elsewhere = DepthFrame(START[:3], wall[:1] + 1.0, is_hit[:1], torch.arange(1))
     for _ in range(12):
-        one._remember(elsewhere)
+        one._remember_returns(elsewhere)
     assert bool(one.local_map(0.125, 0.3).is_passable(wall).all())
 
 
@@ -198,55 +187,3 @@ def test_around_the_start_it_is_free_though_nothing_was_seen() -> None:
     assert float((centers - START[:3]).norm(dim=1).max()) <= 1.4
     assert int(found.passable.sum()) > 1
     assert not bool(found.observed.any())
-
-
-# -- checkpoints ----------------------------------------------------------------------------------------
-
-
-def test_a_restored_robot_goes_on_alike() -> None:
-    one, path = robot(1.4), zigzag()
-    one.planner.number = 7
-    one.mapper.belief.add(CellEvidence(torch.tensor([[1, 2, 3]]), torch.ones(1), torch.ones(1)))
-    everywhere(one, 0.0, 3.0)
-    one.follow(plan(path))
-    one.advance(0, 4)
-    one.collisions = 2
-    views = torch.zeros(0, 4, dtype=torch.float64)
-    one.plans = {
-        3: PlanMessage(3, 7, 1.5, 0.2, START[None].clone(), views),
-        1: PlanMessage(1, 6, 0.5, 0.1, START.expand(4, 4).clone(), START[None].clone()),
-    }
-    wall = torch.tensor([[4.5, 3.1, 1.5]], dtype=torch.float64)
-    one._remember(DepthFrame(START[:3], wall, torch.tensor([True]), torch.arange(1)))
-    twin = robot(1.4)
-    twin.restore(one.checkpoint())
-    assert twin.planner.number == 7
-    assert twin.collisions == 2
-    assert list(twin.plans) == [3, 1]
-    for number, heard in one.plans.items():
-        assert_same(twin.plans[number], heard)
-    for each in (one, twin):
-        each.advance(4, 8)
-        each._remember(DepthFrame(START[:3], wall + 0.5, torch.tensor([True]), torch.arange(1)))
-    assert twin.path_length == one.path_length == pytest.approx(4 * 0.3 + 4 * 0.4)
-    assert torch.equal(twin.state, one.state)
-    assert torch.equal(twin.braking, one.braking)
-    a, b = (each.local_map(0.125, 0.3) for each in (one, twin))
-    for name in ("low", "occupancy", "observed", "free", "passable"):
-        assert torch.equal(getattr(a, name), getattr(b, name))
-    assert torch.equal(one.mapper.belief.grid.dense(BOX)[0], twin.mapper.belief.grid.dense(BOX)[0])
-
-
-def test_what_happens_later_does_not_change_a_checkpoint() -> None:
-    one, path = robot(), zigzag()
-    one.follow(plan(path))
-    one.advance(0, 4)
-    state = one.checkpoint()
-    one.advance(4, 8)
-    one._remember(DepthFrame(START[:3], path[:1, :3], torch.tensor([True]), torch.arange(1)))
-    everywhere(one, 1.0, 0.0)
-    twin = robot()
-    twin.restore(state)
-    assert torch.equal(twin.state, path[3])
-    assert twin.path_length == pytest.approx(2 * 0.3 + 2 * 0.4)
-    assert not bool(twin.local_map(0.125, 0.3).observed.any())

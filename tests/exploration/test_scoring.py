@@ -63,16 +63,6 @@ def test_belief_does_not_depend_on_the_order_of_evidence() -> None:
     assert one.entropy_bits == pytest.approx(other.entropy_bits, abs=1e-3)
 
 
-def test_a_restored_map_goes_on_as_the_first() -> None:
-    one, other = (BeliefMap(0.5, BOX, observable(), BeliefRule()) for _ in range(2))
-    one.add(evidence(1))
-    other.restore(one.state())
-    one.add(evidence(2))
-    other.add(evidence(2))
-    assert other.entropy_bits == one.entropy_bits
-    assert other.n_observed == one.n_observed
-
-
 def test_accuracy_equals_a_loop() -> None:
     seen = observable()
     belief = BeliefMap(0.5, BOX, seen, BeliefRule())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +14,6 @@ from sharing.message_examples import codecs, frame_of_components
 from sharing.replica_model import rows
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.messages.announcements import encode_announcements
@@ -168,32 +166,6 @@ def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
         assert 0 < sum(map(len, sent)) <= budget
         got += sent
     assert got == due
-
-
-@codecs
-def test_restored_it_goes_on_alike(codec: str, tmp_path: Path) -> None:
-    said = history(3, codec)
-    one, twin = Broadcast(0, codec), Broadcast(0, codec)
-    for datagram in said[: len(said) // 2]:
-        if not (
-            isinstance(message := decode(datagram), ComponentsMessage) and message.components.ids[0, 0] == 0
-        ):
-            one.receive(datagram)
-    one.add(frame_of_components(20, seed=5))
-    one.datagrams(budget=500)
-    one.changes()
-    twin.restore(load_checkpoint(save_checkpoint(tmp_path / "broadcast", one.state())))
-    assert twin.changes().added == []
-    for each in (one, twin):
-        each.add(frame_of_components(5, seed=6))
-        for datagram in said:
-            each.receive(datagram)
-    assert one.datagrams() == twin.datagrams()
-    for name, value in vars(one.components()).items():
-        assert torch.equal(value, getattr(twin.components(), name)), name
-    a, b = one.changes(), twin.changes()
-    assert len(a.added) == len(b.added) > 0
-    assert torch.equal(a.gained.support, b.gained.support)
 
 
 # -- what is not taken in ----------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
 from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
 from gmmtorch.sharing.transport.simulated_network import HEADER_BYTES, Network, Reception, Traffic
 
@@ -479,33 +478,6 @@ def test_the_books_count_broadcasts_once_by_sender_and_kind(sent, conditions):
     assert network.n_datagrams == len(everything)
     assert network.n_bytes == sum(map(len, everything)) == sum(network.bytes_by_kind.values())
     assert network.n_wire_bytes == network.n_bytes + 28 * len(everything)
-
-
-@settings(max_examples=60)
-@given(before=sent, after=sent, conditions=conditions, seed=st.integers(0, 9))
-def test_a_restored_network_goes_on_as_if_nothing_had_come_between(tmp_path, before, after, conditions, seed):
-    def go_on(network: Network, now: float) -> list[object]:
-        seen: list[object] = [network.deliver(robot, now) for robot in range(N)]
-        for sender, datagrams, pause, kind in after:
-            now += pause
-            network.send(sender, datagrams, now, kind)
-            seen.append(network.deliver((sender + 1) % N, now))
-        seen += [network.deliver(robot, 1e9) for robot in range(N)]
-        seen += [network.reception(robot) for robot in range(N)]
-        return [*seen, network.bytes_by_kind, network.n_wire_bytes]
-
-    network, now = Network(N, conditions, seed), 0.0
-    network.place(on_a_line([0.0, 0.7, 3.0]))
-    for sender, datagrams, pause, kind in before:
-        now += pause
-        network.send(sender, datagrams, now, kind)
-        network.deliver(0, now)
-    state = load_checkpoint(save_checkpoint(tmp_path / "network", network.state()))
-    other = Network(N, conditions, seed + 1)
-    other.place(on_a_line([5.0, 5.0, 5.0]))
-    other.send(0, [b"forgotten"], 0.0, "maps")
-    other.restore(state)
-    assert go_on(other, now) == go_on(network, now)
 
 
 def test_a_network_without_positions_is_restored_without():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,14 +47,6 @@ class Fatigue:
             return torch.ones(len(keys))
         row = torch.searchsorted(self._keys, keys).clamp_max(len(self._keys) - 1)
         return torch.where(self._keys[row] == keys, self._weights[row], 1.0)
-
-    def state(self) -> dict[str, Any]:
-        when = self._when if math.isfinite(self._when) else None
-        return {"keys": self._keys, "weights": self._weights, "when": when}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._keys, self._weights = state["keys"], state["weights"]
-        self._when = -math.inf if state["when"] is None else float(state["when"])
 
 
 def _keys(local_map: LocalMap) -> Tensor:

@@ -6,13 +6,13 @@ import hashlib
 import math
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.sharing.messages.fields import LATEST, TICKS
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
@@ -47,7 +47,6 @@ _RUN = 96
 """Views, or intervals of removed keys, that are encoded together: about a datagram."""
 _SMALL_CHANGE = 0.2
 """Change of a value, relative to it, that is not sent."""
-_TIMES = ("_valued_at", "_heard_at")
 _LARGEST_VALUE = float(np.finfo(np.float16).max)
 
 
@@ -309,34 +308,6 @@ class ViewLibrary:
                 self._heard_at[key] = now
                 self._due.discard(key)
         return True
-
-    def state(self) -> dict[str, Any]:
-        """Everything, for a checkpoint of a mission."""
-        rows = vars(self._message(sorted(self._views), self._removed))
-        tables = {name: [[key, at] for key, at in getattr(self, name).items()] for name in _TIMES}
-        return {
-            **{name: value for name, value in rows.items() if name != "removed"},
-            "robot": self._robot,
-            "removed": self._removed.stored(),
-            "removed_due": self._removed_due.stored(),
-            "due": sorted(self._due),
-            "n": self._n,
-            **tables,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`. Raises `DataError` for another robot's."""
-        if state["robot"] != self._robot:
-            raise DataError(f"The views are of robot {state['robot']}, this is robot {self._robot}.")
-        fresh = ViewLibrary(self._robot)
-        fresh._n = MOST_RECORDS  # its own keys are accepted
-        rows = {name: state[name] for name in ("ids", "poses", "values", "stamps")}
-        fresh.receive(ViewsMessage(**rows, removed=Intervals.loaded(state["removed"])), 0.0)
-        self._views, self._removed, self._cached = fresh._views, fresh._removed, None
-        self._removed_due, self._due = Intervals.loaded(state["removed_due"]), set(state["due"])
-        self._n = int(state["n"])
-        for name in _TIMES:
-            setattr(self, name, {int(key): float(at) for key, at in state[name]})
 
     def _message(self, keys: list[int], removed: Intervals) -> ViewsMessage:
         views = [self._views[key] for key in keys]

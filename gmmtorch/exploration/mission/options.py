@@ -1,4 +1,4 @@
-"""TeamOptions: how a team explores, everything but the world."""
+"""TeamOptions: how a team explores."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.exploration.planning.primitives import Dynamics
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-from gmmtorch.exploration.robot.heartbeat import Heartbeat
+from gmmtorch.exploration.robot.radio import AnnouncementSchedule
 from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
 from gmmtorch.exploration.world.scoring import BeliefRule
 from gmmtorch.mapping.learning.rules import NoveltyRule
@@ -21,28 +21,33 @@ from gmmtorch.sharing.transport.link_conditions import LinkConditions, Partition
 from gmmtorch.sharing.transport.token_bucket import TokenBucket
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
-_MOST_ROBOTS = 31  # as many bits as say who saw a cell
-_LATE = 5  # mean jitters: less than a hundredth of the datagrams are later
+_MOST_ROBOTS = 31
+"""Bits of the integer that stores which robots saw a cell."""
+_LATE_JITTERS = 5
+"""Mean jitters. Less than 1 % of the datagrams arrive later."""
 
 FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
-"""What the thesis calls them."""
+"""Name in the thesis, by framework."""
 
 
 @dataclass(frozen=True)
 class TeamOptions:
-    """How a team explores, everything but the world.
+    """How a team explores; the world is separate.
 
-    framework: one of `FRAMEWORKS`. size: robots. duration: simulated seconds. seed: of noise and
-    search. rate: frames a second (Hz); a robot plans each time it has flown a primitive
-    (`dynamics.duration`). window: cells around a robot, along x, y, z, that it plans in. planner,
-    information, coordination: by name, see `planners`, `ViewEvaluator`, `Coordination`. planning_prior:
-    occupancy that the planner expects of unknown cells. rest: when a robot has seen enough. codec: of
-    components, see `sharing.messages`; others than quantized are not repaired after losses. latency …
-    partitions: of the network, see `LinkConditions`. announce_every (s): see `Heartbeat`. budget: bytes a
-    second that a robot sends of its map and views; None: no limit.
-    sample_every: simulated seconds between the numbers kept, to the nearest whole frame. codecs: what the
-    novel points are also encoded with, to compare. margin: metres that robots keep between them. start:
-    (size, 4) poses; None: chosen by the world.
+    framework: one of `FRAMEWORKS`. size: number of robots. duration: simulated seconds.
+    seed: of sensor noise, network and planners. rate: frames per second (Hz).
+    camera, dynamics, belief, novelty, frame: see their classes. A robot plans once every `dynamics.duration`.
+    window: cells along x, y, z, around the robot, in which it plans.
+    planner, information, coordination: names; see `planners`, `ViewEvaluator`, `Coordination`.
+    n_beams: of a view. n_rounds: of coordination. planning_prior: occupancy probability of unobserved cells
+        for the planner. rest: when a robot stops exploring.
+    codec: of components, see `sharing.messages`; losses are repaired for "quantized" only.
+    latency … partitions: of the simulated network, see `LinkConditions`.
+    announce_every: seconds, see `AnnouncementSchedule`.
+    budget: bytes per second that a robot sends of its map and views; None: no limit.
+    sample_every: simulated seconds between the values of curves, rounded to whole frames.
+    codecs: other codecs whose bytes for the novel points are measured.
+    margin: metres between robots. start: (size, 4) poses; None: chosen by the world.
     """
 
     framework: str = "gmm_shared"
@@ -87,7 +92,7 @@ class TeamOptions:
             raise InvalidArgumentError(f"planner={self.planner!r} is not one of {', '.join(PLANNERS)}.")
         check_whole("team.size", self.size, 1)
         if self.size > _MOST_ROBOTS:
-            raise InvalidArgumentError(f"team.size={self.size} is more than the {_MOST_ROBOTS} there may be.")
+            raise InvalidArgumentError(f"team.size={self.size} must be at most {_MOST_ROBOTS}.")
         check_whole("seed", self.seed, 0)
         check_whole("n_beams", self.n_beams, 1)
         check_codec(self.codec)
@@ -103,8 +108,9 @@ class TeamOptions:
             raise InvalidArgumentError(
                 f"information={self.information!r} is not one of {', '.join(INFORMATION)}."
             )
-        Coordination(self.coordination, self.n_rounds)  # they check their own
-        Heartbeat(self.announce_every)
+        # These check their own arguments.
+        Coordination(self.coordination, self.n_rounds)
+        AnnouncementSchedule(self.announce_every)
         if self.budget is not None:
             TokenBucket(self.budget)
         self.conditions.check_team(self.size)
@@ -150,7 +156,7 @@ class TeamOptions:
 
     @property
     def conditions(self) -> LinkConditions:
-        """Of the network."""
+        """Conditions of the simulated network."""
         return LinkConditions(
             latency=self.latency,
             jitter=self.jitter,
@@ -163,11 +169,17 @@ class TeamOptions:
 
     @property
     def plan_slack(self) -> float:
-        """Seconds that robots wait for the plan of the one before them; none where the network is too slow
-        for all to wait for one another."""
-        slack = 2 * self.latency + _LATE * self.jitter + 0.01
+        """Seconds for which a robot waits for the plan of the robot before it; 0 if the network is too slow
+        for all robots to wait in one tick."""
+        slack = 2 * self.latency + _LATE_JITTERS * self.jitter + 0.01
         return slack if slack * self.size <= self.tick_seconds / 2 else 0.0
 
     @property
+    def separation(self) -> float:
+        """Least distance (m) between the centres of two robots."""
+        return 2 * self.dynamics.radius + self.margin
+
+    @property
     def shares(self) -> bool:
+        """Whether robots send anything."""
         return self.framework != "grid_isolated"

@@ -1,4 +1,4 @@
-"""Snapshots: a few moments of a mission, spread over what was learned, however long that took."""
+"""Snapshots: a few moments of a mission for pictures, evenly spread over the entropy reduction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MOST = 16
 
 
 class Snapshot(NamedTuple):
-    """tick: of the mission. bits: of the observable entropy that had gone. content: what was taken."""
+    """tick: number of ticks done. bits: entropy reduction so far. content: what was taken of the mission."""
 
     tick: int
     bits: float
@@ -19,51 +19,45 @@ class Snapshot(NamedTuple):
 
 
 class Snapshots:
-    """Keeps at most 17 moments: the first it is shown, the end, and what lies between at about even steps of
+    """At most 17 snapshots of a scored mission: the first, the last, and some between at about equal steps of
     entropy.
 
-    How much there is to learn is known at the end alone. So a moment is kept whenever a step more has gone;
-    once there are 16, only those stay that are two such steps apart, and steps are that long from then on.
+    The final entropy is not known in advance. So the class takes a snapshot after each step of entropy; once
+    there are 16, it doubles the step and drops the snapshots between.
 
     Args:
-        take: what is kept of a mission at a moment: a nested state, as `save_checkpoint` takes them.
+        take: returns the content of a snapshot.
     """
 
     def __init__(self, take: Callable[[Mission], dict[str, Any]]) -> None:
         self._take = take
         self._step = 0.0  # bits
-        self.moments: list[Snapshot] = []
+        self.taken: list[Snapshot] = []
 
-    def look(self, mission: Mission) -> None:
-        """See a mission after a step of it, and keep the moment if it is due."""
-        bits = mission.union.observable_bits - mission.union.entropy_bits
-        if self.moments and not mission.is_over and bits <= self.moments[-1].bits + self._step:
+    def update(self, mission: Mission) -> None:
+        """Takes a snapshot if it is due. Called after every tick."""
+        union = mission.score.union
+        bits = union.observable_bits - union.entropy_bits
+        if self.taken and not mission.is_over and bits <= self.taken[-1].bits + self._step:
             return
-        if len(self.moments) == _MOST:
+        if len(self.taken) == _MOST:
             self._thin()
-        self.moments.append(Snapshot(mission.tick, bits, self._take(mission)))
+        self.taken.append(Snapshot(mission.n_ticks, bits, self._take(mission)))
 
     def _thin(self) -> None:
-        first, *others = self.moments
+        first, *others = self.taken
         self._step = 2 * (others[-1].bits - first.bits) / _MOST
-        self.moments = [first]
-        for moment in others:
-            if moment.bits >= self.moments[-1].bits + self._step:
-                self.moments.append(moment)
+        self.taken = [first]
+        for snapshot in others:
+            if snapshot.bits >= self.taken[-1].bits + self._step:
+                self.taken.append(snapshot)
 
     def chosen(self, shares: Sequence[float] = (0.2, 0.5, 0.8)) -> list[Snapshot]:
-        """The moments, in their order, at which about these shares had gone of what has gone in the end, and
-        the end; fewer if there are not so many."""
-        *left, end = self.moments
+        """The last snapshot, and those nearest to these shares of the final reduction; sorted by time, fewer
+        if there are not enough."""
+        *left, end = self.taken
         chosen = [end]
         for share in shares[: len(left)]:
-            bits = [abs(moment.bits - share * end.bits) for moment in left]
+            bits = [abs(snapshot.bits - share * end.bits) for snapshot in left]
             chosen.append(left.pop(bits.index(min(bits))))
-        return sorted(chosen, key=lambda moment: moment.tick)
-
-    def state(self) -> dict[str, Any]:
-        return {"step": self._step, "moments": [list(moment) for moment in self.moments]}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._step = float(state["step"])
-        self.moments = [Snapshot(int(tick), float(bits), content) for tick, bits, content in state["moments"]]
+        return sorted(chosen, key=lambda snapshot: snapshot.tick)

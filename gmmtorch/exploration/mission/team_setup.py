@@ -1,4 +1,4 @@
-"""A mission put together: a world, and a team as its options describe it."""
+"""Builds a mission: a world, and a team from its options."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
+from gmmtorch.exploration.mission.clocks import Stopwatch
 from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.mission_score import MissionScore
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.stopwatch import Stopwatch
-from gmmtorch.exploration.planning.coordination import Coordination
 from gmmtorch.exploration.planning.planners import make_planner
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
@@ -31,33 +31,38 @@ from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.simulated_network import Network, Transport
 
 _SLACK = 24
-"""Cells that a robot may be off the middle of its sliding map before that moves, by as many. Rays are long:
-filled in broad slabs a map draws each of them far less often. Planners see the window around the robot."""
-_ROUNDING = 4  # cells that the planner's window may be off the robot
-_REMEMBERED = 4096  # datagrams, and what they say: more than are on their way at once
-_CAST = 16  # of each robot, what its messages tell of cells, which is large: of the last dozen seconds
-_REMEMBERED_ALONE = 64  # of a robot that nobody shares its memo with: what strangers send may be large
+"""Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
+is filled in wide slabs casts each ray far less often. Planners read a smaller window around the robot."""
+_ROUNDING = 4
+"""Cells by which the planner's window may be off the robot."""
+_CACHED_MESSAGES = 4096
+"""Decoded datagrams in the cache of a simulated team: more than are in flight together."""
+_CACHED_MESSAGES_ALONE = 64
+"""The same for a robot in its own process, where a stranger's messages may be large."""
+_CACHED_EVIDENCE = 16
+"""Batches of evidence in the cache, per robot. They are large; this covers the last dozen seconds."""
 
 
 def assemble(world: World, options: TeamOptions, watch: Stopwatch | None = None) -> Mission:
-    """A mission that is ready to begin. Raises `InvalidArgumentError` for what cannot begin.
+    """A mission of a simulated team with its network and its score. Raises `InvalidArgumentError` for options
+    that contradict each other or the world.
 
-    watch: times its stages, of all robots together; None: by the wall.
+    watch: times the stages of all robots together; None: wall time.
     """
     poses = start_poses(world, options)
     network = Network(options.size, options.conditions, seed=options.seed)
-    memo, evidence = Memo(_REMEMBERED), Memo(_CAST * options.size)
+    memo, evidence = Memo(_CACHED_MESSAGES), Memo(_CACHED_EVIDENCE * options.size)
     watch = Stopwatch() if watch is None else watch
     agents = [
         make_agent(number, poses[number], world, options, network, memo, evidence, watch)
         for number in range(options.size)
     ]
-    union = BeliefMap(world.resolution, world.box, world.observable, options.belief)
-    return Mission(world, agents, union, network, coordination_of(options), options, watch)
+    score = MissionScore(world, agents, network, options)
+    return Mission(world, agents, options, watch, network, score)
 
 
 def start_poses(world: World, options: TeamOptions) -> Tensor:
-    """Where the robots start (n, 4). Raises `InvalidArgumentError` for where they cannot."""
+    """The start poses (size, 4): x, y, z, yaw. Raises `InvalidArgumentError` where robots cannot start."""
     primitives = Primitives(options.dynamics)
     if options.start is None:
         return world.start_poses(options.size, primitives=primitives)
@@ -68,11 +73,6 @@ def start_poses(world: World, options: TeamOptions) -> Tensor:
             f"{options.size} robots."
         )
     return world.check_start(poses, primitives)
-
-
-def coordination_of(options: TeamOptions) -> Coordination:
-    """How the team plans; robots that do not talk plan on their own."""
-    return Coordination(options.coordination if options.shares else "myopic", options.n_rounds)
 
 
 def make_agent(
@@ -86,17 +86,19 @@ def make_agent(
     watch: Stopwatch | None = None,
     incarnation: int = 0,
 ) -> Agent:
-    """A robot at its start pose (4,), with a transport.
+    """A robot at its start pose (4,).
 
-    memo, evidence (of what datagrams say, and tell of cells), watch: shared by the robots of a simulation;
-    None: its own. incarnation: of its replica; what may
-    be started again needs another each time (`record_ids.drawn_incarnation`).
+    Args:
+        memo, evidence: caches of decoded datagrams and of evidence, and watch: the robots of a simulation
+            share them; None: its own.
+        incarnation: of its replica and view library. A robot that may be restarted needs another one in each
+            session (`record_keys.drawn_incarnation`).
 
-    Raises `InvalidArgumentError` for options that do not go together.
+    Raises `InvalidArgumentError` for options that contradict each other or the world.
     """
     _check_window(options, world.resolution)
-    memo = Memo(_REMEMBERED_ALONE) if memo is None else memo
-    evidence = Memo(_CAST) if evidence is None else evidence
+    memo = Memo(_CACHED_MESSAGES_ALONE) if memo is None else memo
+    evidence = Memo(_CACHED_EVIDENCE) if evidence is None else evidence
     camera = options.camera
     evaluator = ViewEvaluator(
         camera.horizontal_fov,
@@ -107,10 +109,10 @@ def make_agent(
         n_beams=options.n_beams,
     )
     primitives = Primitives(options.dynamics)
-    launch = initial_free_space(world, pose[:3].double(), primitives)
-    if launch is None:
+    start = initial_free_space(world, pose[:3].double(), primitives)
+    if start is None:
         raise InvalidArgumentError(
-            f"pose={pose.tolist()} is no place that a robot can fly off from; move it."
+            f"pose={pose.tolist()} is a place from which a robot cannot take off; choose another."
         )
     robot = Robot(
         number,
@@ -119,7 +121,7 @@ def make_agent(
         make_planner(options.planner, primitives, evaluator),
         ViewLibrary(number, incarnation=incarnation),
         Roadmap(),
-        launch,
+        start,
         rest=options.rest,
     )
     watch = Stopwatch() if watch is None else watch
@@ -127,7 +129,7 @@ def make_agent(
 
 
 def _check_window(options: TeamOptions, resolution: float) -> None:
-    """Raises unless all that a camera sees lies in the window."""
+    """Raises `InvalidArgumentError` unless the window contains the camera's whole field of view."""
     camera = options.camera
     far = (camera.max_range, camera.max_range, camera.max_range * math.sin(camera.vertical_fov / 2))
     for axis, n, needed in zip("xyz", options.window, far, strict=True):

@@ -1,18 +1,15 @@
-"""Trials: missions run to their end, checkpointed as they go, one after another or several at once."""
+"""Trials: missions that run to their end, one after another or several in parallel, and keep their rows."""
 
 from __future__ import annotations
 
-import concurrent.futures
 import concurrent.futures.process
-import contextlib
 import functools
 import hashlib
-import itertools
 import json
-import math
+import tempfile
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,35 +17,33 @@ from typing import Any
 import torch
 
 from gmmtorch import __version__
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import DataError, GmmTorchError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.evaluation.worker_pool import worker_pool
-from gmmtorch.exploration.mission.checkpoint import load_checkpoint, save_checkpoint
+from gmmtorch.evaluation.processes import end_with_parent
+from gmmtorch.exploration.mission.clocks import SimulatedClock
+from gmmtorch.exploration.mission.driver import drive
 from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.mission_results import row_of
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.pace import Pace, Paces, pace_of
-from gmmtorch.exploration.mission.snapshots import Snapshots
+from gmmtorch.exploration.mission.results import mission_row
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.world.world import World, open_world
 from gmmtorch.files import check_writable, write_json, write_npz
 
-CHECKPOINT = "mission.safetensors"
-PACE = "pace.json"
 ROW = "row.json"
 STAGE = "simulated seconds"
 TRAJECTORIES = "trajectories.npz"
-_PATIENCE = 120.0  # simulated seconds after a mission, for maps to become the same
-_GLANCE = 0.5  # seconds between looks at how far the missions of other processes are
+_CONVERGENCE = 120.0
+"""Simulated seconds after a mission in which the maps may become equal."""
 
-OnSample = Callable[[Mission], None]
-OnPace = Callable[[Pace], None]
+OnMission = Callable[[Mission], object]
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Which world; see `world.open_world`. size (m), seed: of worlds drawn at random; path, bounds: of a
-    mesh. cache: keep on disk what is worked out once."""
+    """Which world; see `world.open_world`.
+
+    size (m), seed: of generated worlds. path, bounds: of a mesh. cache: keep computed properties on disk.
+    """
 
     name: str = "warehouse"
     path: str | None = None
@@ -59,7 +54,7 @@ class WorldOptions:
     cache: bool = True
 
     def open(self, team: TeamOptions, on_event: Event = ignore) -> World:
-        """The world, as robots like these can see and fly it."""
+        """The world for robots with this camera and this body."""
         return open_world(
             self.name,
             path=self.path,
@@ -77,37 +72,20 @@ class WorldOptions:
 
 @dataclass(frozen=True)
 class Trial:
-    """One mission in one world.
-
-    folder: where its checkpoint and its row are kept; None: nowhere. checkpoint_every: simulated seconds
-    between checkpoints, at least a tick; 0: none.
-    """
+    """One mission in one world. folder: where its row is kept; None: nowhere."""
 
     world: WorldOptions
     team: TeamOptions
     folder: Path | None = None
-    checkpoint_every: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.checkpoint_every < math.inf:
-            raise InvalidArgumentError(
-                f"checkpoint.every={self.checkpoint_every} must be finite seconds, at least zero."
-            )
-
-    @property
-    def ticks_per_checkpoint(self) -> int | None:
-        """None: there are none."""
-        every = self.checkpoint_every
-        return max(1, round(every * self.team.rate)) if every > 0 else None
 
     def facts(self) -> dict[str, str | None]:
-        """What a checkpoint must agree in to go on from it: the options of world and team, by the names of
-        their fields, what lies at the path of a mesh, and the version."""
+        """What must be equal for a kept row to count: the options of world and team by the names of their
+        fields, a hash of the mesh, and the version."""
         return {**self._options, "mesh": self._mesh, "version": __version__}
 
     @property
     def digest(self) -> str:
-        """Of the options, eight hexadecimal digits: missions that differ can have folders that do."""
+        """Eight hexadecimal digits that depend on the options, for the name of a folder."""
         return f"{zlib.crc32(json.dumps(self._options).encode()):08x}"
 
     @property
@@ -116,68 +94,38 @@ class Trial:
 
     @functools.cached_property
     def _mesh(self) -> str | None:
-        """A hash of the mesh, if the world is one: what lies at its path may change."""
+        """A hash of the mesh file, which may change; None for generated worlds."""
         if self.world.path is None or not (path := Path(self.world.path).expanduser()).is_file():
             return None
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
-def is_begun(folder: Path) -> bool:
-    """Whether a trial in this folder was run to its end, or to a checkpoint."""
-    return any((folder / name).is_file() for name in (CHECKPOINT, ROW))
-
-
 def run_mission(
-    trial: Trial,
-    world: World | None = None,
-    on_sample: OnSample | None = None,
-    album: Snapshots | None = None,
+    trial: Trial, world: World | None = None, on_tick: OnMission | None = None
 ) -> tuple[Mission, dict[str, Any]]:
-    """Run a trial, from its checkpoint if there is one; returns the mission at its end and its row.
+    """Runs a trial; returns the mission at its end, and its row. Keeps nothing.
 
-    A mission that was killed goes on from its last checkpoint to the same result, and to the same album.
-    Raises `OutputError`, before anything is flown, for a folder that cannot be written to.
+    Raises `OutputError`, before anything is computed, if the trial's folder cannot be written to.
 
     Args:
-        on_sample: hears of the mission where it begins or goes on, and whenever numbers are noted.
-        album: is shown every step.
+        on_tick: called at the start and after every tick.
     """
     if trial.folder is not None:
         check_writable(trial.folder)
     world = trial.world.open(trial.team) if world is None else world
     mission = assemble(world, trial.team)
-    path = None if trial.folder is None else trial.folder / CHECKPOINT
-    wall = 0.0
-    if path is not None and path.is_file():
-        state = load_checkpoint(path, **trial.facts())
-        mission.restore(state["mission"])
-        wall = float(state["wall_seconds"])
-        if album is not None and state["album"] is not None:
-            album.restore(state["album"])
-        elif album is not None:  # nobody had one before
-            album.look(mission)
-    begin, every = time.perf_counter() - wall, trial.ticks_per_checkpoint
-    if on_sample is not None:
-        on_sample(mission)
-    while not mission.is_over:
-        mission.step()
-        if album is not None:
-            album.look(mission)
-        if on_sample is not None and mission.sampled_now:
-            on_sample(mission)
-        if path is not None and every is not None and (mission.tick % every == 0 or mission.is_over):
-            state = {
-                "mission": mission.state(),
-                "album": None if album is None else album.state(),
-                "wall_seconds": time.perf_counter() - begin,
-            }
-            save_checkpoint(path, state, **trial.facts())
-    row = row_of(mission, time.perf_counter() - begin)
-    repaired = (
-        mission.converge(_PATIENCE) if any(agent.robot.mapper.digest() for agent in mission.agents) else None
-    )
-    return mission, {**row, "converged_after": repaired}
+    begin = time.perf_counter()
+    if on_tick is not None:
+        on_tick(mission)
+        drive(mission, SimulatedClock(), on_step=functools.partial(on_tick, mission))
+    else:
+        drive(mission, SimulatedClock())
+    row = mission_row(mission, time.perf_counter() - begin)
+    # Only maps with a digest can be compared.
+    has_digests = any(robot.mapper.shared.digest() for robot in mission.robots)
+    row["converged_after"] = mission.converge(_CONVERGENCE) if has_digests else None
+    return mission, row
 
 
 def run_trials(
@@ -185,128 +133,132 @@ def run_trials(
     workers: int = 1,
     on_row: Callable[[dict[str, Any]], None] | None = None,
     on_event: Event = ignore,
-    on_pace: OnPace | None = None,
+    on_sample: OnMission | None = None,
 ) -> list[dict[str, Any]]:
-    """The rows of trials in their order, run in `workers` processes; those done already are read.
+    """The rows of trials in their order, run in `workers` processes; trials with a kept row are not run.
 
-    Every trial has one thread, so that its result does not depend on how many run. Once one fails, no other
-    begins; those that run end, and their rows are kept in their folders.
+    Each trial uses one thread, so results do not depend on `workers`. If one trial fails, no other starts;
+    those that are running end, keep their rows, and then the error is raised.
 
     Args:
-        on_row: hears each row as it is there. on_event: hears of the simulated seconds of all trials
-            together (`STAGE`). on_pace: then hears how far the trial is that has got further.
+        on_row: called with each row when it is there.
+        on_event: called with the simulated seconds of all trials together (`STAGE`).
+        on_sample: with one worker, then called with the running mission whenever its curves grow.
     """
     check_whole("workers", workers, 1)
-    rows = [_kept_row(trial) for trial in trials]
+    rows = [kept_row(trial) for trial in trials]
     missing = [i for i, row in enumerate(rows) if row is None]
     durations = [trial.team.duration for trial in trials]
     seconds = [0.0 if row is None else whole for whole, row in zip(durations, rows, strict=True)]
 
-    def reached(i: int, now: float) -> None:
+    def progress(i: int, now: float) -> None:
         seconds[i] = now
         on_event(STAGE, round(sum(seconds)), round(sum(durations)))
 
-    def got_further(i: int, pace: Pace) -> None:
-        reached(i, pace.now)
-        if on_pace is not None:
-            on_pace(pace)
-
-    def done(i: int, row: dict[str, Any]) -> None:
-        rows[i] = row
-        reached(i, durations[i])
-        if on_row is not None:
-            on_row(row)
+    def sampled(i: int, mission: Mission) -> None:
+        if mission.has_sampled:
+            progress(i, mission.elapsed)
+            if on_sample is not None:
+                on_sample(mission)
 
     for row in rows:
         if row is not None and on_row is not None:
             on_row(row)
     on_event(STAGE, round(sum(seconds)), round(sum(durations)))
     if workers == 1:
-        for i in missing:
-            done(i, _run_one(trials[i], functools.partial(got_further, i)))
+        finished: Iterator[tuple[int, dict[str, Any]]] = (
+            (i, _run_and_keep(trials[i], functools.partial(sampled, i))) for i in missing
+        )
     else:
-        _run_several(trials, missing, workers, done, got_further)
+        finished = _run_in_parallel({i: trials[i] for i in missing}, workers)
+    for i, row in finished:
+        rows[i] = row
+        progress(i, durations[i])
+        if on_row is not None:
+            on_row(row)
     return [row for row in rows if row is not None]
 
 
-def save_trajectories(mission: Mission, path: Path) -> None:
-    """Poses (T, 4) of every robot, one a tick, as arrays robot_0, robot_1, … of an npz file."""
-    paths = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(mission.trajectories)}
-    write_npz(path, **paths)
-
-
-def _run_several(
-    trials: Sequence[Trial],
-    missing: Sequence[int],
-    workers: int,
-    done: Callable[[int, dict[str, Any]], None],
-    got_further: Callable[[int, Pace], None],
-) -> None:
-    """Run those that are missing, so many at once."""
-    waiting = iter(missing)
-    running: dict[concurrent.futures.Future[dict[str, Any]], int] = {}
-    paces = Paces([None if trial.folder is None else trial.folder / PACE for trial in trials])
-    with contextlib.ExitStack() as stack:
-        stack.callback(paces.forget)  # once the pool is no more
-        pool = stack.enter_context(worker_pool(workers))
-        while True:
-            # No more than there are workers: what the pool has been given cannot be taken back.
-            for i in itertools.islice(waiting, workers - len(running)):
-                running[pool.submit(_run_apart, trials[i], paces, i)] = i
-            if not running:
-                return
-            ended, _ = concurrent.futures.wait(
-                running, _GLANCE, return_when=concurrent.futures.FIRST_COMPLETED
-            )
-            for i, pace in paces.changes():
-                got_further(i, pace)
-            for future in ended:
-                done(running.pop(future), _row_in(future))
-
-
-def _row_in(future: concurrent.futures.Future[dict[str, Any]]) -> dict[str, Any]:
-    try:
-        return future.result()
-    except concurrent.futures.process.BrokenProcessPool as error:
-        raise GmmTorchError(
-            "A process that flew a mission was ended from outside, perhaps for want of memory. Missions go "
-            "on from their last checkpoints with checkpoint.folder=RUN; runtime.workers=1 takes least memory."
-        ) from error
-
-
-def _run_apart(trial: Trial, paces: Paces, number: int) -> dict[str, Any]:
-    """Run a trial in a process of its own."""
-    return _run_one(trial, functools.partial(paces.note, number))
-
-
-def _run_one(trial: Trial, on_pace: OnPace) -> dict[str, Any]:
-    torch.set_num_threads(1)
-    mission, row = run_mission(trial, on_sample=lambda mission: on_pace(pace_of(mission)))
-    if trial.folder is not None:
-        save_trajectories(mission, trial.folder / TRAJECTORIES)
-        write_json(trial.folder / ROW, {"facts": trial.facts(), "row": row})
-        (trial.folder / CHECKPOINT).unlink(missing_ok=True)  # the row says it all
-    return row
-
-
-def _fields_of(value: Any, prefix: str = "") -> dict[str, str]:
-    """The fields of a dataclass, and of those in it, by dotted names, as text."""
-    flat: dict[str, str] = {}
-    for field in fields(value):
-        held, name = getattr(value, field.name), prefix + field.name
-        flat |= _fields_of(held, f"{name}.") if is_dataclass(held) else {name: repr(held)}
-    return flat
-
-
-def _kept_row(trial: Trial) -> dict[str, Any] | None:
-    """The row of a trial that was run to its end before."""
+def kept_row(trial: Trial, **more: Any) -> dict[str, Any] | None:
+    """The row that `keep_row` kept for an equal trial with the same `more` facts; None: there is none."""
     if trial.folder is None or not (trial.folder / ROW).is_file():
         return None
     path = trial.folder / ROW
     try:
         kept = json.loads(path.read_text())
         row: dict[str, Any] = kept["row"]
-        same = kept["facts"] == trial.facts()
+        is_same = kept["facts"] == {**trial.facts(), **more}
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is damaged ({error!r}); delete it to run the trial again.") from error
-    return row if same else None
+    return row if is_same else None
+
+
+def keep_row(trial: Trial, row: dict[str, Any], **more: Any) -> None:
+    """Keeps the row of a finished trial in its folder, if it has one."""
+    if trial.folder is not None:
+        write_json(trial.folder / ROW, {"facts": {**trial.facts(), **more}, "row": row})
+
+
+def save_trajectories(mission: Mission, path: Path) -> None:
+    """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, robot_1, … of an npz file."""
+    poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(mission.trajectories)}
+    write_npz(path, **poses)
+
+
+def _run_and_keep(trial: Trial, on_tick: OnMission | None = None) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    mission, row = run_mission(trial, on_tick=on_tick)
+    if trial.folder is not None:
+        save_trajectories(mission, trial.folder / TRAJECTORIES)
+    keep_row(trial, row)
+    return row
+
+
+def _run_in_parallel(trials: dict[int, Trial], workers: int) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Keys and rows of trials, in the order in which they finish."""
+    import joblib
+
+    error: Exception | None = None
+    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
+        # Processes start the next trial before this one sees a failure, so they look for this file.
+        failed = Path(folder) / "failed"
+        parallel = joblib.Parallel(
+            n_jobs=workers, pre_dispatch=workers, batch_size=1, return_as="generator_unordered"
+        )
+        tasks = (joblib.delayed(_run_apart)(i, trial, failed) for i, trial in trials.items())
+        try:
+            for i, outcome in parallel(tasks):
+                if isinstance(outcome, Exception):
+                    error = error or outcome
+                elif outcome is not None:
+                    yield i, outcome
+        except concurrent.futures.process.BrokenProcessPool as broken:
+            raise GmmTorchError(
+                "A process that ran a mission was killed, perhaps because memory ran out. The same command "
+                "with hydra.run.dir=RUN continues with the missions that are missing; runtime.workers=1 "
+                "takes least memory."
+            ) from broken
+    if error is not None:
+        raise error
+
+
+def _run_apart(i: int, trial: Trial, failed: Path) -> tuple[int, dict[str, Any] | Exception | None]:
+    """Runs a trial in a worker process, unless another has failed. Errors are returned: joblib would stop the
+    other trials if they were raised."""
+    end_with_parent()
+    if failed.exists():
+        return i, None
+    try:
+        return i, _run_and_keep(trial)
+    except Exception as error:
+        failed.touch()
+        return i, error
+
+
+def _fields_of(value: Any, prefix: str = "") -> dict[str, str]:
+    """The fields of a dataclass and of nested dataclasses, by dotted names, as text."""
+    flat: dict[str, str] = {}
+    for field in fields(value):
+        held, name = getattr(value, field.name), prefix + field.name
+        flat |= _fields_of(held, f"{name}.") if is_dataclass(held) else {name: repr(held)}
+    return flat

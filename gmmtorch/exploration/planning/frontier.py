@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -218,16 +218,3 @@ class FrontierPlanner:
             apart = torch.cdist(known.poses[:, :3], found.poses[:, :3]).amin(1)
             inside &= apart > _ABOUT
         task.library.remove([known.ids[row] for row in inside.nonzero()[:, 0].tolist()], task.now)
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "journey": None if self._journey is None else self._journey.state(),
-            "target": self._target,
-            "exhausted": self._exhausted,
-            "waiting": self._waiting.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
-        self._target, self._exhausted = state["target"], state["exhausted"]
-        self._waiting.restore(state["waiting"])

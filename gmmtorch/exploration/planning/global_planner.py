@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,23 +81,3 @@ class Journey:
         goals = torch.cat([self.pose[None, :3], self._nodes[rim]])
         offsets = torch.cat([self._rest.new_zeros(1), self._rest[rim]])
         return DistanceField.to(here, goals, offsets)
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "pose": self.pose,
-            "value": self.value,
-            "metres": self.metres,
-            "nearest": self._nearest if math.isfinite(self._nearest) else None,
-            "since": self.since,
-            "nodes": self._nodes,
-            "rest": self._rest,
-            "refreshed": self._refreshed if math.isfinite(self._refreshed) else None,
-        }
-
-    @classmethod
-    def restored(cls, state: dict[str, Any]) -> Journey:
-        journey = cls(state["pose"], float(state["value"]), float(state["metres"]), float(state["since"]))
-        journey._nearest = math.inf if state["nearest"] is None else float(state["nearest"])
-        journey._nodes, journey._rest = state["nodes"], state["rest"]
-        journey._refreshed = -math.inf if state["refreshed"] is None else float(state["refreshed"])
-        return journey

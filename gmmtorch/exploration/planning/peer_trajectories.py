@@ -10,6 +10,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.sharing.messages.message_registry import PlanMessage
+
+_MOST_STEPS = 1000
+"""Steps of a heard plan that are used at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +83,19 @@ def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None)
                 required = torch.minimum(required, _distance(start[..., None, :], after))
             clear &= (_distance(path[..., -1:, :], after) >= required).all(-1)
     return clear
+
+
+def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
+    """Positions (S, 3), metres, of a teammate after 1, 2, …, S steps of `step` seconds from now, by a plan
+    that was heard `age` seconds ago.
+
+    Each is the plan's pose nearest in time, at most half a step of the plan off, which `clear_of` allows for.
+    """
+    n = len(plan.path)
+    left = n * plan.step - age
+    ahead = step * torch.arange(1, min(max(math.ceil(left / step - 1e-9), 1), _MOST_STEPS) + 1)
+    rows = ((age + ahead.double()) / plan.step).round().clamp(1, n).long() - 1
+    return plan.path[rows, :3].double()
 
 
 def _longer_step(path: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -61,10 +61,6 @@ class Planner(Protocol):
     """Chooses the next primitive. Between two plans the robot flies the first one's path to its end."""
 
     def plan(self, task: PlanningTask) -> Plan: ...
-
-    def state(self) -> dict[str, Any]: ...
-
-    def restore(self, state: dict[str, Any]) -> None: ...
 
 
 class Options(NamedTuple):
@@ -144,10 +140,3 @@ class Waiting:
     def over(self) -> None:
         """The robot has found something to do."""
         self._count = 0
-
-    def state(self) -> dict[str, Any]:
-        return {"count": self._count, "last": self._last if math.isfinite(self._last) else None}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._count = int(state["count"])
-        self._last = -math.inf if state["last"] is None else float(state["last"])

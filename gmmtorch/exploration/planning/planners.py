@@ -185,26 +185,6 @@ class TreePlanner:
         values = values.masked_fill((apart < task.library.spacing).any(1), 0.0)
         task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
 
-    def state(self) -> dict[str, Any]:
-        return {
-            "journey": None if self._journey is None else self._journey.state(),
-            "fatigue": self._fatigue.state(),
-            "given_up": self._given_up,
-            "largest": self._largest,
-            "branch": self._branch,
-            "when": self._when if math.isfinite(self._when) else None,
-            "waiting": self._waiting.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._journey = None if state["journey"] is None else Journey.restored(state["journey"])
-        self._fatigue.restore(state["fatigue"])
-        self._given_up = state["given_up"]
-        self._largest = float(state["largest"])
-        self._branch = [int(action) for action in state["branch"]]
-        self._when = -math.inf if state["when"] is None else float(state["when"])
-        self._waiting.restore(state["waiting"])
-
 
 _TURNING = 0.1  # metres that a turn in place counts for in a random choice
 
@@ -236,13 +216,6 @@ class RandomPlanner:
             self._last = int(torch.multinomial(possible, 1, generator=task.generator))
         path = here.paths[0, self._last]
         return Plan(path, here.braking[0, self._last], path[-1:, :4], 0.0, "explore")
-
-    def state(self) -> dict[str, Any]:
-        return {"last": self._last, "waiting": self._waiting.state()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._last = int(state["last"])
-        self._waiting.restore(state["waiting"])
 
 
 PLANNERS = ("mcts", "frontier", "random")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -103,26 +103,6 @@ class Roadmap:
         if self._cached is None:
             self._cached = _Graph.of(self._blocks, self.spacing)
         return self._cached
-
-    def state(self) -> dict[str, Any]:
-        blocks = sorted(self._blocks)
-        return {
-            "resolution": self._resolution,
-            "blocks": torch.tensor(blocks, dtype=torch.int64).reshape(-1, 3),
-            "flags": torch.from_numpy(
-                np.stack([self._blocks[block] for block in blocks])
-                if blocks
-                else np.zeros((0, *(_BLOCK,) * 3), np.uint8)
-            ),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._resolution, self._cached = float(state["resolution"]), None
-        flags = state["flags"].numpy()
-        self._blocks = {
-            (int(x), int(y), int(z)): flags[row].copy()
-            for row, (x, y, z) in enumerate(state["blocks"].tolist())
-        }
 
 
 def at_the_rim(points: Tensor, box: Box, resolution: float, width: float) -> Tensor:

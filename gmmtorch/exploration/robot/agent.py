@@ -1,24 +1,23 @@
-"""Agent: one robot of a team and its radio, as it would be alone on a machine of its own."""
+"""Agent: one robot of a team with its camera, its radio, and its planning."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.mission.clocks import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.mission.stopwatch import Stopwatch
 from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import retreat
 from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
-from gmmtorch.exploration.robot.radio import Logbook, Radio
+from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
@@ -31,21 +30,29 @@ from gmmtorch.sharing.transport.simulated_network import Transport
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
-_SEEDS = 1 << 10  # robots of a mission that draw differently
-_LATE = 10  # plans by which one may come too late; one that is older is of a robot that began anew
-_TOLD_AGAIN = 10  # plans of a robot that stays where it is, of which teammates are told one
-_PATIENCE = 15  # plans in a row that lead nowhere: at a start, to find a way out takes up to six
-_OF_VIEWS = (ViewsMessage, ViewsHeldMessage)
+_SEEDS_PER_MISSION = 1 << 10
+"""Robot ids for which the random draws differ."""
+_LATEST_PLANS = 10
+"""A plan whose number is lower than the last one's by more comes from a restarted robot."""
+_RESTING_PLANS = 10
+"""Plans of a robot at rest, of which one is sent."""
+_PATIENCE = 15
+"""Plans in a row that lead nowhere before a robot looks around: to leave a start takes up to six."""
+_VIEW_MESSAGES = (ViewsMessage, ViewsHeldMessage)
 
 
 class Agent:
-    """Senses, talks, and plans. All that it knows of its team is what its transport brings; who flies
-    close by, a short-range beacon tells (`peers` in `propose`).
+    """One robot and its radio. It learns about its teammates only from messages, and from the paths that the
+    caller of `propose` gives it.
 
     Args:
-        robot: what it knows and does. transport: its end of the network.
-        evaluator: of views. memo: of what datagrams say; shared by the robots of a simulation.
+        robot: its map, planner and path. transport: the network.
+        evaluator: of views. memo: cache of decoded datagrams; shared by the robots of a simulation.
         watch: times its stages.
+
+    Attributes:
+        heard_at: time (s), by this robot's clock, at which each teammate's last plan arrived.
+        refused: plans that were ignored: "stranger" (not from a teammate, or under another sender's id).
     """
 
     def __init__(
@@ -58,109 +65,103 @@ class Agent:
         memo: Memo,
         watch: Stopwatch,
     ) -> None:
-        self.robot, self.options = robot, options
+        self.robot, self.options, self.watch = robot, options, watch
         self.radio = Radio(
             robot.number, transport, options.announce_every, options.budget, decode=memo.decoded
         )
-        self._evaluator, self._primitives, self._timed = evaluator, primitives, watch
         self.heard_at: dict[int, float] = {}
-        """When each teammate's last plan came, by this robot's own clock."""
         self.refused: Counter[str] = Counter()
-        """How many plans were not believed: "stranger" (of no teammate, or not of the one who sent it)."""
+        self._evaluator, self._primitives = evaluator, primitives
         self._waiting = Waiting(primitives, _PATIENCE)
-        # Of its own, so that what one robot draws does not depend on what others do.
-        seed = options.seed * _SEEDS + robot.number
+        # Each robot has its own generator, so its draws do not depend on the other robots.
+        seed = options.seed * _SEEDS_PER_MISSION + robot.number
         self._generator = torch.Generator().manual_seed(seed)
         self._local_map: LocalMap | None = None
         self._rests = False
         self._plan: Plan | None = None
-        self._told: Tensor | None = None  # where it stays, as teammates were told
-        self._silent = 0
+        self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
+        self._n_unsent = 0  # plans at that pose since
 
     @property
     def number(self) -> int:
+        """The robot's id."""
         return self.robot.number
 
     @property
     def braking(self) -> Tensor:
+        """(B, 7) how the robot comes to rest after its present path."""
         return self.robot.braking
-
-    @property
-    def stage_seconds(self) -> dict[str, float]:
-        """Wall seconds by stage; of all robots together, where they share a stopwatch."""
-        return dict(self._timed.seconds)
 
     def digest(self) -> bytes:
         """Equal for robots that hold the same map."""
-        return self.robot.mapper.digest()
+        return self.robot.mapper.shared.digest()
 
-    def keep_in(self, logbook: Logbook) -> None:
-        """From now on keep what is said and heard of the map. What the logbook has restored of it is taken
-        for known."""
-        self.radio.logbook = logbook
+    def keep_in(self, store: RecordStore) -> None:
+        """From now on stores the map's records; enters those that the store has restored into the map."""
+        self.radio.store = store
         self.robot.mapper.center_on(self.robot.position)
         self.robot.mapper.receive([])
 
     # -- sensing ----------------------------------------------------------------------------------
 
-    def look(self, mesh: MeshWorld, others: Tensor) -> DepthFrame:
-        """What its camera sees of a world, with teammates at (M, 3), which it knows not to map."""
-        with self._timed("rendering"):
+    def capture(self, mesh: MeshWorld, others: Tensor) -> DepthFrame:
+        """A depth image of the world, in which teammates at (M, 3) are masked."""
+        with self.watch("rendering"):
             return self.options.camera.sense(
                 mesh, self.robot.state[:4], others, self.options.dynamics.radius, self._generator
             )
 
     def learn(self, frame: DepthFrame, now: float) -> FrameUpdate:
-        """Take in a frame, and tell the team."""
-        with self._timed("mapping"):
-            sensed = self.robot.sense(frame)
-        with self._timed("sharing"):
-            self.send(now)
-        return sensed
+        """Learns from a frame, and sends what is due of the map."""
+        with self.watch("mapping"):
+            update = self.robot.sense(frame)
+        with self.watch("sharing"):
+            self.send_map(now)
+        return update
 
-    # -- the team ---------------------------------------------------------------------------------
+    # -- messages ---------------------------------------------------------------------------------
 
-    def send(self, now: float) -> None:
-        """What its map has for the team, and every while what it holds."""
+    def send_map(self, now: float) -> None:
+        """Sends what is due of the map, and announcements if they are due."""
         if not self.options.shares:
             return
-        mapper, library = self.robot.mapper, self.robot.library
-        datagrams = self.radio.within_budget(mapper.datagrams, now)
-        urgent = mapper.is_behind or library.differs
-        if self.radio.announces(now, (mapper.version, library.version), urgent):
-            datagrams += [*mapper.announcements(), *library.announcements()]
-        self.radio.tell(datagrams, now)
+        shared, library = self.robot.mapper.shared, self.robot.library
+        datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
+        urgent = bool(shared.missing) or library.differs
+        if self.radio.announcements.due(now, (shared.version, library.version), urgent):
+            datagrams += [*shared.announcements(), *library.announcements()]
+        self.radio.send(datagrams, now)
 
-    def tell_views(self, now: float) -> None:
-        """The team of views worth going to, as far as the map has left of the budget."""
+    def send_views(self, now: float) -> None:
+        """Sends views, if the map leaves enough of the budget."""
         library = self.robot.library
-        with self._timed("sharing"):
+        with self.watch("sharing"):
             if self.options.shares:
                 views = self.radio.within_budget(
                     lambda budget: library.datagrams(budget=budget), now, spare=MAX_BYTES
                 )
-                self.radio.tell(views, now)
+                self.radio.send(views, now)
 
     def listen(self, now: float) -> None:
-        """Take in what has come by `now`, in an order that does not depend on who was quicker."""
-        with self._timed("sharing"):
-            heard = self.radio.hear(now)
-        for item in heard:
+        """Merges the messages that arrived by the time `now` (s)."""
+        with self.watch("sharing"):
+            received = self.radio.receive(now)
+        for item in received:
             if isinstance(item.message, PlanMessage):
                 self._note_plan(item.sender, item.message, now)
-            elif isinstance(item.message, _OF_VIEWS):
+            elif isinstance(item.message, _VIEW_MESSAGES):
                 self.robot.library.receive(item.message, now)
-        with self._timed("mapping"):
-            taken = self.robot.mapper.receive(
-                [item for item in heard if not isinstance(item.message, (PlanMessage, *_OF_VIEWS))]
+        with self.watch("mapping"):
+            merged = self.robot.mapper.receive(
+                [item for item in received if not isinstance(item.message, (PlanMessage, *_VIEW_MESSAGES))]
             )
-            self.radio.keep(taken)
+            self.radio.keep(merged)
 
     def _note_plan(self, sender: int, plan: PlanMessage, now: float) -> None:
-        """Keep a teammate's plan, unless it is known, or a later one has overtaken it.
+        """Stores a teammate's plan, unless it is a repetition or a later plan has overtaken it.
 
-        One whose number is not higher is of a robot that began anew, if it is much lower, or comes when the
-        path that is known has been flown.
+        A plan with a lower number comes from a restarted robot if it is much lower, or if the stored path has
+        been flown.
         """
         if plan.sender != sender or plan.sender == self.number or plan.sender >= self.options.size:
             self.refused["stranger"] += 1
@@ -168,33 +169,40 @@ class Agent:
         known = self.robot.plans.get(sender)
         if known is not None:
             is_flown = now - self.heard_at[sender] >= known.step * len(known.path)
-            if 0 <= known.number - plan.number <= _LATE and not is_flown:
+            if 0 <= known.number - plan.number <= _LATEST_PLANS and not is_flown:
                 return
         self.robot.plans[sender] = plan
         self.heard_at[sender] = now
 
     # -- planning ---------------------------------------------------------------------------------
 
-    def survey(self, now: float) -> None:
-        """Look at the map around: what the plan is made from, whatever comes in meanwhile."""
+    def begin_planning(self, now: float) -> None:
+        """Takes the snapshot of the map that `propose` uses, whatever arrives meanwhile."""
         robot, options = self.robot, self.options
-        with self._timed("planning"):
+        with self.watch("planning"):
             self._local_map = robot.local_map(options.planning_prior, options.dynamics.radius, options.window)
-            self._rests = robot.rests(now)
+            self._rests = robot.should_rest(now)
             robot.roadmap.update(self._local_map)
 
     def propose(
-        self, now: float, fixed: Collection[int], peers: PeerTrajectories, since: float | None = None
+        self, now: float, final: Collection[int], peers: PeerTrajectories, since: float | None = None
     ) -> Plan:
-        """A plan from the last survey, given the views of the teammates whose plans are fixed, as far as they
-        have come `since` (s); None: now."""
+        """A plan from the last snapshot.
+
+        Args:
+            final: ids of the teammates whose views are discounted, if their plan arrived at the time `since`
+                (s) or later; None: `now`.
+            peers: committed paths of the other robots, which the plan avoids.
+
+        Raises `RuntimeError` before the first `begin_planning`.
+        """
         if self._local_map is None:
-            raise RuntimeError("survey() comes before propose().")
-        with self._timed("planning"):
+            raise RuntimeError("begin_planning() must come before propose().")
+        with self.watch("planning"):
             known = [
                 heard.views.to(torch.float64)
                 for number, heard in sorted(self.robot.plans.items())
-                if number in fixed and self.heard_at[number] >= (now if since is None else since)
+                if number in final and self.heard_at[number] >= (now if since is None else since)
             ]
             task = PlanningTask(
                 robot=self.number,
@@ -220,49 +228,26 @@ class Agent:
                 )
         return self._plan
 
-    def settle(self) -> None:
-        """Follow the plan that was proposed last."""
+    def follow(self) -> None:
+        """Follows the plan proposed last."""
         if self._plan is not None:
             self.robot.follow(self._plan)
 
-    def tell_plan(self, now: float, number: int) -> None:
-        """The team of the plan that was proposed last, as number so-and-so."""
-        if self._plan is None or not self.options.shares or self._stays(self._plan):
+    def send_plan(self, now: float, number: int) -> None:
+        """Sends the plan proposed last, as that of planning round `number`."""
+        if self._plan is None or not self.options.shares or self._repeats(self._plan):
             return
-        with self._timed("sharing"):
+        with self.watch("sharing"):
             path, views = self._plan.path[:, :4], self._plan.views
             step = self.options.dynamics.step
-            self.radio.tell(encode_plan(self.number, number, now, step, path, views), now)
+            self.radio.send(encode_plan(self.number, number, now, step, path, views), now)
 
-    def _stays(self, plan: Plan) -> bool:
-        """Whether a plan stays where the team was told lately that the robot stays."""
+    def _repeats(self, plan: Plan) -> bool:
+        """Whether a plan rests at the pose of the last plan sent, and need not be sent again yet."""
         moves = bool((plan.path[:, :4] != plan.path[-1, :4]).any())
-        here = None if moves or not self._rests else plan.path[-1, :4]
-        if here is None or self._told is None or not torch.equal(here, self._told):
-            self._told, self._silent = here, 0
+        pose = None if moves or not self._rests else plan.path[-1, :4]
+        if pose is None or self._sent_pose is None or not torch.equal(pose, self._sent_pose):
+            self._sent_pose, self._n_unsent = pose, 0
             return False
-        self._silent = (self._silent + 1) % _TOLD_AGAIN
-        return self._silent != 0
-
-    # -- keeping ----------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        """Everything that changes, at the end of a tick."""
-        return {
-            "robot": self.robot.checkpoint(),
-            "generator": self._generator.get_state(),
-            "waiting": self._waiting.state(),
-            "told": self._told,
-            "silent": self._silent,
-            "heard_at": [[number, when] for number, when in self.heard_at.items()],
-            "radio": self.radio.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`."""
-        self.robot.restore(state["robot"])
-        self._generator.set_state(state["generator"])
-        self._waiting.restore(state["waiting"])
-        self._told, self._silent = state["told"], int(state["silent"])
-        self.heard_at = {int(number): float(when) for number, when in state["heard_at"]}
-        self.radio.restore(state["radio"])
+        self._n_unsent = (self._n_unsent + 1) % _RESTING_PLANS
+        return self._n_unsent != 0

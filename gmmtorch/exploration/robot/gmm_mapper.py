@@ -1,9 +1,8 @@
-"""E0: a map of Gaussian components, learned from novel beams and shared (thesis Fig 4.1).
+"""Mixture maps of robots (framework E0): components learned from novel beams, and shared (thesis Fig 4.1).
 
-Novelty → learn → update → share → sliding map. Components are immutable once they are learned, by
-whoever learned them; points that they explain later are counts that anybody may add. All robots hold
-the components as they were decoded from the datagrams, the owner too, so that all maps are the same.
-The voxels follow the mixture: each of its changes is cast into them once.
+Components are immutable; points that they explain later become counts, which any robot may add. All robots,
+the owner included, hold components as they are decoded from datagrams, so all maps are equal to the bit.
+The voxels follow the mixture: each change of the mixture is cast into them once.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import hashlib
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from torch import Tensor
 
@@ -20,7 +18,7 @@ from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_beams
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
-from gmmtorch.mapping.components import Components, packed, unpacked
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained, summed
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
 from gmmtorch.mapping.learning.incremental import cell_fit
@@ -33,26 +31,27 @@ from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 _HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
-_FRAMES_PER_COUNT = 10  # few large messages, and few looks at what they change
-_EMPTY_LENGTH = 0.75
-_EMPTY_RAYS = 0.75  # of a surface's: neighbours overlap far more
-_EMPTY_CUTOFF = 2.0  # deviations: tails of empty beams go through what they only just miss
+_FRAMES_PER_COUNT = 10
+"""Frames between two messages of counts: they are then few and large, and seldom change the mixture."""
+_EMPTY_LENGTH = 0.75  # of the length of components of surfaces
+_EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
+_EMPTY_CUTOFF = 2.0
+"""Mahalanobis distance. Tails of components of free space reach through surfaces that beams just missed."""
 
 
 @dataclass(frozen=True)
 class FrameRule:
     """How a frame becomes components; lengths in metres. See `IncrementalRule` for the first five.
 
-    rays, shell: rays for each cell that a component hides, and cells before its surface in which they do
-        not speak of free space; see `component_evidence`.
+    rays: for each cell that a component covers; see `component_evidence`.
+    shell: cells in front of a component's surface that its rays do not count as free.
     update_at: counts of a component are sent once they have grown by this factor.
-    update_stride: every so manieth explained beam is counted, for as many as that leaves out.
+    update_stride: of the explained beams, every `update_stride`-th is counted, with that weight.
     """
 
     noise: float = 0.03
@@ -90,8 +89,11 @@ class FrameRule:
 class GmmMapper(Mapper):
     """The map of one robot of a team that shares mixtures.
 
-    shared: the mixture, new; `Replica`, or `Broadcast` for other codecs than its own.
+    Args:
+        shared: the empty mixture; a `Replica`, or a `Broadcast` for codecs other than "quantized".
     """
+
+    shared: Replica | Broadcast
 
     def __init__(
         self,
@@ -109,9 +111,9 @@ class GmmMapper(Mapper):
         self.tiles = MixtureTiles()
         self._rule = rule
         self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
-        self._due: dict[tuple[int, int], float] = {}  # those that have
+        self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
         self._n_frames = 0
-        self._places: dict[tuple[int, ...], list[Components]] = {}  # batches by where they were seen from
+        self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
 
     # -- sensing ----------------------------------------------------------------------------------
 
@@ -121,7 +123,7 @@ class GmmMapper(Mapper):
         regenerate(self.local, boxes, self.tiles, self._evidence)
 
     def sense(self, frame: DepthFrame) -> FrameUpdate:
-        # Components do not speak of free space close to surfaces, so that this alone makes no beam novel.
+        # Components do not count cells close to surfaces as free: this must not make beams novel.
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
         self._count(frame, ~novel)
@@ -138,7 +140,7 @@ class GmmMapper(Mapper):
         return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
 
     def _count(self, frame: DepthFrame, known: Tensor) -> None:
-        """Count the beams (N,) that told nothing new, and what has grown enough as due to be told."""
+        """Adds the beams (N,) that were not novel to the counts of the components that explain them."""
         nearby = self._seen_from_near(frame.origin)
         chosen = known.nonzero().squeeze(1)[:: self._rule.update_stride]
         if nearby is None or len(chosen) == 0:
@@ -160,81 +162,61 @@ class GmmMapper(Mapper):
                 self._gained[key] = total
 
     def _seen_from_near(self, origin: Tensor) -> Components | None:
-        """Components with all their counts, of batches seen from close to a place (3,)."""
-        middle = self._place(origin)
+        """Components with all their counts, of batches seen from near a place (3,); None: there are none."""
+        middle = self._origin_cell(origin)
         near = [
             batch
             for offset in itertools.product((-1, 0, 1), repeat=3)
-            for batch in self._places.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
+            for batch in self._by_origin.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
         ]
         return summed(Components.concatenate(near)) if near else None
 
-    def _place(self, origin: Tensor) -> tuple[int, ...]:
-        """Which cell of the index of origins a place (3,) is in."""
+    def _origin_cell(self, origin: Tensor) -> tuple[int, ...]:
+        """The cell of `_by_origin` that contains a place (3,)."""
         return tuple((origin / self._novelty.distance).floor().long().tolist())
 
-    # -- the team ---------------------------------------------------------------------------------
+    # -- the mixture ------------------------------------------------------------------------------
 
-    def receive(self, heard: Sequence[ReceivedMessage]) -> list[bytes]:
-        taken = [item.datagram for item in heard if self.shared.receive(item.datagram, item.message)]
+    def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
+        merged = [item.datagram for item in received if self.shared.receive(item.datagram, item.message)]
         self._follow()
-        return taken
+        return merged
 
-    def datagrams(self, budget: int | None = None) -> list[bytes]:
-        return self.shared.datagrams(budget=budget)
-
-    def announcements(self) -> list[bytes]:
-        return self.shared.announcements()
-
-    @property
-    def version(self) -> int:
-        return self.shared.version
-
-    @property
-    def held(self) -> Intervals:
-        return self.shared.held
-
-    @property
-    def is_behind(self) -> bool:
-        return bool(self.shared.missing)
-
-    def digest(self) -> bytes:
-        return self.shared.digest()
+    def components(self) -> Components:
+        """All components with all their counts, sorted by id."""
+        return self.shared.components()
 
     def _follow(self) -> list[CellEvidence]:
-        """Enter what the mixture has come to hold; the evidence of it, in parts."""
+        """Enters the changes of the mixture since the last call; returns their evidence, in parts."""
         changes = self.shared.changes()
         if changes.rebuilt:
-            return self._start_over()
+            self._rebuild()
+            return []
         batches = [*changes.added, changes.gained]
         return [self._enter(batch) for batch in batches if len(batch)]
 
-    def _start_over(self) -> list[CellEvidence]:
-        """Cast the whole mixture anew, once components were moved, or others took their place. None of it is
-        evidence that nobody had."""
+    def _rebuild(self) -> None:
+        """Casts the whole mixture again, after components were moved or replaced. None of this is new
+        evidence."""
         self.local.clear()
         self.belief.clear()
-        self.tiles, self._places = MixtureTiles(), {}
+        self.tiles, self._by_origin = MixtureTiles(), {}
         everything = self.shared.components()
         if len(everything):
             self._enter(everything)
-        return []
 
     def _enter(self, batch: Components) -> CellEvidence:
-        """Keep a batch of components, or of counts that are added to some; returns what it says."""
-        self._keep(batch)
+        """Enters a batch of components, or of counts added to some; returns its evidence."""
+        self.tiles.add(len(self.tiles), batch)
+        for cell in {self._origin_cell(origin) for origin in batch.origins}:
+            self._by_origin.setdefault(cell, []).append(batch)
         grid = self.belief.grid
-        evidence = self._memo(_name(batch), lambda: self._evidence(batch, grid.resolution, grid.box))
+        evidence = self._memo(_key(batch), lambda: self._evidence(batch, grid.resolution, grid.box))
         self._add(evidence)
         return evidence
 
-    def _keep(self, batch: Components) -> None:
-        self.tiles.add(len(self.tiles), batch)
-        for place in {self._place(origin) for origin in batch.origins}:
-            self._places.setdefault(place, []).append(batch)
-
     def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
-        """What components say of the cells of a box."""
+        """The evidence of components for the cells of a box."""
         rule = self._rule
         surfaces, empty = (
             batch.selected((batch.max_range == kind).nonzero().squeeze(1)) for kind in (False, True)
@@ -261,36 +243,9 @@ class GmmMapper(Mapper):
             )
         return sum_evidence(parts) if parts else CellEvidence.empty()
 
-    # -- the whole --------------------------------------------------------------------------------
 
-    def components(self) -> Components:
-        """All components with all their counts, in the order of their ids."""
-        return self.shared.components()
-
-    def state(self) -> dict[str, Any]:
-        return {
-            **super().state(),
-            "shared": self.shared.state(),
-            "batches": packed([batch for _, batch in self.tiles.items()]),
-            "gained": [[*key, count] for key, count in self._gained.items()],
-            "due": [[*key, count] for key, count in self._due.items()],
-            "n_frames": self._n_frames,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        super().restore(state)
-        self.shared.restore(state["shared"])
-        for batch in unpacked(state["batches"]):
-            self._keep(batch)
-        self._gained, self._due = (
-            {(int(robot), int(number)): count for robot, number, count in state[name]}
-            for name in ("gained", "due")
-        )
-        self._n_frames = int(state["n_frames"])
-
-
-def _name(batch: Components) -> bytes:
-    """Of all that a batch says: components that were corrected have the ids and the support that they had."""
+def _key(batch: Components) -> bytes:
+    """A hash of all values of a batch: corrected components keep their ids and support."""
     digest = hashlib.blake2b(digest_size=16)
     for value in vars(batch).values():
         digest.update(value.contiguous().numpy().tobytes())

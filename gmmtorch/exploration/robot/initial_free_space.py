@@ -17,15 +17,17 @@ from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 _NEAR = 2.0
-"""Metres that a way to where a robot can fly off may be long."""
+"""Metres from the start to the nearest place where the robot can take off, at most."""
 _STEP = 0.05
-"""Metres between the positions of such a way."""
+"""Metres between the positions of the way there."""
 _YAWS = 16
-_AT_ONCE = 16
+"""Headings tried at each place."""
+_BATCH = 16
+"""Places tried together."""
 
 
 class Place(Protocol):
-    """What is asked of a world."""
+    """The part of a world that is needed here."""
 
     @property
     def mesh(self) -> MeshWorld: ...
@@ -43,10 +45,11 @@ class Place(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class InitialFreeSpace:
-    """What a robot is told when it is set down.
+    """What a robot knows before its first frame.
 
-    known_free: (K, 3) int64, cells of the lattice that are free. trail: (N, 3), metres, from where it can
-    fly off to where it stands: the way that it was carried, a single place where it can fly off at once.
+    known_free: (K, 3) int64, free cells of the lattice.
+    trail: (N, 3), metres, from the place where the robot can take off to its start; N = 1 if it can take off
+        from its start.
     """
 
     known_free: Tensor
@@ -54,30 +57,31 @@ class InitialFreeSpace:
 
 
 def initial_free_space(world: Place, place: Tensor, primitives: Primitives) -> InitialFreeSpace | None:
-    """How a robot gets off from a place (3,), where it touches nothing; None if it cannot.
+    """The free space that a robot knows at its start (3,), metres; None if it cannot take off from there.
 
-    Where there is room, it knows the sphere around it to be free that reaches to the nearest surface. That
-    says too little where a surface is near, and its camera sees nothing above, below or behind it. There
-    whoever set it down has told it which cells are free, and carried it from the nearest place where the
-    cells leave it room to fly off, straight and without touching anything: it goes back there first.
+    The start must touch nothing. In open space the robot knows that the sphere up to the nearest surface is
+    free. Near a surface that sphere is too small, and the camera sees nothing above, below or behind the
+    robot: there it is given the free cells nearby. If its start is too narrow for its primitives, it is also
+    given a straight, collision-free way from the nearest place that is not; it flies back along that way
+    first.
 
-    A robot cannot get off if nothing that its primitives do there is safe even for one that knows all.
+    A robot cannot take off if none of its primitives is safe there even with a perfect map.
     """
     radius, resolution = world.robot_radius, world.resolution
-    # As much as a robot needs to be sure of to fly off from where it was set down.
+    # The radius that a robot must know to be free in order to take off.
     needed = math.sqrt(3) * (radius + 2.5 * resolution)
     clear = float(world.mesh.clearance(place[None]).clamp_max(needed))
     sphere = cells_in_sphere(place, clear, resolution)
     truth = _truth(world, place, _NEAR + primitives.reach + needed)
     here = torch.cat([place.new_zeros(0, 3), place[None]])
     fits = bool(truth.is_passable(place))
-    if fits and bool(_lead_off(here, truth, primitives)[0]):
+    if fits and bool(_can_take_off(here, truth, primitives)[0]):
         if _is_passable_by(sphere, truth, radius, place):
             return InitialFreeSpace(sphere, here)
         return InitialFreeSpace(torch.cat([sphere, _free_near(place, needed, truth)]), here)
     if fits:
         return None
-    there = _nearest_way_off(world, place, truth, primitives)
+    there = _nearest_take_off(world, place, truth, primitives)
     if there is None:
         return None
     n = max(2, math.ceil(float((place - there).norm()) / _STEP) + 1)
@@ -86,7 +90,7 @@ def initial_free_space(world: Place, place: Tensor, primitives: Primitives) -> I
 
 
 def _truth(world: Place, place: Tensor, reach: float) -> LocalMap:
-    """What a robot would know that had seen everything within `reach` metres of a place (3,)."""
+    """The perfect map of everything within `reach` metres of a place (3,)."""
     resolution = world.resolution
     low = torch.maximum(((place - reach) / resolution).floor().long(), world.box.low)
     high = torch.minimum(((place + reach) / resolution).floor().long() + 1, world.box.high)
@@ -100,7 +104,7 @@ def _truth(world: Place, place: Tensor, reach: float) -> LocalMap:
 
 
 def _is_passable_by(known_free: Tensor, truth: LocalMap, radius: float, place: Tensor) -> bool:
-    """Whether a robot knows that it fits at a place (3,), by these cells (K, 3) alone."""
+    """Whether a place (3,) is passable if only these cells (K, 3) are known to be free."""
     cells = known_free - truth.low
     inside = ((cells >= 0) & (cells < torch.tensor(truth.shape))).all(1)
     free = torch.zeros_like(truth.free)
@@ -110,14 +114,14 @@ def _is_passable_by(known_free: Tensor, truth: LocalMap, radius: float, place: T
 
 
 def _free_near(place: Tensor, reach: float, truth: LocalMap) -> Tensor:
-    """Free cells (K, 3) of the lattice that lie wholly within `reach` metres of a place (3,)."""
+    """Free cells (K, 3) of the lattice that lie entirely within `reach` metres of a place (3,)."""
     cells = cells_in_sphere(place, reach, truth.resolution)
     flat, inside = truth.flat_index((cells + 0.5).double() * truth.resolution)
     return cells[truth.free.view(-1)[flat] & inside]
 
 
-def _lead_off(places: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor:
-    """Whether something that leads anywhere is safe, from rest at each of places (P, 3), at some yaw."""
+def _can_take_off(places: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor:
+    """Whether a robot at rest at each of the places (P, 3) can fly somewhere safely, at any heading."""
     yaw = torch.arange(_YAWS, dtype=torch.float64) * (2 * math.pi / _YAWS)
     states = torch.zeros(len(places), _YAWS, 7, dtype=torch.float64)
     states[..., :3], states[..., 3] = places[:, None], yaw
@@ -128,17 +132,18 @@ def _lead_off(places: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor
     return (safe & leads).view(len(places), _YAWS * len(primitives)).any(1)
 
 
-def _nearest_way_off(world: Place, place: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor | None:
-    """The nearest centre (3,) of a cell to fly off from, to which a robot at a place (3,) can be moved."""
+def _nearest_take_off(world: Place, place: Tensor, truth: LocalMap, primitives: Primitives) -> Tensor | None:
+    """The nearest centre (3,) of a cell from which a robot can take off, with a free straight way to a place
+    (3,)."""
     centers = truth.centers(truth.passable.nonzero())
     off = (centers - place).norm(dim=1)
     centers = centers[off.argsort(stable=True)][: int((off <= _NEAR).sum())]
-    for some in centers.split(_AT_ONCE):
+    for some in centers.split(_BATCH):
         n = math.ceil(_NEAR / _STEP) + 1
         share = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
         ways = place + share * (some[:, None] - place)
         room = world.mesh.clearance(ways.view(-1, 3)).view(len(some), n).amin(1)
-        good = (room > world.robot_radius) & _lead_off(some, truth, primitives)
+        good = (room > world.robot_radius) & _can_take_off(some, truth, primitives)
         if bool(good.any()):
             return some[int(good.int().argmax())]
     return None

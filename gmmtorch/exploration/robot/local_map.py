@@ -1,4 +1,4 @@
-"""LocalMap: what a robot knows of the space around it, as its planner reads it."""
+"""LocalMap: the cells around a robot as its planner reads them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gmmtorch.occupancy.voxels.boxes import Box
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """A dense snapshot (nx, ny, nz) of the sliding map, in the order of the lattice.
+    """A dense snapshot (nx, ny, nz) of the cells of the sliding map.
 
-    low: (3,) int64, index of the lowest cell; cell c is [c, c + 1)·resolution, world frame.
+    low: (3,) int64, index of the lowest cell; cell c is [c, c + 1) · resolution, world frame.
     resolution: side (m) of the cells.
-    occupancy: (nx, ny, nz) float32, by the planner's prior: that prior where nothing was observed.
+    occupancy: (nx, ny, nz) float32, with the planner's prior where nothing was observed.
     observed: bool, cells with any evidence.
     free: bool, known to be free.
-    passable: bool, where the centre of the robot may be: every cell that its body touches is free.
+    passable: bool, where the centre of the robot may be: all cells that its body touches are free.
     """
 
     low: Tensor
@@ -43,11 +43,11 @@ class LocalMap:
         return torch.tensor(self.shape)
 
     def cells_of(self, points: Tensor) -> Tensor:
-        """Lattice cells (..., 3) int64 that hold points (..., 3), metres, relative to `low`."""
+        """Indices (..., 3) int64, relative to `low`, of the cells that contain points (..., 3), metres."""
         return (points / self.resolution).floor().long() - self.low
 
     def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat row-major index (...,) of points (..., 3), 0 where outside, and whether each is inside."""
+        """Flat row-major indices (...,) of points (..., 3), 0 where outside; and whether each is inside."""
         cell = self.cells_of(points)
         inside = ((cell >= 0) & (cell < self._size)).all(-1)
         _, ny, nz = self.shape
@@ -55,7 +55,7 @@ class LocalMap:
         return torch.where(inside, flat, 0), inside
 
     def is_passable(self, points: Tensor) -> Tensor:
-        """Whether the centre of the robot may be at points (..., 3), metres; never outside."""
+        """Whether the centre of the robot may be at points (..., 3), metres; False outside the map."""
         flat, inside = self.flat_index(points)
         return self.passable.view(-1)[flat] & inside
 

@@ -1,11 +1,11 @@
-"""What every robot's map offers to the mission, whatever it is made of."""
+"""Mapper: the interface between a robot and its map, and the novelty of a frame's beams."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,14 +24,15 @@ from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 T = TypeVar("T")
-_BLOCK = 3  # pixels along the side of those that one beam speaks for
+_BLOCK = 3
+"""Pixels along the side of the blocks that one beam represents."""
 
 
 class FrameUpdate(NamedTuple):
-    """What a frame has brought.
+    """What a map learned from a frame of N beams.
 
-    evidence: what it adds to the robot's own map, in parts.
-    novel: (N,) bool, the beams of the frame that the map learned from.
+    evidence: what the frame adds to the robot's own map, in parts.
+    novel: (N,) bool, the beams that the map learned from.
     """
 
     evidence: list[CellEvidence]
@@ -39,10 +40,10 @@ class FrameUpdate(NamedTuple):
 
 
 class Memo:
-    """Values of a pure function that several robots of a simulation would work out alike: kept a while.
+    """A cache of a pure function's values, which the robots of a simulation share.
 
-    Robots that hear the same datagram get the same evidence from it, so one of them does the work. The
-    least recently used of more than `size` are forgotten.
+    Robots that receive the same datagram get the same evidence from it, so one computation serves all. The
+    cache keeps the `size` values used last.
     """
 
     def __init__(self, size: int) -> None:
@@ -50,7 +51,7 @@ class Memo:
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def __call__(self, key: Hashable, make: Callable[[], T]) -> T:
-        """The value for `key`, made if it is not known."""
+        """The value for `key`, computed by `make` if it is not cached."""
         if key in self._values:
             self._values.move_to_end(key)
         else:
@@ -61,20 +62,61 @@ class Memo:
         return value
 
     def decoded(self, datagram: bytes) -> Message:
-        """What a datagram says."""
+        """The message of a datagram. Raises `DataError` for a damaged one."""
         return self(("message", datagram), lambda: decode(datagram))
 
 
-class Mapper(ABC):
-    """One robot's map: a window of voxels to plan in, and behind it all that the robot knows.
+class SharedMap(Protocol):
+    """The part of a map that robots share: a `Replica`, a `Broadcast`, or the points of voxel maps."""
 
-    local: the window. belief: the map that the evaluator reads. What `sense` and `receive` take in is in
-    both already when they return.
+    @property
+    def version(self) -> int:
+        """Changes whenever `held` changes."""
+        ...
+
+    @property
+    def held(self) -> Intervals:
+        """Names of the records held; empty for maps that repair no losses."""
+        ...
+
+    @property
+    def missing(self) -> Intervals:
+        """Names of the records that other robots have announced, and that are not here."""
+        ...
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Number of messages that were not merged, by reason."""
+        ...
+
+    def datagrams(self, *, budget: int | None = None) -> list[bytes]:
+        """What is due to be sent, at most `budget` bytes; the rest stays due."""
+        ...
+
+    def announcements(self) -> list[bytes]:
+        """Datagrams that announce `held`."""
+        ...
+
+    def digest(self) -> bytes:
+        """Equal for robots that hold the same records; empty for maps that may differ for good."""
+        ...
+
+
+class Mapper(ABC):
+    """One robot's map: a window of voxels to plan in, and a map of the whole world behind it.
+
+    `sense` and `receive` have updated both when they return.
 
     Args:
-        robot: its number. width: of its images, pixels. novelty: when a beam is novel.
-        memo: of evidence; shared by the robots of a simulation.
+        robot: its id. local: the window. belief: the map of the world, which the evaluator reads.
+        width: of the camera's images, pixels. novelty: when a beam is novel.
+        memo: cache of evidence; shared by the robots of a simulation.
+
+    Attributes:
+        shared: what teammates receive.
     """
+
+    shared: SharedMap
 
     def __init__(
         self,
@@ -90,55 +132,19 @@ class Mapper(ABC):
 
     @abstractmethod
     def center_on(self, position: Tensor) -> None:
-        """Move the window along with the robot at (3,), and fill what it uncovers from what is known."""
+        """Moves the window to a robot at (3,), metres, and fills the cells that it uncovers."""
 
     @abstractmethod
     def sense(self, frame: DepthFrame) -> FrameUpdate:
-        """Learn from a frame of the robot's own camera."""
+        """Learns from a frame of the robot's own camera."""
 
     @abstractmethod
-    def receive(self, heard: Sequence[ReceivedMessage]) -> list[bytes]:
-        """Learn from what teammates sent; returns the datagrams that were understood."""
-
-    @abstractmethod
-    def datagrams(self, budget: int | None = None) -> list[bytes]:
-        """What is due to be sent to the team, in so many bytes at most; what does not fit stays due."""
-
-    def announcements(self) -> list[bytes]:
-        """What this robot holds, for those who have more or less."""
-        return []
-
-    @property
-    def version(self) -> int:
-        """Changes with what is announced."""
-        return 0
-
-    @property
-    def held(self) -> Intervals:
-        """Names of the records that the map is of, where it is of any."""
-        return Intervals.empty()
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether it is known that others hold more."""
-        return False
-
-    def digest(self) -> bytes:
-        """Equal for robots whose maps are the same, where they can tell."""
-        return b""
+    def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
+        """Merges messages of teammates; returns the datagrams that were merged."""
 
     @abstractmethod
     def components(self) -> Components | None:
-        """The mixture, of maps that are one."""
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` of a mapper made alike needs to go on as this one."""
-        return {"local": self.local.state(), "belief": self.belief.state()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take the place of the mapper whose `state` is given; this one must be new."""
-        self.local.restore(state["local"])
-        self.belief.restore(state["belief"])
+        """The mixture; None for maps of voxels."""
 
     def _add(self, evidence: CellEvidence) -> None:
         self.local.add(evidence)
@@ -153,11 +159,13 @@ def novel_beams(
     within: Box,
     short: float = 0.0,
 ) -> Tensor:
-    """Which beams (N,) of a frame tell the map something new; `width` of the image, pixels.
+    """Which beams (N,) of a frame are novel to a map.
 
-    The first beam of every three by three pixels speaks for all nine: neighbouring pixels are much closer
-    to one another than the cells are large. `within`, `short`: see
-    `beam_novelty`.
+    The first beam of each block of 3 × 3 pixels decides for the block: neighbouring pixels are much closer to
+    one another than the cells are wide.
+
+    Args:
+        width: of the image, pixels. within, short: see `beam_novelty`.
     """
     n, across = len(frame.pixel), -(-width // _BLOCK)
     block = frame.pixel // (_BLOCK * width) * across + frame.pixel % width // _BLOCK

@@ -1,40 +1,91 @@
-"""Radio: what one robot says of its map, how often and in how many bytes; and what it hears."""
+"""Radio: one robot's end of a network. Bounds what the robot sends, and decodes what it receives."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-from gmmtorch.errors import DataError
-from gmmtorch.exploration.robot.heartbeat import Heartbeat
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.sharing.messages.message_registry import Message, decode, kind_of
 from gmmtorch.sharing.transport.simulated_network import Transport
 from gmmtorch.sharing.transport.token_bucket import TokenBucket
 
+_LONGEST_PAUSE = 16
+"""Announcement periods between two announcements of the same content, at most."""
+
 
 class ReceivedMessage(NamedTuple):
-    """A datagram as it arrived, and what it says."""
+    """A datagram as it arrived, and the decoded message."""
 
     sender: int
     datagram: bytes
     message: Message
 
 
-class Logbook(Protocol):
-    """Where what is said and heard is kept, before it is sent or announced: see `sharing.journal`."""
+class RecordStore(Protocol):
+    """Keeps the records of a map on disk.
 
-    def said(self, datagrams: Sequence[bytes]) -> None: ...
-    def heard(self, datagrams: Sequence[bytes]) -> None: ...
+    n_failed: batches of records that could not be kept.
+    """
+
+    @property
+    def n_failed(self) -> int: ...
+
+    def keep(self, datagrams: Sequence[bytes]) -> object:
+        """Stores the records of datagrams that the robot is about to send, or has merged."""
+
+
+class AnnouncementSchedule:
+    """When a robot announces which records it holds: every period while they change or some are missing.
+
+    A lost announcement must be repeated, but a team at rest would send little else. So the pause doubles
+    after each announcement without news, up to 16 periods.
+
+    Args:
+        period: seconds.
+    """
+
+    def __init__(self, period: float) -> None:
+        if not 0 < period < math.inf:
+            raise InvalidArgumentError(f"announce_every={period} must be above zero seconds, and finite.")
+        self._period = self._pause = float(period)
+        self._last: float | None = None
+        self._announced: tuple[int, ...] | None = None
+
+    def due(self, now: float, content: tuple[int, ...], urgent: bool = False) -> bool:
+        """Whether to announce at the time `now` (s). If so, the caller must announce.
+
+        The first call starts the first period, and so does a clock that was set back.
+
+        Args:
+            content: changes whenever what is announced changes. urgent: whether records are missing.
+        """
+        if self._last is None or now < self._last:
+            self._last, self._announced, self._pause = now, content, self._period
+            return False
+        is_old = content == self._announced and not urgent
+        pause = self._pause if is_old else self._period
+        if now - self._last < pause - 1e-9:
+            return False
+        self._pause = min(2 * pause, _LONGEST_PAUSE * self._period) if is_old else self._period
+        self._last, self._announced = now, content
+        return True
 
 
 class Radio:
-    """A robot's end of a network. What it says is in its logbook before it is sent, if it has one.
+    """A robot's end of a network.
 
     Args:
-        robot: its number. transport: its end of the network.
-        announce_every: seconds between announcements while there is news; see `Heartbeat`.
-        budget: bytes a second, of records and of views; None: no limit.
-        decode: says what a datagram says, or raises `DataError`.
+        robot: its id. transport: the network.
+        announce_every: seconds between announcements while there is news.
+        budget: bytes per second for records and views; None: no limit.
+        decode: turns a datagram into a message, or raises `DataError`.
+
+    Attributes:
+        store: keeps records before they are sent, and after they were merged; None: nothing is kept.
+        announcements: when to announce.
+        n_received: datagrams that arrived. n_damaged: those of them that could not be decoded.
     """
 
     def __init__(
@@ -46,97 +97,75 @@ class Radio:
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
         self.robot, self.transport = robot, transport
-        self.logbook: Logbook | None = None
-        self.n_heard = 0
-        """Datagrams that have come."""
-        self.n_damaged = 0
-        """Of them, those that say nothing that can be understood."""
-        self._heartbeat = Heartbeat(announce_every)
+        self.store: RecordStore | None = None
+        self.announcements = AnnouncementSchedule(announce_every)
+        self.n_received = self.n_damaged = 0
         self._budget = None if budget is None else TokenBucket(budget)
         self._decode = decode
 
     def within_budget(
-        self, made: Callable[[int | None], list[bytes]], now: float, spare: int = 0
+        self, make: Callable[[int | None], list[bytes]], now: float, spare: int = 0
     ) -> list[bytes]:
-        """What `made` makes of the bytes that there are for it at the time `now` (s), None if there is no
-        limit. To be told at once.
+        """Datagrams to be sent now, which `make` makes from the bytes available at the time `now` (s); None
+        stands for no limit.
 
-        spare: bytes; where fewer are left, nothing is made. A datagram's, for what comes after the records:
-        a record that waits has first of all what it still needs.
+        spare: bytes that must be available, or nothing is made. Views need room for a whole datagram, so that
+        they never delay a record.
         """
         if self._budget is None:
-            return made(None)
+            return make(None)
         available = self._budget.available(now)
         if available < spare:
             return []
-        datagrams = made(available)
+        datagrams = make(available)
         self._budget.take(sum(map(len, datagrams)))
         return datagrams
 
-    def announces(self, now: float, content: tuple[int, ...], urgent: bool) -> bool:
-        """Whether it is time to announce a content that these numbers stand for; it is taken to be done."""
-        return self._heartbeat.due(now, content, urgent)
-
-    def tell(self, datagrams: Sequence[bytes], now: float) -> None:
-        """Broadcast datagrams."""
-        if self.logbook is not None:
-            self.logbook.said(datagrams)
+    def send(self, datagrams: Sequence[bytes], now: float) -> None:
+        """Stores the records of datagrams, then broadcasts the datagrams."""
+        self.keep(datagrams)
         by_kind: dict[str, list[bytes]] = {}
         for datagram in datagrams:
             by_kind.setdefault(kind_of(datagram), []).append(datagram)
         for kind, some in by_kind.items():
             self.transport.send(self.robot, some, now, kind)
 
-    def hear(self, now: float) -> list[ReceivedMessage]:
-        """What has come by `now`, and can be understood, sorted by sender, which no longer tells who was
-        quicker."""
+    def receive(self, now: float) -> list[ReceivedMessage]:
+        """The sound messages that arrived by the time `now` (s), sorted by sender. So the result does not
+        depend on which sender was faster."""
         arrived = sorted(self.transport.deliver(self.robot, now), key=lambda pair: pair[0])
-        self.n_heard += len(arrived)
-        heard = []
+        self.n_received += len(arrived)
+        received = []
         for sender, datagram in arrived:
             try:
-                heard.append(ReceivedMessage(sender, datagram, self._decode(datagram)))
+                received.append(ReceivedMessage(sender, datagram, self._decode(datagram)))
             except DataError:
                 self.n_damaged += 1
-        return heard
+        return received
 
-    def keep(self, merged: Sequence[bytes]) -> None:
-        """Datagrams that were heard are part of the map now: into the logbook, before it is announced."""
-        if self.logbook is not None:
-            self.logbook.heard(merged)
+    def keep(self, datagrams: Sequence[bytes]) -> None:
+        """Stores the records of datagrams. Merged datagrams must be stored before they are announced."""
+        if self.store is not None:
+            self.store.keep(datagrams)
 
-    def twin(self, conflicts: int) -> str | None:
-        """What is said of another robot of this number, if there is one: if the transport has met it, or so
-        many records that came contradict this robot's own."""
-        met: str | None = getattr(self.transport, "namesakes", {}).get(self.robot)
-        if met is None and not conflicts:
+    def duplicate_id(self, n_conflicts: int) -> str | None:
+        """An error message if another robot uses this robot's id, else None.
+
+        n_conflicts: records that arrived under this robot's id, and contradict what it sent.
+        """
+        source: str | None = getattr(self.transport, "duplicates", {}).get(self.robot)
+        if source is None and not n_conflicts:
             return None
-        whence = "" if met is None else f" ({met})"
+        address = "" if source is None else f" ({source})"
         return (
-            f"Another robot says that it is robot {self.robot}{whence}: give each a number (id=…) and a "
-            "folder of its own."
+            f"Another robot uses the id of robot {self.robot}{address}: give each robot its own id (id=…) "
+            "and its own folder."
         )
 
-    def remarks(self, conflicts: int) -> str:
-        """What the end of a status line says of the network, if something is wrong; see `twin`."""
-        alone = getattr(self.transport, "n_neighbours", None) == 0
-        twin = self.twin(conflicts) is not None
-        return (", connected to nobody" if alone else "") + (
-            f", another robot {self.robot} is there" if twin else ""
+    def warnings(self, n_conflicts: int) -> str:
+        """The end of a status line: what is wrong with the network, or nothing."""
+        is_alone = getattr(self.transport, "n_neighbours", None) == 0
+        is_duplicate = self.duplicate_id(n_conflicts) is not None
+        return (", no robot connected" if is_alone else "") + (
+            f", another robot has id {self.robot}" if is_duplicate else ""
         )
-
-    def state(self) -> dict[str, Any]:
-        """Everything that changes, but the transport and the logbook."""
-        return {
-            "n_heard": self.n_heard,
-            "n_damaged": self.n_damaged,
-            "heartbeat": self._heartbeat.state(),
-            "budget": None if self._budget is None else self._budget.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`."""
-        self.n_heard, self.n_damaged = int(state["n_heard"]), int(state["n_damaged"])
-        self._heartbeat.restore(state["heartbeat"])
-        if self._budget is not None:
-            self._budget.restore(state["budget"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from sklearn.metrics import roc_auc_score
@@ -98,20 +97,6 @@ class BeliefMap:
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3)."""
         return self.rule.probability(*self.grid.at_cells(cells))
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "grid": self.grid.state(),
-            "entropy_bits": self.entropy_bits,
-            "known_bits": self.known_bits,
-            "n_observed": self.n_observed,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.grid.restore(state["grid"])
-        self.entropy_bits = float(state["entropy_bits"])
-        self.known_bits = float(state["known_bits"])
-        self.n_observed = int(state["n_observed"])
 
 
 def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, float | None]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from gmmtorch.exploration.mission.variants import NETWORK, differing
+from gmmtorch.exploration.mission.results import NETWORK, differing
 from gmmtorch.report.exploration.trial_groups import by_variant, check_rows, paired_difference
 from gmmtorch.report.style import Rows
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gmmtorch.exploration.mission.variants import differing
+from gmmtorch.exploration.mission.results import differing
 from gmmtorch.report.style import Rows
 from gmmtorch.report.tensorboard_writer import Board
 

@@ -1,0 +1,35 @@
+"""Worker processes that end with the process that started them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import time
+from typing import Any
+
+_PERIOD = 0.5
+"""Seconds between checks whether the parent process is alive."""
+
+
+def end_with_parent() -> None:
+    """From now on, this worker process of multiprocessing or joblib ends as soon as its parent has ended.
+
+    It ends as if killed, in the middle of its work: files that must be whole are renamed into place
+    (`gmmtorch.files`). In any other process nothing happens.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    sentinel: Any = parent.sentinel
+
+    def wait() -> None:
+        if sentinel is not None:
+            parent.join()
+        else:  # joblib's processes have no sentinel
+            while os.getppid() == parent.pid:
+                time.sleep(_PERIOD)
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with parent", daemon=True).start()

@@ -1,0 +1,294 @@
+"""Rows of missions: against values computed by hand."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from gmmtorch.exploration.mission.results import (
+    VARIANT,
+    differing,
+    mission_row,
+    variant_of,
+    with_network_costs,
+    with_times,
+)
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
+from gmmtorch.sharing.transport.simulated_network import Reception
+
+OPTIONS = {
+    "framework": "gmm_shared",
+    "planner": "mcts",
+    "information": "csqmi",
+    "coordination": "greedy",
+    "planning_prior": 0.125,
+    "codec": "quantized",
+    "loss": 0.0,
+    "jitter": 0.0,
+    "partitions": [],
+    "announce": 5.0,
+    "budget": None,
+}
+
+
+def row(reduction: list[float], **changes: Any) -> dict[str, Any]:
+    """A row with a sample every ten seconds, whose entropy falls from 1000 bits."""
+    return {
+        **OPTIONS,
+        "times": [10.0 * k for k in range(len(reduction))],
+        "entropy_bits": [1000.0 - bits for bits in reduction],
+        "observable_bits": 1000.0,
+        "entropy_reduction_bits": reduction[-1],
+        **changes,
+    }
+
+
+def test_reference_is_the_mean_reduction_of_shared_grids() -> None:
+    rows = [
+        row([0, 100, 200, 300, 400]),
+        row([0, 400, 800, 900, 950]),  # better than any grid, without effect
+        row([0, 50, 100, 150, 200], framework="grid_shared"),
+        row([0, 150, 300, 450, 600], framework="grid_shared"),
+        row([0, 20, 40, 60, 80], framework="grid_isolated"),
+    ]
+    timed = with_times(rows)
+    assert {t["reference_bits"] for t in timed} == {400.0}
+    assert [t["t50"] for t in timed] == pytest.approx([20.0, 5.0, 40.0, 10 + 10 / 3, None])
+    assert [t["t90"] for t in timed] == pytest.approx([36.0, 9.0, None, 24.0, None])
+    for before, after in zip(rows, timed, strict=True):
+        assert {k: v for k, v in after.items() if k not in ("reference_bits", "t50", "t90")} == before
+
+
+def test_reference_is_the_best_of_several_variants_of_shared_grids() -> None:
+    rows = [
+        row([0, 300], framework="grid_shared", planner="frontier"),
+        row([0, 500], framework="grid_shared", planner="mcts"),
+        row([0, 300], framework="grid_shared", planner="mcts"),
+        row([0, 900]),
+    ]
+    assert {t["reference_bits"] for t in with_times(rows)} == {400.0}
+
+
+def test_reference_without_grids_is_the_best_variant() -> None:
+    rows = [
+        row([0, 300, 600], planner="mcts", seed=0),
+        row([0, 100, 400], planner="mcts", seed=1),
+        row([0, 100, 700], planner="random", seed=0),  # the best trial, but not the best mean
+        row([0, 50, 100], planner="random", seed=1),
+    ]
+    timed = with_times(rows)
+    assert {t["reference_bits"] for t in timed} == {500.0}
+    assert timed[0]["t50"] == pytest.approx(10 * 250 / 300)
+    assert timed[3]["t50"] is None
+
+
+@pytest.mark.parametrize("name", list(OPTIONS))
+def test_fields_that_make_a_variant(name: str) -> None:
+    others = {"planning_prior": 0.5, "loss": 0.3, "jitter": 0.1, "partitions": [{"begin": 1.0}]}
+    others |= {"announce": 9.0, "budget": 100.0}
+    other = others.get(name, "grid_isolated")
+    rows = [row([0, 400]), row([0, 600], **{name: other})]
+    assert with_times(rows)[0]["reference_bits"] == 600.0
+    rows = [row([0, 400], seed=0), row([0, 600], seed=1)]
+    assert with_times(rows)[0]["reference_bits"] == 500.0
+
+
+def test_without_reduction_there_is_no_time() -> None:
+    (timed,) = with_times([row([0, 0, 0])])
+    assert timed["t50"] is None
+    assert timed["t90"] is None
+    assert with_times([]) == []
+
+
+# -- a mission with known values ----------------------------------------------------------------------
+
+SHAPE = (4, 3, 2)
+LOW = torch.tensor([5, -2, 0])
+
+
+def belief(cells: list[list[int]], hits: list[float], misses: list[float], seen: torch.Tensor) -> BeliefMap:
+    made = BeliefMap(0.5, Box(LOW, LOW + torch.tensor(SHAPE)), seen, BeliefRule())
+    made.add(CellEvidence(torch.tensor(cells) + LOW, torch.tensor(hits), torch.tensor(misses)))
+    return made
+
+
+def mission(lengths: list[float], seen_by: list[int]) -> Any:
+    """Three robots in a world of 24 cells; the last 4 are not observable."""
+    observable = torch.ones(24, dtype=torch.bool)
+    observable[20:] = False
+    observable = observable.view(SHAPE)
+    occupied = torch.zeros(SHAPE, dtype=torch.bool)
+    occupied[0] = True
+    cells = [[0, 0, 0], [1, 0, 0], [2, 0, 0]]
+    maps = [
+        belief(cells, [9.0, 0.0, 0.0], [0.0, 30.0, 30.0], observable),
+        belief(cells[:2], [9.0, 0.0], [0.0, 30.0], observable),
+        belief(cells[:2], [0.0, 0.0], [30.0, 30.0], observable),
+    ]
+    mask = torch.zeros(24, dtype=torch.int16)
+    mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
+    mask[20:] = 7  # not observable: not counted
+    names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
+    names += ["coordination", "codec", "latency", "jitter", "bandwidth", "duplication", "reach"]
+    names += ["announce_every", "budget"]
+    options = SimpleNamespace(size=3, codecs=("zip",), partitions=(), **dict.fromkeys(names, "x"))
+    robots = [
+        SimpleNamespace(
+            path_length=length,
+            collisions=number,
+            mapper=SimpleNamespace(components=lambda: None, belief=one),
+        )
+        for number, (length, one) in enumerate(zip(lengths, maps, strict=True))
+    ]
+    return SimpleNamespace(
+        world=SimpleNamespace(
+            observable=observable,
+            occupied=occupied,
+            resolution=0.5,
+            box=Box(LOW, LOW + torch.tensor(SHAPE)),
+            name="w",
+        ),
+        options=options,
+        coordination=SimpleNamespace(name="myopic"),
+        score=SimpleNamespace(
+            union=maps[0],
+            seen_by=mask,
+            samples={"raw_points_bytes_over_time": [1, 22], "zip_bytes_over_time": [1, 11]},
+        ),
+        robots=robots,
+        network=SimpleNamespace(
+            n_bytes=100,
+            n_wire_bytes=128,
+            bytes_by_kind=Counter(a=100),
+            n_datagrams=1,
+            reception=lambda: Reception(1, 100, lost=1),
+        ),
+        watch=SimpleNamespace(seconds={"plan": 1.0}),
+        elapsed=30.0,
+    )
+
+
+def test_fields_of_a_mission_row() -> None:
+    # seen_by has a bit per robot: five cells were seen, three of them by two or more robots.
+    made = mission([1.0, 2.0, 3.0], [1, 0, 3, 7, 4, 0, 6])
+    found = mission_row(made, 10.0)
+    assert found["overlap"] == pytest.approx(3 / 5)
+    assert found["path_length"] == 6.0
+    assert found["collisions"] == 3
+    assert found["coverage_per_metre"] == pytest.approx(3 * 0.5**3 / 6)
+    assert found["observed_share"] == pytest.approx(3 / 20)
+    # The maps differ in cells 0 (occupied or free) and 2 (unknown to two robots).
+    assert found["map_disagreement"] == pytest.approx(2 / 20)
+    assert found["entropy_reduction_bits"] == pytest.approx(20 - made.score.union.entropy_bits)
+    assert found["bytes_raw_points"] == 22
+    assert found["bytes_zip"] == 11
+    assert found["simulated_per_wall_seconds"] == 3.0
+    assert found["n_components"] is None
+    assert found["partitions"] == []
+    assert (found["reception"]["bytes"], found["reception"]["lost"]) == (100, 1)
+
+
+def test_fields_of_a_mission_without_motion() -> None:
+    found = mission_row(mission([0.0, 0.0, 0.0], []), 0.0)
+    assert found["overlap"] is None
+    assert found["coverage_per_metre"] is None
+    assert found["simulated_per_wall_seconds"] is None
+
+
+# -- costs of networks --------------------------------------------------------------------------------
+
+MINUTE = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
+
+
+def network_row(seed: int = 0, missing: list[float] | None = None, **changes: Any) -> dict[str, Any]:
+    """A row with a sample every twenty seconds."""
+    missing = [0.0] if missing is None else missing
+    return {
+        "framework": "gmm_shared",
+        "seed": seed,
+        "loss": 0.0,
+        "partitions": [],
+        "delay": 0.05,
+        "entropy_reduction_bits": 1000.0,
+        "wire_bytes": 500,
+        "t90": 200.0,
+        "times": [20.0 * i for i in range(len(missing))],
+        "missing_share": missing,
+        **changes,
+    }
+
+
+def test_costs_compare_with_the_lossless_mission_of_the_same_seed() -> None:
+    rows = [
+        network_row(0),
+        network_row(1, wire_bytes=400, t90=100.0),
+        network_row(0, loss=0.5, wire_bytes=750, t90=250.0),
+        network_row(1, loss=0.5, wire_bytes=1000, t90=90.0),
+        network_row(1, partitions=[MINUTE], wire_bytes=440, t90=110.0),
+    ]
+    found = with_network_costs(rows)
+    assert [made["wire_ratio"] for made in found] == pytest.approx([1, 1, 1.5, 2.5, 1.1])
+    assert [made["t90_ratio"] for made in found] == pytest.approx([1, 1, 1.25, 0.9, 1.1])
+    assert [made["bits_per_byte"] for made in found] == pytest.approx([2, 2.5, 4 / 3, 1, 1000 / 440])
+    added = {"wire_ratio", "t90_ratio", "bits_per_byte", "healed_after"}
+    for before, after in zip(rows, found, strict=True):
+        assert {k: v for k, v in after.items() if k not in added} == before
+
+
+@pytest.mark.parametrize("other", [{"framework": "grid_shared"}, {"delay": 0.2}, {"seed": 1}, {"loss": 0.1}])
+def test_no_ratio_to_a_mission_of_another_variant(other: dict[str, Any]) -> None:
+    _, found = with_network_costs([network_row(**other), network_row(loss=0.3)])
+    assert found["wire_ratio"] is found["t90_ratio"] is None
+    assert found["bits_per_byte"] == 2
+
+
+def test_no_ratio_where_nothing_was_sent_or_reached() -> None:
+    alone, never = with_network_costs(
+        [network_row(framework="grid_isolated", wire_bytes=0), network_row(framework="grid_shared", t90=None)]
+    )
+    assert alone["bits_per_byte"] is alone["wire_ratio"] is None
+    assert alone["t90_ratio"] == 1
+    assert never["t90_ratio"] is None
+    assert with_network_costs([]) == []
+
+
+def test_healed_after_is_when_the_missing_share_is_as_small_as_without_partition() -> None:
+    #       0    20   40   60    80    100   120  140  160   180
+    usual = [0.9, 0.5, 0.3, 0.02, 0.04, 0.01, 0.0, 0.0, 0.00, 0.0]  # at most 0.04 in the minute
+    parted = [0.9, 0.5, 0.3, 0.02, 0.30, 0.50, 0.6, 0.2, 0.04, 0.0]
+    lossless, found = with_network_costs(
+        [network_row(missing=usual), network_row(missing=parted, partitions=[MINUTE])]
+    )
+    assert lossless["healed_after"] is None
+    assert found["healed_after"] == 40  # 160 s
+    _, never = with_network_costs(
+        [network_row(missing=usual), network_row(missing=parted[:8], partitions=[MINUTE])]
+    )
+    assert never["healed_after"] is None
+    (alone,) = with_network_costs([network_row(missing=parted, partitions=[MINUTE])])
+    assert alone["healed_after"] is None
+
+
+def test_healed_after_uses_the_partition_that_ends_last() -> None:
+    usual, parted = [0.0, 0.1, 0.1, 0.2, 0.0, 0.0], [0.0, 0.5, 0.0, 0.9, 0.9, 0.15]
+    cuts = [{**MINUTE, "begin": 40.0, "end": 80.0}, {**MINUTE, "begin": 10.0, "end": 30.0}]
+    rows = [network_row(missing=usual), network_row(missing=parted, partitions=cuts)]
+    assert with_network_costs(rows)[1]["healed_after"] == 20
+    between = [{**MINUTE, "begin": 45.0, "end": 55.0}]  # between two samples
+    assert with_network_costs([rows[0], {**rows[1], "partitions": between}])[1]["healed_after"] is None
+
+
+def test_differing_names_the_fields_of_variants_only() -> None:
+    rows = [network_row(0), network_row(1, wire_bytes=9), network_row(0, loss=0.1, partitions=[MINUTE])]
+    assert differing(rows) == ["loss", "partitions"]
+    assert differing(rows, without=["loss"]) == ["partitions"]
+    assert differing(rows[:2]) == differing([]) == []
+    assert variant_of(rows[0]) == variant_of(rows[1]) != variant_of(rows[2])
+    assert len(variant_of(rows[0], without=["loss"])) == len(VARIANT) - 1
+    assert variant_of(rows[2], ["loss"]) == (0.1,)
