@@ -183,7 +183,7 @@ def test_a_robot_continues_on_a_full_disk_and_names_missing_files(run, monkeypat
     assert "scan 6/6" in done.stderr
     *status, error = done.stderr.splitlines()
     assert all(line.startswith("robot 0 ") for line in status)  # no tracebacks
-    assert error.startswith(f"gmmtorch: error: hydra.run.dir={done.folder} has not got all results: ")
+    assert error.startswith(f"gmmtorch: error: hydra.run.dir={done.folder} does not contain all results: ")
     for name in ("map.safetensors", "own_map.safetensors", "results.json", "run.png", "File too large"):
         assert error.count(name) == (2 if name == "map.safetensors" else 1)
     assert not (done.folder / "results.json").exists()

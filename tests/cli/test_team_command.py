@@ -147,7 +147,7 @@ def test_files_that_a_full_disk_rejects_are_named_below_the_table(run, monkeypat
     assert "robot 1 refused 7 frames: 7 wrong_key; compare link.key_file" in done.stdout
     (error,) = done.stderr.splitlines()
     assert error.startswith(
-        f"gmmtorch: error: hydra.run.dir={done.folder} has not got all results: results.json ("
+        f"gmmtorch: error: hydra.run.dir={done.folder} does not contain all results: results.json ("
     )
 
 
