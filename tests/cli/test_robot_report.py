@@ -138,6 +138,6 @@ def test_every_file_is_written_and_failures_are_named(tmp_path):
     with pytest.raises(OutputError) as caught:
         outputs.check()
     assert str(caught.value).startswith(
-        f"hydra.run.dir={tmp_path} does not contain all results: one, three (No space left on device); taken ("
+        f"hydra.run.dir={tmp_path} does not contain all results: one, three (No space left on device); taken"
     )
     assert (tmp_path / "two").read_bytes() == b"2"
