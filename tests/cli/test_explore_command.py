@@ -449,7 +449,7 @@ def test_no_process_of_a_killed_study_survives(room, tmp_path):
         ("team.start=[3,3]", "team.start"),
         ("team.start=[[nan,3,1.5,0],[2,2,1.5,0]]", "team.start[0] finite"),
         ("world.path=/no/where.ply", "world.path=/no/where.ply"),
-        ("world.bounds=[20,20,0,30,30,3]", "world.bounds=[20.0, miss room"),
+        ("world.bounds=[20,20,0,30,30,3]", "world.bounds=[20.0, do not meet room"),
         ("world.bounds=[0,0,0,3]", "world.bounds= six"),
         ("world.resolution=0", "world.resolution=0.0"),
         ("sensor.horizontal_fov=0", "sensor.horizontal_fov=0.0"),

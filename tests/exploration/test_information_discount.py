@@ -1,4 +1,4 @@
-"""Fatigue, against a dictionary of blocks."""
+"""InformationDiscount, against a dictionary of blocks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from exploration.voxel_worlds import surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.exploration.information.information_discount import Fatigue
+from gmmtorch.exploration.information.information_discount import InformationDiscount
 
 SHAPE = (12, 9, 8)
 COUNTS = (3, 3, 2)
@@ -25,7 +25,7 @@ corners = st.tuples(*[st.integers(-3, 3).map(lambda n: 4 * n)] * 3)
 @given(lows=st.lists(corners, min_size=1, max_size=5), seed=st.integers(0, 99))
 def test_weights_equal_a_dictionary_for_any_window(lows, seed):
     generator = torch.Generator().manual_seed(seed)
-    fatigue, kept = Fatigue(decay=0.3), {}
+    fatigue, kept = InformationDiscount(decay=0.3), {}
     for now, low in enumerate(lows):
         measured = torch.rand(18, generator=generator) * (torch.rand(18, generator=generator) < 0.5)
         fatigue.note(window(low), measured, float(now))
@@ -41,7 +41,7 @@ def test_weights_equal_a_dictionary_for_any_window(lows, seed):
 
 
 def test_note_counts_once_for_each_time():
-    fatigue = Fatigue(decay=0.5)
+    fatigue = InformationDiscount(decay=0.5)
     assert fatigue.weights(window((0, 0, 0))).tolist() == [1.0] * 18
     for _ in range(3):
         fatigue.note(window((0, 0, 0)), torch.ones(18), 2.0)

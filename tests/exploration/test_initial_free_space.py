@@ -122,10 +122,10 @@ def test_start_without_safe_motion_is_rejected_with_a_better_place() -> None:
     moved = tuple(float(x) for x in str(error.value).split("for instance to [")[1].split("]")[0].split(","))
     assert len(start_poses(hall, replace(ALONE, start=(moved,)))) == 1
     with pytest.raises(
-        InvalidArgumentError, match=r"team.start\[0\].* nothing that leads anywhere .*robot.radius=0.3 m"
+        InvalidArgumentError, match=r"team.start\[0\].* no safe motion leads away .*robot.radius=0.3 m"
     ):
         flown(inside, (3.9, 3.9, 1.1, 0.0))
-    with pytest.raises(InvalidArgumentError, match=r"no places were found .*robot.radius=0.3 .*team.start"):
+    with pytest.raises(InvalidArgumentError, match=r"found no start poses .*robot.radius=0.3 .*team.start"):
         flown(inside)
 
 

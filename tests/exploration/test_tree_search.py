@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewValues
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
@@ -109,7 +109,7 @@ def test_search_finds_the_best_of_all_branches():
     rule = SearchRule(depth=2, n_rounds=20, n_leaves=64, discount=0.8)
     for seed in range(3):
         task, evaluator = task_in(ROOM, MIDDLE, seed, residual=torch.rand(N_BLOCKS)), MadeUp(seed)
-        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
         assert found is not None
         branches = all_branches(task, 2)
         assert len(branches) > 50
@@ -124,7 +124,7 @@ def test_search_finds_the_best_of_all_branches():
 
 def test_found_describes_its_branch():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, evaluator))
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, evaluator))
     assert found is not None
     assert 1 <= len(found.actions) <= 4
     states = [task.state]
@@ -141,10 +141,10 @@ def test_search_beats_random_branches_with_few_leaves():
     shares = []
     for seed in range(6):
         task, evaluator = task_in(ROOM, MIDDLE, seed), MadeUp(100 + seed)
-        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
         assert found is not None
         full = SearchRule(depth=3, n_rounds=60, n_leaves=64, exploration=2.0)
-        better = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
+        better = TreeSearch(PRIMITIVES, full).search(task, ViewCache(task, evaluator))
         drawn = torch.Generator().manual_seed(seed)
         two = all_branches(task, 2)
         chance = [
@@ -158,7 +158,7 @@ def test_search_beats_random_branches_with_few_leaves():
 
 def test_search_evaluates_each_view_once_in_batches():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
-    TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, Memory(task, evaluator))
+    TreeSearch(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32)).search(task, ViewCache(task, evaluator))
     assert len(evaluator.calls) <= 5
     keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
     assert len(keys) == len(set(keys))
@@ -172,7 +172,7 @@ def test_views_planned_by_teammates_have_no_value():
         residual[seen] = 1.0
         task = task_in(ROOM, MIDDLE, residual=residual)
         rule = SearchRule(depth=1, n_rounds=1)
-        found = TreeSearch(PRIMITIVES, rule).search(task, Memory(task, evaluator))
+        found = TreeSearch(PRIMITIVES, rule).search(task, ViewCache(task, evaluator))
         ends = PRIMITIVES.rollout(task.state[None])[0, :, -1, :4]
         here = evaluator.evaluate(None, evaluator.keys(task.state[None, :4])).measured[0, seen]
         gains = evaluator.evaluate(None, evaluator.keys(ends)).gain[:, seen] * (1 - here)
@@ -187,7 +187,7 @@ def test_same_seed_gives_the_same_branch(seed):
     runs = []
     for _ in range(2):
         task = task_in(ROOM, MIDDLE, seed)
-        runs.append(TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(seed))))
+        runs.append(TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, MadeUp(seed))))
     assert runs[0].actions == runs[1].actions
     assert runs[0].value == runs[1].value
 
@@ -195,12 +195,12 @@ def test_same_seed_gives_the_same_branch(seed):
 def test_rest_of_the_last_branch_is_tried_first():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(7)
     full = SearchRule(depth=2, n_rounds=20, n_leaves=64)
-    best = TreeSearch(PRIMITIVES, full).search(task, Memory(task, evaluator))
+    best = TreeSearch(PRIMITIVES, full).search(task, ViewCache(task, evaluator))
     brief = TreeSearch(PRIMITIVES, SearchRule(depth=2, n_rounds=1, n_leaves=1))
-    found = brief.search(task, Memory(task, evaluator), first=best.actions)
+    found = brief.search(task, ViewCache(task, evaluator), first=best.actions)
     assert found.actions == best.actions
     assert found.value == pytest.approx(best.value)
-    beyond = brief.search(task, Memory(task, evaluator), first=[0, 0, 0, 0, 0])  # flies into the wall
+    beyond = brief.search(task, ViewCache(task, evaluator), first=[0, 0, 0, 0, 0])  # flies into the wall
     assert beyond is not None
     assert len(beyond.actions) <= 2
 
@@ -241,9 +241,9 @@ def test_search_keeps_clear_of_peers_in_time():
     other = torch.tensor([[2.9, 2.7, 1.2]], dtype=torch.float64)
     task = task_in(ROOM, MIDDLE, peers=PeerTrajectories.of([other]))
     free = TreeSearch(PRIMITIVES, SearchRule(depth=1, n_rounds=1)).search(
-        task_in(ROOM, MIDDLE), Memory(task, MadeUp(0))
+        task_in(ROOM, MIDDLE), ViewCache(task, MadeUp(0))
     )
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, MadeUp(0)))
     assert free is not None
     assert found is not None
     apart = (found.path[:, :3] - other).norm(dim=1)
@@ -254,7 +254,7 @@ def test_search_keeps_clear_of_peers_in_time():
 def test_boxed_in_robot_has_no_moving_branch():
     nowhere = torch.zeros(30, 30, 12, dtype=torch.bool)
     task = task_in(nowhere, MIDDLE)
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, MadeUp(0)))
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, MadeUp(0)))
     assert found is None or bool((found.views[:, :3] == task.state[:3]).all())
 
 
@@ -265,7 +265,7 @@ def test_search_at_the_start_looks_around():
     explorer.hits.zero_()
     explorer.misses.zero_()
     task = explorer.task(torch.Generator().manual_seed(0))
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, Memory(task, EVALUATOR))
+    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, EVALUATOR))
     assert found is not None
     assert found.information > 0
     looks = [float(yaw) for yaw in found.views[:, 3]]

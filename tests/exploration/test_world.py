@@ -114,12 +114,12 @@ def test_start_selects_the_navigable_part():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"bounds": (20, 20, 0, 30, 30, 3)}, r"miss mesh, which extends from \(0.1"),
-        ({"bounds": (5, 0, 0, 1, 6, 3)}, "hold nothing"),
+        ({"bounds": (20, 20, 0, 30, 30, 3)}, r"do not meet mesh, which extends from \(0.1"),
+        ({"bounds": (5, 0, 0, 1, 6, 3)}, "are empty"),
         ({"bounds": (0, 0, 0, 5, 6, math.nan)}, "six finite numbers"),
         ({"bounds": (0, 0, 0, 5)}, "six finite numbers"),
         ({"bounds": (0, 0, 0, 5)}, r"bounds=\[0.0, 0.0, 0.0, 5.0\]"),
-        ({"bounds": (1, 1, 1, 2, 2, 2)}, r"bounds=\[1.0, .* 2.0\] hold no surface of mesh"),
+        ({"bounds": (1, 1, 1, 2, 2, 2)}, r"bounds=\[1.0, .* 2.0\] contain no surface of mesh"),
         ({"max_range": 0.7}, r"max_range=0.7 .*robot_radius=0.3 .*resolution=0.2"),
         ({"resolution": 3.0}, r"max_range=6.0 .*resolution=3.0"),
         ({"robot_radius": 3.0}, "robot_radius=3.0"),
@@ -141,7 +141,7 @@ def test_world_rejects_bad_meshes_and_too_many_cells():
         World.from_mesh(HALL[:0], cache=False)
     with pytest.raises(MemoryLimitError, match="coarser resolution"):
         World.from_mesh(HALL, 0.001, cache=False)
-    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not in millimetres"):
+    with pytest.raises(MemoryLimitError, match=r"world\.bounds.*not millimetres"):
         World.from_mesh(1000 * HALL, cache=False)
 
 
@@ -242,7 +242,7 @@ def test_world_cache_rejects_damaged_and_foreign_files(hall, tmp_path, caplog, h
     with caplog.at_level(logging.WARNING):
         world = World.from_mesh(HALL)
     assert same(world, hall)
-    assert "Working the world out anew" in caplog.text
+    assert "cannot be used and is computed again" in caplog.text
     assert same(World.from_mesh(HALL), hall)  # it was mended
 
 
@@ -251,7 +251,7 @@ def test_world_cache_warns_if_it_cannot_write(hall, tmp_path, monkeypatch, caplo
     monkeypatch.setenv("GMMTORCH_CACHE", str(tmp_path / "file"))
     with caplog.at_level(logging.WARNING):
         assert same(World.from_mesh(HALL), hall)
-    assert "not kept" in caplog.text
+    assert "not cached" in caplog.text
 
 
 def test_open_world_opens_each_name(tmp_path):

@@ -1,4 +1,6 @@
-"""BeamTemplates: cells that a depth camera's beams meet, for each heading, relative to the camera's own."""
+"""BeamTemplates: the cells that a depth camera's beams meet, for each heading, relative to the camera's
+cell.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,12 @@ _MOST_CELLS = 1 << 22
 class BeamTemplates(NamedTuple):
     """Y headings, B beams each, up to C cells a beam, from a camera at the centre of its cell.
 
-    offsets: (Y, B, C, 3) int64, lattice cells relative to the camera's, in order; zeros beyond the end.
-    depths: (Y, B, C), metres along the beam, the middle of its way through each cell.
-    volumes: (Y, B, C), of the beam's pencil inside each cell, in cells: summed over the beams that
-        share a cell it is about one, so a sum over beams weighted by it is a sum over cells.
-    lengths: (Y, B) int64, cells of each beam.
-    leading: (Y, B, 3, K) int64: how many of a beam's cells come before its offset on an axis exceeds k.
+    offsets: (Y, B, C, 3) int64, lattice cells relative to the camera's cell, in order; zeros beyond the end.
+    depths: (Y, B, C), metres along the beam to the middle of its way through each cell.
+    volumes: (Y, B, C), volume of the beam's pencil inside each cell, in cells. It sums to about one over
+        the beams that share a cell, so a sum over beams weighted by it is a sum over cells.
+    lengths: (Y, B) int64, number of cells of each beam.
+    leading: (Y, B, 3, K) int64, number of a beam's cells before its offset on an axis exceeds k.
     """
 
     offsets: Tensor
@@ -39,13 +41,13 @@ def beam_templates(
     n_beams: int,
     n_yaws: int,
 ) -> BeamTemplates:
-    """Templates of a pinhole camera that looks along its heading, pitch 0: yaw k is 2πk/n_yaws.
+    """Compute templates of a pinhole camera that looks along its heading with pitch 0; yaw k is 2πk/n_yaws.
 
     Args:
         horizontal_fov, vertical_fov: radians, each in (0, π).
         max_range: metres along the beam.
         resolution: side (m) of the cells.
-        n_beams: about how many beams; rows and columns are chosen to be evenly apart.
+        n_beams: approximate number of beams; rows and columns are evenly spaced.
     """
     directions, solid_angles = pinhole_beams(horizontal_fov, vertical_fov, n_beams)
     if not 0 < max_range < math.inf:
@@ -54,7 +56,7 @@ def beam_templates(
     if n_yaws * len(directions) * per_beam > _MOST_CELLS:
         raise InvalidArgumentError(
             f"max_range={max_range} m at resolution={resolution} m, n_beams={n_beams} and n_yaws={n_yaws} "
-            f"makes more than {_MOST_CELLS} cells; take coarser cells, fewer beams or fewer yaws."
+            f"make more than {_MOST_CELLS} cells; use coarser cells, fewer beams or fewer yaws."
         )
     yaw = torch.arange(n_yaws, dtype=torch.float64) * (2 * math.pi / n_yaws)
     cos, sin, zero = yaw.cos(), yaw.sin(), torch.zeros_like(yaw)
@@ -73,9 +75,9 @@ def beam_templates(
 
 
 def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> tuple[Tensor, Tensor]:
-    """Unit directions (B, 3), x ahead, y left, z up, and the solid angle (B,) that each stands for.
+    """Return unit directions (B, 3), x ahead, y left, z up, and the solid angle (B,) of each.
 
-    Rows and columns are at equal angles; the patches around them tile the image exactly.
+    Rows and columns are at equal angles. Their patches tile the image exactly.
     """
     for name, fov in (("horizontal_fov", horizontal_fov), ("vertical_fov", vertical_fov)):
         if not 0 < fov < math.pi:
@@ -85,7 +87,7 @@ def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> t
     columns = max(round(n_beams / rows), 1)
 
     def tangents(fov: float, count: int) -> Tensor:
-        """Of the edges (even) and middles (odd) of `count` equal angles."""
+        """Tangents of the edges (even) and middles (odd) of `count` equal angles."""
         steps = torch.arange(2 * count + 1, dtype=torch.float64) / (2 * count) - 0.5
         return (steps * fov).tan()
 
@@ -93,21 +95,21 @@ def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> t
     middle_v, middle_u = torch.meshgrid(v[1::2], u[1::2], indexing="ij")
     directions = torch.stack([torch.ones_like(middle_u), middle_u, middle_v], -1).view(-1, 3)
     edge_v, edge_u = torch.meshgrid(v[::2], u[::2], indexing="ij")
-    # Solid angle of the image from its middle to (u, v); of a patch by its four corners.
+    # Solid angle of the image from its middle to (u, v); that of a patch follows from its four corners.
     corner = torch.atan(edge_u * edge_v / (1 + edge_u**2 + edge_v**2).sqrt())
     solid_angles = corner.diff(dim=0).diff(dim=1).reshape(-1)
     return directions / directions.norm(dim=1, keepdim=True), solid_angles
 
 
 def cells_along(directions: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Every cell that rays from the centre of cell 0 pass through, in order.
+    """Return every cell that rays from the centre of cell 0 pass through, in order.
 
     Args:
         directions: (..., 3) unit vectors. reach: length of the rays, in cells.
 
     Returns:
-        Cells (..., C, 3) int64, zeros beyond the end; the distances (..., C + 1) in cells between which
-        the ray is in each; and how many there are (...,).
+        Cells (..., C, 3) int64, zeros beyond the end; the distances (..., C + 1), in cells, at which the ray
+        enters and leaves them; and their number (...,).
     """
     n_planes = math.ceil(reach) + 1
     step = directions.abs()[..., None]  # (..., 3, 1)

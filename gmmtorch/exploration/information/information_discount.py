@@ -1,4 +1,4 @@
-"""Fatigue: blocks that promise information, and keep it when they are looked at."""
+"""InformationDiscount: lowers the weight of blocks whose promised information a view failed to gain."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from gmmtorch.exploration.robot.local_map import LocalMap
 _EXTENT = 1 << 20  # blocks along each axis that keys can tell apart
 
 
-class Fatigue:
-    """Weights of the blocks of the world, 1 where nothing is known to the contrary.
+class InformationDiscount:
+    """Weights of the blocks of the world; 1 by default.
 
-    The view from where a robot is, valued right after it has looked, should bring nothing. What it still
-    promises then, the camera did not resolve: grazing surfaces, gaps that the cells are too coarse for.
-    Each such look takes the block's weight w to w (1 − decay · measured), measured being the share of what
-    the block has to tell that the view claims. So a robot does not stare at what it cannot see.
+    The view from the robot's pose, evaluated right after an image was taken there, should gain nothing.
+    What it still promises, the camera cannot resolve: grazing surfaces, and gaps smaller than a cell.
+    Each such image changes the weight w of a block to w (1 − decay · measured), where `measured` is the
+    share of the block's remaining information that the view promises. The robot then does not keep
+    looking at what it cannot see.
     """
 
     def __init__(self, decay: float = 0.25) -> None:
@@ -29,7 +30,9 @@ class Fatigue:
         self._when = -math.inf
 
     def note(self, local_map: LocalMap, measured: Tensor, now: float) -> None:
-        """What the view from here, measured (G,), claims although it was just taken; once at each time."""
+        """Apply `measured` (G,) of the view that was just taken; repeated calls at one time have no
+        effect.
+        """
         if now <= self._when:
             return
         self._when = now
@@ -41,7 +44,7 @@ class Fatigue:
         self._weights = torch.ones(len(self._keys)).scatter_reduce_(0, row, factors, "prod")
 
     def weights(self, local_map: LocalMap) -> Tensor:
-        """Weights (G,) float32 of the window's blocks."""
+        """Weights (G,) float32 of the local map's blocks."""
         keys = _keys(local_map)
         if len(self._keys) == 0:
             return torch.ones(len(keys))
@@ -50,7 +53,7 @@ class Fatigue:
 
 
 def _keys(local_map: LocalMap) -> Tensor:
-    """What names each block (G,) of a window, in row-major order, wherever the window is."""
+    """Return world-fixed keys (G,) of the local map's blocks, in row-major order."""
     first = local_map.low.cpu() // BLOCK
     x, y, z = (
         (torch.arange(-(-n // BLOCK)) + low) % _EXTENT for n, low in zip(local_map.shape, first, strict=True)

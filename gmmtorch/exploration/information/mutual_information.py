@@ -1,9 +1,9 @@
-"""What a range beam is expected to tell about the cells it meets: CSQMI and Shannon information.
+"""Mutual information between a range beam and the cells it meets: CSQMI and Shannon information.
 
-A beam meets cells 1 … C in order, cell i occupied with probability o_i independently of the others, and
-reads the depth of the first occupied one, or that there was none. That reading without a return is
-told apart from every depth. A cell of occupancy 0 changes nothing, wherever it stands: beams of
-different lengths are padded with it, or their `lengths` given. All information is in nats.
+A beam meets cells 1 … C in order. Cell i is occupied with probability o_i, independently of the others.
+The beam measures the depth of the first occupied cell, or returns nothing; no return differs from every
+depth. A cell of occupancy 0 has no effect: beams of different lengths are padded with such cells, or
+`lengths` is given. All information is in nats.
 """
 
 from __future__ import annotations
@@ -16,29 +16,31 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 
 _NEGLIGIBLE = 1e-5
-"""Of the kernel: readings less alike than this count as unlike."""
+"""Kernel values below this count as zero."""
 
 
 def first_hit(occupancy: Tensor, lengths: Tensor | None = None) -> Tensor:
-    """Probability of each cell to be the first occupied one, and of none to be.
+    """Return the probability that each cell is the first occupied one, and that none is occupied.
 
     Args:
         occupancy: (..., C) in [0, 1], cells in order along each beam.
-        lengths: (...,) cells that a beam has; all C if not given. Later ones do not exist.
+        lengths: (...,) number of cells of each beam; default C. Later cells do not exist.
 
     Returns:
-        (..., C + 1), o_i Π_{j<i} (1 − o_j), and last Π_j (1 − o_j); rows sum to one.
+        (..., C + 1): o_i Π_{j<i} (1 − o_j), and last Π_j (1 − o_j); rows sum to one.
     """
     return first_block(_ended(check_occupancy(occupancy), lengths))
 
 
 def first_block(occupancy: Tensor) -> Tensor:
-    """Probability (..., C) of each cell to be the first occupied one; the last must be occupied surely."""
+    """Return the probability (..., C) that each cell is the first occupied one; the last must have
+    occupancy 1.
+    """
     return _reach(occupancy).mul_(occupancy)
 
 
 def _reach(occupancy: Tensor) -> Tensor:
-    """Probability (..., C) that all cells before each are free."""
+    """Return the probability (..., C) that all cells before each cell are free."""
     clear = torch.empty_like(occupancy)
     torch.sub(1, occupancy[..., :-1], out=clear[..., 1:])
     clear[..., 0] = 1
@@ -46,7 +48,7 @@ def _reach(occupancy: Tensor) -> Tensor:
 
 
 def sharpened(occupancy: Tensor) -> Tensor:
-    """o²/(o² + (1 − o)²): cells of the maps drawn with the squares of their probabilities."""
+    """Return o²/(o² + (1 − o)²), the occupancy under squared and normalized probabilities."""
     occupied = occupancy * occupancy
     clear = (1 - occupancy).square_()
     return occupied / clear.add_(occupied)
@@ -60,20 +62,19 @@ def csqmi(
     band: int | None = None,
     lengths: Tensor | None = None,
 ) -> Tensor:
-    """Cauchy–Schwarz quadratic mutual information of each beam's reading and the cells it meets.
+    """Compute the Cauchy–Schwarz quadratic mutual information of each beam's reading and the cells it meets.
 
-    I = log(pᵀKp) − 2 log(pᵀKv), p the first hits of o, v those of `sharpened` o and
-    K_ij = exp(−(d_i − d_j)²/4σ²): Charrow et al., ICRA 2015, without the products of squares of theirs
-    that underflow, so that float32 serves for beams of any length. The reading is normal about the depth
-    of the cell that is hit.
+    I = log(pᵀKp) − 2 log(pᵀKv), where p are the first hits of o, v those of `sharpened` o, and
+    K_ij = exp(−(d_i − d_j)²/4σ²) (Charrow et al., ICRA 2015). Their products of squares, which underflow, are
+    avoided, so that float32 is enough for beams of any length. A reading is normal about the depth of the
+    cell hit.
 
     Args:
         occupancy: (..., C) in [0, 1].
-        depths: (..., C), metres, where a hit in each cell is expected, not decreasing; broadcast if need be.
-        sigma: standard deviation (m) of a reading, positive.
-        band: how many cells on either side a reading can be mistaken for; if not given as many as have
-            a K_ij above 10⁻⁵.
-        lengths: (...,) cells that a beam has; all C if not given.
+        depths: (..., C), metres, expected depth of a hit in each cell, not decreasing; broadcastable.
+        sigma: standard deviation of a reading (m), positive.
+        band: number of cells on each side with a nonzero K_ij; default: those with K_ij above 10⁻⁵.
+        lengths: (...,) number of cells of each beam; default C.
 
     Returns:
         (...,) nats, never negative.
@@ -81,7 +82,7 @@ def csqmi(
     check_sigma(sigma)
     ended = _ended(check_occupancy(occupancy), lengths)
     if not bool(torch.isfinite(depths).all()):
-        raise InvalidArgumentError("depths must be finite, those of cells beyond a beam's end as well.")
+        raise InvalidArgumentError("depths must be finite, also those of cells beyond a beam's end.")
     depths = depths.expand_as(occupancy)
     if band is None:
         band = needed_band(depths, sigma)
@@ -92,7 +93,9 @@ def csqmi(
 
 
 def needed_band(depths: Tensor, sigma: float, negligible: float = _NEGLIGIBLE) -> int:
-    """Most cells (of depths (..., C), not decreasing) within which K stays above `negligible`."""
+    """Return the largest distance in cells at which K exceeds `negligible`; depths (..., C), not
+    decreasing.
+    """
     reach = 2 * sigma * math.sqrt(-math.log(negligible))
     n_cells = depths.shape[-1]
     for band in range(1, n_cells):
@@ -102,12 +105,12 @@ def needed_band(depths: Tensor, sigma: float, negligible: float = _NEGLIGIBLE) -
 
 
 def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor | None = None) -> Tensor:
-    """K_{i,i+s} for s = 1 … band as (band, ..., C + 1): zero where i + s is beyond the beam's cells.
+    """Return K_{i,i+s} for s = 1 … band as (band, ..., C + 1); zero if i + s is beyond the beam's cells.
 
     Args:
         depths: (..., C), metres.
         sigma: metres.
-        lengths: (...,) cells that a beam has; all C if not given.
+        lengths: (...,) number of cells of each beam; default C.
     """
     n_cells = depths.shape[-1]
     kernel = depths.new_zeros(band, *depths.shape[:-1], n_cells + 1)
@@ -121,15 +124,16 @@ def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor | None
 
 
 def banded_csqmi(hit: Tensor, hit_sharp: Tensor, kernel: Tensor) -> Tensor:
-    """log(pᵀKp) − 2 log(pᵀKv), nats (...,).
+    """Return log(pᵀKp) − 2 log(pᵀKv), nats (...,).
 
     Args:
-        hit, hit_sharp: p and v (..., C), contiguous: `first_block` of the occupancy and of it `sharpened`.
-        kernel: (band, ..., C) of `depth_kernel`: upper diagonals of K, whose main diagonal is one.
+        hit, hit_sharp: p and v (..., C), contiguous: `first_block` of the occupancy, and of the
+            `sharpened` one.
+        kernel: (band, ..., C) from `depth_kernel`: upper diagonals of K, whose main diagonal is one.
     """
     p, v = hit.reshape(-1), hit_sharp.reshape(-1)
-    half_p, half_v = p / 2, v / 2  # the upper half of Kp and of Kv, half the diagonal included
-    # Rows laid end to end: the kernel is zero wherever a shift would run into the next beam.
+    half_p, half_v = p / 2, v / 2  # the upper halves of Kp and Kv, with half of the diagonal
+    # Rows lie end to end: the kernel is zero where a shift would reach the next beam.
     for s, diagonal in enumerate(kernel, start=1):
         upper = diagonal.reshape(-1)
         half_p[:-s].addcmul_(upper[:-s], p[s:])
@@ -149,16 +153,16 @@ def fsmi(
     """Shannon mutual information of each beam's reading and the cells it meets (FSMI).
 
     I = Σ_j P(e_j) C_j over the events e_j that cell j is hit first,
-    C_j = f(δ_occ, r_j) + Σ_{i<j} f(δ_emp, r_i), r the odds of a cell and f(δ, r) what multiplying them
-    by δ tells about it (Zhang et al., IJRR 2020, for noise within a cell); without a hit every cell
-    gets δ_emp. With δ_occ → ∞ and δ_emp → 0 this is the exact information of a sensor without noise,
-    the entropy of the first hit.
+    C_j = f(δ_occ, r_j) + Σ_{i<j} f(δ_emp, r_i), where r are the odds of a cell and f(δ, r) is the information
+    gained by multiplying them by δ (Zhang et al., IJRR 2020, for noise within a cell). Without a hit
+    every cell gets δ_emp. For δ_occ → ∞ and δ_emp → 0 this is the exact information of a noise-free
+    sensor, the entropy of the first hit.
 
     Args:
         occupancy: (..., C) in [0, 1].
-        delta_occ: factor of a cell's odds when it is hit, above 1.
-        delta_emp: the same when it is passed through, in (0, 1).
-        lengths: (...,) cells that a beam has; all C if not given.
+        delta_occ: factor on a cell's odds when it is hit, above 1.
+        delta_emp: factor when it is passed through, in (0, 1).
+        lengths: (...,) number of cells of each beam; default C.
 
     Returns:
         (...,) nats, never negative.
@@ -172,17 +176,20 @@ def fsmi(
 
 
 def shannon(hit: Tensor, occupancy: Tensor, delta_occ: float = 1.5, delta_emp: float = 1 / 1.5) -> Tensor:
-    """`fsmi` (...,) by the first hits (..., C) of an occupancy (..., C) whose last cell is occupied surely.
+    """Compute `fsmi` (...,) from the first hits (..., C) of an occupancy (..., C) whose last cell is
+    occupied.
 
-    Cell i is passed through with probability Σ_{j>i} P(e_j) = Π_{j≤i} (1 − o_j): the sum is one over cells.
+    Cell i is passed through with probability Σ_{j>i} P(e_j) = Π_{j≤i} (1 − o_j), so the sum runs over cells.
     """
     passed = _reach(occupancy).mul_(1 - occupancy)
-    told = hit * _told(delta_occ, occupancy) + passed * _told(delta_emp, occupancy)
-    return told.sum(-1).clamp_min_(0)
+    information = hit * _information_of(delta_occ, occupancy) + passed * _information_of(delta_emp, occupancy)
+    return information.sum(-1).clamp_min_(0)
 
 
-def _told(delta: float, occupancy: Tensor) -> Tensor:
-    """f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r): finite at 0 and 1."""
+def _information_of(delta: float, occupancy: Tensor) -> Tensor:
+    """Return f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r); finite at 0 and
+    1.
+    """
     clear = 1 - occupancy
     after = (occupancy + clear / delta).log_()
     return after.neg_().sub_(math.log(delta) * clear / (occupancy * delta + clear))
@@ -196,7 +203,7 @@ def check_sigma(sigma: float) -> None:
 
 
 def check_occupancy(occupancy: Tensor) -> Tensor:
-    """The occupancy, if it is (..., C) of probabilities."""
+    """Return the occupancy after checking that it is (..., C) probabilities."""
     if occupancy.ndim < 1 or not occupancy.is_floating_point():
         raise InvalidArgumentError(
             f"occupancy of shape {tuple(occupancy.shape)} and {occupancy.dtype} must be (..., C) of floats."
@@ -207,7 +214,9 @@ def check_occupancy(occupancy: Tensor) -> Tensor:
 
 
 def _ended(occupancy: Tensor, lengths: Tensor | None) -> Tensor:
-    """(..., C + 1): cells beyond a beam's end cleared, and after all one surely occupied, for no hit."""
+    """Return (..., C + 1): cells beyond a beam's end set to 0, and a last cell of occupancy 1 for no
+    return.
+    """
     if lengths is not None:
         cell = torch.arange(occupancy.shape[-1], device=occupancy.device)
         occupancy = torch.where(cell < lengths[..., None], occupancy, 0)

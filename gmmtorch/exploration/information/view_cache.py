@@ -1,4 +1,4 @@
-"""What views are worth, given each other: each is evaluated once a plan."""
+"""ViewCache: values of views during one plan. Each view is evaluated once."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 
 
-class Memory:
-    """What lattice poses are worth, for the length of a plan."""
+class ViewCache:
+    """Values of lattice poses during one plan."""
 
     def __init__(self, task: PlanningTask, evaluator: ViewEvaluator) -> None:
         self._local_map, self._evaluator = task.local_map, evaluator
@@ -20,7 +20,7 @@ class Memory:
         self._gain, self._left = torch.zeros(0, n_blocks), torch.zeros(0, n_blocks)
 
     def rows(self, poses: Tensor) -> Tensor:
-        """Row (V,) of each of poses (V, 4); those not known yet are evaluated in one call."""
+        """Return the row (V,) of each of poses (V, 4); new ones are evaluated in one call."""
         keys = self._evaluator.keys(poses)
         names = [tuple(key) for key in keys.tolist()]
         new = []
@@ -36,15 +36,15 @@ class Memory:
         return torch.tensor([self._row[name] for name in names], dtype=torch.int64)
 
     def marginal(self, rows: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
-        """What views (V,) bring where residuals (V, G) are left, and what they leave, (V, G)."""
+        """Return the gain (V,) of views given residuals (V, G), and the residuals (V, G) after them."""
         return (self._gain[rows] * residuals).sum(1), residuals * self._left[rows]
 
     def measured(self, row: int) -> Tensor:
-        """The share (G,) of what each block has to tell that a view takes."""
+        """Return the share (G,) of each block's information that a view gains."""
         return 1 - self._left[row]
 
     def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses (V, 4) of all that was evaluated, and what each is worth (V,), `residual` (G,) being left."""
+        """Return all evaluated poses (V, 4) and their values (V,) given `residual` (G,)."""
         if not self._keys:
             return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
         return self._evaluator.poses(torch.cat(self._keys)), self._gain @ residual

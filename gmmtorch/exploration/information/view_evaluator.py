@@ -1,10 +1,10 @@
-"""ViewEvaluator: what depth images from many poses are worth, and what one leaves for the next.
+"""ViewEvaluator: the information of depth images from many poses, and what one image leaves for the next.
 
-A view's beams are few, each with a pencil of the field of view around it. A beam's information is shared
-out over the cells it meets, in proportion to the variance o(1 − o) that it is expected to resolve in
-each, and a cell counts by the part of it that the pencil fills. Where beams crowd, close to the
-camera, a cell is thereby shared among them, and where they are far apart one stands for the cells
-between: the value is a sum over cells, whatever the number of beams.
+A view has few beams; each represents a pencil of the field of view. The information of a beam is
+distributed over the cells it meets, in proportion to the variance o(1 − o) that it is expected to
+resolve, and weighted by the part of the cell that the pencil fills. Close to the camera several beams
+share a cell; far away one beam represents several cells. The value is therefore a sum over cells,
+independent of the number of beams.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ BLOCK = 4
 
 INFORMATION = ("csqmi", "fsmi")
 
-_CHUNK_VIEWS = 16  # as many as stay in a core's cache
+_CHUNK_VIEWS = 16  # views that fit in a core's cache
 _WORTHLESS = 1e-4  # cells: a beam that resolves less is left out
-_BEYOND = 1 << 30  # offset of what does not exist
-_IMAGE_ODDS = 100.0  # factor of a cell's odds (FSMI): dozens of an image's pixels see it, not one beam
+_BEYOND = 1 << 30  # offset of cells that do not exist
+_IMAGE_ODDS = 100.0  # factor on a cell's odds (FSMI): dozens of pixels see a cell, not one beam
 
-# A view that has been taken is worth nothing the second time, although it was likely to be blocked before it
-# came to some cells, and although a block is only in part in its field of view: what it did not see is
-# what it cannot see. So a cell counts as measured if it is reached with this probability, and a block
-# if this share of what it still has to tell is.
+# A second image from the same pose gains nothing, even if the first was probably blocked before some
+# cells, and even if a block is only partly in the field of view: the pose cannot see the rest. A cell
+# therefore counts as measured if a beam reaches it with this probability, and a block if this share of
+# its information is gained.
 _REACHED = 0.05
 _SATURATED = 0.25
 
 
 class ViewValues(NamedTuple):
-    """V views of a window of G coarse blocks, in row-major order of the blocks.
+    """Values of V views on a local map of G coarse blocks, in row-major order of the blocks.
 
-    values: (V,) nats. gain: (V, G) float32, where each view's value lies; rows sum to `values`.
-    measured: (V, G) float32 in [0, 1], the share of what each block still has to tell that the view
-    takes. Once others are planned a view is worth gain @ residual, with the product of their 1 − measured.
+    values: (V,) nats. gain: (V, G) float32, the part of the value in each block; rows sum to `values`.
+    measured: (V, G) float32 in [0, 1], the share of each block's remaining information that the view
+    gains. Given other planned views, a view is worth gain @ residual, where residual is the product of
+    their 1 − measured.
     """
 
     values: Tensor
@@ -63,16 +64,16 @@ class ViewValues(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """What windows of n cells of one shape have in common."""
+    """Index tables for all local maps of one shape with n cells."""
 
     shape: tuple[int, ...]
     n_blocks: int
-    block: Tensor  # (n + 1,) int32, coarse block of each cell; the last stands for what lies outside
+    block: Tensor  # (n + 1,) int32, coarse block of each cell; the last is for cells outside
     offsets: Tensor  # (Y, B, C + 1) int32, templates in the flat index
 
 
 class _Window(NamedTuple):
-    """What evaluations of the same local map have in common."""
+    """Data shared by all evaluations of one local map."""
 
     layout: _Layout
     occupancy: Tensor  # (n + 1,) float32
@@ -80,19 +81,21 @@ class _Window(NamedTuple):
 
 
 class ViewEvaluator:
-    """Information of depth images from poses on a lattice: every `stride`th cell's centre, n_yaws headings.
+    """Computes the information of depth images from a lattice of poses: every `stride`-th cell, n_yaws
+    headings.
 
     Args:
-        horizontal_fov, vertical_fov: radians, in (0, π). The camera looks along the heading, pitch 0.
+        horizontal_fov, vertical_fov: radians, in (0, π). The camera looks along the heading with pitch 0.
         max_range: metres along the beam.
-        resolution: side (m) of the cells of the local map.
+        resolution: side of the local map's cells (m).
         information: of a beam, "csqmi" or "fsmi".
-        n_beams: about how many stand for an image.
-        n_yaws: headings.
+        n_beams: approximate number of beams that represent an image.
+        n_yaws: number of headings.
         stride: cells between positions.
-        sigma: standard deviation (m) of a reading (CSQMI).
-        known_free, known_occupied: observed cells below and above are taken for certain: they neither dim
-            what lies behind them nor draw a robot back to what it has seen enough of.
+        sigma: standard deviation of a reading (m), for CSQMI.
+        known_free, known_occupied: observed cells below and above these probabilities count as certain.
+            They do not weaken the beams behind them, and they do not attract a robot to space that it has
+            seen well.
     """
 
     def __init__(
@@ -138,7 +141,7 @@ class ViewEvaluator:
         self._windows: weakref.WeakKeyDictionary[LocalMap, _Window] = weakref.WeakKeyDictionary()
 
     def keys(self, poses: Tensor) -> Tensor:
-        """Lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
+        """Return lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
         if poses.ndim != 2 or poses.shape[1] != 4:
             raise InvalidArgumentError(
                 f"poses have shape {tuple(poses.shape)}; expected (V, 4): x, y, z, yaw."
@@ -147,19 +150,21 @@ class ViewEvaluator:
         place = (poses[:, :3] / self.resolution - 0.5) / self.stride
         if not bool((place.abs() < 2**52).all() & (poses[:, 3].abs() < 2**32).all()):
             raise InvalidArgumentError(
-                "poses must be finite metres and radians, and fewer than 2⁵² cells from the origin."
+                "poses must be finite metres and radians, less than 2⁵² cells from the origin."
             )
         yaw = (poses[:, 3:] * (self.n_yaws / (2 * math.pi))).round().long() % self.n_yaws
         return torch.cat([place.round().long(), yaw], 1)
 
     def poses(self, keys: Tensor) -> Tensor:
-        """Poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
+        """Return poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
         self._check_keys(keys)
         place = (keys[:, :3] * self.stride + 0.5).double() * self.resolution
         return torch.cat([place, keys[:, 3:].double() * (2 * math.pi / self.n_yaws)], 1)
 
     def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
-        """Each view (V, 4) by itself. Beams end at the window's border; a camera outside sees nothing."""
+        """Evaluate each view (V, 4) alone. Beams end at the local map's border; a camera outside sees
+        nothing.
+        """
         self._check_keys(keys)
         window = self._window(local_map)
         shape = torch.tensor(local_map.shape)
@@ -179,7 +184,9 @@ class ViewEvaluator:
         return ViewValues(gain.sum(1), gain, taken.div_(enough).clamp_max_(1))
 
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
-        """What views from poses (M, 4), such as teammates have planned, leave of each block (G,) float32."""
+        """Return the residual (G,) float32 of each block after views from poses (M, 4), such as
+        teammates' plans.
+        """
         return residual_of(self.evaluate(local_map, self.keys(poses)))
 
     def _check_keys(self, keys: Tensor) -> None:
@@ -188,14 +195,14 @@ class ViewEvaluator:
                 f"keys have shape {tuple(keys.shape)} and {keys.dtype}; expected (V, 4) int64, see `keys`."
             )
         if len(keys) and not bool(((keys[:, 3] >= 0) & (keys[:, 3] < self.n_yaws)).all()):
-            raise InvalidArgumentError(f"keys name headings outside 0 … {self.n_yaws - 1}; see `keys`.")
+            raise InvalidArgumentError(f"keys contain headings outside 0 … {self.n_yaws - 1}; see `keys`.")
 
     def _window(self, local_map: LocalMap) -> _Window:
         window = self._windows.get(local_map)
         if window is None:
             if not math.isclose(local_map.resolution, self.resolution, rel_tol=1e-9):
                 raise InvalidArgumentError(
-                    f"The local_map have cells of {local_map.resolution} m, the evaluator of "
+                    f"The local map has cells of {local_map.resolution} m, but the evaluator has "
                     f"{self.resolution} m; give both the same resolution."
                 )
             if self._layout is None or self._layout.shape != local_map.shape:
@@ -205,9 +212,7 @@ class ViewEvaluator:
 
     def _laid_out(self, shape: tuple[int, ...]) -> _Layout:
         if math.prod(shape) >= _BEYOND:
-            raise InvalidArgumentError(
-                f"A window of {shape} cells is too large; views see at most 2³⁰ cells."
-            )
+            raise InvalidArgumentError(f"A local map of {shape} cells is too large; the limit is 2³⁰ cells.")
         _, ny, nz = shape
         counts = [-(-n // BLOCK) for n in shape]
         x, y, z = (torch.arange(n, dtype=torch.int32) // BLOCK for n in shape)
@@ -226,7 +231,7 @@ class ViewEvaluator:
         return _Window(layout, occupancy, unresolved)
 
     def _lengths_within(self, cameras: Tensor, template: Tensor, shape: Tensor) -> Tensor:
-        """Cells (V, B) that each beam has before it leaves the window; none if the camera is outside."""
+        """Return the number of cells (V, B) of each beam inside the local map; 0 if the camera is outside."""
         lengths = self._lengths.take(template)
         for axis in range(3):
             below = cameras[:, axis]
@@ -242,7 +247,7 @@ class ViewEvaluator:
     def _blocks(
         self, window: _Window, yaw: Tensor, base: Tensor, template: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Gain and variance taken, (v, G) each, of a few views."""
+        """Return the gain and the resolved variance, (v, G) each, of a few views."""
         layout, n_cells = window.layout, len(window.occupancy) - 1
         cell = layout.offsets.index_select(0, yaw).add_(base[:, None, None])
         if bool((lengths < self._lengths.take(template)).any()):
@@ -250,7 +255,7 @@ class ViewEvaluator:
         cell = cell.clamp_max_(n_cells).view(-1, cell.shape[-1])  # (N, C + 1), N beams
         template = template.reshape(-1)
         occupancy = window.occupancy.index_select(0, cell.view(-1)).view(cell.shape)
-        occupancy[:, -1] = 1  # so that what is left of a beam ends there: the reading without a hit
+        occupancy[:, -1] = 1  # the rest of a beam ends there: a reading without a hit
         hit = first_block(occupancy)
         resolved = (1 - occupancy).mul_(hit)  # o (1 − o) of each cell, if it is reached
         total = resolved.sum(1)
@@ -268,12 +273,12 @@ class ViewEvaluator:
         block = layout.block.index_select(0, cell.view(-1)).view(cell.shape)
         block = block.add_((beams // self.n_beams * layout.n_blocks).int()[:, None]).view(-1)
         size = len(yaw) * layout.n_blocks
-        gain = torch.bincount(block, gain.view(-1), size).to(gain)  # of no beam at all, counts of integers
+        gain = torch.bincount(block, gain.view(-1), size).to(gain)  # without beams bincount returns integers
         taken = torch.bincount(block, taken.view(-1), size).to(taken)
         return gain.view(len(yaw), -1), taken.view(len(yaw), -1)
 
     def _information(self, hit: Tensor, occupancy: Tensor, template: Tensor) -> Tensor:
-        """Nats (N,) that each beam tells, by its first hits (N, C + 1)."""
+        """Return the information (N,) of each beam in nats, from its first hits (N, C + 1)."""
         if self.information == "fsmi":
             return shannon(hit, occupancy, _IMAGE_ODDS, 1 / _IMAGE_ODDS)
         kernel = self._kernel.index_select(1, template)
@@ -281,10 +286,10 @@ class ViewEvaluator:
 
 
 def residual_of(values: ViewValues) -> Tensor:
-    """What is left of each block (G,) after all of several views: the product of 1 − measured."""
+    """Return the residual of each block (G,) after several views: the product of 1 − measured."""
     return (1 - values.measured).prod(0)
 
 
 def _with_end(cells: Tensor, value: float = 0) -> Tensor:
-    """(..., C) with one more for the reading without a hit."""
+    """Append a cell for the reading without a hit to (..., C)."""
     return torch.cat([cells, torch.full_like(cells[..., :1], value)], -1)

@@ -1,8 +1,8 @@
-"""Safety: where a robot's body fits by what is known, and which paths stay there and keep clear of others.
+"""Collision checking: where a robot's body fits in the known free space, and which paths are safe.
 
-The robot is a sphere. A cell is passable if the robot, its centre anywhere in the cell, touches no cell
-that is not known to be free, and half a cell is kept besides: so a path whose points every cell's width
-are in passable cells is safe in between, too.
+The robot is a sphere. A cell is passable if a robot with its centre anywhere in the cell touches only
+cells that are known to be free, with a margin of half a cell. A path is therefore safe between checked
+points if points one cell apart are in passable cells.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ __all__ = [
 ]
 
 _SPACING = 1.0
-"""Cells between the points at which a path is checked; half of it is kept around the body besides."""
+"""Cells between the checked points of a path; half of it is the margin around the body."""
 _FINE_SPACING = 0.25
-"""The same for a robot that has to leave where it does not fit: there is no room to spare."""
+"""The same for a robot that leaves a place where it does not fit, and has little room."""
 _STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
-"""A cell with so many hits that are so large a share of its rays holds something, however thin: a rail of a
-twentieth of a cell's width is hit by no more of them."""
+"""A cell with at least this many hits and this share of hits among its rays is an obstacle. A rail of a
+twentieth of a cell's width is hit by no larger share."""
 _ROUNDING = 1e-9
 _CHUNK_PAIRS = 1 << 22
 
 
 def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
-    """Cells (nx, ny, nz), bool, in which a sphere's centre may not be: somewhere in such a cell the
-    sphere of `radius` metres reaches into a blocked cell. All that lies outside is blocked.
+    """Return cells (nx, ny, nz), bool, in which the centre of a sphere of `radius` metres may not be.
 
-    Cells i, j, k apart are so if Σ max(|i| − 1, 0)² < (radius / resolution)²: a union of boxes, and a
-    box is one axis after the other.
+    A sphere centred somewhere in such a cell reaches into a blocked cell. Cells outside the array are
+    blocked. A cell at offset (i, j, k) from a blocked cell is included if Σ max(|i| − 1, 0)² < (radius /
+    resolution)². That set is a union of boxes; each box is computed one axis after the other.
     """
     check_resolution(resolution)
     if not (math.isfinite(radius) and radius > 0):
@@ -64,12 +64,12 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
 
 
 def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
-    """Cells (nx, ny, nz), bool, in which the centre of a robot may be that knows these to be free."""
+    """Return cells (nx, ny, nz), bool, in which the centre of a robot may be, given the free cells."""
     return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
 
 
 def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
-    """Cells (K, 3) int64 of the lattice that lie wholly in a sphere, centre (3,) and radius in metres."""
+    """Return lattice cells (K, 3) int64 that lie entirely in a sphere; centre (3,) and radius in metres."""
     axes, squares = [], []
     for x in center.tolist():
         index = torch.arange(math.floor((x - radius) / resolution), math.floor((x + radius) / resolution) + 1)
@@ -95,17 +95,18 @@ def local_map_of(
     known_free: Tensor | None = None,
     obstacles: Tensor | None = None,
 ) -> LocalMap:
-    """What a planner reads, from the hits H and misses M of dense cells (nx, ny, nz).
+    """Build the planner's local map from the hits H and misses M of dense cells (nx, ny, nz).
 
-    The map's occupancy is θ = (H + N_p)/(H + M + 2N_p), the planner's (H + 2N_p π)/(H + M + 2N_p). A cell
-    is free if observed with θ below `free_below` and hardly ever hit, or if it is known to be free.
+    The map's occupancy is θ = (H + N_p)/(H + M + 2N_p); the planner's is (H + 2N_p π)/(H + M + 2N_p). A
+    cell is free if it is observed, θ is below `free_below`, and few of its rays are hits; or if it is in
+    `known_free`.
 
     Args:
-        low: (3,) int64, index of the lowest cell on the lattice. resolution: side (m) of the cells.
-        prior: N_p, rays. planning_prior: π, the planner's occupancy of what was not observed.
-        radius: of the robot (m). known_free: (K, 3) int64, cells of the lattice; those of a sphere of
-            √3 (radius + 5/2 resolution) or more make the cell of its centre passable.
-        obstacles: (C, 3) int64, cells of the lattice that are not free whatever is known of them.
+        low: (3,) int64, lattice index of the lowest cell. resolution: side of a cell (m).
+        prior: N_p, rays. planning_prior: π, the planner's occupancy of unobserved cells.
+        radius: of the robot (m). known_free: (K, 3) int64, lattice cells known to be free; a sphere of them
+            with radius √3 (radius + 5/2 resolution) or more makes the cell of its centre passable.
+        obstacles: (C, 3) int64, lattice cells that are never free.
     """
     for name, value in (("planning_prior", planning_prior), ("free_below", free_below)):
         if not 0 < value < 1:
@@ -140,19 +141,19 @@ def feasible(
     start: Tensor | None = None,
     radius: float | None = None,
 ) -> Tensor:
-    """Which (...,) paths are safe: states (..., S, 7), and states (..., B, 7) on the way to rest after them.
+    """Flag (...,) the safe paths: states (..., S, 7), followed by braking states (..., B, 7) until rest.
 
-    Every point of a path must be in passable cells and clear of the peers (see `clear_of`). A path that
-    never moves, to turn in place or wait, is always feasible.
+    Every point of a safe path is in a passable cell and clear of the peers (see `clear_of`). A path that
+    does not move, such as a turn in place or a wait, is always safe.
 
-    A robot whose own cell has become impassable, as the map changes, may leave it where `start` and
-    `radius` are given. Its body, exactly where it is and not anywhere in its cell, then may touch no
-    cell that is not free, except those that it touches at the start; and it moves away from every point
-    of those: (x − x₀)·(q − x₀) ≤ 0. So nothing known comes closer than it is, or than the body's radius.
+    The map may change so that the robot's own cell is no longer passable. The robot may leave that cell
+    if `start` and `radius` are given. Its body, at its exact position, may then touch only free cells and
+    the cells that it touches at the start, and it must move away from every point q of those: (x − x₀)·(q
+    − x₀) ≤ 0. So no known obstacle comes closer than it is at the start, or than the radius.
 
     Args:
-        start: (..., 7) or what broadcasts to that: the states before the first step. Without it the way to
-            the first state is not checked.
+        start: (..., 7) or broadcastable: the states before the first step. Without it the way to the
+            first state is not checked.
         radius: of the robot (m).
     """
     states = torch.cat([rollout, braking], -2)
@@ -177,7 +178,7 @@ def feasible(
 
 
 def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
-    """Boxes of offsets up to (i, j, k) whose union is all with Σ max(|·| − 1, 0)² < square, by rising i."""
+    """Return boxes of offsets up to (i, j, k), by rising i, whose union is Σ max(|·| − 1, 0)² < square."""
 
     def largest(rest: float) -> int:
         return math.ceil(math.sqrt(rest)) - 1
@@ -194,10 +195,10 @@ def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
 
 
 def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
-    """Cells with a blocked one up to `cells` away along an axis; not to be trusted that near the ends."""
+    """Return cells with a blocked cell within `cells` along an axis; invalid that close to the ends."""
     size, done = blocked.shape[axis], 0
     while done < cells:
-        shift = min(2 * done + 1, cells - done)  # what is covered so far is 2 · done + 1 wide
+        shift = min(2 * done + 1, cells - done)  # 2 · done + 1 cells are covered so far
         wider = blocked.clone()
         wider.narrow(axis, shift, size - shift).logical_or_(blocked.narrow(axis, 0, size - shift))
         wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
@@ -206,10 +207,11 @@ def _widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
 
 
 def _points_along(states: Tensor, spacing: float) -> Tensor:
-    """Points (..., n, 3) along paths (..., L, 7), from which no point of the paths is over spacing / 2 away.
+    """Sample points (..., n, 3) of paths (..., L, 7), so that every point of a path is within spacing / 2
+    of one.
 
-    The first state is left out. Steps are taken for straight; an arc of chord c that turns by φ bends away
-    from it by c φ/8.
+    The first state is left out. Steps are treated as straight; an arc of chord c that turns by φ deviates
+    from its chord by c φ/8.
     """
     place, yaw = states[..., :3], states[..., 3]
     step = place[..., 1:, :] - place[..., :-1, :]
@@ -220,14 +222,16 @@ def _points_along(states: Tensor, spacing: float) -> Tensor:
     if room <= 0:
         raise InvalidArgumentError(
             f"Steps of {longest:.3g} m and {turn:.3g} rad are too long to be checked in cells of "
-            f"{spacing:.3g} m; take a shorter step, or coarser cells."
+            f"{spacing:.3g} m; use a shorter step or coarser cells."
         )
     n = max(1, math.ceil(longest / room))
     return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
 
 
 def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) -> Tensor:
-    """Which (P,) of paths (P, L, 7) from a point (3,) lead away from all that the body touches there."""
+    """Flag (P,) the paths (P, L, 7) from a point (3,) that lead away from every cell the body touches
+    there.
+    """
     resolution = local_map.resolution
     if not bool(local_map.flat_index(here)[1]):
         return torch.zeros(len(states), dtype=torch.bool)
@@ -253,7 +257,9 @@ def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) ->
 def _touched(
     points: Tensor, blocked: Tensor, low: Tensor, resolution: float, radius: float
 ) -> tuple[Tensor, Tensor]:
-    """Rows (T,) of points (N, 3) and cells (T, 3), relative to `low`, that spheres around them reach into."""
+    """Return rows (T,) of points (N, 3) and the blocked cells (T, 3), relative to `low`, in spheres
+    around them.
+    """
     reach = math.ceil(radius / resolution)
     offset = torch.arange(-reach, reach + 1)
     cell = (points / resolution).floor().long()

@@ -1,4 +1,4 @@
-"""Coordination: who plans when, and which of the others' plans each robot respects (thesis 4.3)."""
+"""Coordination: the order in which robots plan, and the plans that each robot considers (thesis 4.3)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COORDINATIONS = ("myopic", "greedy", "distributed_greedy", "random_partition")
 
 
 class Valued(Protocol):
-    """What is planned: all that counts here is what it is expected to bring."""
+    """A plan with an expected value."""
 
     @property
     def value(self) -> float: ...
@@ -23,13 +23,15 @@ P = TypeVar("P", bound=Valued)
 
 
 class Coordination:
-    """A rule by which robots agree on their plans.
+    """The rule by which the robots of a team plan together.
 
-    "myopic": each plans as if it were alone. "greedy": one after the other, each given all plans before;
-    where what plans bring together is monotone and submodular, at least half of the optimum. The others
-    take `n_rounds` rounds, in each of which robots plan at the same time, given the plans of the rounds
-    before: in "random_partition" each robot plans in a round drawn for it; in "distributed_greedy" all who
-    are left plan in every round, and those with the best plans are settled, an equal share in each.
+    "myopic": each robot plans as if it were alone. "greedy": robots plan one after the other, and each
+    considers all earlier plans; if the joint value is monotone and submodular, the result is at least
+    half of the optimum. The other rules take `n_rounds` rounds. In a round robots plan at the same time
+    and consider the plans of the
+    rounds before. "random_partition": each robot plans in one random round. "distributed_greedy": all
+    remaining robots plan in every round, and an equal share of them, those with the best plans, keep
+    their plans.
     """
 
     def __init__(self, name: str = "greedy", n_rounds: int = 3) -> None:
@@ -39,10 +41,9 @@ class Coordination:
         self.n_rounds = check_whole("n_rounds", n_rounds, 1)
 
     def rounds(self, n_robots: int, generator: torch.Generator) -> list[list[int]]:
-        """Who plans in each round, of robots 0 … n_robots − 1; rounds of nobody are left out.
+        """Return the robots, of 0 … n_robots − 1, that plan in each round, without empty rounds.
 
-        In "distributed_greedy" who plans again depends on the plans: everyone, in the first round, is all
-        that is known before.
+        In "distributed_greedy" the later rounds depend on the plans, so only the first round is returned.
         """
         everyone = list(range(n_robots))
         if self.name == "greedy":
@@ -57,10 +58,10 @@ class Coordination:
     def coordinate(
         self, robots: Iterable[int], plan: Callable[[int, dict[int, P]], P], generator: torch.Generator
     ) -> dict[int, P]:
-        """The plan of each robot, in the order in which they were settled.
+        """Return the plan of each robot, in the order in which the plans were fixed.
 
         Args:
-            plan: the plan of a robot given the plans that it shall respect, of robots by number.
+            plan: called with a robot and the plans of other robots that it must consider; returns its plan.
         """
         team = list(robots)
         if self.name == "distributed_greedy":
@@ -76,7 +77,9 @@ class Coordination:
         left = team
         for k in range(self.n_rounds):
             found = {robot: plan(robot, dict(settled)) for robot in left}
-            best = sorted(left, key=lambda robot: -found[robot].value)  # the first of equals first
+            best = sorted(
+                left, key=lambda robot: -found[robot].value
+            )  # stable: the first of equals comes first
             best = best[: -(-len(left) // (self.n_rounds - k))]
             settled.update((robot, found[robot]) for robot in best)
             left = [robot for robot in left if robot not in best]

@@ -1,4 +1,4 @@
-"""Frontiers: where known free space meets the unknown, and the planner that goes there (Yamauchi 1997)."""
+"""Frontiers, where known free space meets unknown space, and the planner that visits them (Yamauchi 1997)."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from gmmtorch.exploration.robot.local_map import LocalMap
 
 _COARSE = 2
 _SAMPLES = 24  # of a line of sight
-_TURNING = 0.3  # metres that a radian counts for
-_TRIES = 3  # goals that may turn out to be out of reach in one plan
-_GLANCE = 9  # coarse cells along the side of a frontier that is seen at one glance
-_MOST = 20  # clusters looked at in a plan
-_CLOSEST, _FARTHEST = 1.5, 3.0  # metres, level, from which a robot looks at a frontier
-_SAME = 1.0  # metres between the targets of a frontier, before and after it was looked at
-_ABOUT = 2.0  # metres around a remembered frontier within which one must be left
+_TURNING = 0.3  # metres that a radian of turning costs
+_TRIES = 3  # unreachable goals that one plan may try
+_GLANCE = 9  # coarse cells along the side of a frontier that one view covers
+_MOST = 20  # clusters considered in a plan
+_CLOSEST, _FARTHEST = 1.5, 3.0  # horizontal distances (m) from which a robot looks at a frontier
+_SAME = 1.0  # metres between targets that belong to the same frontier
+_ABOUT = 2.0  # metres around a remembered frontier within which a frontier must still exist
 
 
 class Frontiers(NamedTuple):
     """K clusters of frontier cells that a robot can look at.
 
-    poses: (K, 4), the nearest place to see each from, towards it. targets: (K, 3), its cell in the middle.
-    sizes: (K,) cells. metres: (K,) from the robot to the place.
+    poses: (K, 4), the nearest pose that sees each cluster. targets: (K, 3), the middle cell of the cluster.
+    sizes: (K,) cells. metres: (K,) distance from the robot to the pose.
     """
 
     poses: Tensor
@@ -43,7 +43,9 @@ class Frontiers(NamedTuple):
 
 
 def frontier_cells(local_map: LocalMap) -> Tensor:
-    """Free cells (nx, ny, nz) bool with a face to one that is neither observed nor free."""
+    """Return free cells (nx, ny, nz), bool, that share a face with a cell that is neither observed nor
+    free.
+    """
     unknown = ~(local_map.observed | local_map.free)
     beside = torch.zeros_like(unknown)
     for axis in range(3):
@@ -56,11 +58,11 @@ def frontier_cells(local_map: LocalMap) -> Tensor:
 def find_frontiers(
     local_map: LocalMap, start: Tensor, exhausted: Tensor, least: int, elevation: float
 ) -> Frontiers:
-    """Clusters of at least so many cells that a robot at `start` (3,) can look at, the most promising first.
+    """Find clusters of at least `least` cells that a robot at `start` (3,) can look at, most promising first.
 
     Args:
-        exhausted: (E, 3), targets that did not go away when looked at; cells within a metre do not count.
-        elevation: radians above or below the camera up to which it can look at a target.
+        exhausted: (E, 3), targets that remained after a look; cells within a metre of them are ignored.
+        elevation: largest angle (rad) above or below the camera at which it can see a target.
     """
     distances = DistanceField.to(local_map, start[None], coarse=_COARSE)
     cells = frontier_cells(local_map).nonzero()
@@ -104,9 +106,9 @@ def find_frontiers(
 
 
 def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Of each coarse frontier cell (n,), by `counts`: which cluster it is of, and its middle (n, 3).
+    """Return the cluster (n,) and the middle (n, 3) of each coarse frontier cell with a positive count.
 
-    Connected cells are one frontier, cut by a lattice of cubes small enough to be seen at one glance.
+    A cluster is a connected set of cells, cut by a lattice of cubes that one view covers.
     """
     labels, _ = ndimage.label(counts.numpy() > 0, structure=np.ones((3, 3, 3)))
     cells = (counts > 0).nonzero()
@@ -118,7 +120,7 @@ def _parts(distances: DistanceField, counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sees(local_map: LocalMap, places: Tensor, target: Tensor) -> Tensor:
-    """Whether all between places (N, 3) and just before a target (3,) is free."""
+    """Flag (N,) the places (N, 3) with only free cells on the way to just before a target (3,)."""
     share = torch.linspace(0, 1, _SAMPLES + 1, dtype=torch.float64)[:-1, None]
     points = places[:, None] + share * (target - places)[:, None]
     flat, inside = local_map.flat_index(points)
@@ -130,15 +132,16 @@ def _middles(distances: DistanceField, cells: Tensor) -> Tensor:
 
 
 class FrontierPlanner:
-    """Goes to the frontier of the largest size/(1 + distance) and looks at it; keeps to one while it lasts.
+    """Flies to the frontier with the largest size/(1 + distance), looks at it, and stays with it while it
+    exists.
 
-    Frontiers left behind are remembered in the view library, their values the sizes, for when the window
-    shows no other.
+    The view library stores the other frontiers with their sizes as values. The robot uses them when its
+    window contains no frontier.
 
     Args:
-        least: cells of the smallest frontier. largest: cells from which on more do not count.
+        least: cells of the smallest frontier. largest: sizes above it count as this size.
         loyalty: factor by which another frontier must be better than the present one.
-        elevation: radians above or below the camera up to which it can look at a frontier.
+        elevation: largest angle (rad) above or below the camera at which it can see a frontier.
     """
 
     def __init__(
@@ -175,7 +178,7 @@ class FrontierPlanner:
         return self._waiting.plan(task)
 
     def _choose(self, task: PlanningTask, found: Frontiers) -> str:
-        """Settle where to go; returns the kind of plan."""
+        """Choose the goal; returns the kind of plan."""
         here = task.local_map
         if len(self._exhausted):
             left = torch.cdist(found.targets, self._exhausted).amin(1) >= _SAME
@@ -205,13 +208,13 @@ class FrontierPlanner:
         return "explore"
 
     def _give_up(self, targets: Tensor) -> None:
-        """Never again go to targets (N, 3): they were looked at, or cannot be got to."""
+        """Exclude targets (N, 3) that were looked at or cannot be reached."""
         self._exhausted = torch.cat([self._exhausted, targets])
         if bool(((targets - self._target).norm(dim=1) < _SAME).any()):
             self._journey = None
 
     def _forget(self, task: PlanningTask, found: Frontiers) -> None:
-        """Remove what the library remembers in the window, where no frontier is left."""
+        """Remove views inside the window from the library if no frontier is left near them."""
         known = task.library.candidates()
         inside = task.local_map.is_passable(known.poses[:, :3])
         if len(found.poses):

@@ -1,4 +1,4 @@
-"""Geodesic distance: how far it is to a goal through space that is known to be free."""
+"""Geodesic distance to a goal through space that is known to be free."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from gmmtorch.exploration.robot.local_map import LocalMap
 from gmmtorch.occupancy.grid import check_resolution
 
 _AROUND = list(itertools.product((-1, 0, 1), repeat=3))
-_CHECK_EVERY = 4  # rounds of the wave between two looks whether it still moves
+_CHECK_EVERY = 4  # rounds of the wave between two convergence checks
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceField:
-    """Metres (nx, ny, nz) float32 to the nearest goal from the cells of a coarse lattice; inf: no way.
+    """Distances to the nearest goal on a coarse lattice.
 
-    origin: (3,) metres, world frame, the lattice's lowest corner; spacing: side (m) of its cells.
+    metres: (nx, ny, nz) float32; inf if a cell has no way to a goal. origin: (3,) metres, world frame, the
+    lattice's lowest corner. spacing: side of its cells (m).
     """
 
     origin: Tensor
@@ -33,9 +34,9 @@ class DistanceField:
     def to(
         cls, local_map: LocalMap, goals: Tensor, offsets: Tensor | None = None, coarse: int = 2
     ) -> DistanceField:
-        """The distance to the nearest of goals (M, 3), metres; `offsets` (M,): what remains beyond each.
+        """Compute the distance to the nearest of goals (M, 3), metres; `offsets` (M,) are added to each goal.
 
-        Goals outside the window do not count; where none is inside, all is inf.
+        Goals outside the local map are ignored. Without a goal inside, all distances are inf.
         """
         _, inside = local_map.flat_index(goals)
         cells = local_map.cells_of(goals[inside])
@@ -50,14 +51,18 @@ class DistanceField:
         return cls(origin, coarse * local_map.resolution, metres)
 
     def at(self, points: Tensor) -> Tensor:
-        """Metres (...,) float64 from points (..., 3): the least of going on from the cell that holds
-        one or from any of its 26 neighbours, so that a point between passable cells has a way, too."""
+        """Return metres (...,) float64 from points (..., 3).
+
+        It is the smallest value over the cell of a point and its 26 neighbours, so that a point between
+        passable cells also has a way.
+        """
         return self._entry(points)[0]
 
     def way(self, points: Tensor, n_cells: int) -> tuple[Tensor, Tensor]:
-        """As `at`, and where the shortest way from points (..., 3) has got to after as many cells, (..., 3).
+        """Return the metres of `at`, and the points (..., 3) reached after `n_cells` cells of the
+        shortest way.
 
-        Where there is no way, that is the point itself.
+        Without a way, the reached point is the point itself.
         """
         metres, cell = self._entry(points)
         for _ in range(n_cells - 1):
@@ -68,7 +73,9 @@ class DistanceField:
         return metres, torch.where(torch.isfinite(metres)[..., None], there, points)
 
     def _entry(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Metres (...,) from points, and the flat index (...,) of the cell that each goes to first."""
+        """Return metres (...,) from points, and the flat index (...,) of the first cell on the way of
+        each.
+        """
         size = torch.tensor(self.metres.shape, device=points.device)
         steps = torch.tensor(_AROUND, device=points.device)
         cell = ((points - self.origin) / self.spacing).floor().long().unsqueeze(-2) + steps
@@ -140,7 +147,7 @@ def geodesic(
 
 
 def coarsened(passable: Tensor, coarse: int) -> Tensor:
-    """Cells (⌈n/coarse⌉, …) bool of which at least half are passable."""
+    """Return coarse cells (⌈n/coarse⌉, …), bool, at least half of which is passable."""
     if coarse == 1:
         return passable.clone()
     count = passable.to(torch.int16)
@@ -156,10 +163,10 @@ def coarsened(passable: Tensor, coarse: int) -> Tensor:
 
 
 def _wave(open_cells: Tensor, start: Tensor) -> Tensor:
-    """Least number of cell widths to each cell: the wave spreads from `start` until it rests.
+    """Return the smallest number of cell widths to each cell: a wave spreads from `start` until it converges.
 
-    The least over the 26 neighbours is taken axis by axis: that of the edges from that of the faces,
-    that of the corners from that of the edges. Cells lie in one padded row, so a shift is a slice.
+    The minimum over the 26 neighbours is computed axis by axis: edges from faces, corners from edges.
+    Cells lie in one padded row, so that a shift is a slice.
     """
     inside = (slice(1, -1),) * 3
     shape = tuple(n + 2 for n in open_cells.shape)

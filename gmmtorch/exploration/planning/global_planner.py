@@ -1,4 +1,4 @@
-"""Journey: the way to a far view, through the window and beyond it."""
+"""Journey: the way to a distant view, through the local map and beyond it."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from gmmtorch.exploration.planning.goal import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.roadmap import at_the_rim
 
-_REFRESHED = 10.0  # seconds that a way over the roadmap is relied on
-_PATIENCE = 12.0  # seconds without coming closer, after which a robot gives up
-_CLOSER = 0.5  # metres that count as closer
-_THERE = 1.2  # metres from the goal
-_FACING = 0.7  # radians off its heading
+_REFRESHED = 10.0  # seconds after which the way over the roadmap is computed again
+_PATIENCE = 12.0  # seconds without progress after which a robot gives up
+_CLOSER = 0.5  # metres that count as progress
+_THERE = 1.2  # metres from the goal at which the robot has arrived
+_FACING = 0.7  # radians off the goal's heading at which the robot has arrived
 
 
 def looks(state: Tensor, poses: Tensor) -> Tensor:
-    """Whether (...,) a robot in a state (7,) is where poses (..., 4) are, as good as, and looks their way."""
+    """Flag (...,) the poses (..., 4) that a robot in a state (7,) has reached, position and heading."""
     off = torch.remainder(state[3] - poses[..., 3] + math.pi, 2 * math.pi) - math.pi
     return ((state[:3] - poses[..., :3]).norm(dim=-1) < _THERE) & (off.abs() < _FACING)
 
 
 class Journey:
-    """To a view `pose` (4,) worth `value`, `metres` away at the start; `since`: when it last came closer (s).
+    """A journey to a view `pose` (4,) with a `value`, `metres` away at the start.
 
-    Over the roadmap the distance to the goal is known at its nodes; in the window it is worked out cell by
-    cell, from the goal if it is inside, and from the nodes at the window's rim, each with what remains
-    beyond it.
+    `since` is the time (s) of the last progress. The roadmap gives the distance from its nodes to the
+    goal. Inside the local map the distance is computed cell by cell, from the goal if it is inside, and
+    from the nodes near the border, each with its remaining distance.
     """
 
     def __init__(self, pose: Tensor, value: float, metres: float, now: float) -> None:
@@ -41,9 +41,10 @@ class Journey:
 
     @classmethod
     def chosen(cls, task: PlanningTask, least: float, given_up: Tensor | None = None) -> Journey | None:
-        """To the view of the library with the largest value/(1 + metres), which is taken out of it.
+        """Start a journey to the view of the library with the largest value/(1 + metres), and remove that
+        view.
 
-        None if none worth `least` can be reached; views close to those of `given_up` (N, 4) do not count.
+        Returns None if no view worth `least` can be reached. Views close to `given_up` (N, 4) are ignored.
         """
         known = task.library.candidates()
         if not known.ids:
@@ -59,11 +60,11 @@ class Journey:
         return cls(known.poses[row], float(known.values[row]), float(metres[row]), task.now)
 
     def put_back(self, task: PlanningTask) -> None:
-        """Leave the view to whoever comes by."""
+        """Return the view to the library."""
         task.library.add(self.pose[None], torch.tensor([self.value]), task.now, 0.0)
 
     def goal(self, task: PlanningTask, weight: float) -> Goal | None:
-        """Where to go from here; None if the robot is there, or comes no closer."""
+        """Return the goal of the next motion; None if the robot has arrived or makes no progress."""
         if bool(looks(task.state, self.pose)):
             return None
         goal = Goal(self._field(task), weight, float(self.pose[3]))

@@ -1,4 +1,4 @@
-"""Where a robot is to go, and what is left of the way from any state."""
+"""Goal of a robot, and the cost that remains from any state."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from torch import Tensor
 
 from gmmtorch.exploration.planning.geodesic import DistanceField
 
-_NEAR = 1.0  # metres of level way within which a robot turns to look as the goal asks
-_AHEAD = 3  # cells of the distance field that a robot looks along its way
+_NEAR = 1.0  # horizontal metres from the goal within which a robot turns to the goal's heading
+_AHEAD = 3  # cells of the distance field along which the direction of the way is measured
 
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Where to go, and what a metre on the way there is worth.
+    """A goal and the value of a metre of progress towards it.
 
-    distances: to the goal. yaw: heading to look along once there; None: any. weight: return of a metre.
-    turning: metres that a radian off the way counts for.
+    distances: to the goal. yaw: heading at the goal; None: any. weight: value of a metre of progress.
+    turning: metres that a radian off the direction of the way costs.
     """
 
     distances: DistanceField
@@ -28,9 +28,10 @@ class Goal:
     turning: float = 1.25
 
     def cost(self, states: Tensor) -> Tensor:
-        """Metres (...,) left from states (..., 7): the way, the turn into it, and that to the goal's yaw.
+        """Remaining cost (...,) in metres from states (..., 7): the way, the turn into it, the turn to
+        the goal's yaw.
 
-        Close to the goal, and straight above or below it, only the last turn counts.
+        Close to the goal, and directly above or below it, only the last turn counts.
         """
         points, yaw = states[..., :3], states[..., 3]
         metres, there = self.distances.way(points, _AHEAD)
@@ -44,5 +45,5 @@ class Goal:
 
 
 def _angle(radians: Tensor) -> Tensor:
-    """The size of angles, at most half a turn."""
+    """Absolute angles, wrapped to at most π."""
     return (torch.remainder(radians + math.pi, 2 * math.pi) - math.pi).abs()

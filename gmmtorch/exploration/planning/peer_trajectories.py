@@ -1,4 +1,4 @@
-"""PeerTrajectories: where the other robots have committed to be, and which paths keep clear of them."""
+"""PeerTrajectories: the committed paths of the other robots, and which paths keep clear of them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _MOST_STEPS = 1000
 class PeerTrajectories:
     """Committed paths of other robots.
 
-    paths: (M, T, 3) float64, metres, world frame: each robot's position after 1, 2, …, T ≥ 1 steps of the
-    planner's own paths; it rests at the last from then on.
+    paths: (M, T, 3) float64, metres, world frame: each robot's position after 1, 2, …, T ≥ 1 planner
+    steps. Each robot rests at its last position afterwards.
     separation: least distance (m) between the centres of two robots: two radii and a margin.
     """
 
@@ -39,7 +39,7 @@ class PeerTrajectories:
 
     @classmethod
     def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> PeerTrajectories:
-        """PeerTrajectories on paths (T_i, 3) of any lengths, at least one position each."""
+        """Build from paths (T_i, 3) of any lengths, at least one position each."""
         longest = max((len(path) for path in paths), default=1)
         padded = [path[torch.arange(longest).clamp_max(len(path) - 1)] for path in paths]
         return cls(torch.stack(padded) if padded else torch.zeros(0, 1, 3, dtype=torch.float64), separation)
@@ -48,23 +48,23 @@ class PeerTrajectories:
         return len(self.paths)
 
     def later(self, steps: int) -> PeerTrajectories:
-        """The peers for a path that begins that many steps from now."""
+        """Return the peers as seen by a path that begins that many steps from now."""
         return PeerTrajectories(self.paths[:, min(steps, self.paths.shape[1] - 1) :], self.separation)
 
 
 def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None) -> Tensor:
-    """Which (...,) of paths (..., L, 3), positions after 1, 2, …, L steps, keep clear of the peers.
+    """Flag (...,) the paths (..., L, 3), positions after 1, 2, …, L steps, that keep clear of the peers.
 
-    After step L a robot stays where it is. At step k its distance from another robot must be at least the
-    separation, plus how far that robot is from its place at step k one step earlier and later, plus half
-    of this robot's own longer step before or after: so they are clear in between, too, and if the other
-    robot is up to half a step early or late. With `start` (..., 3), where the path begins, a robot that is
-    too close already may move, as long as it is at no step closer than it would be by staying.
+    After step L the robot stays. At step k its distance from another robot must be at least the
+    separation, plus the longer step of that robot before or after step k, plus half of its own longer
+    step. The robots are then also clear between steps, and if the other robot is up to half a step early
+    or late. With `start` (..., 3), the position before the first step, a robot that is already too close
+    may move if it is never closer than it would be by staying.
     """
     if len(peers) == 0:
         return torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
     n_path, n_traffic = path.shape[-2], peers.paths.shape[1]
-    # After the shorter of the two ends, one robot rests.
+    # One robot rests after the shorter path ends.
     n = max(n_path, n_traffic)
     there = peers.paths[:, torch.arange(n).clamp_max(n_traffic - 1)]
     least = peers.separation + _longer_step(there)
@@ -99,7 +99,9 @@ def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
 
 
 def _longer_step(path: Tensor) -> Tensor:
-    """Metres (..., L) from each position of paths (..., L, 3) to the farther of its neighbours in time."""
+    """Return metres (..., L) from each position of paths (..., L, 3) to the farther of its neighbours in
+    time.
+    """
     step = (path[..., 1:, :] - path[..., :-1, :]).norm(dim=-1)
     pad = torch.nn.functional.pad
     return torch.maximum(pad(step, (0, 1)), pad(step, (1, 0)))

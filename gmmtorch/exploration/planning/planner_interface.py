@@ -1,4 +1,4 @@
-"""What every planner is asked, and what it answers."""
+"""The interface of planners: the task, the plan, and the feasible motion primitives."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.local_map import LocalMap
 
 LEAST = 0.05
-"""Metres of a way that leads anywhere."""
+"""Smallest displacement (m) that counts as motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningTask:
-    """What a robot knows when it plans.
+    """The input of a planner.
 
-    robot: its number. state: (7,), where it will be when the plan begins. peers: of the others.
-    residual: (G,) float32, information that teammates' plans leave in each block of the local map.
-    now: (s). generator: of the planner's random choices. trail: (N, 3), metres, where the robot flew lately,
-    the latest last.
+    robot: number of the robot. state: (7,), its state when the plan begins. peers: paths of the other robots.
+    residual: (G,) float32, share of the information in each block of the local map that teammates' plans
+    leave.
+    now: time (s). generator: random numbers of the planner. trail: (N, 3), metres, recent positions,
+    latest last.
     """
 
     robot: int
@@ -44,9 +45,10 @@ class PlanningTask:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """path: (S, 7), the states of the next primitive. braking: (B, 7), how the robot comes to rest after it.
+    """The output of a planner.
 
-    views: (n, 4), poses from which it means to look on its way. value: the return that it expects.
+    path: (S, 7), the states of the next primitive. braking: (B, 7), the states until rest after it.
+    views: (n, 4), planned camera poses. value: expected return.
     kind: "explore", "travel", "wait", "retreat" or "boxed_in".
     """
 
@@ -58,7 +60,7 @@ class Plan:
 
 
 class Planner(Protocol):
-    """Chooses the next primitive. Between two plans the robot flies the first one's path to its end."""
+    """Chooses the next motion primitive. The robot flies the path to its end before it plans again."""
 
     def plan(self, task: PlanningTask) -> Plan: ...
 
@@ -74,9 +76,9 @@ class Options(NamedTuple):
 def options(
     primitives: Primitives, states: Tensor, task: PlanningTask, *, after: int = 0, may_escape: bool = False
 ) -> Options:
-    """What a robot can do from states (N, 7), `after` so many primitives, and which of it is safe.
+    """Roll out all primitives from states (N, 7) that are reached `after` so many primitives, and check them.
 
-    may_escape: a robot whose own cell is no longer passable may leave it, see `safety.feasible`.
+    may_escape: a robot whose own cell is no longer passable may leave it, see `collision_checking.feasible`.
     """
     dynamics = primitives.dynamics
     paths = primitives.rollout(states)
@@ -93,17 +95,17 @@ def options(
 
 
 def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
-    """Whether nothing that leads anywhere is feasible; to turn in place always is, for a robot at rest."""
+    """Return whether no primitive that moves the robot is feasible. Turning in place at rest always is."""
     here = options(primitives, task.state[None].double(), task, may_escape=True)
     leads = (here.paths[0, :, -1, :3] - task.state[:3]).norm(dim=1) > LEAST
     return not bool((here.feasible[0] & leads).any())
 
 
 class Waiting:
-    """What to do where nothing is feasible: come to rest, and after some plans at rest look around.
+    """The fallback when no primitive is feasible: come to rest, then look around after some plans at rest.
 
-    The last plan's braking was feasible, and to stop from its end is that very motion. A robot at rest
-    that turns in place takes up no other space than it does already.
+    Stopping is safe because it is the braking of the last plan, which was feasible. A robot at rest that
+    turns in place occupies no new space.
     """
 
     def __init__(self, primitives: Primitives, patience: int = 2) -> None:
@@ -112,8 +114,8 @@ class Waiting:
         self._count = 0
 
     def plan(self, task: PlanningTask) -> Plan:
-        """Rest, or turn in place once patience is over."""
-        if task.now > self._last:  # a robot may be asked several times at once
+        """Rest, or turn in place after `patience` plans."""
+        if task.now > self._last:  # a robot may plan several times at one time
             self._count, self._last = self._count + 1, task.now
         at_rest = not bool(task.state[4:].any())
         if at_rest and self._count > self._patience:
@@ -125,7 +127,9 @@ class Waiting:
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
 
     def boxed_in(self, task: PlanningTask) -> Plan | None:
-        """A look around for a robot that stands, boxed in for longer than its patience; else None."""
+        """Return a turn in place for a robot at rest that was boxed in for longer than `patience` plans,
+        or None.
+        """
         if bool(task.state[4:6].any()) or not is_boxed_in(self._primitives, task):
             self.over()
             return None
@@ -133,10 +137,10 @@ class Waiting:
         return replace(plan, kind="boxed_in") if self._count > self._patience else None
 
     def rest(self, task: PlanningTask) -> Plan:
-        """Come to rest and stay there: there is nothing to do, for now."""
+        """Come to rest and stay."""
         path = self._primitives.rollout(task.state[None])[0, self._primitives.stop]
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
 
     def over(self) -> None:
-        """The robot has found something to do."""
+        """Reset the count: the robot moves again."""
         self._count = 0

@@ -1,4 +1,6 @@
-"""Planners: tree search over views, frontiers, and chance, on the same primitives and the same safety."""
+"""Planners with the same primitives and collision checks: tree search over views, frontiers, random
+motion.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ from typing import Any
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.information_discount import Fatigue
-from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.information.information_discount import InformationDiscount
+from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.planning.frontier import FrontierPlanner
 from gmmtorch.exploration.planning.global_planner import Journey
@@ -31,20 +33,21 @@ __all__ = [
 ]
 
 
-_NOTHING = 1e-3  # of the largest value
-_STUCK = 0.3  # metres that a branch must come closer
-_REMEMBERED = 32  # views that were given up
+_NOTHING = 1e-3  # share of the largest value below which information counts as zero
+_STUCK = 0.3  # metres of progress that a branch must make
+_REMEMBERED = 32  # abandoned views that are remembered
 
 
 @dataclass(frozen=True)
 class TreeRule:
-    """When a robot explores where it is, and when it travels; all values as shares of the largest seen.
+    """When a robot explores locally and when it travels. Values are shares of the largest value seen.
 
-    search: of the tree while exploring; travel: while travelling; squeeze: where that comes no closer,
-    for the way alone. little: information a primitive below
-    which a robot looks for something better; plenty: from which on a traveller stays. worthwhile: value of
-    a view that is kept in the library. metre: what a metre on the way to a goal is worth, against
-    information on the way. n_added, n_revalued: views of the library in one plan.
+    search: tree search while exploring. travel: tree search while travelling. squeeze: tree search by
+    distance only, when `travel` makes no progress. little: information a primitive below which a robot
+    looks for a better
+    place. plenty: information a primitive from which on a travelling robot stays. worthwhile: smallest
+    value of a view in the library. metre: value of a metre of progress, compared with information.
+    n_added, n_revalued: views of the library added and evaluated again in one plan.
     """
 
     search: SearchRule = field(default_factory=SearchRule)
@@ -59,12 +62,11 @@ class TreeRule:
 
 
 class TreePlanner:
-    """Explores by tree search; with little left around, travels to the best view of the library.
+    """Explores by tree search; travels to the best view of the library when little information is near.
 
-    What a view is worth at all is measured by the largest value seen so far, and what looking in vain has
-    shown not to be there does not count, see `Fatigue`. A robot that travels has
-    taken its goal out of the library, so that nobody else goes there; it puts the goal back when it finds
-    enough to do on the way.
+    The largest value seen so far is the scale of all values. Information that earlier views failed to gain is
+    discounted, see `InformationDiscount`. A travelling robot removes its goal from the library, so that
+    no other robot goes there, and puts it back when it finds enough information on the way.
     """
 
     def __init__(
@@ -80,16 +82,16 @@ class TreePlanner:
         self._duration = primitives.dynamics.duration
         self._journey: Journey | None = None
         self._given_up = torch.zeros(0, 4, dtype=torch.float64)
-        self._fatigue, self._weights = Fatigue(), torch.zeros(0)
+        self._discount, self._weights = InformationDiscount(), torch.zeros(0)
         self._largest = 0.0
         self._branch: list[int] = []
         self._when = -math.inf
 
     def plan(self, task: PlanningTask) -> Plan:
-        memory = Memory(task, self._evaluator)
+        memory = ViewCache(task, self._evaluator)
         here = int(memory.rows(task.state[None, :4].double())[0])
-        self._fatigue.note(task.local_map, memory.measured(here), task.now)
-        self._weights = self._fatigue.weights(task.local_map)
+        self._discount.note(task.local_map, memory.measured(here), task.now)
+        self._weights = self._discount.weights(task.local_map)
         task = replace(task, residual=task.residual * self._weights)
         task.library.visit(task.state[None, :4], task.now)
         self._revalue(task, memory)
@@ -105,8 +107,8 @@ class TreePlanner:
         kind = "explore" if self._journey is None else "travel"
         return Plan(found.path, found.braking, found.views, found.value, kind)
 
-    def _around(self, task: PlanningTask, memory: Memory) -> Found | None:
-        """Explore, or set out on a journey where that promises more."""
+    def _around(self, task: PlanningTask, memory: ViewCache) -> Found | None:
+        """Explore here, or start a journey if it promises more."""
         found = self._explore.search(task, memory, first=self._rest_of_branch(task))
         self._measure(memory)
         rate = _rate(found)
@@ -122,8 +124,8 @@ class TreePlanner:
         self._journey, self._largest = journey, max(self._largest, journey.value)
         return self._on_the_way(task, memory) or found
 
-    def _on_the_way(self, task: PlanningTask, memory: Memory) -> Found | None:
-        """Travel on; None where the journey is over, or there is enough to explore here."""
+    def _on_the_way(self, task: PlanningTask, memory: ViewCache) -> Found | None:
+        """Continue the journey; None if it is over or there is enough to explore here."""
         journey = self._journey
         if journey is None:
             return None
@@ -150,21 +152,21 @@ class TreePlanner:
             return None
         return found
 
-    def _measure(self, memory: Memory) -> None:
-        """Hold the largest value up to date."""
+    def _measure(self, memory: ViewCache) -> None:
+        """Update the largest value."""
         _, values = memory.views(self._weights)
         if len(values):
             self._largest = max(self._largest, float(values.max()))
 
     def _give_up(self, journey: Journey) -> None:
-        """Do not go there again: the view was looked from, or cannot be got to."""
+        """End the journey and exclude its view: it was taken or cannot be reached."""
         self._given_up = torch.cat([self._given_up, journey.pose[None]])[-_REMEMBERED:]
         self._journey = None
 
     def _rest_of_branch(self, task: PlanningTask) -> list[int]:
         return self._branch[1:] if task.now > self._when else self._branch
 
-    def _revalue(self, task: PlanningTask, memory: Memory) -> None:
+    def _revalue(self, task: PlanningTask, memory: ViewCache) -> None:
         ids = task.library.covered(task.local_map, task.now, self._rule.n_revalued)
         if ids:
             known = task.library.candidates()
@@ -173,8 +175,8 @@ class TreePlanner:
             values, _ = memory.marginal(rows, self._weights[None])
             task.library.revalue(ids, values, task.now, self._rule.worthwhile * self._largest)
 
-    def _note(self, task: PlanningTask, memory: Memory, found: Found | None) -> None:
-        """Remember the branch, and in the library the best of what it leaves."""
+    def _note(self, task: PlanningTask, memory: ViewCache, found: Found | None) -> None:
+        """Store the branch, and add the best views that it leaves out to the library."""
         self._branch, self._when = ([] if found is None else found.actions), task.now
         poses, values = memory.views(self._weights)
         self._measure(memory)
@@ -186,13 +188,14 @@ class TreePlanner:
         task.library.add(poses, values, task.now, self._rule.worthwhile * self._largest, self._rule.n_added)
 
 
-_TURNING = 0.1  # metres that a turn in place counts for in a random choice
+_TURNING = 0.1  # metres that a turn in place counts as in a random choice
 
 
 class RandomPlanner:
-    """Keeps to a primitive for a while, then takes another that is feasible, the rather the farther it leads.
+    """Repeats a primitive for a while, then draws another feasible one with probability proportional to
+    its length.
 
-    persistence: the chance that it goes on as before, if that is feasible.
+    persistence: probability of repeating the last primitive if it is feasible.
     """
 
     def __init__(self, primitives: Primitives, persistence: float = 0.7) -> None:
@@ -222,7 +225,7 @@ PLANNERS = ("mcts", "frontier", "random")
 
 
 def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator, **rule: Any) -> Planner:
-    """The planner of that name; `rule`: fields of `TreeRule`, or the other planners' own arguments."""
+    """Make the planner `name`; `rule`: fields of `TreeRule`, or arguments of the other planners."""
     if name == "mcts":
         return TreePlanner(primitives, evaluator, TreeRule(**rule))
     if name == "frontier":
@@ -233,5 +236,5 @@ def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator, **
 
 
 def _rate(found: Found | None) -> float:
-    """Information a primitive of a branch."""
+    """Mean information of a branch's primitives."""
     return 0.0 if found is None else found.information / len(found.actions)

@@ -1,7 +1,7 @@
-"""Motion primitives of a quadrotor: short flights at commanded velocities, and how to stop after them.
+"""Motion primitives of a quadrotor: short flights at commanded velocities, and the braking after them.
 
-A state (7,) is x, y, z, yaw and the velocities v along the heading, v_z up, ω of the yaw; world frame,
-metres, radians, seconds. Yaw runs on beyond ±π, so that it has no jumps.
+A state (7,) is x, y, z, yaw, and the velocities v (along the heading), v_z (up) and ω (yaw rate); world
+frame, metres, radians, seconds. Yaw is not wrapped, so it has no jumps.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ _QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What the robot can do, in metres, radians and seconds.
+    """The limits of a robot's motion, in metres, radians and seconds.
 
     Attributes:
         speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
-        acceleration: largest change of each of the first two, m/s². yaw_acceleration: of the last, rad/s².
-        duration: of a primitive. step: time between two states of a path, which divides the duration.
+        acceleration: largest acceleration along the heading and vertically, m/s².
+        yaw_acceleration: largest yaw acceleration, rad/s².
+        duration: of a primitive. step: time between two states of a path; it divides the duration.
         radius: of a sphere around the body.
 
     Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
@@ -49,17 +50,17 @@ class Dynamics:
                 raise InvalidArgumentError(f"{field.name}={value} must be finite, above zero.")
         if self.n_steps < 1 or abs(self.n_steps * self.step - self.duration) > 1e-6 * self.duration:
             raise InvalidArgumentError(
-                f"step={self.step} s does not divide duration={self.duration} s; take a fraction of it."
+                f"step={self.step} s does not divide duration={self.duration} s; use a fraction of it."
             )
 
     @property
     def n_steps(self) -> int:
-        """States on the path of a primitive."""
+        """Number of states on the path of a primitive."""
         return round(self.duration / self.step)
 
     @property
     def n_braking_steps(self) -> int:
-        """States on the way to rest from the largest velocities."""
+        """Number of states until rest from the largest velocities."""
         return int(self._n_ramp_steps(self._limits).max())
 
     @property
@@ -67,19 +68,20 @@ class Dynamics:
         return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
 
     def _n_ramp_steps(self, change: Tensor) -> Tensor:
-        """Whole steps that changes (..., 3) of the velocities take."""
+        """Number of whole steps that changes (..., 3) of the velocities take."""
         rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
         per_step = torch.tensor(rates, dtype=torch.float64) * self.step
         return (change.abs() / per_step - _ROUNDING).ceil()
 
     def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
-        """Velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
+        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
 
-        Each changes evenly over as many whole steps as the largest acceleration asks for, then stays: so
-        it is linear in time within every step. Raises `InvalidArgumentError` for states beyond the limits.
+        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
+        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
+        beyond the limits.
         """
         now = states[..., 4:]
-        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # NaN is not within them, either
+        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
             worst = now.reshape(-1, 3).abs().amax(0).tolist()
             raise InvalidArgumentError(
                 f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
@@ -93,10 +95,10 @@ class Dynamics:
 
 
 class Primitives:
-    """The library: arcs, climbing arcs, slow arcs, turns in place, straight up and down, and to stop.
+    """The set of primitives: arcs, climbing arcs, slow arcs, turns in place, vertical motion, and a stop.
 
-    commands: (P, 3) float64, the velocities v, v_z, ω that each primitive goes over to. stop: the index of
-    the one that comes to rest.
+    commands: (P, 3) float64, the final velocities v, v_z, ω of each primitive. stop: index of the
+    primitive that comes to rest.
     """
 
     def __init__(self, dynamics: Dynamics) -> None:
@@ -109,7 +111,7 @@ class Primitives:
         library = [*arcs, *slow, *turns, *vertical, (0.0, 0.0, 0.0)]
         self.commands = torch.tensor(library, dtype=torch.float64)
         self.stop = len(library) - 1
-        # Nearly all states asked about are ends of primitives: what follows is known but for the pose.
+        # Nearly all queried states are ends of primitives, so their continuations are computed once.
         ends = torch.cat([torch.zeros(len(library), 4, dtype=torch.float64), self.commands], 1)
         self._paths = self._rollout(ends)
         self._stops = self._braking(ends)
@@ -119,19 +121,19 @@ class Primitives:
 
     @property
     def reach(self) -> float:
-        """Metres along an axis that a robot gets off from rest by a primitive, until it is at rest again."""
+        """Largest distance (m) that a robot covers from rest by one primitive, until it is at rest again."""
         paths = self._rollout(torch.zeros(1, 7, dtype=torch.float64))[0]
         return float(self.braking(paths[:, -1])[..., :3].norm(dim=-1).max())
 
     def rollout(self, states: Tensor) -> Tensor:
-        """States (N, P, S, 7) after 1, 2, …, S steps of every primitive from states (N, 7).
+        """Return states (N, P, S, 7) after 1, 2, …, S steps of every primitive from states (N, 7).
 
-        With velocities that change evenly within a step h,
+        Velocities are linear within a step h:
 
             z += h (v_z⁰ + v_z¹)/2,   ψ += h (ω⁰ + ω¹)/2,   (x, y) += ∫₀ʰ v(t) (cos ψ(t), sin ψ(t)) dt
 
-        the integral by three Gauss–Legendre nodes. At constant velocities it is that of the closed form,
-        x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)), to better than 10⁻⁸ m.
+        The integral uses three Gauss–Legendre nodes. At constant velocities it equals the closed form
+        x += v/ω (sin(ψ + ωT) − sin ψ), y += v/ω (cos ψ − cos(ψ + ωT)) to better than 10⁻⁸ m.
         """
         states = states.double()
         follows = self._follows(states)
@@ -140,7 +142,7 @@ class Primitives:
         return _moved(self._paths[follows], states[:, None])
 
     def braking(self, states: Tensor) -> Tensor:
-        """States (..., B, 7) on the way to rest from states (..., 7); the last is at rest."""
+        """Return states (..., B, 7) of braking from states (..., 7); the last is at rest."""
         flat = states.double().reshape(-1, 7)
         follows = self._follows(flat)
         if follows is None:
@@ -148,7 +150,9 @@ class Primitives:
         return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
 
     def _follows(self, states: Tensor) -> Tensor | None:
-        """The primitive (N,) that each of states (N, 7) has the velocities of; None unless all have one's."""
+        """Return the primitive (N,) whose final velocities each state (N, 7) has; None if any state has
+        none.
+        """
         is_end = (states[:, None, 4:] == self.commands).all(-1)
         which = is_end.int().argmax(1)
         return which if bool(is_end.any(1).all()) else None
@@ -162,7 +166,7 @@ class Primitives:
 
 
 def _moved(paths: Tensor, states: Tensor) -> Tensor:
-    """Paths (..., S, 7) that begin at the origin with yaw 0, from the poses of states (..., 7) instead."""
+    """Move paths (..., S, 7) that begin at the origin with yaw 0 to the poses of states (..., 7)."""
     pose = states[..., None, :]
     cos, sin = pose[..., 3].cos(), pose[..., 3].sin()
     moved = paths.clone()
@@ -173,7 +177,9 @@ def _moved(paths: Tensor, states: Tensor) -> Tensor:
 
 
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
-    """States (..., n_steps, 7) that follow states (..., 7) as the velocities go over to commands (..., 3)."""
+    """Return states (..., n_steps, 7) after states (..., 7) while the velocities change to commands (...,
+    3).
+    """
     h = dynamics.step
     velocity = dynamics.velocities(states.double(), commands, n_steps)
     x, y, z, yaw = (states[..., i, None].double() for i in range(4))
@@ -191,5 +197,5 @@ def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: i
 
 
 def _accumulated(steps: Tensor) -> Tensor:
-    """Sums (..., n + 1) of the first 0, 1, …, n of steps (..., n)."""
+    """Return cumulative sums (..., n + 1) of steps (..., n), starting with 0."""
     return torch.nn.functional.pad(steps.cumsum(-1), (1, 0))

@@ -1,4 +1,4 @@
-"""Retreat: back along the way it came, for a robot that no longer fits where it is, by what it knows now."""
+"""Recovery: a robot that no longer fits at its position, according to its map, flies back along its trail."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from gmmtorch.exploration.planning.peer_trajectories import clear_of
 from gmmtorch.exploration.planning.planner_interface import LEAST, Plan, PlanningTask, is_boxed_in
 from gmmtorch.exploration.planning.primitives import Primitives
 
-_METRES = 0.8  # of the way, in one plan
+_METRES = 0.8  # largest distance of one plan
 
 
 def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
-    """A plan back along the robot's trail; None where it fits, is not at rest, or can leave otherwise.
+    """Plan a flight back along the robot's trail; None if it fits, is not at rest, or can leave by a
+    primitive.
 
-    A map that changes its mind about a cell nearby can leave a robot where no primitive is safe, as they are
-    all longer than the gap. Where it has flown, it fits: it goes back slowly, easing in and out, so that it
-    is at rest at the end, with s(t) = L (1 − cos πt/T)/2 metres flown of L.
+    A cell nearby may become occupied in the map, so that no primitive is safe because all are longer than
+    the gap. The trail is safe because the robot has flown it. The robot starts and ends at rest and
+    covers s(t) = L (1 − cos πt/T)/2 of L metres.
     """
     if bool(task.state[4:].any()) or bool(task.local_map.is_passable(task.state[:3])):
         return None
@@ -41,14 +42,15 @@ def retreat(primitives: Primitives, task: PlanningTask) -> Plan | None:
 
 
 def shortened(trail: Tensor, path: Tensor) -> Tensor:
-    """What is left of a trail (N, 3), the latest last, of a robot that retreated along it to the end of a
-    path (S, 3)."""
+    """Return the rest of a trail (N, 3), latest last, after the robot flew back along it to the end of a
+    path (S, 3).
+    """
     nearest = int((trail - path[-1]).norm(dim=1).argmin())
     return torch.cat([trail[:nearest], path[-1:]]) if nearest else path[-1:]
 
 
 def _back(trail: Tensor, metres: float) -> Tensor | None:
-    """The last so many metres of a trail (N, 3), from its end backwards; None where it is no way at all."""
+    """Return the last `metres` of a trail (N, 3), from its end backwards; None if the trail is too short."""
     way = trail.flip(0)
     length = torch.cumsum((way[1:] - way[:-1]).norm(dim=1), 0)
     if len(length) == 0 or float(length[-1]) < LEAST:
@@ -59,7 +61,7 @@ def _back(trail: Tensor, metres: float) -> Tensor | None:
 
 
 def _along(way: Tensor, share: Tensor) -> Tensor:
-    """Places (S, 3) at shares (S,) of the length of a way (N, 3)."""
+    """Return places (S, 3) at shares (S,) of the length of a way (N, 3)."""
     step = (way[1:] - way[:-1]).norm(dim=1)
     length = torch.cat([step.new_zeros(1), torch.cumsum(step, 0)])
     at = share * length[-1]

@@ -1,4 +1,4 @@
-"""Roadmap: where a robot can travel beyond its window, sparse and coarse."""
+"""Roadmap: a sparse, coarse graph of passable space beyond the robot's local map."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from gmmtorch.occupancy.voxels.boxes import Box
 
 _BLOCK = 8  # nodes along each side of a block of storage
 _PASSABLE = 1
-_EDGES = (2, 4, 8)  # a way on to the next node along x, y, z
+_EDGES = (2, 4, 8)  # flags of an edge to the next node along x, y, z
 _REACH = 2.5  # node spacings from a point within which it joins the roadmap
 
 
 class Route(NamedTuple):
-    """Ways from a start to M goals. metres: (M,) float64, inf where there is none."""
+    """Shortest routes from a start to M goals. metres: (M,) float64, inf if there is none."""
 
     metres: Tensor
     nodes: np.ndarray
@@ -32,7 +32,7 @@ class Route(NamedTuple):
     last: np.ndarray
 
     def path(self, goal: int) -> Tensor:
-        """Nodes (L, 3), metres, that lead from the start to a goal; empty where there is no way."""
+        """Return the nodes (L, 3), metres, from the start to a goal; empty if there is no route."""
         rows = []
         node = int(self.last[goal]) if math.isfinite(float(self.metres[goal])) else -1
         while node >= 0:
@@ -42,11 +42,12 @@ class Route(NamedTuple):
 
 
 class Roadmap:
-    """Nodes of a lattice `factor` times as coarse as the map's, wherever some cell of one is passable.
+    """A graph on a lattice `factor` times as coarse as the map's; a node exists if one of its cells is
+    passable.
 
-    Two nodes that share a face are joined where passable cells meet on it, those that share an edge or
-    a corner where two or three such steps join them. Nodes lie in blocks, so that an update costs what
-    the window does, however large the world; a query costs what has been explored.
+    Two nodes that share a face are joined if passable cells meet on it. Nodes that share an edge or a
+    corner are joined if two or three such steps connect them. Nodes are stored in blocks: the cost of an
+    update depends on the local map, not on the world; the cost of a query grows with the explored space.
     """
 
     def __init__(self, factor: int = 4) -> None:
@@ -56,7 +57,7 @@ class Roadmap:
         self._cached: _Graph | None = None
 
     def __len__(self) -> int:
-        """How many nodes there are."""
+        """Number of nodes."""
         return sum(int(np.count_nonzero(block & _PASSABLE)) for block in self._blocks.values())
 
     @property
@@ -65,7 +66,7 @@ class Roadmap:
         return self._factor * self._resolution
 
     def update(self, local_map: LocalMap) -> None:
-        """Take over what the window shows, nodes that are no longer passable included."""
+        """Replace the nodes inside the local map, including those that are no longer passable."""
         self._resolution, self._cached = local_map.resolution, None
         passable, low = local_map.passable.cpu().numpy(), local_map.low.cpu().numpy()
         first = -(-low // self._factor)
@@ -80,7 +81,7 @@ class Roadmap:
             kept[inside] = (kept[inside] & ~known[outside]) | flags[outside]
 
     def route(self, start: Tensor, goals: Tensor) -> Route:
-        """The shortest ways from `start` (3,) to goals (M, 3), metres."""
+        """Return the shortest routes from `start` (3,) to goals (M, 3), metres."""
         graph = self._graph
         source, gap = graph.nearest(start.cpu().numpy()[None])
         ends, rest = graph.nearest(goals.cpu().numpy().reshape(-1, 3))
@@ -91,7 +92,9 @@ class Roadmap:
         return Route(torch.from_numpy(total), graph.points, before, ends)
 
     def reaching(self, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Nodes (N, 3), metres, from which a goal (3,) can be reached, and how far it is (N,)."""
+        """Return the nodes (N, 3), metres, from which a goal (3,) can be reached, and their distances
+        (N,).
+        """
         graph = self._graph
         source, gap = graph.nearest(goal.cpu().numpy()[None])
         metres, _ = graph.from_node(int(source[0]))
@@ -106,14 +109,14 @@ class Roadmap:
 
 
 def at_the_rim(points: Tensor, box: Box, resolution: float, width: float) -> Tensor:
-    """Which of points (N, 3), metres, lie inside a box of cells, but no deeper than `width` metres."""
+    """Flag (N,) the points (N, 3), metres, inside a box of cells and within `width` metres of its border."""
     low, high = box.low.double() * resolution, box.high.double() * resolution
     depth = torch.minimum(points - low, high - points).amin(-1)
     return (depth >= 0) & (depth <= width)
 
 
 class _Graph:
-    """The nodes as points (N, 3), metres, in the order of their cells, and the ways between them."""
+    """The nodes as points (N, 3), metres, in the order of their cells, and the edges between them."""
 
     def __init__(self, points: np.ndarray, ways: csr_matrix, spacing: float) -> None:
         self.points, self.ways, self.spacing = points, ways, spacing
@@ -125,14 +128,14 @@ class _Graph:
         return cls((cells + 0.5) * spacing, _ways(cells, flags) * spacing, spacing)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The node (M,) next to each point and the metres between; −1 and inf where none is near."""
+        """Return the nearest node (M,) of each point and its distance; −1 and inf if none is near."""
         if self._tree is None:
             return np.full(len(points), -1), np.full(len(points), math.inf)
         gap, node = self._tree.query(points, distance_upper_bound=_REACH * self.spacing)
         return np.where(np.isfinite(gap), node, -1), gap
 
     def from_node(self, source: int) -> tuple[np.ndarray, np.ndarray]:
-        """Metres (N,) from a node to all, inf where there is no way, and the node before each."""
+        """Return metres (N,) from a node to all nodes, inf if not connected, and each node's predecessor."""
         if source < 0:
             return np.full(len(self.points), math.inf), np.full(len(self.points), -1)
         metres, before = dijkstra(self.ways, indices=source, return_predecessors=True)
@@ -140,7 +143,9 @@ class _Graph:
 
 
 def _flags(passable: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of each node (a, b, c) uint8: its flags, and which of them the window knows."""
+    """Return the flags of each node (a, b, c), uint8, and a mask of the flags that the local map
+    determines.
+    """
     node = passable
     for axis in range(3):
         node = _any(node, axis, factor)
@@ -155,12 +160,12 @@ def _flags(passable: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
         inner = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
         rim = tuple(slice(-1, None) if a == axis else slice(None) for a in range(3))
         flags[inner] |= joined.astype(np.uint8) * np.uint8(flag)
-        known[rim] &= np.uint8(255 - flag)  # the next node lies beyond the window
+        known[rim] &= np.uint8(255 - flag)  # the next node lies beyond the local map
     return flags, known
 
 
 def _any(values: np.ndarray, axis: int, factor: int) -> np.ndarray:
-    """Whether any of each `factor` in a row along an axis is true."""
+    """Reduce groups of `factor` values along an axis by logical or."""
     cut = [slice(None)] * 3
     parts = []
     for i in range(factor):
@@ -172,7 +177,9 @@ def _any(values: np.ndarray, axis: int, factor: int) -> np.ndarray:
 def _blocks_between(
     first: np.ndarray, last: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Blocks that nodes `first` up to without `last` lie in; of each, its part, and that of the nodes."""
+    """Return the blocks that contain nodes `first` to `last` (exclusive), with the slices in block and
+    nodes.
+    """
     ranges = [range(int(a) // _BLOCK, (int(b) - 1) // _BLOCK + 1) for a, b in zip(first, last, strict=True)]
     found = []
     for block in itertools.product(*ranges):
@@ -187,7 +194,7 @@ def _blocks_between(
 
 
 def _nodes(blocks: dict[tuple[int, int, int], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Cells (N, 3) of the nodes, in lexicographic order, and their flags (N,)."""
+    """Return the cells (N, 3) of the nodes, in lexicographic order, and their flags (N,)."""
     if not blocks:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.uint8)
     corner = np.array(list(blocks)) * _BLOCK
@@ -200,12 +207,12 @@ def _nodes(blocks: dict[tuple[int, int, int], np.ndarray]) -> tuple[np.ndarray, 
 
 
 def _ways(cells: np.ndarray, flags: np.ndarray) -> csr_matrix:
-    """Lengths, in node spacings, of the ways between nodes (N, N), both directions."""
+    """Return the lengths (N, N), in node spacings, of the edges between nodes, in both directions."""
     n = len(cells)
     if n == 0:
         return csr_matrix((0, 0))
     low = cells.min(0)
-    size = cells.max(0) - low + 2  # one to spare, so that a step beyond the end is no other node
+    size = cells.max(0) - low + 2  # one more, so that a step beyond the end matches no other node
     key = ((cells - low) * [size[1] * size[2], size[2], 1]).sum(1)
     straight = []
     for stride, flag in zip((size[1] * size[2], size[2], 1), _EDGES, strict=True):
@@ -223,7 +230,7 @@ def _ways(cells: np.ndarray, flags: np.ndarray) -> csr_matrix:
 
 
 def _either(*steps: csr_matrix) -> csr_matrix:
-    """1 where any of the matrices has an entry."""
+    """Return a matrix with 1 at every entry of any of the matrices."""
     total = csr_matrix(sum(steps))
     total.data[:] = 1
     return total

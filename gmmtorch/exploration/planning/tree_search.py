@@ -1,4 +1,4 @@
-"""Monte Carlo tree search over motion primitives, its leaves evaluated in batches (thesis 4.3)."""
+"""Monte Carlo tree search over motion primitives, with leaves evaluated in batches (thesis 4.3)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.information.view_cache import Memory
+from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.planning.goal import Goal
 from gmmtorch.exploration.planning.planner_interface import Options, PlanningTask, options
 from gmmtorch.exploration.planning.primitives import Primitives
@@ -20,11 +20,12 @@ _FAR = 1e4  # metres
 
 @dataclass(frozen=True)
 class SearchRule:
-    """How the tree grows.
+    """Parameters of the search.
 
     depth: primitives on a branch. n_rounds, n_leaves: batches, and new nodes in each. exploration: c of
-    UCT, as a share of the largest return found so far. discount: of what each further primitive brings.
-    widening: a node tries about as many primitives times √(its visits), the root all.
+    UCT, as a share of the largest return found so far. discount: factor on the gain of each further
+    primitive.
+    widening: a node tries about `widening` √visits primitives; the root tries all.
     """
 
     depth: int = 4
@@ -46,8 +47,8 @@ class SearchRule:
 class Found:
     """The best branch.
 
-    actions: its L primitives. path: (S, 7) and braking: (B, 7) of the first. views: (L, 4), where each ends.
-    value: the return of the whole. information: its part that views bring, undiscounted.
+    actions: its L primitives. path: (S, 7) and braking: (B, 7) of the first. views: (L, 4), the end of each.
+    value: return of the branch. information: undiscounted information of its views.
     progress: metres that the branch comes closer to the goal.
     """
 
@@ -62,7 +63,7 @@ class Found:
 
 @dataclass(slots=True, eq=False)
 class _Node:
-    """A state at the end of a primitive, and what is known of those that follow."""
+    """A state at the end of a primitive, with the statistics of its branch."""
 
     number: int
     parent: _Node | None
@@ -74,18 +75,18 @@ class _Node:
     total: float = 0.0
     information: float = 0.0  # of the views up to here
     value: float = 0.0  # return of the branch up to here
-    closed: bool = False  # nothing below is left to try
-    shut: int = -1  # the round in which nothing below can be chosen
+    closed: bool = False  # no node below remains to be tried
+    shut: int = -1  # the round in which no node below can be chosen
 
     @property
     def above(self) -> _Node:
-        """The parent, of all but the root."""
+        """The parent; the root has none."""
         if self.parent is None:
             raise LookupError("The root has no parent.")
         return self.parent
 
     def branch(self) -> list[_Node]:
-        """The nodes that lead here, without the root."""
+        """The nodes from the root to this node, without the root."""
         node, branch = self, []
         while node.parent is not None:
             branch.append(node)
@@ -94,12 +95,12 @@ class _Node:
 
 
 class TreeSearch:
-    """Searches for the branch of the largest return (thesis 4.3).
+    """Searches for the branch with the largest return (thesis 4.3).
 
-    A branch returns what its views bring, given each other and the teammates' plans, and the goal's weight
-    for every metre that it comes closer; the sooner, the more, so that nothing is put off. What the robot
-    sees from where it is counts as seen. The next primitive to try maximises Q̄(a) + c √(ln N / N_a); a leaf
-    counts as visited, with no return, until its round is over.
+    The return of a branch is the information of its views, given each other and the teammates' plans,
+    plus the goal's weight for every metre of progress, both discounted by depth. The view from the start
+    counts as taken. UCT chooses the primitive that maximises Q̄(a) + c √(ln N / N_a). A leaf counts as
+    visited with zero return until its round ends.
     """
 
     def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
@@ -108,16 +109,16 @@ class TreeSearch:
     def search(
         self,
         task: PlanningTask,
-        memory: Memory | None = None,
+        memory: ViewCache | None = None,
         goal: Goal | None = None,
         first: Sequence[int] = (),
     ) -> Found | None:
-        """The best branch; None if no primitive is feasible.
+        """Return the best branch; None if no primitive is feasible.
 
         Args:
-            memory: of what views are worth; None: only the goal counts.
-            goal: where to go; None: only views count.
-            first: primitives of a branch that is tried before all others: what is left of the last plan.
+            memory: values of views; None: only the goal counts.
+            goal: the goal; None: only views count.
+            first: primitives of a branch that is tried first, such as the rest of the last plan.
         """
         tree = _Tree(self._primitives, self._rule, task, memory, goal)
         tree.grow(first)
@@ -132,7 +133,7 @@ class _Tree:
         primitives: Primitives,
         rule: SearchRule,
         task: PlanningTask,
-        memory: Memory | None,
+        memory: ViewCache | None,
         goal: Goal | None,
     ) -> None:
         self._primitives, self._rule, self._task = primitives, rule, task
@@ -141,11 +142,11 @@ class _Tree:
         most = 1 + rule.depth + rule.n_rounds * rule.n_leaves
         n_primitives = len(primitives.commands)
         self._states = start.expand(most, 7).clone()
-        self._ends = start.expand(most, n_primitives, 7).clone()  # where primitives lead
-        self._metres = torch.zeros(most, dtype=torch.float64)  # left to the goal
+        self._ends = start.expand(most, n_primitives, 7).clone()  # end states of the primitives
+        self._metres = torch.zeros(most, dtype=torch.float64)  # remaining to the goal
         self._metres_after = torch.zeros(most, n_primitives, dtype=torch.float64)
         residual = task.residual[None]
-        if memory is not None:  # the robot has just looked from here: what it did not see then, it will not
+        if memory is not None:  # the robot has just looked from here, so another look gains nothing
             residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
         self._residuals = residual.expand(most, -1).clone()
         self._scale = 1e-12  # the largest return found
@@ -157,7 +158,7 @@ class _Tree:
         self._open([root], self._options)
 
     def grow(self, first: Sequence[int]) -> None:
-        """Try a branch, then round after round what looks best."""
+        """Try the branch `first`, then the most promising leaves, round by round."""
         node = self._nodes[0]
         for action in first[: self._rule.depth]:
             if action not in node.untried:
@@ -174,7 +175,7 @@ class _Tree:
             self._extend(chosen, is_last=turn == self._rule.n_rounds)
 
     def best(self) -> Found | None:
-        """The branch to the node of the largest return, the first of equals."""
+        """Return the branch to the node with the largest return; the first of equals."""
         if len(self._nodes) == 1:
             return None
         last = max(self._nodes[1:], key=lambda node: node.value)
@@ -192,7 +193,7 @@ class _Tree:
     # -- choosing leaves --------------------------------------------------------------------------
 
     def _select(self, turn: int) -> _Node | None:
-        """A new node below the most promising one; None if there is none left in this round."""
+        """Return a new node below the most promising one; None if none remains in this round."""
         root = self._nodes[0]
         node = root
         while not root.closed and root.shut != turn:
@@ -211,7 +212,7 @@ class _Tree:
         return math.inf if node.parent is None else self._rule.widening * math.sqrt(node.visits)
 
     def _promising(self, node: _Node, turn: int) -> _Node | None:
-        """The child that UCT prefers, of those that are neither exhausted nor waiting."""
+        """Return the child that UCT prefers among those that are neither exhausted nor waiting."""
         c, log_visits = self._rule.exploration * self._scale, math.log(max(node.visits, 1))
         best, best_score = None, -math.inf
         for child in node.children:
@@ -229,10 +230,10 @@ class _Tree:
             node.visits += 1
         return child
 
-    # -- what they are worth, and what follows them -----------------------------------------------
+    # -- values of nodes and their continuations ---------------------------------------------------
 
     def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
-        """Place and value new nodes, and find out which primitives can follow them, unless none will."""
+        """Set the states and values of new nodes, and find the primitives that can follow them."""
         rows = [node.number for node in nodes]
         parents = [node.above.number for node in nodes]
         actions = [node.action for node in nodes]
@@ -259,12 +260,12 @@ class _Tree:
             self._open(some, options(self._primitives, states, self._task, after=depth))
 
     def _open(self, nodes: list[_Node], follow: Options) -> None:
-        """Note what can follow nodes."""
+        """Store the primitives that can follow nodes."""
         rows = [node.number for node in nodes]
         ends = follow.paths[:, :, -1]
         self._ends[rows] = ends
         order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
-        if self._goal is not None:  # what leads towards it first
+        if self._goal is not None:  # primitives that lead towards it come first
             self._metres_after[rows] = order = _finite(self._goal.cost(ends))
         order = order.masked_fill(~follow.feasible, math.inf).argsort(dim=1, stable=True)
         count = follow.feasible.sum(1).tolist()
@@ -273,5 +274,5 @@ class _Tree:
 
 
 def _finite(metres: Tensor) -> Tensor:
-    """Metres to a goal, more than from anywhere else where there is no way."""
+    """Replace infinite distances to a goal by a large finite one."""
     return metres.clamp_max(_FAR)

@@ -1,4 +1,4 @@
-"""Where a robot can be: cells at whose centre it does not touch the mesh, above a floor, all connected."""
+"""Navigable cells: connected cells above a floor at whose centre a robot does not touch the mesh."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 ON_PLANE = 1e-6
-"""Of a cell, within which a length counts as lying on a plane of the lattice: more than rounding."""
+"""Tolerance, as a share of a cell, for a length to lie on a plane of the lattice; larger than rounding."""
 
 
 def occupied_and_clear(
@@ -26,9 +26,11 @@ def occupied_and_clear(
     radius: float,
     on_event: Event,
 ) -> tuple[Tensor, Tensor]:
-    """Cells (nx, ny, nz) that the mesh meets, and grounded ones from whose centre it is beyond `radius`."""
-    # The centre of a cell is at least (m − ½) cells from what lies m cells away on some axis. Only up to
-    # there need distances be asked for; what lies just outside the box matters too.
+    """Return cells (nx, ny, nz) that the mesh meets, and grounded cells whose centre is beyond `radius`
+    of it.
+    """
+    # A cell m cells away on some axis is at least (m − ½) cells from a cell's centre. Distances are therefore
+    # computed only for cells that close to the mesh. The mesh just outside the box counts too.
     reach = math.floor(radius / resolution + 0.5 + ON_PLANE)
     on_event("occupied cells", 0, None)
     wider = occupied_cells(triangles, resolution, Box(box.low - reach, box.high + reach))
@@ -46,7 +48,7 @@ def occupied_and_clear(
 
 
 def above_floor(mesh: MeshWorld, resolution: float, box: Box) -> Tensor:
-    """Cells (nx, ny, nz), bool, whose centre has a surface of the mesh somewhere below it."""
+    """Return cells (nx, ny, nz), bool, that have a surface of the mesh below their centre."""
     centers = [
         (torch.arange(low, high) + 0.5).double() * resolution
         for low, high in zip(box.low.tolist(), box.high.tolist(), strict=True)
@@ -62,7 +64,7 @@ def above_floor(mesh: MeshWorld, resolution: float, box: Box) -> Tensor:
 
 
 def _dilated(mask: Tensor, reach: int) -> Tensor:
-    """Cells (nx, ny, nz) within `reach` cells of one that is set, on every axis."""
+    """Return cells (nx, ny, nz) within `reach` cells, on every axis, of a cell that is set."""
     for axis in range(3):
         n = mask.shape[axis]
         spread = mask.clone()
@@ -82,7 +84,10 @@ def connected(
     radius: float,
     name: str,
 ) -> Tensor:
-    """The part (nx, ny, nz), bool, of the clear cells that holds the start, or that is to be flown in."""
+    """Return the connected part (nx, ny, nz), bool, of the clear cells that robots use.
+
+    It is the part that contains the start. Without a start it is the part with the most standing room.
+    """
     from scipy.ndimage import label
 
     parts, n_parts = label(clear.numpy())
@@ -90,7 +95,7 @@ def connected(
     if n_parts == 0:
         raise InvalidArgumentError(
             f"{name}: no cell of {resolution} m is above a floor and farther than robot_radius={radius} m "
-            "from the mesh; take a smaller radius, or wider bounds; is the mesh in metres, and z up?"
+            "from the mesh. Use a smaller radius or wider bounds; check that the mesh is in metres with z up."
         )
     if start is not None:
         cell = (start / resolution).floor().long() - box.low
@@ -99,8 +104,8 @@ def connected(
         part = int(parts[tuple(cell.tolist())])
         if part == 0:
             raise InvalidArgumentError(
-                f"{name}: at start={start.tolist()} a robot of radius {radius} m touches the mesh, or "
-                "has no floor below it; move it."
+                f"{name}: at start={start.tolist()} a robot of radius {radius} m touches the mesh or has no "
+                "floor below it; move the start."
             )
         return parts == part
     places = (mesh.standing_places() / resolution).floor().long() - box.low

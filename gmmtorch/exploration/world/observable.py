@@ -1,9 +1,9 @@
-"""Which cells of a world can be seen at all, from where a robot can be: the domain on which maps are scored.
+"""Observable cells: those that a camera can see from some navigable cell. Maps are scored on them.
 
-From the centre of a navigable cell every metre or so, rays go out to all sides, up and down to the edge of
-the camera's view. All viewpoints lie at cell centres, so rays of one direction cross the same cells relative
-to where they start: their order is worked out once, and one look-up a ray tells how many of them it crosses
-before it meets the mesh.
+Rays leave the centre of about one navigable cell per cubic metre in all directions within the camera's
+vertical field of view. All viewpoints are cell centres, so rays of one direction cross the same cells
+relative to their start. That order is computed once; one search for each ray then gives the number of
+cells before the mesh.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 _AT_SURFACE = 1e-3
-"""Metres: what float32 rays may err by. Only a cell that the mesh meets can be one in which a ray ends."""
+"""Tolerance (m) for float32 rays. A ray can only end in a cell that the mesh meets."""
 
 _RAYS_AT_ONCE = 1 << 18
 
 
 def viewpoints(navigable: Tensor, step: int) -> Tensor:
-    """Of navigable (nx, ny, nz), bool, in each block of `step`³ cells the one (V, 3) nearest its middle."""
+    """Return cells (V, 3): in each block of `step`³ cells, the navigable one nearest to the block's
+    middle.
+    """
     cells = navigable.nonzero()
     shape = torch.tensor(navigable.shape)
     block = (cells // step * torch.tensor(row_major_strides(tuple(-(-shape // step))))).sum(1)
@@ -39,13 +41,13 @@ def viewpoints(navigable: Tensor, step: int) -> Tensor:
 
 
 def view_directions(vertical_fov: float, angle: float) -> Tensor:
-    """Unit vectors (N, 3) of all yaws, and elevations within the field of view, about `angle` rad apart."""
+    """Return unit vectors (N, 3) about `angle` rad apart: all yaws, elevations within the field of view."""
     rows = max(1, math.ceil(vertical_fov / angle)) + 1
     rings = []
     elevations = torch.linspace(-vertical_fov / 2, vertical_fov / 2, rows, dtype=torch.float64)
     for row, elevation in enumerate(elevations.tolist()):
         n_yaws = max(4, math.ceil(2 * math.pi * math.cos(elevation) / angle))
-        # Rows turned against each other sample the sphere more evenly, and no ray runs along a lattice plane.
+        # Rotating each row samples the sphere more evenly, and no ray runs along a lattice plane.
         yaw = (torch.arange(n_yaws, dtype=torch.float64) + (row + 0.5) * _GOLDEN) * (2 * math.pi / n_yaws)
         up = torch.full_like(yaw, math.sin(elevation))
         rings.append(torch.stack([math.cos(elevation) * yaw.cos(), math.cos(elevation) * yaw.sin(), up], 1))
@@ -62,7 +64,7 @@ def observable_cells(
     max_range: float,
     on_event: Event = ignore,
 ) -> Tensor:
-    """Cells (nx, ny, nz), bool, that some ray crosses or ends in; rays end at the mesh, range or box.
+    """Return cells (nx, ny, nz), bool, that some ray crosses or ends in. Rays end at the mesh, range or box.
 
     Args:
         occupied: (nx, ny, nz) bool, the cells of the box that the mesh meets.
@@ -104,9 +106,10 @@ def observable_cells(
 
 
 def _crossed(direction: Tensor, reach: float, strides: Tensor) -> tuple[Tensor, Tensor]:
-    """How far, in cells, a ray from a cell's centre enters others, and how far on their flat index is, (K,).
+    """Return the distances (K,), in cells, at which a ray from a cell's centre enters cells, and their
+    offsets.
 
-    The first is the cell it starts in, which it enters at 0.
+    Offsets are differences of flat indices, (K,). The first cell is the start, entered at distance 0.
     """
     plane = torch.arange(math.ceil(reach) + 1, dtype=torch.float64) + 0.5
     distance = (plane / direction.abs()[:, None]).flatten()  # infinite along planes

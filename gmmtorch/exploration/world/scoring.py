@@ -1,4 +1,4 @@
-"""One evaluator for all teams: entropy over the observable cells as evidence comes in, and the truth."""
+"""The evaluator of all teams: entropy over the observable cells, and comparison with the truth."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 @dataclass(frozen=True)
 class BeliefRule:
-    """How evidence becomes probability, the same for every team and for the evaluator.
+    """How evidence becomes probability. Every team and the evaluator use the same rule.
 
-    prior: N_p of `occupancy_probability`. clamp: probabilities are kept within [clamp, 1 − clamp]: no
-    number of rays makes a cell more certain than that. free, occupied: a cell is called free below the
-    one, occupied above the other, unknown between.
+    prior: N_p of `occupancy_probability`. clamp: probabilities stay within [clamp, 1 − clamp]. free,
+    occupied: a cell is free if its probability is below `free`, occupied if above `occupied`, and unknown
+    in between.
     """
 
     prior: float = 1.0
@@ -37,11 +37,11 @@ class BeliefRule:
         Thresholds(self.free, self.occupied)  # checks them
 
     def probability(self, hits: Tensor, misses: Tensor) -> Tensor:
-        """Occupancy of cells with so many hits and misses, any shape."""
+        """Occupancy of cells with these hits and misses, any shape."""
         return occupancy_probability(hits, misses, self.prior).clamp(self.clamp, 1 - self.clamp)
 
     def entropy(self, hits: Tensor, misses: Tensor) -> Tensor:
-        """Bits of each cell: 1 where nothing is known."""
+        """Entropy of each cell in bits; 1 without evidence."""
         return bernoulli_entropy(self.probability(hits, misses))
 
     def classes(self, probability: Tensor) -> Tensor:
@@ -49,21 +49,21 @@ class BeliefRule:
         return Thresholds(self.free, self.occupied).classify(probability)
 
 
-_MARGIN = 8  # cells around a world in which evidence is kept, though it is not scored
+_MARGIN = 8  # cells around a world whose evidence is stored but not scored
 
 
 class BeliefMap:
-    """Evidence of a bounded world in blocks, and its entropy over the observable cells (MATH: H = Σ h(p)).
+    """Evidence of a bounded world in blocks, and its entropy H = Σ h(p) over the observable cells.
 
-    The entropy follows every addition from the cells that it touches, so that its cost does not grow
-    with the world.
+    Each addition updates the entropy from the cells that it touches, so the cost does not grow with the
+    world.
 
     Args:
         observable: (nx, ny, nz) bool over `box`: cells that a sensor could ever see.
     """
 
     def __init__(self, resolution: float, box: Box, observable: Tensor, rule: BeliefRule) -> None:
-        # Noise puts a wall that lies in the bounds on either side of them: that must not count as unseen.
+        # Noise can move hits on a wall just outside the bounds; they must not count as unseen.
         bounds = Box(box.low - _MARGIN, box.high + _MARGIN)
         self.grid = SparseEvidence(resolution, box=bounds, dtype=torch.float32)
         self.rule = rule
@@ -74,14 +74,14 @@ class BeliefMap:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all evidence."""
+        """Remove all evidence."""
         self.grid.clear()
         self.entropy_bits = self.observable_bits
-        self.known_bits = 0.0  # off the entropy of all cells, observable or not, as a robot can tell
+        self.known_bits = 0.0  # entropy removed from all cells, observable or not, as a robot computes it
         self.n_observed = 0
 
     def add(self, evidence: CellEvidence) -> Tensor:
-        """Count evidence in; returns which of its cells (C,) are observable."""
+        """Add evidence; returns which of its cells (C,) are observable."""
         h, m = self.grid.add(evidence)
         chosen = self._is_observable(evidence.cells)
         gone = self.rule.entropy(h, m) - self.rule.entropy(h + evidence.hits, m + evidence.misses)
@@ -100,7 +100,7 @@ class BeliefMap:
 
 
 def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, float | None]:
-    """AUC and mean cross-entropy (bits a cell) of a map against the truth, over given cells (C, 3)."""
+    """Return AUC and mean cross-entropy (bits a cell) of a map against the truth, over given cells (C, 3)."""
     p = belief.probability(cells).double()
     right = torch.where(occupied, p, 1 - p).clamp_min(torch.finfo(torch.float64).tiny)
     both = bool(occupied.any()) and not bool(occupied.all())
@@ -111,7 +111,7 @@ def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, fl
 
 
 def disagreement(maps: list[BeliefMap], cells: Tensor) -> float | None:
-    """Share of cells (C, 3) that two of the maps put into different classes; None for a single map."""
+    """Return the share of cells (C, 3) with different classes in any two maps; None for a single map."""
     if len(maps) < 2 or len(cells) == 0:
         return None
     classes = torch.stack([m.rule.classes(m.probability(cells)) for m in maps])
@@ -119,6 +119,6 @@ def disagreement(maps: list[BeliefMap], cells: Tensor) -> float | None:
 
 
 def overlap(seen_by: Tensor) -> float:
-    """Share of the cells seen by any robot that were seen by two or more; `seen_by` counts robots."""
+    """Return the share of the seen cells that two or more robots saw; `seen_by` counts robots."""
     seen = int((seen_by > 0).sum())
     return int((seen_by > 1).sum()) / seen if seen else math.nan

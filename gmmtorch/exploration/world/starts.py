@@ -1,4 +1,4 @@
-"""Where the robots of a team start: together in a roomy place, or as told, if they can fly off from there."""
+"""Start poses of a team: chosen together in open space, or given by the user and checked."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gmmtorch.exploration.robot.initial_free_space import Place, initial_free_sp
 from gmmtorch.exploration.world.observable import viewpoints
 
 _ROOMY = 1.0
-"""Metres from the nearest surface at which robots start, where the world has such places."""
+"""Preferred distance (m) of a start from the nearest surface."""
 _DOWN = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
 _TRIES = 40
-"""Places, or choices of places, that are tried before it is said that there is none to fly off from."""
+"""Number of places, or sets of places, that are tried before the search fails."""
 
 
 class _World(Place, Protocol):
-    """What is asked of a world."""
+    """The part of `World` that start poses need."""
 
     @property
     def name(self) -> str: ...
@@ -31,12 +31,12 @@ class _World(Place, Protocol):
 
 
 def start_poses(world: _World, n: int, spacing: float, at: Tensor | None, primitives: Primitives) -> Tensor:
-    """Poses (n, 4), x, y, z (m) and yaw (rad), in the navigable space near a place (3,).
+    """Choose start poses (n, 4), x, y, z (m) and yaw (rad), in the navigable space near `at` (3,).
 
-    They are at least `spacing` metres apart, and never touch; as far as there is room they are in sight of
-    the first, a metre from every surface, or as far as they can be, and level with it. They look all around,
-    the first towards the middle of the world. If `at` is None they start at the end that is farthest from its
-    middle. Raises `InvalidArgumentError` where so many do not find room to fly off.
+    The poses are at least `spacing` metres apart, and the robots never touch. If there is room, every pose is
+    visible from the first, a metre from every surface, and at the same height. Yaw angles are spread evenly;
+    the first robot looks towards the middle of the world. If `at` is None, robots start at the end that is
+    farthest from the middle. Raises `InvalidArgumentError` if there is no room for n robots that can fly off.
     """
     check_whole("n", n, 1)
     if not (math.isfinite(spacing) and spacing >= 0):
@@ -49,9 +49,9 @@ def start_poses(world: _World, n: int, spacing: float, at: Tensor | None, primit
         robots = "1 robot that starts" if len(found) == 1 else f"{len(found)} robots that start"
         volume = len(centers) * world.resolution**3
         raise InvalidArgumentError(
-            f"{world.name} has room for {robots} {apart:.4g} m apart, and team.size={n}: of it only "
-            f"{volume:.3g} m³ can be flown in, away from surfaces and above one. Take fewer robots, or set "
-            "team.start; if there should be more room, has the mesh a floor?"
+            f"{world.name} has room for {robots} {apart:.4g} m apart, but team.size={n}. "
+            f"Only {volume:.3g} m³ are navigable (away from surfaces and above a floor). "
+            "Use fewer robots, or set team.start. If you expect more room, check that the mesh has a floor."
         )
     for _ in range(_TRIES):
         stuck = [place for place in found if initial_free_space(world, place, primitives) is None]
@@ -64,14 +64,16 @@ def start_poses(world: _World, n: int, spacing: float, at: Tensor | None, primit
         if len(found) < n:
             break
     raise InvalidArgumentError(
-        f"{world.name}: no places were found from which a team of team.size={n} can fly off, with "
-        f"{_robot(world)}; take a smaller radius, finer cells, slower or fewer robots, or set team.start."
+        f"{world.name}: found no start poses from which a team of team.size={n} can fly off, with "
+        f"{_robot(world)}. Use a smaller radius, finer cells, slower or fewer robots, or set team.start."
     )
 
 
 def check_start(world: _World, poses: Tensor, primitives: Primitives) -> Tensor:
-    """The poses (n, 4), float64, if robots can start there; else `InvalidArgumentError` names the first, and
-    where it could be moved."""
+    """Check that robots can start at poses (n, 4) and return them as float64.
+
+    Raises `InvalidArgumentError` that names the first bad pose and a better place for it.
+    """
     if poses.ndim != 2 or poses.shape[1] != 4 or len(poses) == 0:
         raise InvalidArgumentError(
             f"start poses have shape {tuple(poses.shape)}; expected (n, 4): x, y, z (m), yaw (rad); n ≥ 1."
@@ -89,7 +91,7 @@ def check_start(world: _World, poses: Tensor, primitives: Primitives) -> Tensor:
 
 
 def _fault(world: _World, others: Tensor, place: Tensor, primitives: Primitives) -> str | None:
-    """What is wrong with a place (3,), beside robots at (N, 3); None: nothing."""
+    """Describe why a robot cannot start at a place (3,) beside robots at (N, 3); None if it can."""
     cell = (place / world.resolution).floor() - world.box.low
     if not bool(((cell >= 0) & (cell < torch.tensor(world.box.shape))).all()):
         low, high = (_text(end.double() * world.resolution) for end in world.box)
@@ -111,12 +113,12 @@ def _fault(world: _World, others: Tensor, place: Tensor, primitives: Primitives)
             "solid, or in another part, which world.bounds=[x0,y0,z0,x1,y1,z1] around that would choose"
         )
     if launch is None:
-        return f"{near}, and nothing that leads anywhere is safe there with {_robot(world)}"
+        return f"{near}, and no safe motion leads away from there with {_robot(world)}"
     return None
 
 
 def _instead(world: _World, others: Tensor, pose: Tensor, primitives: Primitives) -> str:
-    """What to do about a pose (4,), beside robots at (N, 3): move it to the nearest place that is found."""
+    """Suggest the nearest valid place for a pose (4,) beside robots at (N, 3)."""
     places = world.centers(world.navigable.nonzero())
     places = places[(torch.cdist(places, others) > 2 * world.robot_radius).all(1)]
     places = places[(places - pose[:3]).norm(dim=1).argsort(stable=True)]
@@ -126,7 +128,7 @@ def _instead(world: _World, others: Tensor, pose: Tensor, primitives: Primitives
         if initial_free_space(world, places[0], primitives) is not None:
             return f"move it, for instance to {_text(torch.cat([places[0], pose[3:]]))}"
         places = places[(places - places[0]).norm(dim=1) > 2 * world.resolution]
-    return "no place near it is better; take a smaller radius, finer cells or slower robots"
+    return "no better place is near; use a smaller radius, finer cells or slower robots"
 
 
 def _robot(world: _World) -> str:
@@ -138,8 +140,7 @@ def _text(numbers: Tensor) -> str:
 
 
 def _together(world: _World, places: Tensor, anchor: Tensor, n: int, apart: float) -> Tensor:
-    """The best n, or as many as there are, of places (P, 3) near an anchor (3,), `apart` metres from one
-    another."""
+    """Choose up to n of places (P, 3) near an anchor (3,), at least `apart` metres from each other."""
     if len(places) == 0:
         return places
     off = (places - anchor).norm(dim=1)
@@ -152,15 +153,17 @@ def _together(world: _World, places: Tensor, anchor: Tensor, n: int, apart: floa
 
 
 def _apart(world: _World, places: Tensor, anchor: Tensor, n: int, apart: float) -> Tensor:
-    """Up to n of places (P, 3), P ≥ 1, the best first: in sight, roomy, level with the anchor and near it."""
+    """Choose up to n of places (P, 3), P ≥ 1, best first: visible, roomy, level with the anchor and near
+    it.
+    """
     nearest = places[(places - anchor).norm(dim=1).argmin()]
     off = places - nearest
     distance = off.norm(dim=1)
     sight = world.mesh.distances(nearest, off / distance.clamp_min(1e-9)[:, None])
     hidden = (sight <= distance) & (distance > 0)
-    # Cells that a place is short of being roomy.
+    # How many cells a place is closer to a surface than the preferred distance.
     cramped = ((_ROOMY - world.mesh.clearance(places)) / world.resolution).clamp_min(0).ceil()
-    # One kind of fault outweighs any distance, the worse kind the other.
+    # A cramped place costs more than any distance; a hidden place costs more than a cramped one.
     cost = torch.hypot(distance, 2 * off[:, 2]) + 1e6 * cramped + 1e9 * hidden
     places = places[cost.argsort(stable=True)]
     chosen: list[Tensor] = []
@@ -171,10 +174,10 @@ def _apart(world: _World, places: Tensor, anchor: Tensor, n: int, apart: float) 
 
 
 def _far_end(world: _World) -> Tensor:
-    """A place (3,) far from the middle: roomy, and not high above the floor, if there is one."""
+    """Return a place (3,) far from the middle of the world: roomy and near the floor, if there is one."""
     places = world.centers(viewpoints(world.navigable, max(1, round(1.0 / world.resolution))))
     room = world.mesh.clearance(places)
-    if bool((room < _ROOMY).all()):  # what little room there is lies in few cells
+    if bool((room < _ROOMY).all()):  # a cramped world: look at every navigable cell
         places = world.centers(world.navigable.nonzero())
         room = world.mesh.clearance(places)
     off = (places - places.mean(0))[:, :2].norm(dim=1)

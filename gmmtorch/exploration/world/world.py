@@ -18,7 +18,7 @@ from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.world.navigable import ON_PLANE, above_floor, connected, occupied_and_clear
 from gmmtorch.exploration.world.observable import observable_cells, view_directions, viewpoints
 from gmmtorch.exploration.world.starts import check_start, start_poses
-from gmmtorch.exploration.world.world_cache import kept_cells
+from gmmtorch.exploration.world.world_cache import cached_cells
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld, checked_triangles
@@ -26,33 +26,33 @@ from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse, warehouse_start
 
 MAX_CELLS = 1 << 28
-"""Of a box: about 2 GB while a world is worked out."""
+"""Largest number of cells of a world; computing it takes about 2 GB."""
 
 _SHARP = 0.4
-"""Share of the camera's range at which the rays that find what is observable are a cell apart."""
+"""Share of the camera's range at which the rays that find observable cells are one cell apart."""
 
 _FINEST = 0.01
-"""Radians between those rays, at least."""
+"""Smallest angle (rad) between those rays."""
 
 _CELLS = ("occupied", "observable", "navigable")
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A mesh within bounds, on the lattice.
+    """A mesh within bounds, on a lattice of cells.
 
     Attributes:
-        name: for messages and results.
-        mesh: casts rays.
-        resolution: side (m) of the cells.
+        name: used in messages and results.
+        mesh: the mesh; it casts rays.
+        resolution: side of a cell (m).
         box: the lattice cells of the bounds.
         occupied: (nx, ny, nz) bool, cells that the mesh meets.
-        navigable: bool, connected cells at whose centre a robot does not touch the mesh, above a floor: what
-            has no surface below it is outside, as is the rock beside a mine without a roof.
-        observable: bool, cells that a camera somewhere in the navigable space can see, free or occupied;
-            of the free ones those above a floor.
+        navigable: bool, connected cells above a floor at whose centre a robot does not touch the mesh. Cells
+            without a surface below them are outside, such as the rock beside a mine without a roof.
+        observable: bool, cells that a camera in the navigable space can see: occupied cells, and free cells
+            above a floor.
         robot_radius: metres.
-        start: (3,), metres, where robots start if not told otherwise.
+        start: (3,), metres, the default start of the robots.
     """
 
     name: str
@@ -81,22 +81,22 @@ class World:
         on_event: Event = ignore,
         name: str = "mesh",
     ) -> World:
-        """Work out a world, or read it from the cache.
+        """Compute a world, or read it from the cache.
 
         Args:
             triangles: (T, 3, 3) corners, metres, z up.
-            bounds: x0, y0, z0, x1, y1, z1 (m); the box of the mesh if not given. Cells that their closed
-                box touches belong to the world, rays that leave it are cut off there.
-            vertical_fov: of the camera (rad); it looks level and turns about the vertical.
-            max_range: of the camera, metres.
-            start: (3,), a place of the part to fly in. If not given that is the part where most of the
-                places lie that are surrounded by walls (`MeshWorld.standing_places`), else the largest.
-            spacing: metres between the places from which the world is looked at.
-            cache: keep the result on disk, and take it from there (see `world_cache`).
-            on_event: hears of the stages.
+            bounds: x0, y0, z0, x1, y1, z1 (m); default: the box of the mesh. The world consists of the cells
+                that touch the closed box. Rays end where they leave it.
+            vertical_fov: of the camera (rad). The camera looks horizontally and turns about the vertical.
+            max_range: of the camera (m).
+            start: (3,), a point in the connected part to fly in. Default: the part with most places that are
+                surrounded by walls (`MeshWorld.standing_places`), else the largest part.
+            spacing: distance (m) between the viewpoints that determine the observable cells.
+            cache: read the result from disk, or store it there (see `world_cache`).
+            on_event: callback for the stages.
 
-        Raises `DataError` for a mesh that no rays can be cast in, `InvalidArgumentError` for bounds that
-        hold none of it, a camera that sees no farther than the next cells, or a world without room for a
+        Raises `DataError` for a mesh in which no rays can be cast, `InvalidArgumentError` for bounds that
+        contain no surface, a camera that sees only the neighbouring cells, or a world without room for a
         robot, and `MemoryLimitError` for more than `MAX_CELLS` cells.
         """
         check_resolution(resolution)
@@ -107,23 +107,23 @@ class World:
                 raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
         if max_range <= robot_radius + 2 * resolution:
             raise InvalidArgumentError(
-                f"max_range={max_range} m ends within two cells of the robot: robot_radius={robot_radius} m, "
-                f"resolution={resolution} m; take a longer range, or finer cells."
+                f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
+                f"resolution={resolution} m); use a longer range or finer cells."
             )
         triangles = checked_triangles(triangles, name)
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
         place = None if start is None else _point(start, "start")
 
-        def work_out() -> dict[str, Tensor]:
+        def compute() -> dict[str, Tensor]:
             grounded = above_floor(mesh, resolution, box)
             occupied, clear = occupied_and_clear(
                 mesh, triangles, resolution, box, grounded, robot_radius, on_event
             )
             if not bool(occupied.any()):
                 raise InvalidArgumentError(
-                    f"bounds={_listed(bounds)} hold no surface of {name}, which extends from "
-                    f"{_text(mesh.low, mesh.high)}; take wider bounds, with a floor."
+                    f"bounds={_listed(bounds)} contain no surface of {name}, which extends from "
+                    f"{_text(mesh.low, mesh.high)}; use wider bounds that include a floor."
                 )
             navigable = connected(clear, mesh, resolution, box, place, robot_radius, name)
             seen = observable_cells(
@@ -149,7 +149,7 @@ class World:
             "start": None if place is None else place.tolist(),
             "spacing": spacing,
         }
-        cells = kept_cells(triangles, options, _CELLS, box.shape, work_out) if cache else work_out()
+        cells = cached_cells(triangles, options, _CELLS, box.shape, compute) if cache else compute()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
 
     def start_poses(
@@ -159,12 +159,12 @@ class World:
         at: Sequence[float] | Tensor | None = None,
         primitives: Primitives | None = None,
     ) -> Tensor:
-        """See `starts.start_poses`: `at` (3,) is `start` if not given, the primitives the usual ones."""
+        """See `starts.start_poses`. Defaults: `at` (3,) is `start`; the primitives are the standard set."""
         place = self.start if at is None else _point(at, "at")
         return start_poses(self, n, spacing, place, self._flown(primitives))
 
     def check_start(self, poses: Tensor, primitives: Primitives | None = None) -> Tensor:
-        """See `starts.check_start`; the primitives are the usual ones if not given."""
+        """See `starts.check_start`. Default primitives: the standard set."""
         return check_start(self, poses, self._flown(primitives))
 
     def _flown(self, primitives: Primitives | None) -> Primitives:
@@ -183,7 +183,7 @@ def _point(place: Sequence[float] | Tensor, name: str) -> Tensor:
 
 
 def _listed(bounds: Sequence[float] | Tensor | None) -> list[float]:
-    """As the user wrote them."""
+    """Return the bounds as the user wrote them, for messages."""
     return torch.as_tensor(() if bounds is None else bounds, dtype=torch.float64).tolist()
 
 
@@ -203,18 +203,18 @@ def _lattice_box(
             )
         low, high = ends[:3], ends[3:]
         if not bool((low < high).all()):
-            raise InvalidArgumentError(f"bounds={ends.tolist()} hold nothing; write the low corner first.")
+            raise InvalidArgumentError(f"bounds={ends.tolist()} are empty; give the low corner first.")
         if bool(((high < mesh.low) | (low > mesh.high)).any()):
             raise InvalidArgumentError(
-                f"bounds={ends.tolist()} miss {name}, which extends from {_text(mesh.low, mesh.high)}."
+                f"bounds={ends.tolist()} do not meet {name}, which extends from {_text(mesh.low, mesh.high)}."
             )
     first, last = ((end / resolution + ON_PLANE).floor() for end in (low, high))
     n_cells = float((last - first + 1).prod())
     if n_cells > MAX_CELLS:
         raise MemoryLimitError(
-            f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)}, more than "
-            f"{MAX_CELLS:.3g}; take a coarser resolution (world.resolution), or tighter bounds "
-            "(world.bounds); is the mesh in metres, not in millimetres?"
+            f"{name}: {n_cells:.3g} cells of {resolution} m from {_text(low, high)} are more than "
+            f"{MAX_CELLS:.3g}. Use a coarser resolution (world.resolution) or tighter bounds (world.bounds); "
+            "check that the mesh is in metres, not millimetres."
         )
     return Box(first.long(), last.long() + 1)
 
@@ -228,25 +228,25 @@ def open_world(
     size: Sequence[float] | None = None,
     **options: Any,
 ) -> World:
-    """The world `name`: "warehouse" or "tunnels", of a seed and a size (m), or the "mesh" of a file.
+    """Open the world `name`: "warehouse" or "tunnels" with a seed and a size (m), or the "mesh" in a file.
 
-    `options` are those of `World.from_mesh`. Raises what that does, `InvalidArgumentError` for a name that
-    is not known or a setting that the world does not have, and `MissingDataError` for a path that does
-    not exist.
+    `options` are those of `World.from_mesh`, which also raises its errors. Raises `InvalidArgumentError`
+    for an unknown name or an option that the world does not have, and `MissingDataError` for a missing
+    file.
     """
     if name not in ("warehouse", "tunnels", "mesh"):
         raise InvalidArgumentError(f"world={name!r} is not known; choose warehouse, tunnels or mesh.")
     if name == "mesh":
         if size is not None:
-            raise InvalidArgumentError(f"size={size} is given, but a mesh has its own; give bounds instead.")
+            raise InvalidArgumentError(f"size={size}: a mesh has its own size; give bounds instead.")
         file = Path("" if path is None else path).expanduser()
         if not file.is_file():
             raise MissingDataError(
-                f"world.path={path} is no file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
+                f"world.path={path} is not a file; give a triangle mesh (PLY, OBJ, STL) in metres, z up."
             )
         return World.from_mesh(read_triangles(file), bounds=bounds, name=file.stem, **options)
     if path is not None:
-        raise InvalidArgumentError(f"path={path} is given, but world={name} needs none; drop it.")
+        raise InvalidArgumentError(f"path={path}: world={name} is generated and takes no path; drop it.")
     extent = () if size is None else (size,)
     if name == "warehouse":
         triangles = warehouse(seed, *extent)

@@ -1,4 +1,4 @@
-"""What was worked out about a world, kept on disk: bit-packed, found by a hash of all that it depends on."""
+"""Cache of the computed cells of worlds on disk: bit-packed, found by a hash of everything they depend on."""
 
 from __future__ import annotations
 
@@ -22,42 +22,42 @@ _log = logging.getLogger(__name__)
 
 _KIND = "gmmtorch-world"
 VERSION = 1
-"""To be raised whenever the same mesh would give other cells."""
+"""Increase it when the same mesh would give other cells."""
 
 
 def cache_folder() -> Path:
-    """$GMMTORCH_CACHE, else gmmtorch in $XDG_CACHE_HOME, else in ~/.cache."""
+    """Return $GMMTORCH_CACHE, else gmmtorch in $XDG_CACHE_HOME, else in ~/.cache."""
     own = os.environ.get("GMMTORCH_CACHE")
     if own:
         return Path(own)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "gmmtorch"
 
 
-def kept_cells(
+def cached_cells(
     triangles: Tensor,
     options: Mapping[str, Any],
     names: tuple[str, ...],
     shape: tuple[int, ...],
-    work_out: Callable[[], dict[str, Tensor]],
+    compute: Callable[[], dict[str, Tensor]],
 ) -> dict[str, Tensor]:
-    """Bool tensors of this shape by name: what is kept for the mesh and options, else worked out and kept."""
+    """Return bool tensors of this shape by name, from the cache, or computed and stored there."""
     key = world_key(triangles, options)
     cells = load_cells(key, names, shape)
     if cells is None:
-        cells = work_out()
+        cells = compute()
         save_cells(key, cells)
     return cells
 
 
 def world_key(triangles: Tensor, options: Mapping[str, Any]) -> str:
-    """A hash of triangles (T, 3, 3), float64, options that JSON can hold, and the version."""
+    """Hash triangles (T, 3, 3), float64, options (JSON), and the version."""
     digest = hashlib.sha256(triangles.contiguous().numpy().tobytes())
     digest.update(json.dumps({"version": VERSION, **options}, sort_keys=True).encode())
     return digest.hexdigest()
 
 
 def load_cells(key: str, names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, Tensor] | None:
-    """Bool tensors of this shape by name, or None where none are kept. What is damaged is not believed."""
+    """Read bool tensors of this shape by name; None if the file is missing or damaged."""
     path = _path(key)
     try:
         tensors, facts = read_tensors(path, _KIND, VERSION)
@@ -65,11 +65,11 @@ def load_cells(key: str, names: tuple[str, ...], shape: tuple[int, ...]) -> dict
             require(tensors, name, (math.ceil(math.prod(shape) / 8),), torch.uint8, path) for name in names
         ]
         if facts.get("key") != key or facts.get("shape") != list(shape) or facts.get("sum") != _sum(packed):
-            raise DataError(f"{path} is damaged, or another world's.")
+            raise DataError(f"{path} is damaged or belongs to another world.")
     except MissingDataError:
         return None
     except (DataError, OSError) as error:
-        _log.warning("Working the world out anew: %s", error)
+        _log.warning("The cached world cannot be used and is computed again: %s", error)
         return None
     bits = (np.unpackbits(part.numpy(), count=math.prod(shape)) for part in packed)
     return {
@@ -78,14 +78,14 @@ def load_cells(key: str, names: tuple[str, ...], shape: tuple[int, ...]) -> dict
 
 
 def save_cells(key: str, cells: Mapping[str, Tensor]) -> None:
-    """Keep bool tensors, all of one shape; where that cannot be done, a warning is logged and that is all."""
+    """Store bool tensors, all of one shape. A failure is logged as a warning."""
     packed = {name: torch.from_numpy(np.packbits(cell.numpy())) for name, cell in cells.items()}
     shape = list(next(iter(cells.values())).shape)
     data = pack_tensors(packed, _KIND, VERSION, key=key, shape=shape, sum=_sum(list(packed.values())))
     try:
         write_bytes(_path(key), data)
     except OutputError as error:
-        _log.warning("The world is not kept for the next run: %s", error)
+        _log.warning("The world is not cached: %s", error)
 
 
 def _path(key: str) -> Path:
