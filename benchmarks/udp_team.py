@@ -3,7 +3,7 @@
     python benchmarks/udp_team.py --runs 20 --loss 0.3 --kill    # three robots, one killed in each run
     python benchmarks/udp_team.py --robots 16 --scans 9600 --rate 1           # ten minutes
 
-Each robot is a `gmmtorch-robot` with its part of the log and a journal. With --kill one
+Each robot is a `gmmtorch-robot` with its part of the log and a store. With --kill one
 is killed (kill -9) at a random time, and started again a little later. Once all have had their say the
 maps must be equal, and hold every component of each robot's own map, once, to the bit; nothing may have
 been refused. Memory is what the kernel says of each process, and must not grow by more than a tenth from
@@ -34,7 +34,7 @@ from gmmtorch.sharing.replica.component_table import fingerprints
 _PAUSE = 0.1
 _SAMPLE = 10.0  # seconds between looks at the memory
 _PATIENCE = 60.0
-_KILLED_WITHIN = 12.0  # seconds of its first map
+_KILLED_WITHIN = 12.0  # seconds after its store is open
 _LONG, _GROWTH = 300.0, 1.1  # seconds of a run in which memory is to be level; and how much that allows
 
 
@@ -112,8 +112,8 @@ def run(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _is_at_work(home: Path) -> bool:
-    """Whether a robot has kept a map."""
-    return any(home.glob("kept/**/map-*.state"))
+    """Whether a robot has opened its store."""
+    return any(home.glob("kept/robot_*.sqlite"))
 
 
 def _start(

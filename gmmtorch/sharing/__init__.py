@@ -1,6 +1,6 @@
-"""What robots tell one another, as bytes, and the networks that carry it.
+"""The replicated map of a team, its store on disk, and the networks that carry its messages.
 
-`Replica` and `Journal` are imported when they are first used, so that `import gmmtorch.sharing` stays light.
+`Replica` and `Store` are imported when they are first used, so that `import gmmtorch.sharing` stays light.
 """
 
 from __future__ import annotations
@@ -9,14 +9,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gmmtorch.sharing.journal import Journal as Journal
     from gmmtorch.sharing.replica.replica import Replica as Replica
     from gmmtorch.sharing.store import Store as Store
 
-__all__ = ["Journal", "Replica", "Store"]
+__all__ = ["Replica", "Store"]
 
 _HOMES = {
-    "Journal": "gmmtorch.sharing.journal",
     "Replica": "gmmtorch.sharing.replica.replica",
     "Store": "gmmtorch.sharing.store",
 }

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 from command_runs import COMMANDS, QUIET, Disk, Finished, refused, run_here, succeeded
-from exploration.test_map_publisher import everything
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from sharing.test_publish import everything
 from test_robot_command import LOG, SMALL, room
 
 from gmmtorch.cli import robot_process, team

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 from gmmtorch.errors import DataError, check_whole
 from gmmtorch.exploration.mission.clocks import Stopwatch, check_pace
-from gmmtorch.exploration.mission.map_publisher import MapPublisher
 from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
@@ -88,7 +87,6 @@ class ReplayMission:
         self.is_over = False
         """Whether the log is over and all of it is published."""
         self._scans, self._store = scans, store
-        self._publisher = MapPublisher(replica)
         self._keep_every = check_whole("keep_every", keep_every, 1)
         self._covered_at: int | None = None
         """Position from which the map has all that earlier sessions published; None: there were none."""
@@ -187,7 +185,7 @@ class ReplayMission:
         # A map that is behind what was published would withdraw what it has not learned again yet.
         is_whole = self.is_over or (self._covered_at is not None and self.position >= self._covered_at)
         if self.map.dim is not None and (is_whole or self._covered_at is None):
-            self._publisher.update(self.map.components(), is_whole)
+            self.replica.publish(self.map.components(), whole=is_whole)
 
     def _save(self, position: int) -> None:
         if self._store is not None:

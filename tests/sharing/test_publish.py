@@ -1,4 +1,4 @@
-"""MapPublisher: the records of a robot equal its map, however the map changes and sessions end."""
+"""Replica.publish: the records of a robot equal its map, also after changes and restarts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sharing.schedules import components
 
-from gmmtorch.exploration.mission.map_publisher import MapPublisher
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.replica.replica import Replica
 
@@ -32,13 +31,13 @@ def empty() -> Components:
 @given(seed=st.integers(0, 10**6))
 def test_in_one_session_records_equal_the_map_and_only_changes_are_sent(seed):
     rng, replica, observer = random.Random(seed), Replica(3), Replica(9)
-    publisher, known = MapPublisher(replica), empty()
+    known = empty()
     for _ in range(6):
         before, known = content(known), changed(rng, known)
-        publisher.update(known, is_whole=rng.random() < 0.5)
+        replica.publish(known, whole=rng.random() < 0.5)
         assert content(replica.components()) == content(known)
         version = replica.version
-        publisher.update(known, is_whole=True)
+        replica.publish(known, whole=True)
         assert replica.version == version
         sent = replica.datagrams()
         assert bool(sent) == (content(known) != before)
@@ -55,17 +54,16 @@ def test_a_session_continues_another_one_that_was_killed(seed):
         replica = Replica(3)
         for datagram in [datagram for datagram in everything(team) if rng.random() < 0.7]:
             replica.receive(datagram)
-        publisher = MapPublisher(replica)
         for _ in range(2):
             known = changed(rng, known)
-            publisher.update(known, is_whole=False)
+            replica.publish(known, whole=False)
             assert not content(known) - content(replica.components())
             for datagram in replica.datagrams():
                 if rng.random() < 0.7:
                     assert team.receive(datagram)
         for datagram in everything(team):
             replica.receive(datagram)
-        publisher.update(known, is_whole=True)
+        replica.publish(known, whole=True)
         assert content(replica.components()) == content(known)
         for datagram in [*replica.datagrams(), *everything(replica)]:
             team.receive(datagram)
@@ -84,8 +82,8 @@ def everything(replica: Replica) -> list[bytes]:
 
 def test_counts_of_other_robots_do_not_repeat_records():
     rng, replica, other = random.Random(0), Replica(3), Replica(4)
-    publisher, known = MapPublisher(replica), components(random.Random(1), 5)
-    publisher.update(known, is_whole=True)
+    known = components(random.Random(1), 5)
+    replica.publish(known, whole=True)
     for datagram in replica.datagrams():
         other.receive(datagram)
     other.count({tuple(row): 10.0 * rng.random() + 1 for row in other.components().ids.tolist()})
@@ -93,7 +91,7 @@ def test_counts_of_other_robots_do_not_repeat_records():
         assert replica.receive(datagram)
     assert float(replica.components().support.sum()) > float(known.support.sum())
     version = replica.version
-    publisher.update(known, is_whole=True)
+    replica.publish(known, whole=True)
     assert replica.version == version
 
 
@@ -103,8 +101,8 @@ def test_components_of_other_robots_stay():
     for datagram in other.datagrams():
         assert replica.receive(datagram)
     known = components(random.Random(2), 3)
-    MapPublisher(replica).update(known, is_whole=True)
+    replica.publish(known, whole=True)
     assert content(replica.components()) == content(known, other.components())
     again = replace(known, support=known.support * 2, seen_count=known.seen_count * 2)
-    MapPublisher(replica).update(again, is_whole=True)
+    replica.publish(again, whole=True)
     assert content(replica.components()) == content(again, other.components())
