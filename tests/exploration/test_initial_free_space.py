@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.mission.clocks import SimulatedClock
+from gmmtorch.exploration.mission.driver import drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble, start_poses
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
@@ -36,8 +38,7 @@ def corridor(width: float, height: float) -> World:
 def flown(world: World, *start: tuple[float, ...], size: int = 1, duration: float = 8.0) -> Mission:
     options = replace(ALONE, size=len(start) or size, start=start or None, duration=duration)
     mission = assemble(world, options)
-    while not mission.is_over:
-        mission.step()
+    drive(mission, SimulatedClock())
     assert not any(robot.collisions for robot in mission.robots)
     return mission
 
