@@ -184,29 +184,6 @@ class Components:
         return self
 
 
-def packed(batches: Sequence[Components]) -> dict[str, Tensor]:
-    """B batches as one tensor for each field, and `sizes` (B, 3): components, origins and viewpoints."""
-    sizes = [[len(b), b.origins.shape[0], b.seen_by.shape[0]] for b in batches]
-    names = [f.name for f in fields(Components)] if batches else []
-    return {
-        "sizes": torch.tensor(sizes, dtype=torch.int64).reshape(-1, 3),
-        **{name: torch.cat([getattr(b, name) for b in batches]) for name in names},
-    }
-
-
-def unpacked(state: dict[str, Tensor]) -> list[Components]:
-    """The inverse of `packed`."""
-    n_components, n_origins, n_viewpoints = (column.tolist() for column in state["sizes"].unbind(1))
-    sizes = {"origins": n_origins, **dict.fromkeys(("seen_by", "seen_from", "seen_count"), n_viewpoints)}
-    if not n_components:
-        return []
-    columns = {f.name: state[f.name].split(sizes.get(f.name, n_components)) for f in fields(Components)}
-    return [
-        Components(**{name: parts[row] for name, parts in columns.items()})
-        for row in range(len(n_components))
-    ]
-
-
 def viewpoints_of(
     origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -6,16 +6,15 @@ import bisect
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
 from gmmtorch.mapping.codec.component_batch import spatial_order
-from gmmtorch.mapping.components import Components, packed, unpacked
+from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import summed
-from gmmtorch.sharing.messages.envelope import check_codec, loaded, stored, within
+from gmmtorch.sharing.messages.envelope import check_codec, within
 from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
@@ -178,24 +177,6 @@ class Broadcast:
     def digest(self) -> bytes:
         """None: what two robots hold may differ for good."""
         return b""
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs, once `changes` have been asked for."""
-        return {
-            "n_numbered": self._n_numbered,
-            "batches": packed(self._batches),
-            "gained": packed(self._gained),
-            "due": [stored(datagram) for datagram in self._due],
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a state; all of it has been told."""
-        for batch in unpacked(state["batches"]):
-            self._enter(batch)
-        self._gained = list(unpacked(state["gained"]))
-        self._n_rows += sum(map(len, self._gained))
-        self._n_told, self._n_numbered = len(self._batches), int(state["n_numbered"])
-        self._due = [loaded(data) for data in state["due"]]
 
 
 def _is_fit(batch: Components) -> bool:

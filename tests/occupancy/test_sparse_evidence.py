@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
 from gmmtorch.occupancy.voxels.boxes import Box
@@ -398,23 +398,6 @@ def test_evidence_is_added_from_another_store():
     target.add_from(source, box((50, 50, 50), (60, 60, 60)))  # outside the target
     with pytest.raises(InvalidArgumentError, match="they must be equal"):
         SparseEvidence(0.1).add_from(source, box())
-
-
-def test_a_restored_store_continues_alike():
-    store, _ = filled(3)
-    other = SparseEvidence(0.2, box=box(), dtype=torch.float32)
-    other.add(random_evidence(500, 77))  # is replaced
-    state = store.state()
-    other.restore(state)
-    more = random_evidence(3000, 8)
-    for one, two in zip(store.add(more), other.add(more), strict=True):
-        assert torch.equal(one, two)
-    assert counts_of(store) == counts_of(other)
-    other.restore(state)  # a state is a copy
-    assert counts_of(other) == filled(3)[1]
-    for wrong in (SparseEvidence(0.1, box=box()), SparseEvidence(0.2, box=box((0, 0, 0), (9, 9, 9)))):
-        with pytest.raises(DataError, match="Use an equal store"):
-            wrong.restore(state)
 
 
 def test_invalid_resolutions_and_boxes_are_refused():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass, field
-from typing import Any
 from unittest import mock
 
 import torch
@@ -50,7 +49,7 @@ class _Team:
     now: int = 0
     flying: list[tuple[int, int, bytes]] = field(default_factory=list)  # arrival, receiver, datagram
     cut: set[int] = field(default_factory=set)  # robots on one side of a partition
-    snapshots: dict[int, dict[str, Any]] = field(default_factory=dict)
+    snapshots: dict[int, tuple[list[bytes], list[bytes]]] = field(default_factory=dict)
     refused: dict[str, int] = field(default_factory=dict)
     crashes: int = 0
 
@@ -77,7 +76,7 @@ class _Team:
         self.note_refused(robot)
         self.replicas[robot] = Replica(robot, incarnation=self.rng.getrandbits(24))
         if keeps_disk and robot in self.snapshots:
-            self.replicas[robot].restore(self.snapshots[robot])
+            assert self.replicas[robot].load(*self.snapshots[robot]) == 0
 
     def note_refused(self, robot: int) -> None:
         for reason, n in self.replicas[robot].refused.items():
@@ -132,14 +131,14 @@ def _run(rng: random.Random, n_robots: int, n_steps: int) -> Outcome:
             if rng.random() < 0.7:
                 team.broadcast(robot, replica.datagrams(budget=rng.choice([None, 1500])))
             if rng.randrange(_SNAPSHOT_EVERY) == 0:
-                team.snapshots[robot] = replica.state()
+                team.snapshots[robot] = replica.stored()
         team.deliver()
     rounds = _heal(team, held := _union(team.replicas))
     for robot in range(n_robots):
         team.note_refused(robot)
     return Outcome(
         converged=_agree(team.replicas),
-        complete=all(_held(replica).covers(held) for replica in team.replicas),
+        complete=all(replica.held.covers(held) for replica in team.replicas),
         rounds=rounds,
         replicas=team.replicas,
         refused=team.refused,
@@ -172,13 +171,8 @@ def _agree(replicas: list[Replica]) -> bool:
     return len({replica.digest() for replica in replicas}) == 1
 
 
-def _held(replica: Replica) -> Intervals:
-    edges = replica.state()["records"]["held"].numpy()
-    return Intervals(edges)
-
-
 def _union(replicas: list[Replica]) -> Intervals:
     held = Intervals.empty()
     for replica in replicas:
-        held |= _held(replica)
+        held |= replica.held
     return held

@@ -345,7 +345,7 @@ def test_nothing_is_due_for_ever():
     """Superseded while it was due, or before somebody turns out to lack it."""
 
     def due() -> Intervals:
-        return Intervals.loaded(one.state()["backlog"]["due"])
+        return one._backlog.due
 
     one, other = Replica(0), Replica(1)
     ids = one.add(random_components(3, k=20))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -49,8 +49,8 @@ def announcement(number: int, begin: int, n: int = 550) -> AnnouncementMessage:
     return AnnouncementMessage(number % 5 + 1, 0, begin, begin + 2 * n, spread(begin, n))
 
 
-def n_intervals(rows: list) -> int:
-    return sum(len(edges) // 2 for _, edges in rows)
+def n_intervals(by_robot: Mapping[int, Intervals]) -> int:
+    return sum(map(len, by_robot.values()))
 
 
 def burying(new: Intervals | None = None) -> bytes:
@@ -74,8 +74,8 @@ def goes_on(replica: Replica) -> None:
     assert all(other.receive(datagram) for datagram in replica.datagrams())
     mine = {tuple(row) for row in [*ids[3:].tolist(), *kept.tolist()]}
     assert {tuple(row) for row in other.components().ids.tolist()} == mine
-    again = Replica(replica.robot, most_components=10)
-    again.restore(replica.state())
+    again = Replica(replica.robot)
+    assert again.load(*replica.stored()) == 0
     assert again.digest() == replica.digest()
 
 
@@ -97,11 +97,11 @@ def test_announcements_without_end(table, begin):
     n = anti_entropy.MOST_REMEMBERED // 550 + 40
     for number in range(n):
         assert replica.receive(b"\x1a", announcement(number, begin))
-    backlog = replica.state()["backlog"]
-    assert n_intervals(backlog[table]) > anti_entropy.MOST_REMEMBERED // 2
-    assert n_intervals(backlog["gaps"]) <= anti_entropy.MOST_REMEMBERED
-    assert n_intervals(backlog["theirs"]) <= anti_entropy.MOST_REMEMBERED
-    assert len(backlog["due"]) == 0
+    backlog = replica._backlog
+    sizes = {"gaps": n_intervals(backlog._gaps), "theirs": n_intervals(backlog._theirs)}
+    assert sizes[table] > anti_entropy.MOST_REMEMBERED // 2
+    assert max(sizes.values()) <= anti_entropy.MOST_REMEMBERED
+    assert not backlog.due
 
 
 def test_who_announces_without_end_is_forgotten_and_the_honest_are_not():
@@ -131,12 +131,6 @@ def test_what_nobody_has_is_missing_for_a_while_alone(again):
     assert not replica.missing
     replica.receive(b"\x1a", invented)
     assert replica.missing == invented.held  # it may be there after all
-    restored = Replica(0, incarnation=replica.incarnation)
-    for _ in range(PATIENCE - 1):
-        replica.announcements()
-    restored.restore(replica.state())
-    restored.announcements()
-    assert not restored.missing
 
 
 def test_what_is_taken_to_be_on_its_way_is_bounded():
@@ -150,8 +144,7 @@ def test_what_is_taken_to_be_on_its_way_is_bounded():
         keys = BURIED + 2 * n * number + 2 * np.arange(n)
         components = replace(message.components, ids=ids_of(keys))
         assert replica.receive(b"\x11", replace(message, components=components))
-    passing = replica.state()["backlog"]["passing"]
-    assert sum(len(edges) // 2 for edges in passing) <= anti_entropy.MOST_IN_FLIGHT
+    assert sum(map(len, replica._backlog._in_flight)) <= anti_entropy.MOST_IN_FLIGHT
 
 
 def test_totals_without_end(monkeypatch):

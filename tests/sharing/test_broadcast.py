@@ -204,9 +204,6 @@ def test_more_than_is_held_is_refused_from_others_and_said_all_the_same(
     assert one.refused == {"full": 3}
     assert len(one.components()) == 10
     assert float(one.components().support.sum()) == support
-    restored = Broadcast(0, "float")
-    restored.restore(one.state())
-    assert not restored.receive(counted)
     one.add(frame_of_components(4))
     assert one.datagrams()
     assert len(one.components()) == 14

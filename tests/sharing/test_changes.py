@@ -13,7 +13,6 @@ from mapping.random_components import random_components
 from sharing.replica_model import rows
 from sharing.schedules import act, components
 
-from gmmtorch.errors import DataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import CountersMessage, SupersessionMessage, encode_record
@@ -257,61 +256,6 @@ def tell(replica: Replica, seed: int) -> None:
     replica.count({tuple(row): 9.0 + seed for row in ids[:2].tolist()})
     known = replica.components().ids
     replica.count({tuple(known[0].tolist()): 100.0 * 2**seed})
-
-
-@pytest.mark.parametrize("asked", [0, 1, 2])
-def test_a_saved_position_is_gone_on_from(asked):
-    """The changes after a restart are those of a replica that was not restarted."""
-    one = Replica(0, incarnation=3)
-    for seed in range(asked):
-        tell(one, seed)
-        one.changes()
-    tell(one, 7)
-    tell(one, 8)
-    again = Replica(0, incarnation=3)
-    again.restore(one.state())
-    for replica in (one, again):
-        tell(replica, 9)
-    plain, restored = one.changes(), again.changes()
-    assert not restored.rebuilt
-    assert len(plain.added) == len(restored.added) == 3
-    for mine, theirs in zip([*plain.added, plain.gained], [*restored.added, restored.gained], strict=True):
-        assert rows(mine) == rows(theirs)
-    again.restore(one.state())
-    assert again.changes().added == []
-
-
-def test_another_life_starts_over():
-    one = Replica(0, incarnation=3)
-    tell(one, 1)
-    one.changes()
-    again, follower = Replica(0, incarnation=4), Follower()
-    again.restore(one.state())
-    follower.follow(again)
-    assert follower.rebuilt == 1
-    assert follower.agrees(again)
-    tell(again, 2)
-    follower.follow(again)
-    assert follower.rebuilt == 1
-    assert follower.agrees(again)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("keys", torch.tensor([5])),
-        ("sizes", torch.tensor([1, 2])),
-        ("sums", torch.tensor([-1.0])),
-        ("told", None),
-    ],
-)
-def test_a_damaged_position_is_refused(name, value):
-    one = Replica(0, incarnation=3)
-    tell(one, 1)
-    state = one.state()
-    state["records"]["log"][name] = value
-    with pytest.raises(DataError):
-        Replica(0, incarnation=3).restore(state)
 
 
 def test_who_does_not_ask_costs_no_memory(monkeypatch):

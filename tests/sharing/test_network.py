@@ -480,33 +480,6 @@ def test_the_books_count_broadcasts_once_by_sender_and_kind(sent, conditions):
     assert network.n_wire_bytes == network.n_bytes + 28 * len(everything)
 
 
-def test_a_network_without_positions_is_restored_without():
-    network = network_of(2, reach=1.0)
-    other = network_of(2, reach=1.0)
-    other.place(on_a_line([0.0, 0.0]))
-    other.restore(network.state())
-    with pytest.raises(InvalidArgumentError, match="needs positions"):
-        other.send(0, [b""], 0.0, "maps")
-
-
-def test_what_was_delivered_is_forgotten():
-    network = network_of(2, duplication=1.0)
-    sizes = []
-    for tick in range(50):
-        network.send(0, [bytes(1000)], float(tick), "maps")
-        network.deliver(1, float(tick) + 0.5)
-        sizes.append(network.state()["payload"].numel())
-    assert network.n_in_flight == 0
-    assert max(sizes) == sizes[0] <= 1
-
-
-def test_a_datagram_on_its_way_to_many_is_kept_once():
-    network = network_of(9, jitter=1.0, duplication=1.0)
-    network.send(0, [bytes(1000)], 0.0, "maps")
-    assert network.n_in_flight == 16
-    assert network.state()["payload"].numel() == 1001
-
-
 def test_a_robot_alone_still_pays_for_what_it_sends():
     network = network_of(1, jitter=1.0, loss=0.5, duplication=0.5)
     network.send(0, [b"abc"], 0.0, "maps")
@@ -615,8 +588,5 @@ def test_what_cannot_be_sent_is_named_and_not_sent():
     for robot in (2, -1):
         with pytest.raises(InvalidArgumentError, match=f"robot={robot}"):
             network.reception(robot)
-    with pytest.raises(InvalidArgumentError, match="3 robots"):
-        network.restore(Network(3).state())
     assert (network.n_datagrams, network.n_in_flight) == (0, 0)
     assert network.reception() == Reception()
-    assert isinstance(network.state()["losses"], torch.Tensor)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from fractions import Fraction
 
@@ -68,22 +67,6 @@ def test_a_clock_that_is_set_back_brings_nothing_for_that_step() -> None:
     bucket = TokenBucket(100.0)
     bucket.take(bucket.available(1e9))
     assert [bucket.available(t) for t in (50.0, 51.0, 51.0, 40.0, 42.0)] == [0, 100, 100, 100, 300]
-
-
-@given(rate=rates, steps=steps, cut=st.integers(0, 40))
-def test_restored_it_goes_on_alike(rate: int, steps: list[tuple[int, int]], cut: int) -> None:
-    whole, first, second = (TokenBucket(rate) for _ in range(3))
-    expected = spent(whole, steps)
-    before = spent(first, steps[:cut])
-    second.restore(json.loads(json.dumps(first.state())))
-    now = before[-1][0] if before else 0.0
-    after = (
-        spent(second, [(steps[cut][0] + round(8 * now), steps[cut][1]), *steps[cut + 1 :]])
-        if steps[cut:]
-        else []
-    )
-    assert before + after == expected
-    assert second.state() == whole.state()
 
 
 @pytest.mark.parametrize("rate", [0.0, -5.0, math.inf, math.nan])

@@ -88,10 +88,7 @@ class ViewLibrary:
     Attributes:
         refused: number of messages that were not accepted, by reason: "duplicate_id", "full".
         version: rises with every change.
-        differs: False: no robot announces its views, as missing ones are repeated.
     """
-
-    differs = False
 
     def __init__(
         self,
@@ -267,10 +264,6 @@ class ViewLibrary:
             self._due.difference_update(views)
             self._heard_at.update(dict.fromkeys(views, now))
         return sent
-
-    def announcements(self) -> list[bytes]:
-        """None: missing views are repeated."""
-        return []
 
     def receive(self, message: ViewsMessage, now: float) -> bool:
         """Merge the views of another robot at the time `now` (s); returns whether they were accepted.

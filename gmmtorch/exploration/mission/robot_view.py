@@ -71,7 +71,7 @@ class FlyingRobotView:
 
     @property
     def _n_conflicts(self) -> int:
-        return self._shared.conflicts[self.robot] if isinstance(self._shared, Replica) else 0
+        return self._shared.duplicates[self.robot] if isinstance(self._shared, Replica) else 0
 
     def status(self) -> str:
         belief = self._agent.robot.mapper.belief
@@ -139,7 +139,7 @@ class ReplayingRobotView:
         self.robot = self._replica.robot
 
     def check_id(self) -> None:
-        _check_id(self._mission.radio, self._replica.conflicts[self.robot])
+        _check_id(self._mission.radio, self._replica.duplicates[self.robot])
 
     def status(self) -> str:
         n_scans, replica = self._mission.n_scans, self._replica
@@ -148,7 +148,7 @@ class ReplayingRobotView:
             f"scan {self._mission.position:,}/{total}, {replica.n_components:,} components, "
             f"{replica.missing.size:,} missing, "
             f"{self._transport.traffic(self.robot).bytes / 1e3:,.0f} kB sent"
-            f"{self._mission.radio.warnings(replica.conflicts[self.robot])}"
+            f"{self._mission.radio.warnings(replica.duplicates[self.robot])}"
         )
 
     def scalars(self) -> dict[str, float]:
@@ -182,7 +182,7 @@ class ReplayingRobotView:
             **self._transport.books(self.robot),
             **_reception(mission.radio),
             "not_merged": dict(replica.refused),
-            "conflicts": {str(robot): n for robot, n in sorted(replica.conflicts.items()) if n},
+            "conflicts": {str(robot): n for robot, n in sorted(replica.duplicates.items()) if n},
             "unkept": _n_unkept(mission.radio),
             "stage_seconds": mission.watch.seconds,
         }

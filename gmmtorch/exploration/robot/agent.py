@@ -22,7 +22,6 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (
     MAX_BYTES,
     PlanMessage,
-    ViewsHeldMessage,
     ViewsMessage,
     encode_plan,
 )
@@ -38,7 +37,6 @@ _RESTING_PLANS = 10
 """Plans of a robot at rest, of which one is sent."""
 _PATIENCE = 15
 """Plans in a row that lead nowhere before a robot looks around: to leave a start takes up to six."""
-_VIEW_MESSAGES = (ViewsMessage, ViewsHeldMessage)
 
 
 class Agent:
@@ -127,9 +125,9 @@ class Agent:
             return
         shared, library = self.robot.mapper.shared, self.robot.library
         datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
-        urgent = bool(shared.missing) or library.differs
+        urgent = bool(shared.missing)
         if self.radio.announcements.due(now, (shared.version, library.version), urgent):
-            datagrams += [*shared.announcements(), *library.announcements()]
+            datagrams += shared.announcements()
         self.radio.send(datagrams, now)
 
     def send_views(self, now: float) -> None:
@@ -149,11 +147,11 @@ class Agent:
         for item in received:
             if isinstance(item.message, PlanMessage):
                 self._note_plan(item.sender, item.message, now)
-            elif isinstance(item.message, _VIEW_MESSAGES):
+            elif isinstance(item.message, ViewsMessage):
                 self.robot.library.receive(item.message, now)
         with self.watch("mapping"):
             merged = self.robot.mapper.receive(
-                [item for item in received if not isinstance(item.message, (PlanMessage, *_VIEW_MESSAGES))]
+                [item for item in received if not isinstance(item.message, PlanMessage | ViewsMessage)]
             )
             self.radio.keep(merged)
 

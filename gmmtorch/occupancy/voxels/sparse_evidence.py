@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.boxes import Box, contains, intersection
@@ -318,33 +317,6 @@ class SparseEvidence(SparseLattice):
         """Lowest and highest corner (D,) of the stored blocks, world metres."""
         corner = self._corners()
         return corner.amin(0) * self.resolution, (corner.amax(0) + self.block_side) * self.resolution
-
-    # -- checkpoints ------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        """A copy of the evidence and the box, for `restore`."""
-        return {
-            "resolution": self.resolution,
-            "box": None if self._box is None else tuple(side.clone() for side in self._box),
-            "anchor": self.anchor,
-            "keys": self.keys.clone(),
-            "counts": torch.stack(self.in_key_order()),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Replace the evidence and the box by a `state`; raise `DataError` if it does not fit this store."""
-        box = None if state["box"] is None else Box(*state["box"])
-        if state["resolution"] != self.resolution or (
-            self._box is not None and box is not None and box.shape != self._box.shape
-        ):
-            raise DataError(
-                f"The state has cells of {state['resolution']} m in a box of {box and box.shape} cells; this "
-                f"store has {self.resolution} m and {self._box and self._box.shape}. Use an equal store."
-            )
-        self._box, self.anchor = box, state["anchor"]
-        self.clear()
-        self.open_blocks(state["keys"].to(self.device))
-        self.counts[:, 1 : self.n_blocks + 1] = state["counts"]
 
     # -- files ------------------------------------------------------------------------------------
 

@@ -7,9 +7,6 @@ import zlib
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 
-import torch
-from torch import Tensor
-
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 VERSION = 1
@@ -111,16 +108,6 @@ def within(datagrams: Sequence[bytes], budget: int | None) -> int:
     """How many of the first datagrams take at most `budget` bytes together; None: all."""
     sizes = itertools.accumulate(map(len, datagrams))
     return len(datagrams) if budget is None else sum(size <= budget for size in sizes)
-
-
-def stored(datagram: bytes) -> Tensor:
-    """A datagram as a tensor, for a file."""
-    return torch.frombuffer(bytearray(datagram), dtype=torch.uint8)
-
-
-def loaded(data: Tensor) -> bytes:
-    """The inverse of `stored`."""
-    return data.numpy().tobytes()
 
 
 def check_codec(codec: str) -> str:

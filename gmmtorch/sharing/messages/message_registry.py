@@ -38,7 +38,6 @@ __all__ = [
     "PlanMessage",
     "PointsMessage",
     "SupersessionMessage",
-    "ViewsHeldMessage",
     "ViewsMessage",
     "decode",
     "encode_components",
@@ -61,8 +60,6 @@ Message = (
     | CountersMessage
     | CorrectionMessage
 )
-
-ViewsHeldMessage = ViewsMessage  # views are repeated, not announced
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.COMPONENTS: component_messages.read_quantized,

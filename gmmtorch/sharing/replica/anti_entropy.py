@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any
 
 from gmmtorch.sharing.messages.announcements import AnnouncementMessage
-from gmmtorch.sharing.messages.envelope import loaded, stored
 from gmmtorch.sharing.replica.intervals import Intervals, evict
 from gmmtorch.sharing.replica.record_keys import keys_of_robot
 
@@ -99,33 +97,3 @@ class Backlog:
     def missing(self, held: Intervals) -> Intervals:
         """Records that others announced and that are not held here."""
         return Intervals.union(self._theirs.values()) - held
-
-    # -- saving -----------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "due": self.due.stored(),
-            "passing": [keys.stored() for keys in self._in_flight],
-            "gaps": [[robot, gap.stored()] for robot, gap in self._gaps.items()],
-            "theirs": [[robot, keys.stored()] for robot, keys in self._theirs.items()],
-            "waited": [[robot, n] for robot, n in self._waited.items()],
-            "ready": [[stored(datagram), keys.stored()] for datagram, keys in self.ready],
-        }
-
-    def forget_others(self) -> None:
-        """Forget what others lack and hold, and what is in flight."""
-        self._in_flight = [Intervals.empty()] * _CALLS_IN_FLIGHT
-        self._gaps.clear()
-        self._theirs.clear()
-        self._waited.clear()
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
-        self.due = Intervals.loaded(state["due"])
-        self._in_flight = [Intervals.loaded(keys) for keys in state["passing"]][:_CALLS_IN_FLIGHT]
-        self._gaps, self._theirs = (
-            OrderedDict((int(robot), Intervals.loaded(keys)) for robot, keys in state[name])
-            for name in ("gaps", "theirs")
-        )
-        self._waited = {int(robot): int(n) for robot, n in state["waited"]}
-        self.ready = [(loaded(data), Intervals.loaded(keys)) for data, keys in state["ready"]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -66,7 +66,7 @@ class Author:
     """
 
     def __init__(self, records: Records, robot: int, incarnation: int) -> None:
-        self._records, self._robot, self._incarnation = records, robot, incarnation
+        self._records, self._robot = records, robot
         self._first = first_key(robot, incarnation)
         self._last = self._first + MOST_RECORDS - 1  # no key of this author takes more bytes
         self._keys_of_robot, self.keys = keys_of_robot(robot), keys_of_author(robot, incarnation)
@@ -281,23 +281,3 @@ class Author:
             )
         self._n += n
         return self._first + self._n - n
-
-    # -- saving -----------------------------------------------------------------------------------
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "incarnation": self._incarnation,
-            "n": self._n,
-            "fold_at": self._merge_at,
-            "totals": [[key, points] for key, points in self._points.items()],
-            "told": [[key, step] for key, step in self._written_steps.items()],
-            "published": sorted(self._published),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue; but what another incarnation numbered and counted stays that one's."""
-        self._published = {int(key) for key in state["published"]}
-        if state["incarnation"] == self._incarnation:
-            self._n, self._merge_at = int(state["n"]), int(state["fold_at"])
-            self._points = {int(key): float(points) for key, points in state["totals"]}
-            self._written_steps = {int(key): int(step) for key, step in state["told"]}

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
-from gmmtorch.errors import DataError
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.record_messages import CorrectionMessage
 from gmmtorch.sharing.replica.component_table import ComponentTable
@@ -43,13 +41,13 @@ class Changes:
 class ChangeLog:
     """Which components and counters were reported. It costs nothing until the first call of `read`."""
 
-    def __init__(self, rebuilt: bool = False) -> None:
+    def __init__(self) -> None:
         self._batch = 0  # the first batch that was not reported
         # Points reported, by component; None: before the first call.
-        self._reported: dict[int, float] | None = {} if rebuilt else None
+        self._reported: dict[int, float] | None = None
         self._touched: list[Ints] | None = None  # components whose counters changed; None: any
         self._n_touched = 0
-        self._rebuilt = rebuilt
+        self._rebuilt = False
 
     def counted(self, keys: Ints) -> None:
         """Counters of these components were added or dropped."""
@@ -88,29 +86,3 @@ class ChangeLog:
             return Changes(added, Components.empty(table.dim), False)
         held = corrected(table.selected(risen), risen, corrections)
         return Changes(added, gains(held, torch.from_numpy(rise[rise > 0])), False)
-
-    # -- saving -----------------------------------------------------------------------------------
-
-    def state(self, table: ComponentTable) -> dict[str, Any]:
-        """Batches that were not reported, by keys, and what was reported."""
-        batches = [keys for keys, _ in table.since(self._batch)]
-        reported = self._reported or {}
-        return {
-            "asked": self._reported is not None,
-            "rebuilt": self._rebuilt,
-            "sizes": torch.tensor([len(keys) for keys in batches], dtype=torch.int64),
-            "keys": torch.from_numpy(np.concatenate([_NO_KEYS, *batches])),
-            "told": torch.tensor(list(reported), dtype=torch.int64),
-            "sums": torch.tensor(list(reported.values()), dtype=torch.float64),
-        }
-
-    @classmethod
-    def restored(cls, state: dict[str, Any], n_batches: int) -> ChangeLog:
-        """The log of a `state`; the table has so many batches that were reported."""
-        reported, sums = state["told"].tolist(), state["sums"].tolist()
-        if not (state["sums"].isfinite() & (state["sums"] >= 0)).all():
-            raise DataError("The reported counters are damaged.")
-        log = cls()
-        log._batch, log._rebuilt = n_batches, bool(state["rebuilt"])
-        log._reported = dict(zip(reported, sums, strict=True)) if state["asked"] else None
-        return log

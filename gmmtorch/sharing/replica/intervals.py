@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gmmtorch.errors import InvalidArgumentError
@@ -63,15 +62,6 @@ class Intervals:
         is_first[1:] = begins[1:] > ends[:-1]
         is_last = np.append(is_first[1:], True)
         return cls(np.stack([begins[is_first], ends[is_last]], 1).reshape(-1))
-
-    def stored(self) -> torch.Tensor:
-        """The edges (2n,), a copy, for a file."""
-        return torch.from_numpy(self.edges.copy())
-
-    @classmethod
-    def loaded(cls, edges: torch.Tensor) -> Intervals:
-        """What was `stored`. Raises `InvalidArgumentError` for what was not."""
-        return cls(edges.numpy().astype(np.int64))
 
     def __len__(self) -> int:
         """The number of intervals."""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
 
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.codec.component_batch import encode, quantized
+from gmmtorch.mapping.codec.component_batch import encode
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import read_batch
-from gmmtorch.sharing.messages.message_registry import decode
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
@@ -75,7 +74,7 @@ class Records:
     """
 
     def __init__(self, dim: int | None = None, most_components: int = MOST_COMPONENTS) -> None:
-        self.dim = self._dim_asked = dim
+        self.dim = dim
         self._most = most_components
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
@@ -244,10 +243,6 @@ class Records:
         """The changes since the last call."""
         return self._log.read(self.table, self.counters, self.of(CorrectionMessage))
 
-    def break_off(self) -> None:
-        """Make the next `changes` say `rebuilt`."""
-        self._log = ChangeLog(rebuilt=True)
-
     def digest(self) -> bytes:
         """16 bytes, equal if and only if the held keys and the records that count are equal to the bit."""
         digest = hashlib.blake2b(self.held.edges.astype("<i8").tobytes(), digest_size=16)
@@ -281,54 +276,6 @@ class Records:
                 part = components.selected(piece)
                 self.add_components(part, bounded=bool((part.ids[:, 0] != own).any()))
 
-    def state(self) -> dict[str, Any]:
-        keys = self.table.keys()
-        components = self.table.selected(keys) if len(keys) else Components.empty(self.dim or 3)
-        datagrams = [self.datagrams[key] for key in sorted(self.others)]
-        return {
-            "dim": self.dim,
-            "held": self.held.stored(),
-            "components": dict(vars(components)),
-            "record_bytes": torch.tensor([len(datagram) for datagram in datagrams], dtype=torch.int64),
-            "records": torch.frombuffer(bytearray(b"".join(datagrams) or b"\0"), dtype=torch.uint8),
-            "log": self._log.state(self.table),
-        }
-
-    def restore(self, state: dict[str, Any], robot: int) -> None:
-        """Replace all records by those of a `state`. Raises `DataError` if it is damaged, of another
-        dimension, or has too many components of others; nothing has changed then.
-        """
-        if None not in (asked := self._dim_asked, dim := state["dim"]) and asked != dim:
-            raise DataError(f"The state is of a map in {dim}D, this is one with dim={asked}.")
-        fresh = Records(asked if dim is None else dim, self._most)
-        fresh._dim_asked = asked
-        components = Components(**state["components"]).checked()
-        if (n := int((components.ids[:, 0] != robot).sum())) > self._most:
-            raise DataError(f"The state has {n} components of others, with most_components={self._most}.")
-        if fingerprints(quantized(components)) != fingerprints(components):
-            raise DataError("Components are not as the codec leaves them: the state is damaged.")
-        keys, log = keys_of(components.ids), state["log"]
-        untold = [batch.numpy() for batch in log["keys"].split(log["sizes"].tolist())]
-        if not np.isin(log["keys"].numpy(), keys).all():
-            raise DataError("Components that came are not there: the state is damaged.")
-        told = np.flatnonzero(~np.isin(keys, log["keys"].numpy()))
-        pieces = [told[begin : begin + _PIECE] for begin in range(0, len(told), _PIECE)]
-        row_of = dict(zip(keys.tolist(), range(len(keys)), strict=True))
-        pieces += [np.array([row_of[key] for key in batch.tolist()], np.int64) for batch in untold]
-        for piece in pieces:
-            fresh.add_components(components.selected(torch.from_numpy(piece)), bounded=False)
-        data, at = state["records"].numpy().tobytes(), 0
-        for n_bytes in state["record_bytes"].tolist():
-            fresh.add_record(_record(data[at : at + n_bytes]), bounded=False)
-            at += n_bytes
-        held = fresh.held | Intervals.loaded(state["held"])
-        fresh.dead = held - fresh.live()
-        fresh._hold(held)
-        fresh._log = ChangeLog.restored(log, len(pieces) - len(untold))
-        fresh.version = self.version + 1
-        fresh._view = None
-        vars(self).update(vars(fresh))
-
 
 def _n_entries(record: RecordMessage) -> int:
     """The entries of a record that count towards `MOST_ENTRIES`."""
@@ -337,13 +284,6 @@ def _n_entries(record: RecordMessage) -> int:
     if isinstance(record, SupersessionMessage):
         return len(record.old) + len(record.new)
     return len(record.moved)
-
-
-def _record(datagram: bytes) -> RecordMessage:
-    message = decode(datagram)
-    if not isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
-        raise DataError("A record is none: the state is damaged.")
-    return message
 
 
 def _duplicate_id(key: int) -> RefusedError:

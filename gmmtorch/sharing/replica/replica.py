@@ -300,10 +300,6 @@ class Replica:
     def n_components(self) -> int:
         return len(self._records.table)
 
-    @property
-    def conflicts(self) -> Counter[int]:
-        return self.duplicates
-
     # -- storing ----------------------------------------------------------------------------------
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
@@ -331,34 +327,6 @@ class Replica:
         if not isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
             raise DataError(f"{type(message).__name__} is no record.")
         self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
-
-    def state(self) -> dict[str, Any]:
-        """Everything, for a checkpoint of a mission."""
-        return {
-            "robot": self.robot,
-            "records": self._records.state(),
-            "author": self._author.state(),
-            "backlog": self._backlog.state(),
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Replace all contents by those of a `state`. The incarnation stays that of this replica.
-
-        Raises `DataError` for a state that is damaged, or another robot's.
-        """
-        try:
-            if state["robot"] != self.robot:
-                raise DataError(f"The state is of robot {state['robot']}, this is robot={self.robot}.")
-            self._records.restore(state["records"], self.robot)
-            self._author.restore(state["author"])
-            self._backlog.restore(state["backlog"])
-            if state["author"]["incarnation"] != self.incarnation:
-                self._records.break_off()
-                self._backlog.forget_others()
-        except DataError:
-            raise
-        except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise DataError(f"The state of robot {self.robot} is damaged ({error}).") from error
 
     def _checked(self, components: Components) -> Components:
         components = components.checked()

@@ -159,8 +159,6 @@ class FramedTransport(ABC):
         """Robot ids that two robots use, with the addresses and sessions of both."""
         return self._opener.duplicates
 
-    namesakes = duplicates
-
     # -- closing -------------------------------------------------------------------------------------------
 
     def close(self) -> None:

@@ -198,47 +198,6 @@ class Network:
         """Datagrams in flight, one for each robot that will receive it."""
         return sum(map(len, self._queues))
 
-    def state(self) -> dict[str, Any]:
-        """All that `restore` needs: datagrams in flight, statistics, positions, and the generators."""
-        arrivals = [(robot, arrival) for robot, queue in enumerate(self._queues) for arrival in sorted(queue)]
-        datagrams = {arrival.order: arrival.datagram for _, arrival in arrivals}
-        return {
-            "losses": self._losses.get_state(),
-            "delays": self._delays.get_state(),
-            "positions": self._positions,
-            "busy_until": torch.tensor(self._busy_until, dtype=torch.float64),
-            "n_sent": self._n_sent,
-            "traffic": [[sender, kind, *traffic] for (sender, kind), traffic in self._traffic.items()],
-            "received": [list(self.reception(robot)) for robot in range(self.n_robots)],
-            "payload": torch.frombuffer(bytearray(b"".join(datagrams.values()) + b"\0"), dtype=torch.uint8),
-            "datagrams": [[order, len(data)] for order, data in datagrams.items()],
-            "arrivals": [[robot, a.time, a.order, a.sender] for robot, a in arrivals],
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state` of a network with as many robots, and the same conditions."""
-        busy_until = state["busy_until"].tolist()
-        if len(busy_until) != self.n_robots:
-            raise InvalidArgumentError(
-                f"state is of {len(busy_until)} robots; this network has n_robots={self.n_robots}."
-            )
-        payload, datagrams, begin = bytes(state["payload"].numpy()), {}, 0
-        for order, size in state["datagrams"]:
-            datagrams[order] = payload[begin : begin + size]
-            begin += size
-        queues: list[list[_Arrival]] = [[] for _ in range(self.n_robots)]
-        for robot, time, order, sender in state["arrivals"]:
-            queues[robot].append(_Arrival(time, order, sender, datagrams[order]))
-        self._queues = queues  # each was sorted, so it is a heap
-        self._busy_until, self._n_sent = busy_until, state["n_sent"]
-        self._traffic = {(sender, kind): Traffic(n, size) for sender, kind, n, size in state["traffic"]}
-        self._received = [
-            Counter(dict(zip(Reception._fields, counts, strict=True))) for counts in state["received"]
-        ]
-        self._positions = state["positions"]
-        self._losses.set_state(state["losses"])
-        self._delays.set_state(state["delays"])
-
     def _near(self, sender: int, others: Sequence[int]) -> list[bool]:
         """Whether each of the others is in reach."""
         reach, positions = self.conditions.reach, self._positions

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from gmmtorch.errors import InvalidArgumentError
 
@@ -41,9 +40,3 @@ class TokenBucket:
     def take(self, n_bytes: int) -> None:
         """Subtract bytes that were sent. More than were available delay later ones."""
         self._tokens -= n_bytes
-
-    def state(self) -> dict[str, Any]:
-        return {"tokens": self._tokens, "last": self._last}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._tokens, self._last = float(state["tokens"]), state["last"]
