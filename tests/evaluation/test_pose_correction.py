@@ -21,7 +21,7 @@ NOISE = (0.3, 0.1)
 
 
 def per_scan() -> GaussianMap:
-    return GaussianMap(WindowedRule(window=1), n_samples=20_000)
+    return GaussianMap(WindowedRule(window=1), n_samples=100_000)
 
 
 @pytest.fixture(scope="module")
