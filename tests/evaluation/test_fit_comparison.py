@@ -169,6 +169,7 @@ def test_held_out_scores_are_none_without_test_points():
     assert row["n_points"] == 1200
 
 
+@pytest.mark.slow
 def test_rows_depend_only_on_the_seed(everything):
     """The methods run in another order, so the rows do not depend on it either."""
     first = timeless(everything.outcome.rows)

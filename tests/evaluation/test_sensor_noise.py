@@ -126,6 +126,7 @@ def test_a_sensor_without_noise_gives_the_plain_mixture(scans):
         assert noise[name] == pytest.approx(plain[name], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_rows_depend_only_on_the_seed_and_progress_is_complete(scans):
     events: list[tuple[str, int, int | None]] = []
     first = run("room", scans, SMALL, 3, lambda *event: events.append(event))

@@ -38,6 +38,7 @@ def brute_distance(point: np.ndarray, mean: np.ndarray, covariance: np.ndarray, 
     return min(float(optimize.minimize(gap, start, options={"gtol": 1e-9}).fun) for start in starts)
 
 
+@pytest.mark.slow
 @dims
 def test_clearance_is_the_distance_to_the_nearest_ellipsoid(dim):
     c = random_components(6, dim, seed=1, spread=1.0)

@@ -520,6 +520,7 @@ def auc(components: Components, asked: queries.Queries, resolution: float) -> fl
     return metrics.roc(theta[asked.of(1)], theta[asked.of(0)]).auc
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_a_real_map_loses_nothing(real_data):
     frames = load("depth_frames", path=real_data / "kinect", pixel_stride=8)

@@ -293,6 +293,7 @@ def test_scans_of_another_dimension_are_refused():
         absorb_depth(Components.empty(2), depth_frames(1), INTRINSICS, RULE)
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_a_hall_in_eight_kilobytes(real_data: Path):
     scans = list(gmmtorch.datasets.load("scan_folder", path=real_data / "hall"))

@@ -138,6 +138,7 @@ def test_the_parts_that_the_hostile_files_start_from_are_sound(tmp_path, exact, 
         assert load_parts(tmp_path, *parts).n_components > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", [0x01, 0x80])
 @codecs
 def test_every_byte_may_be_damaged(tmp_path, codec, mask):

@@ -132,6 +132,7 @@ def test_pairs_that_are_left_out_do_not_matter(dim):
     torch.testing.assert_close(culled, full, rtol=0, atol=5e-3)
 
 
+@pytest.mark.slow
 @dims
 def test_the_score_never_falls(dim):
     f, g = scene(dim, 5), scene(dim, 5)
@@ -171,6 +172,7 @@ def test_parts_of_one_scene_are_laid_over_each_other(dim):
     assert 0.2 < found.overlap < 0.9
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 @settings(max_examples=6)
 def test_source_and_target_may_be_swapped_and_components_shuffled(seed, dim):
@@ -334,6 +336,7 @@ def test_an_indefinite_covariance_is_refused():
 # -- real scans -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_scans_of_a_hall_are_registered(real_data):
     scans = gt.datasets.load("scan_folder", real_data / "hall")

@@ -385,6 +385,7 @@ def test_fit_works_under_no_grad():
     assert fit.n_iter_ == 3
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 def test_fit_of_a_real_scan_is_closer_than_em(real_data):
     from gmmtorch.datasets import load

@@ -42,6 +42,7 @@ def interior(seed: int, spacing: float = 0.5) -> tuple[torch.Tensor, torch.Tenso
     return odd.view([len(axis) for axis in axes]), points[odd], mesh.clearance(points[odd])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mine_surface_is_closed_and_inside_its_size(seed):
     corners = mine(seed).reshape(-1, 3)
