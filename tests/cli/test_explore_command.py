@@ -469,7 +469,7 @@ def test_no_process_of_a_killed_study_survives(room, tmp_path):
         ("network.reach=0", "network.reach=0.0 metres"),
         ("network.partitions=[{begin:2,end:1,groups:[[0]]}]", "network.partitions[0]= begin end"),
         ("network.partitions=[{begin:0,end:1,groups:[[0,2]]}]", "network.partitions[0].groups= 2"),
-        ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= nobody"),
+        ("network.partitions=[{begin:0,end:1,groups:[[0,1]]}]", "network.partitions[0].groups= leave it out"),
         ("network.partitions=[cut]", "network.partitions[0]='cut'"),
         ("network.announce=0", "network.announce=0.0 seconds"),
         ("network.budget=0", "network.budget=0.0 bytes"),

@@ -315,12 +315,12 @@ def test_a_robot_that_is_alone_goes_on_and_is_heard_when_others_come(opening):
     a = opening(0, listen=endpoints[:1], connect=endpoints[1:], key=KEY)
     a.send(0, [b"nobody hears this"], 0.0, "maps")
     assert (a.n_neighbours, a.deliver(0, 0.0), a.failures) == (0, [], {})
-    assert Radio(0, a, announce_every=1.0).remarks(0) == ", connected to nobody"
+    assert Radio(0, a, announce_every=1.0).warnings(0) == ", no robot connected"
     b = opening(1, listen=endpoints[1:], key=KEY)
     meet([a, b])
     a.send(0, [b"this is heard"], 0.0, "maps")
     assert heard(b, 1) == [(0, b"this is heard")]
-    assert Radio(0, a, announce_every=1.0).remarks(0) == ""
+    assert Radio(0, a, announce_every=1.0).warnings(0) == ""
     assert (a.books(0)["neighbours"], a.books(0)["session"]) == (1, a.session.hex())
 
 
