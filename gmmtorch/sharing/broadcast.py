@@ -77,7 +77,7 @@ class Broadcast:
         return ids
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
-        """Points that components (robot, sequence), of whomever, have gained since the last call."""
+        """Adds points gained since the last call by components (robot, sequence) of any robot."""
         self._say(encode_counts(self.robot, dict(gains), self.codec))
 
     def _say(self, datagrams: list[bytes]) -> None:

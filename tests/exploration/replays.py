@@ -107,10 +107,10 @@ def content(*maps: Components) -> Counter[tuple[object, ...]]:
     for components in maps:
         c = quantized(components)
         seen: list[list[tuple[float, ...]]] = [[] for _ in range(len(c))]
-        for by, whence, count in zip(
+        for by, viewpoint, count in zip(
             c.seen_by.tolist(), c.seen_from.tolist(), c.seen_count.tolist(), strict=True
         ):
-            seen[by].append((*c.origins[whence].tolist(), count))
+            seen[by].append((*c.origins[viewpoint].tolist(), count))
         for row in range(len(c)):
             shape = (*c.means[row].tolist(), *c.covariances[row].flatten().tolist())
             found[(shape, float(c.support[row]), bool(c.max_range[row]), tuple(sorted(seen[row])))] += 1

@@ -231,7 +231,7 @@ def test_a_replica_that_hears_it_in_any_order_and_often_holds_the_same(flight: t
     often = [*said, *said[::2]]
     order = torch.randperm(len(often), generator=generator).tolist()
     other = mapper(robot=1)
-    for begin in range(0, len(order), 5):  # as they come, a few at a time
+    for begin in range(0, len(order), 5):  # a few at a time
         datagrams = [often[i] for i in order[begin : begin + 5]]
         assert other.receive(heard(*datagrams)) == datagrams
     assert one.shared.digest() == other.shared.digest()

@@ -20,7 +20,7 @@ def random_components(
     factors = 0.3 * normal(k, dim, dim)
     seen = torch.rand(k, n_origins, generator=generator) < 0.5
     seen[torch.arange(k), torch.randint(n_origins, (k,), generator=generator)] = True
-    by, whence = seen.nonzero(as_tuple=True)
+    by, viewpoint = seen.nonzero(as_tuple=True)
     count = 1 + 50 * torch.rand(len(by), generator=generator, dtype=torch.float64)
     return Components(
         means=spread * normal(k, dim),
@@ -30,7 +30,7 @@ def random_components(
         ids=torch.stack([torch.full((k,), 3), torch.arange(k)], 1),
         origins=2 * normal(n_origins, dim),
         seen_by=by,
-        seen_from=whence,
+        seen_from=viewpoint,
         seen_count=count,
     ).checked()
 

@@ -77,12 +77,12 @@ def test_merged_origins_are_united():
     labels = torch.tensor([0, 1, 0, 2, 1, 0])
     found = merged(given_, labels)
     expected: dict[tuple[int, int], float] = {}
-    for by, whence, count in zip(given_.seen_by, given_.seen_from, given_.seen_count, strict=True):
-        key = (int(labels[by]), int(whence))
+    for by, viewpoint, count in zip(given_.seen_by, given_.seen_from, given_.seen_count, strict=True):
+        key = (int(labels[by]), int(viewpoint))
         expected[key] = expected.get(key, 0.0) + float(count)
     got = {
-        (int(by), int(whence)): float(count)
-        for by, whence, count in zip(found.seen_by, found.seen_from, found.seen_count, strict=True)
+        (int(by), int(viewpoint)): float(count)
+        for by, viewpoint, count in zip(found.seen_by, found.seen_from, found.seen_count, strict=True)
     }
     assert got.keys() == expected.keys()
     assert all(math.isclose(got[key], expected[key]) for key in got)
@@ -177,8 +177,8 @@ def test_origins_that_see_much_and_lie_apart_are_kept(k, dim, seed, limit, mean)
     left = limit_origins(given_, limit, mean).checked()
     table = {tuple(row): i for i, row in enumerate(given_.origins.tolist())}
     got = {
-        (int(by), table[tuple(left.origins[whence].tolist())])
-        for by, whence in zip(left.seen_by, left.seen_from, strict=True)
+        (int(by), table[tuple(left.origins[viewpoint].tolist())])
+        for by, viewpoint in zip(left.seen_by, left.seen_from, strict=True)
     }
     assert len(got) <= min(limit, mean or limit) * k
     assert counts_add_up(left)

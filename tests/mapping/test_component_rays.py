@@ -43,11 +43,11 @@ def sheet(thickness: float = 0.02, a: float = 0.3, b: float = 0.2) -> torch.Tens
 
 def subset(components: Components, rows: torch.Tensor) -> Components:
     """The components of some rows, in that order, sightings in theirs."""
-    by, whence, count = [], [], []
+    by, viewpoint, count = [], [], []
     for place, row in enumerate(rows.tolist()):
         mine = (components.seen_by == row).nonzero().squeeze(1)
         by += [place] * len(mine)
-        whence.append(components.seen_from[mine])
+        viewpoint.append(components.seen_from[mine])
         count.append(components.seen_count[mine])
     picked = {
         n: getattr(components, n)[rows] for n in ("means", "covariances", "support", "max_range", "ids")
@@ -56,7 +56,7 @@ def subset(components: Components, rows: torch.Tensor) -> Components:
         components,
         **picked,
         seen_by=torch.tensor(by),
-        seen_from=torch.cat(whence),
+        seen_from=torch.cat(viewpoint),
         seen_count=torch.cat(count),
     )
 

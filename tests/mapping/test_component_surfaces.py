@@ -26,8 +26,8 @@ RESOLUTION = 0.2
 def sightings(components: Components, row: int) -> list[tuple[tuple[float, ...], float]]:
     """(origin, count) of each sighting of a component, in order."""
     return [
-        (tuple(components.origins[whence].tolist()), count)
-        for by, whence, count in zip(
+        (tuple(components.origins[viewpoint].tolist()), count)
+        for by, viewpoint, count in zip(
             components.seen_by.tolist(),
             components.seen_from.tolist(),
             components.seen_count.tolist(),

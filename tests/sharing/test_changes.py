@@ -228,7 +228,7 @@ def test_components_that_come_after_their_correction_come_where_it_puts_them():
 
 
 def test_totals_that_fall_start_it_over():
-    """No robot of ours says less than it did; whoever does is believed, as everywhere."""
+    """A lower count from another robot is accepted, and the follower starts over."""
     one, other, follower = Replica(0), Replica(5, incarnation=2), Follower()
     key = one.add(random_components(3, k=1))[0].tolist()
     other.count({tuple(key): 64.0})

@@ -161,10 +161,10 @@ me.settimeout(10)
 print(me.getsockname()[1], flush=True)
 session = os.urandom(8)
 for number in range(50):
-    frame, whence = me.recvfrom(2000)
+    frame, sender = me.recvfrom(2000)
     datagram = aead.decrypt(frame[3:15], frame[15:], frame[:15])
     header = b"\\xf1" + (7).to_bytes(2, "little") + session + number.to_bytes(4, "little")
-    me.sendto(header + aead.encrypt(header[3:], datagram[::-1], header), whence)
+    me.sendto(header + aead.encrypt(header[3:], datagram[::-1], header), sender)
 """
 
 

@@ -220,8 +220,8 @@ def _in_reach(
 
 def _numbers(components: Components, seen: Tensor, density: _Density) -> Tensor:
     """Number of rays (C,) of each of the viewpoints `seen` (C,)."""
-    by, whence = components.seen_by[seen], components.seen_from[seen]
-    toward = components.means[by].double() - components.origins[whence].double()
+    by, viewpoint = components.seen_by[seen], components.seen_from[seen]
+    toward = components.means[by].double() - components.origins[viewpoint].double()
     hidden = _hidden_area(toward, components.covariances[by].double()) / density.resolution**2
     wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
     return wanted.clamp(density.least, density.most).long()
