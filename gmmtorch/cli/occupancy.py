@@ -88,7 +88,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, roc_figure
     from gmmtorch.report.maps.map_figures import map_figure
     from gmmtorch.report.maps.map_images import MapPanel
-    from gmmtorch.report.maps.regions import busiest_regions, robust_bounds
+    from gmmtorch.report.maps.map_regions import busiest_regions, robust_bounds
     from gmmtorch.report.scenes.cutaway import first_viewpoints
     from gmmtorch.report.scenes.mixture_figures import mixture_figure
 

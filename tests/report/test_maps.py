@@ -12,7 +12,7 @@ from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 from gmmtorch.report.maps.map_figures import map_figure
 from gmmtorch.report.maps.map_images import MapPanel, height_image, roof_above, slice_image
-from gmmtorch.report.maps.regions import robust_bounds
+from gmmtorch.report.maps.map_regions import robust_bounds
 
 
 def wall_map(dim: int) -> SparseEvidence:

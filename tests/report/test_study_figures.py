@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gmmtorch.report.maps.regions import busiest_regions
+from gmmtorch.report.maps.map_regions import busiest_regions
 from gmmtorch.report.studies import auc_memory_figures as auc_memory
 from gmmtorch.report.studies import variance_threshold_figures as variance_threshold
 

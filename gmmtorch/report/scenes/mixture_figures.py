@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
-from gmmtorch.report.maps.regions import robust_bounds
+from gmmtorch.report.maps.map_regions import robust_bounds
 from gmmtorch.report.quantities import count_text
 from gmmtorch.report.scenes.cutaway import cut_away
 from gmmtorch.report.scenes.ellipsoids import (

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.occupancy.evidence import CellClass, classify
 from gmmtorch.report import style
-from gmmtorch.report.maps.regions import Corners, busiest_regions
+from gmmtorch.report.maps.map_regions import Corners, busiest_regions
 from gmmtorch.report.scenes.ellipsoids import height_colour_map, height_colours
 from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene
 from gmmtorch.report.scenes.scene_renderer import Camera
