@@ -20,10 +20,11 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import GaussianMap, GaussianMixture, datasets
-from gmmtorch.datasets.depth_frames import DepthFrames, back_project
+from gmmtorch.datasets.depth_frames import DepthFrames
 from gmmtorch.evaluation.metrics import roc
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.mixture.depth_image import fit_depth_image
+from gmmtorch.pinhole import back_project
 
 N_COMPONENTS = 50
 RESOLUTION = 0.05
@@ -44,7 +45,7 @@ def learned(
     for (depth, pose), mixture in zip(frames, mixtures, strict=True):
         points = points_of(depth)
         likelihood.append(mixture.score(points[::7]))
-        moved = mixture.transform(pose)
+        moved = mixture.moved(pose)
         means.append(moved.means.cpu())
         covariances.append(moved.covariances.cpu())
         support.append(moved.weights.cpu() * points.shape[0])

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import torch
 
-from gmmtorch.exploration.mission.clocks import Stopwatch
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.team_setup import assemble

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch import datasets
-from gmmtorch.datasets.depth_frames import DepthFrames, back_project
-from gmmtorch.evaluation.queries import Queries, hit_and_free, test_beams
-from gmmtorch.evaluation.split import split_indices
+from gmmtorch.datasets.depth_frames import DepthFrames
+from gmmtorch.evaluation.queries import Queries, hit_and_free, split_indices, test_beams
+from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld

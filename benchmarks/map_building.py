@@ -18,8 +18,7 @@ from tables import hardware, markdown
 from gmmtorch import GaussianMap, IncrementalRule, datasets
 from gmmtorch.datasets.depth_frames import DepthFrames
 from gmmtorch.evaluation.metrics import roc
-from gmmtorch.evaluation.queries import FREE, OCCUPIED, hit_and_free, test_beams
-from gmmtorch.evaluation.split import split_indices
+from gmmtorch.evaluation.queries import FREE, OCCUPIED, hit_and_free, split_indices, test_beams
 
 RULES = {
     "as a map's default": (4, {}),

@@ -34,8 +34,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.evaluation.codecs.point_codecs import Draco, Octree, PointCodec
-from gmmtorch.exploration.mission.clocks import SimulatedClock
-from gmmtorch.exploration.mission.driver import drive
+from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.team_setup import assemble

@@ -24,13 +24,14 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
+from gmmtorch.kernels.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 
@@ -60,10 +61,10 @@ def em_iteration(n: int = 100_000, k: int = 100, iterations: int = 10, repeats: 
 
     def ours(dtype: torch.dtype) -> tuple[float, float]:
         center = points.mean(0)
-        step = em.natural_step(em.quadratic_features(points - center), torch.ones(n).double(), 1e-6, dtype)
+        step = loop.natural_step(em.quadratic_features(points - center), torch.ones(n).double(), 1e-6, dtype)
         state = em.Parameters(weights, means - center, covariances)
         begin = time.perf_counter()
-        found = em.run_em(step, state, tol=0, max_iter=iterations)
+        found = loop.run_em(step, state, tol=0, max_iter=iterations)
         return (time.perf_counter() - begin) / iterations, found.lower_bounds[-1]
 
     def theirs() -> tuple[float, float]:

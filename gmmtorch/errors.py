@@ -37,7 +37,7 @@ class MemoryLimitError(GmmTorchError, MemoryError):
     """A request does not fit into the memory allowed for it."""
 
 
-class NumericalError(GmmTorchError, ArithmeticError):
+class NumericalError(GmmTorchError, ArithmeticError, ValueError):
     """A matrix cannot be factorised, even with the largest permitted jitter."""
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
-import tempfile
+import secrets
+import stat
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,36 +26,67 @@ from gmmtorch.errors import DataError, MissingDataError, OutputError
 MAX_FILE_BYTES = 8 << 30
 NARROW_DTYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)
 _TENSOR = "$tensor"
+_NO_CHECKSUM = "00000000"  # stands for the checksum while it is computed
+_BEFORE_CHECKSUM = rb'"{\"crc32\":\"'  # the first bytes of our entry in the header
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
     """Call `write` with a temporary file in the folder of `path`, then rename that file to `path`.
 
     On any failure the temporary file is removed and `path` stays as it was. The temporary file has the
-    suffix of `path`, because some writers choose their format by it. Raises `OutputError` if the folder
-    cannot be written to or the disk is full.
+    suffix of `path`, because some writers choose their format by it. If `path` is a symbolic link, the file
+    it points to is replaced and the link stays. A replaced file keeps its mode; a new file has the mode of
+    the umask.
+
+    Raises `OutputError` if the folder cannot be written to, the disk is full, or `path` is a folder, a
+    device, a FIFO or a socket.
     """
     path = Path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+        target, mode = _target(path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}; choose another folder.") from error
-    os.close(handle)
-    temporary = Path(name)
+        raise _unwritable(path, error, "choose another path") from error
+    # The name is known before the file exists, so that an interrupt at any time leaves no file behind.
+    temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(8)}{target.suffix}")
     try:
-        write(temporary)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}; no file was changed."
-        ) from error
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY
+            os.close(os.open(temporary, flags, 0o666 if mode is None else 0o600))
+        except OSError as error:
+            raise _unwritable(path, error, "choose another path") from error
+        try:
+            write(temporary)
+            if mode is not None:
+                temporary.chmod(mode)
+            temporary.replace(target)
+        except OSError as error:
+            raise _unwritable(path, error, "no file was changed") from error
     except BaseException:  # includes KeyboardInterrupt
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise
     return path
+
+
+def _unwritable(path: Path, error: OSError, remedy: str) -> OutputError:
+    return OutputError(f"{path} cannot be written: {error.strerror or error}; {remedy}.")
+
+
+def _target(path: Path) -> tuple[Path, int | None]:
+    """The file that `path` names, links followed, and its mode; None if it does not exist.
+
+    Raises `OSError` for a loop of links, and for what is not a regular file.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return Path(os.path.realpath(path)), None
+    if not stat.S_ISREG(mode):
+        kinds = ((stat.S_ISDIR, "folder"), (stat.S_ISFIFO, "FIFO"), (stat.S_ISSOCK, "socket"))
+        kind = next((name for is_kind, name in kinds if is_kind(mode)), "device")
+        raise OSError(f"it is a {kind}, not a regular file")
+    return Path(os.path.realpath(path)), stat.S_IMODE(mode)
 
 
 def check_writable(folder: Path) -> None:
@@ -84,12 +118,30 @@ def write_json(path: str | Path, value: Any) -> Path:
 
 
 def pack_tensors(tensors: Mapping[str, Tensor], kind: str, version: int, **facts: Any) -> bytes:
-    """Bytes of a safetensors file whose header states its kind, version and `facts` (JSON values)."""
+    """Bytes of a safetensors file whose header states its kind, version, `facts` (JSON values) and CRC-32."""
     # A single entry keeps the bytes reproducible: the order of several entries varies between runs.
-    header = json.dumps({"format": kind, "version": version, "facts": facts}, sort_keys=True)
-    return safetensors_save(
-        {k: v.detach().cpu().contiguous() for k, v in tensors.items()}, {"gmmtorch": header}
-    )
+    entry = {"crc32": _NO_CHECKSUM, "format": kind, "version": version, "facts": facts}
+    header = json.dumps(entry, sort_keys=True, separators=(",", ":"))
+    contiguous = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    return with_checksum(safetensors_save(contiguous, {"gmmtorch": header}))
+
+
+def with_checksum(data: bytes) -> bytes:
+    """The bytes of a tensor file with its CRC-32 in the header, in place of the present one."""
+    place = _checksum_place(data)
+    return b"".join((data[:place], _checksum(data, place).encode(), data[place + len(_NO_CHECKSUM) :]))
+
+
+def _checksum_place(data: bytes) -> int:
+    """Where the header states the CRC-32. Raises `ValueError` if it does not."""
+    # The entry of the metadata is the first of the header, so the first match is the right one.
+    return data.index(_BEFORE_CHECKSUM) + len(_BEFORE_CHECKSUM)
+
+
+def _checksum(data: bytes, place: int) -> str:
+    """CRC-32 of all bytes, with zeros where the header states the CRC-32; eight hexadecimal digits."""
+    before = zlib.crc32(_NO_CHECKSUM.encode(), zlib.crc32(memoryview(data)[:place]))
+    return f"{zlib.crc32(memoryview(data)[place + len(_NO_CHECKSUM) :], before):08x}"
 
 
 def read_tensors(path: str | Path, kind: str, *versions: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -119,6 +171,7 @@ def unpack_tensors(
             f"{path} is version {header.get('version')!r} of {kind}; this gmmtorch reads version "
             f"{' or '.join(map(str, versions))}. Update gmmtorch, or write the file again."
         )
+    _check_checksum(data, path, header.get("crc32"))
     facts = header.get("facts")
     if not isinstance(facts, dict):
         raise DataError(f"{path}: facts is not a table; the file is damaged.")
@@ -126,6 +179,18 @@ def unpack_tensors(
         return safetensors_load(data), facts
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(f"{path} is damaged: {error}") from error
+
+
+def _check_checksum(data: bytes, path: str | Path, stated: object) -> None:
+    try:
+        found = _checksum(data, _checksum_place(data))
+    except ValueError as error:
+        raise DataError(f"{path} has no checksum, or a damaged one; write the file again.") from error
+    if found != stated:
+        raise DataError(
+            f"{path} is damaged: its CRC-32 is {found}, but its header states {stated!r}. Copy the file "
+            "again from where it was written."
+        )
 
 
 def _read_header(data: bytes, path: str | Path, kind: str) -> dict[str, Any]:

@@ -7,7 +7,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.distinct_keys import distinct_keys
 
+_MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal
 
 
@@ -135,6 +138,8 @@ def count_distinct(keys: Tensor) -> int:
     """Number of distinct keys (N,)."""
     if keys.numel() == 0:
         return 0
+    if _by_hash(keys):
+        return len(distinct_keys(keys, numbered=False)[0])
     ordered = torch.from_numpy(np.sort(keys.numpy())) if keys.device.type == "cpu" else keys.sort().values
     return 1 + int((ordered[1:] != ordered[:-1]).sum())
 
@@ -144,5 +149,15 @@ def dense_ranks(keys: Tensor) -> tuple[Tensor, int]:
     if keys.device.type != "cpu":
         unique, number = torch.unique(keys, return_inverse=True)
         return number, unique.numel()
+    if _by_hash(keys):
+        distinct, place = distinct_keys(keys, numbered=True)
+        rank = torch.empty_like(distinct)
+        rank[argsort(distinct)] = torch.arange(len(distinct))
+        return rank[place], len(distinct)
     unique, number = np.unique(keys.numpy(), return_inverse=True)
     return torch.from_numpy(number.reshape(-1)), len(unique)
+
+
+def _by_hash(keys: Tensor) -> bool:
+    """Whether a hash table replaces sorting: for many keys, if fused kernels run."""
+    return keys.dtype == torch.int64 and keys.shape[0] >= _MANY_KEYS and is_fused(keys)

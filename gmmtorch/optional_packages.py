@@ -29,3 +29,15 @@ def load_pyoctomap() -> Any:
             "pip install 'gmmtorch[baselines]'."
         ) from error
     return pyoctomap
+
+
+def load_viser() -> Any:
+    """The module viser. Raises `GmmTorchError` if it does not load."""
+    try:
+        import viser
+    except ImportError as error:
+        raise GmmTorchError(
+            f"The browser viewer needs the package viser, which does not load ({error}); install it: "
+            "pip install 'gmmtorch[viewer]'."
+        ) from error
+    return viser

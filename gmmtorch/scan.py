@@ -5,47 +5,32 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike as ArrayLike
+from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_rigid
 
-ArrayLike = Tensor | np.ndarray | list | tuple
+FARTHEST = 2.0**27
+"""Largest absolute coordinate in metres, 134 217 km. Map files store no larger ones."""
 
 _FLOAT32_WARNING_METRES = 1e4
 """Distance from the origin beyond which float32 coordinates are coarser than about a millimetre."""
 
 
-def _as_tensor(name: str, value: ArrayLike) -> Tensor:
-    try:
-        return torch.as_tensor(value)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidArgumentError(
-            f"{name} is {type(value).__name__}, not an array of numbers: {error}."
-        ) from error
-
-
 def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
     if value is None:
         return torch.empty(0, dim or 0, dtype=torch.float64)
-    tensor = _as_tensor(name, value)
-    if not tensor.is_floating_point():
-        tensor = tensor.double()
+    tensor = as_tensor(value, name)
     if tensor.numel() == 0 and tensor.ndim < 2:
         tensor = tensor.new_empty(0, dim or 0)
     if tensor.ndim != 2 or (dim is not None and tensor.shape[1] != dim):
         raise InvalidArgumentError(
             f"{name} has shape {tuple(tensor.shape)}; expected (N, {dim if dim else '2 or 3'}), metres."
         )
-    finite = torch.isfinite(tensor).all(1)
-    if not bool(finite.all()):
-        row = int((~finite).nonzero()[0])
-        raise InvalidArgumentError(
-            f"{name}[{row}] = {tensor[row].tolist()} is not finite; remove such rows first: "
-            f"{name} = {name}[torch.isfinite({name}).all(1)]."
-        )
+    check_positions(name, tensor)
     if tensor.dtype == torch.float32 and bool((tensor.abs() > _FLOAT32_WARNING_METRES).any()):
         warnings.warn(
             f"{name} has float32 coordinates more than {_FLOAT32_WARNING_METRES / 1e3:.0f} km from the "
@@ -56,7 +41,35 @@ def _as_points(name: str, value: ArrayLike | None, dim: int | None) -> Tensor:
     return tensor
 
 
-@dataclass(frozen=True, eq=False)
+def check_positions(name: str, rows: Tensor) -> None:
+    """Raise `InvalidArgumentError`, which names the first bad row, unless all positions (N, D) are finite
+    and at most `FARTHEST` metres from the origin along each axis.
+    """
+    good = (rows.abs() <= FARTHEST).all(1)  # False for NaN
+    if bool(good.all()):
+        return
+    row = int((~good).nonzero()[0])
+    if bool(torch.isfinite(rows[row]).all()):
+        raise InvalidArgumentError(
+            f"{name}[{row}] = {rows[row].tolist()}: the largest allowed coordinate is {FARTHEST:.0f} m. Give "
+            "metres, relative to an origin near the map."
+        )
+    raise InvalidArgumentError(
+        f"{name}[{row}] = {rows[row].tolist()} is not finite; remove such rows first: "
+        f"{name} = {name}[torch.isfinite({name}).all(1)]."
+    )
+
+
+def extent(rows: Tensor) -> str:
+    """Text of the bounding box of positions (N, D), metres, after a comma; empty if there are none."""
+    if not rows.shape[0]:
+        return ""
+    low, high = rows.detach().amin(0).tolist(), rows.detach().amax(0).tolist()
+    sides = zip("xyz", low, high, strict=False)
+    return ", " + ", ".join(f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in sides) + " m"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Scan:
     """Measured surface points and the sensor position that measured them. World frame, metres.
 
@@ -66,8 +79,9 @@ class Scan:
         no_return: (M, D) one row for each beam without return: the point up to which the beam is
             assumed to cross free space. It is never a surface point.
 
-    Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes and for
-    NaN or infinite coordinates. Warns if float32 coordinates are too far from the origin to be precise.
+    Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes, for NaN and
+    infinite coordinates, and for coordinates beyond 2²⁷ m. Warns if float32 coordinates are too far from
+    the origin to be precise.
     """
 
     points: Tensor
@@ -75,8 +89,7 @@ class Scan:
     no_return: Tensor = None  # type: ignore[assignment]  # None becomes an empty (0, D) tensor
 
     def __post_init__(self) -> None:
-        origin = _as_tensor("origin", self.origin)
-        origin = origin if origin.is_floating_point() else origin.double()
+        origin = as_tensor(self.origin, "origin")
         if origin.shape not in ((2,), (3,)):
             raise InvalidArgumentError(f"origin has shape {tuple(origin.shape)}; expected (2,) or (3,).")
         dim = origin.shape[0]
@@ -86,6 +99,13 @@ class Scan:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "origin", origin.to(points.device))
         object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
+
+    def __repr__(self) -> str:
+        origin = ", ".join(f"{x:.6g}" for x in self.origin.tolist())
+        return (
+            f"Scan({self.points.shape[0]} points and {self.no_return.shape[0]} no-return beams in {self.dim}D"
+            f" from ({origin}) m{extent(self.points)}, {self.points.dtype}, {self.points.device})"
+        )
 
     @property
     def dim(self) -> int:
@@ -109,7 +129,7 @@ class Scan:
 
     def transformed(self, transform: ArrayLike) -> Scan:
         """The scan moved by a rigid motion (D+1, D+1): x → R x + t."""
-        matrix = torch.as_tensor(transform, dtype=torch.float64, device=self.points.device)
+        matrix = as_tensor(transform, "transform", torch.float64, self.points.device)
         rotation, translation = check_rigid(matrix, self.dim)
 
         def move(x: Tensor) -> Tensor:
@@ -125,6 +145,6 @@ class Scan:
 
         return Scan(copy(self.points), copy(self.origin), copy(self.no_return))
 
-    def to(self, device: torch.device | str) -> Scan:
-        """The scan on another device."""
+    def to(self, device: torch.device | str | None) -> Scan:
+        """The scan on another device. None: where it is."""
         return Scan(self.points.to(device), self.origin.to(device), self.no_return.to(device))

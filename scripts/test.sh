@@ -10,4 +10,12 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff format --check .
 .venv/bin/ruff check .
 .venv/bin/mypy
-.venv/bin/pytest -n auto -m "not slow" "$@" # each test uses one thread; a later -m replaces the first
+status=0
+# Each test uses one thread. A later -m replaces the first.
+.venv/bin/pytest -n auto --dist worksteal -m "not slow" "$@" || status=$?
+if [ "$status" = 1 ]; then
+  echo "test: the tests that failed run once more, one at a time; those that fail again fail the run"
+  .venv/bin/pytest --last-failed --last-failed-no-failures none -m "not slow" "$@"
+else
+  exit "$status"
+fi

@@ -1,8 +1,9 @@
-"""What all tests share: one thread, reproducible examples, and where the real data is."""
+"""Fixtures of all tests: one thread, reproducible hypothesis examples, and the folder of real data."""
 
 from __future__ import annotations
 
 import os
+import signal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # k-means has threads of its own
 
@@ -14,6 +15,8 @@ from hypothesis import HealthCheck, settings
 
 pytest.register_assert_rewrite("occupancy.protocol_contract", "mixture.estimator_contract")
 
+# A shell that starts a job in the background makes it ignore SIGINT, and its children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 torch.set_num_threads(1)
 settings.register_profile(
     "gmmtorch",

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save as save_tensors
 
-from gmmtorch.errors import DataError, GmmTorchError, MissingDataError
+from gmmtorch.errors import DataError, GmmTorchError, MissingDataError, OutputError
 from gmmtorch.files import (
     joined_tensors,
     narrowest,
@@ -23,6 +23,8 @@ from gmmtorch.files import (
     require,
     require_counts,
     split_tensors,
+    unpack_tensors,
+    with_checksum,
     write_atomically,
     write_bytes,
     write_json,
@@ -36,8 +38,9 @@ def valid_file() -> bytes:
 
 
 def raw_file(header: object, body: bytes = b"") -> bytes:
-    text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    return len(text).to_bytes(8, "little") + text + body
+    text = header if isinstance(header, bytes) else json.dumps(header, separators=(",", ":")).encode()
+    data = len(text).to_bytes(8, "little") + text + body
+    return with_checksum(data) if b"crc32" in data else data
 
 
 def with_entry(value: str) -> dict[str, Any]:
@@ -46,7 +49,8 @@ def with_entry(value: str) -> dict[str, Any]:
 
 
 def with_facts(facts: object) -> dict[str, Any]:
-    return with_entry(json.dumps({"format": KIND, "version": VERSION, "facts": facts}))
+    entry = {"crc32": "00000000", "format": KIND, "version": VERSION, "facts": facts}
+    return with_entry(json.dumps(entry, separators=(",", ":")))
 
 
 def with_tensor(dtype: str, shape: list[int], offsets: list[int]) -> dict[str, Any]:
@@ -85,6 +89,21 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_other(tmp_path, error, ex
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == ([("a.bin", b"old")] if exists else [])
 
 
+@pytest.mark.parametrize("call", ["open", "close"])
+def test_an_interrupt_while_the_file_is_created_leaves_no_file(call, tmp_path, monkeypatch):
+    """The interrupt arrives after the system has created the file, before Python knows that it exists."""
+    real = getattr(os, call)
+
+    def interrupted(*arguments: Any, **options: Any) -> int:
+        real(*arguments, **options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, call, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_bytes(tmp_path / "map.bin", b"new")
+    assert not list(tmp_path.iterdir())
+
+
 def test_write_onto_a_folder_leaves_no_temporary_file(tmp_path):
     (tmp_path / "a.bin").mkdir()
     with pytest.raises(OSError):  # noqa: PT011 - the error depends on the system
@@ -105,10 +124,62 @@ def test_old_file_is_complete_until_the_new_one_is(tmp_path):
     assert path.read_bytes() == b"new"
 
 
+@pytest.fixture
+def umask():
+    """Sets the umask, and restores it after the test."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="file modes")
-def test_written_file_is_readable_by_others(tmp_path):
+@pytest.mark.parametrize(("mask", "expected"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_new_file_has_the_mode_of_the_umask(tmp_path, umask, mask, expected):
+    umask(mask)
     path = write_bytes(tmp_path / "a.bin", b"x")
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+    assert stat.S_IMODE(path.stat().st_mode) == expected
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes")
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o666])
+def test_replaced_file_keeps_its_mode(tmp_path, umask, mode):
+    path = write_bytes(tmp_path / "a.bin", b"old")
+    path.chmod(mode)
+    write_bytes(path, b"new")
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"new", mode)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="symbolic links")
+@pytest.mark.parametrize("exists", [True, False])
+def test_write_through_a_link_replaces_its_target(tmp_path, exists):
+    target, link = tmp_path / "maps" / "target.bin", tmp_path / "link.bin"
+    target.parent.mkdir()
+    if exists:
+        target.write_bytes(b"old")
+        target.chmod(0o600)
+    (tmp_path / "second.bin").symlink_to("maps/target.bin")
+    link.symlink_to("second.bin")
+    assert write_bytes(link, b"new") == link
+    assert link.is_symlink()
+    assert os.readlink(link) == "second.bin"
+    assert target.read_bytes() == b"new"
+    assert not exists or stat.S_IMODE(target.stat().st_mode) == 0o600
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["link.bin", "maps", "second.bin", "target.bin"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="special files")
+@pytest.mark.parametrize(("kind", "name"), [("fifo", "FIFO"), ("device", "device"), ("loop", "links")])
+def test_what_is_not_a_regular_file_is_refused_and_stays(tmp_path, kind, name):
+    path = tmp_path / "a.bin"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null" if kind == "device" else "a.bin")
+    before = path.lstat()
+    with pytest.raises(OutputError, match=rf"a\.bin cannot be written.*{name}.*another path"):
+        write_bytes(path, b"x")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+    assert (path.lstat().st_ino, path.lstat().st_mode) == (before.st_ino, before.st_mode)
 
 
 def test_write_json_round_trips_and_rejects_nan(tmp_path):
@@ -177,6 +248,22 @@ def test_foreign_safetensors_file_is_rejected(tmp_path):
     path = write(tmp_path, save_tensors({"x": torch.ones(2)}))
     with pytest.raises(DataError, match=r"expected 'gmmtorch\.test'"):
         read_tensors(path, KIND, VERSION)
+
+
+def test_file_without_checksum_says_to_write_it_again(tmp_path):
+    header = json.dumps({"format": KIND, "version": VERSION, "facts": {}})
+    path = write(tmp_path, save_tensors({"x": torch.ones(2)}, {"gmmtorch": header}))
+    with pytest.raises(DataError, match=r"file\.safetensors has no checksum.*write the file again"):
+        read_tensors(path, KIND, VERSION)
+
+
+def test_every_flipped_bit_is_refused(tmp_path):
+    data = valid_file()
+    for place in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[place // 8] ^= 1 << place % 8
+        with pytest.raises(DataError, match=r"file\.safetensors"):
+            unpack_tensors(bytes(flipped), "file.safetensors", KIND, VERSION)
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ class BaselineMap(ABC):
             theta = query.new_full((query.shape[0],), 0.5)
         else:
             theta = self._answer(query.to(self.device)).to(query.device)
-        return theta if isinstance(points, Tensor) else theta.cpu().numpy()
+        return theta if isinstance(points, Tensor) else theta.detach().cpu().numpy()
 
     # -- files ------------------------------------------------------------------------------------
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,24 +31,6 @@ def conf_dir() -> str:
     raise FileNotFoundError(
         f"conf/ is neither in {package} nor beside it; install gmmtorch again, or use a complete checkout."
     )
-
-
-def run_guarded(command: Callable[[DictConfig], Any], config: DictConfig) -> Any:
-    """Run a command. A `GmmTorchError` becomes a one-line message and exit status 1, without a traceback.
-
-    A job of a sweep that runs in its own process ends if the sweep's process ends.
-    """
-    from gmmtorch.errors import GmmTorchError
-    from gmmtorch.evaluation.processes import end_with_parent
-
-    end_with_parent()
-    try:
-        return command(config)
-    except GmmTorchError as error:
-        sys.exit(f"gmmtorch: error: {error}")
-    except KeyboardInterrupt:
-        print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
-        sys.exit(130)
 
 
 @contextmanager
@@ -92,6 +73,17 @@ def run_dir() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+def is_job_of_sweep() -> bool:
+    """Whether this run is one of several with folders of their own; their results are in one table."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    if not HydraConfig.initialized():
+        return False
+    config = HydraConfig.get()
+    return config.mode == RunMode.MULTIRUN and config.output_subdir is not None
+
+
 def set_up(config: DictConfig) -> str:
     """Check the seed and apply `runtime.*`; returns the device."""
     from gmmtorch.errors import check_whole
@@ -105,6 +97,7 @@ def use_runtime(runtime: DictConfig) -> str:
     import torch
 
     from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.kernels import use_kernels
 
     if runtime.threads is not None:
         if runtime.threads < 1:
@@ -112,6 +105,8 @@ def use_runtime(runtime: DictConfig) -> str:
         torch.set_num_threads(runtime.threads)
     if runtime.get("memory_limit", 1) < 1:  # some commands have no memory limit
         raise InvalidArgumentError(f"runtime.memory_limit={runtime.memory_limit} must be above zero bytes.")
+    with naming({"kernels": "runtime.kernels"}):
+        use_kernels(runtime.kernels)
     try:
         torch.zeros(1, device=runtime.device).item()  # item() also refuses the device "meta"
     except (RuntimeError, AssertionError, NotImplementedError) as error:
@@ -189,14 +184,18 @@ def save_figures(config: DictConfig, figures: dict[str, Any], folder: Path) -> N
 
 
 def print_table(rows: Sequence[Row], columns: Sequence[str], title: str) -> None:
-    """Print the rows as a table on standard output."""
+    """Print the rows as a table on standard output; not in a sweep, whose table has all rows."""
+    if is_job_of_sweep():
+        return
     from gmmtorch.report.table import format_table
 
     print(f"\n{title}\n{format_table(list(rows), columns)}")
 
 
 def print_files(folder: Path, results: Path) -> None:
-    """Print the places of the run's files on standard output."""
+    """Print the places of the run's files on standard output; not in a sweep."""
+    if is_job_of_sweep():
+        return
     pictures = sorted(path.name for path in folder.glob("*.png"))
     print(f"\nresults   {results}")
     if pictures:
@@ -205,13 +204,16 @@ def print_files(folder: Path, results: Path) -> None:
         print(f"browse    tensorboard --logdir {folder / 'tensorboard'}")
 
 
-def flat(config: DictConfig) -> dict[str, Any]:
-    """The configuration as values by dotted names, for TensorBoard's table of hyperparameters."""
+def chosen_options(config: DictConfig) -> dict[str, Any]:
+    """The options that the command line sets, by name, for TensorBoard's table of hyperparameters.
 
-    def walk(prefix: str, value: Any) -> dict[str, Any]:
-        if isinstance(value, dict):
-            parts = [walk(f"{prefix}.{key}" if prefix else str(key), v) for key, v in value.items()]
-            return {k: v for part in parts for k, v in part.items()}
-        return {prefix: value}
+    In a sweep these are the swept options and those that all jobs share.
+    """
+    from hydra.core.hydra_config import HydraConfig
 
-    return walk("", OmegaConf.to_container(config, resolve=True))
+    found: dict[str, Any] = {"seed": config.seed}
+    for override in HydraConfig.get().overrides.task:
+        name, _, text = str(override).lstrip("+~").partition("=")
+        value = OmegaConf.select(config, name, throw_on_missing=False)
+        found[name] = value if isinstance(value, bool | int | float | str) else text
+    return found

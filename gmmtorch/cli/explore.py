@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, missions, schema
+from gmmtorch.cli import app, common, missions
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.mission import Mission
     from gmmtorch.report.progress import ProgressBars
 
-_TABLE = (
+TABLE = (
     "framework seed planner t50 t90 entropy_reduction_bits bytes_sent bytes_raw_points auc "
     "cross_entropy_bits map_disagreement coverage_per_metre path_length collisions wall_seconds"
 )
@@ -25,12 +24,7 @@ _TIME_TO_LEAVE = 30.0
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="explore")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> float | None:
-    return common.run_guarded(run, config)
+    app.start("explore", run)
 
 
 def run(config: DictConfig) -> float | None:
@@ -120,7 +114,7 @@ def _status(mission: Mission) -> str:
     union, seconds = mission.score.union, sum(mission.watch.seconds.values())
     left = union.entropy_bits / max(1.0, union.observable_bits)
     speed = f", {mission.elapsed / seconds:.1f}x real time" if mission.elapsed and seconds else ""
-    return f"{left:.1%} of the entropy left, {mission.network.n_bytes / 1e3:,.0f} kB sent{speed}"
+    return f"{left:.1%} of the entropy left, {mission.network.traffic().bytes / 1e3:,.0f} kB sent{speed}"
 
 
 def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
@@ -160,7 +154,7 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
     differ."""
     from gmmtorch.exploration.mission.results import NETWORK, differing
 
-    columns = _TABLE.split()
+    columns = TABLE.split()
     title = f"{rows[0]['world']}: {rows[0]['n_robots']} robots"
     if fields := differing(rows):
         from gmmtorch.report.exploration.trial_groups import by_variant

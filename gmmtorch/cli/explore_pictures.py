@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.exploration.mission.mission import Mission
-    from gmmtorch.exploration.mission.snapshots import Snapshot
+    from gmmtorch.exploration.mission.results import Snapshot
     from gmmtorch.exploration.world.world import World
     from gmmtorch.mapping.components import Components
     from gmmtorch.report.exploration.mission_maps import TeamSnapshot
@@ -32,7 +32,7 @@ class MissionRecorder:
     """
 
     def __init__(self, config: DictConfig, folder: Path, world: World) -> None:
-        from gmmtorch.exploration.mission.snapshots import Snapshots
+        from gmmtorch.exploration.mission.results import Snapshots
         from gmmtorch.report.tensorboard_writer import Board
 
         self._config, self._folder, self._world = config, folder, world
@@ -61,7 +61,6 @@ class MissionRecorder:
         import torch
 
         from gmmtorch.exploration.mission.trials import TRAJECTORIES, save_trajectories
-        from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
 
         paths = [torch.stack(path) for path in mission.trajectories]
 
@@ -78,7 +77,13 @@ class MissionRecorder:
                     mixture = (snapshot.content["means"], snapshot.content["covariances"])
                     self._board.ellipsoids("mixture", *mixture, step=seconds)
                 self._board.paths("paths", [path[: snapshot.tick + 1] for path in paths], step=seconds)
-            write_exploration_board(self._board, [row], figures)
+            # The curves are there already; numbers of a curve's name are its last values.
+            numbers = {k: v for k, v in row.items() if k not in mission.score.samples}
+            self._board.scalars(numbers, "result", step=int(row["times"][-1]))
+            for name, figure in figures.items():
+                self._board.figure(f"figures/{name}", figure)
+            numbers = {name: row[name] for name in ("entropy_reduction_bits", "auc", "bytes_sent")}
+            self._board.hparams(common.chosen_options(self._config), numbers)
             self._board.close()
         if self._config.report.recording:
             from gmmtorch.report.exploration.rerun_recording import RecordedMap, record_rerun
@@ -139,7 +144,7 @@ class MissionRecorder:
         from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means
         from gmmtorch.report.exploration.mission_curves import bandwidth_figure, entropy_figure
         from gmmtorch.report.exploration.mission_maps import team_map_figure, trajectories_figure
-        from gmmtorch.report.scenes.cutaway import first_viewpoints
+        from gmmtorch.report.scenes.ellipsoids import first_viewpoints
         from gmmtorch.report.scenes.scene import mixture_scene_figure
 
         if not (self._config.report.figures or self._config.report.tensorboard):
@@ -173,15 +178,14 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
     """
     from gmmtorch.exploration.mission.results import NETWORK, differing
     from gmmtorch.files import write_bytes
-    from gmmtorch.report.exploration.loss_figures import loss_figure
     from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
     from gmmtorch.report.exploration.mission_curves import (
         bandwidth_figure,
         entropy_figure,
         planner_comparison_figure,
     )
-    from gmmtorch.report.exploration.mission_summary import study_summary
-    from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
+    from gmmtorch.report.exploration.mission_summary import study_summary, write_exploration_board
+    from gmmtorch.report.exploration.network_figures import loss_figure
     from gmmtorch.report.tensorboard_writer import Board
 
     write_bytes(folder / "summary.md", study_summary(rows).encode())

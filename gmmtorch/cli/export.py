@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, schema
+from gmmtorch.cli import app, common
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,19 +19,25 @@ if TYPE_CHECKING:
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.occupancy.grid import VoxelGrid
 
-_OF_SPACE = ("map_server", "octomap", "ply", "pcd")
+_OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
 _OF_COMPONENTS = ("csv", "npz", "mixture")
+_OF_ENDINGS = {
+    **dict.fromkeys((".yaml", ".pgm"), "map_server"),
+    **dict.fromkeys((".bt", ".ot"), "octomap"),
+    **dict.fromkeys((".obj", ".glb"), "mesh"),
+    ".ply": "ply",
+    ".pcd": "pcd",
+    ".csv": "csv",
+    ".npz": "npz",
+    ".safetensors": "mixture",
+}
+"""Formats by the endings of the output, if none is given."""
 _EXTENT = 3.0  # standard deviations around each component that the cells cover
 
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="export")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> None:
-    common.run_guarded(run, config)
+    app.start("export", run)
 
 
 def run(config: DictConfig) -> None:
@@ -40,19 +45,35 @@ def run(config: DictConfig) -> None:
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.report.progress import ProgressBars
 
-    known = (*_OF_SPACE, *_OF_COMPONENTS)
-    if config.format not in known:
-        raise InvalidArgumentError(f"format={config.format!r} is not one of {', '.join(known)}.")
     for name in ("path", "output"):
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
+    config.format = _format(config)
     device = common.use_runtime(config.runtime)
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.format in _OF_COMPONENTS:
             message = _export_components(config)
         else:
-            message = _export_space(config, _map(Path(config.path), device), bars)
+            message = write_space(config, _map(Path(config.path), device), bars)
     print(message)
+
+
+def _format(config: DictConfig) -> str:
+    """The format that is given, or that of the output's ending."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    known = (*_OF_SPACE, *_OF_COMPONENTS)
+    if config.format is None:
+        ending = Path(config.output).suffix.lower()
+        if ending not in _OF_ENDINGS:
+            raise InvalidArgumentError(
+                f"output={config.output} has none of the endings {', '.join(_OF_ENDINGS)}; add one, or give "
+                f"format={'|'.join(known)}."
+            )
+        return _OF_ENDINGS[ending]
+    if config.format not in known:
+        raise InvalidArgumentError(f"format={config.format!r} is not one of {', '.join(known)}.")
+    return str(config.format)
 
 
 # -- components -----------------------------------------------------------------------------------
@@ -121,21 +142,30 @@ def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
         raise DataError(f"{path} is not a map that can be exported. {no_map} {error}") from error
 
 
-def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
-    """Write the probabilities of cells; returns a message."""
-    from gmmtorch.export import map_server
+def write_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
+    """Write the space of a map: probabilities of cells, distances or surfaces; returns a message."""
+    from gmmtorch.export import distance_field, map_server
     from gmmtorch.export.octomap import write_octomap
     from gmmtorch.export.point_cloud import write_pcd, write_ply
     from gmmtorch.occupancy.evidence import Thresholds
 
     output, rule = Path(config.output), Thresholds(config.free_thresh, config.occupied_thresh)
     if config.format == "map_server":
+        about = _choose_band(config, source)
         grid, theta = _dense(config, source, on_event)
         if grid.dim == 3:
             grid, theta = map_server.highest_in_band(grid, theta)  # `_dense` returns only the band
         written = map_server.write_map_server(output, grid, theta, rule)
         size = " × ".join(map(str, grid.shape))
-        return "\n".join(map(_size, written)) + f": {size} cells of {grid.resolution:g} m"
+        return "\n".join(map(_size, written)) + f": {size} cells of {grid.resolution:g} m{about}"
+    if config.format == "mesh":
+        return _export_mesh(config, source, on_event)
+    if config.format == "distance_field":
+        grid, theta = _dense(config, source, on_event)
+        field = distance_field.distance_field(grid, theta, rule)
+        distance_field.write_distance_field(output, grid, field)
+        size = " × ".join(map(str, grid.shape))
+        return f"{_size(output)}: {size} cells of {grid.resolution:g} m"
     cells = _cloud(config, source, on_event)
     if config.format == "octomap":
         write_octomap(output, cells, rule)
@@ -144,6 +174,45 @@ def _export_space(config: DictConfig, source: GaussianMap | OccupancyGrid, on_ev
         write = write_ply if config.format == "ply" else write_pcd
         write(output, cells)
     return f"{_size(output)}: {len(cells):,} cells of {cells.resolution:g} m"
+
+
+def _choose_band(config: DictConfig, source: GaussianMap | OccupancyGrid) -> str:
+    """Sets the heights between the floor and the ceiling of a 3D map if none are given; returns a note."""
+    from gmmtorch.export import floor_and_ceiling
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    side = _resolution(config, source)
+    if config.bounds is not None or _band(config) is not None:
+        return ""
+    if isinstance(source, GaussianMap):
+        found = source.components()
+        levels = None if found.dim == 2 or not len(found) else floor_and_ceiling.of_components(found, side)
+    else:
+        evidence = source.evidence()
+        is_flat = evidence.dim == 2 or not evidence.n_blocks
+        levels = None if is_flat else floor_and_ceiling.of_grid(source, config.occupied_thresh)
+    if levels is None:
+        return ""
+    config.z_min, config.z_max = levels.band(side)
+    return f"\nz_min={config.z_min:.2f} z_max={config.z_max:.2f} (m) were chosen: {levels.about()}"
+
+
+def _export_mesh(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> str:
+    """Write the surfaces of a map inside the box, if there is one; returns a message."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.export.mesh import surface_mesh
+    from gmmtorch.export.mesh_formats import write_mesh
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    if not isinstance(source, GaussianMap):
+        raise InvalidArgumentError(f"format=mesh needs a GaussianMap; {config.path} is an occupancy grid.")
+    on_event("mesh", 0, None)
+    side = _resolution(config, source)
+    mesh = surface_mesh(source.components(), side, memory_limit=config.runtime.memory_limit)
+    if config.bounds is not None or _band(config) is not None:
+        mesh = mesh.inside(*_box(config, source))
+    write_mesh(Path(config.output), mesh)
+    return f"{_size(Path(config.output))}: {len(mesh.faces):,} triangles, cells of {side:g} m"
 
 
 def _cloud(config: DictConfig, source: GaussianMap | OccupancyGrid, on_event: Event) -> CellCloud:
@@ -232,6 +301,11 @@ def _box(config: DictConfig, source: GaussianMap | OccupancyGrid) -> tuple[list[
                 "the highest."
             )
         low, high = list(config.bounds[:dim]), list(config.bounds[dim:])
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            raise InvalidArgumentError(
+                f"bounds={list(config.bounds)}: the lowest corner {low} must be below the highest {high} "
+                "along every axis."
+            )
     elif empty:
         raise DataError(f"{config.path} is an empty map; give bounds to export it.")
     else:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, fit_stream, fit_studies, schema, studies
+from gmmtorch.cli import app, common, fit_stream, fit_studies, studies
 from gmmtorch.cli.fit_data import fit_data
 
 if TYPE_CHECKING:
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.evaluation.fit_comparison import FitOutcome
 
-_TABLE = (
+TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
     "psnr2_db held_out_psnr2_db nbytes"
 )
@@ -25,13 +24,8 @@ _TABLE = (
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
     with fit_stream.quiet_worker():
-        hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="fit")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> float | None:
-    return common.run_guarded(run, config)
+        app.start("fit", run)
 
 
 def run(config: DictConfig) -> float | None:
@@ -61,7 +55,7 @@ def _run_streamed(config: DictConfig) -> float | None:
         return None
     row, mixture, sample = streamed
     _show(config, sample.train, FitOutcome([row], {"em": mixture}, {"em": mixture.lower_bounds_}), folder)
-    common.print_table([row], _TABLE.split(), f"{sample.dataset}: {row['n_points']:,} points")
+    common.print_table([row], TABLE.split(), f"{sample.dataset}: {row['n_points']:,} points")
     common.print_files(folder, folder / "results.json")
     return common.log_likelihood(row)
 
@@ -83,7 +77,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")
     _show(config, data.train, outcome, folder)
-    common.print_table(outcome.rows, _TABLE.split(), common.headline(outcome.rows))
+    common.print_table(outcome.rows, TABLE.split(), common.headline(outcome.rows))
     return outcome.rows
 
 
@@ -91,8 +85,7 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.evaluation.estimators import NO_LIKELIHOODS
-    from gmmtorch.evaluation.fit_comparison import in_use
+    from gmmtorch.evaluation.fit_comparison import NO_LIKELIHOODS, in_use
     from gmmtorch.report.maps.fitting_figures import comparison_figure, convergence_figure
     from gmmtorch.report.scenes.mixture_figures import mixture_figure
     from gmmtorch.report.style import label_of
@@ -126,8 +119,8 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
         for method, mixture in outcome.mixtures.items():
             used = in_use(mixture, points)
             board.ellipsoids(f"mixture_{method}", mixture.means[used], mixture.covariances[used])
-        metrics = {f"hparam/log_likelihood_{row['method']}": row["log_likelihood"] for row in outcome.rows}
-        board.hparams(common.flat(config), metrics)
+        metrics = {f"log_likelihood_{row['method']}": row["log_likelihood"] for row in outcome.rows}
+        board.hparams(common.chosen_options(config), metrics)
 
 
 if __name__ == "__main__":

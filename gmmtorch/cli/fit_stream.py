@@ -100,6 +100,13 @@ def _check(config: DictConfig) -> None:
         )
     if config.resume and config.checkpoint is None:
         raise InvalidArgumentError("resume=true needs a checkpoint; give checkpoint=FILE.")
+    if config.resume and not (path := Path(config.checkpoint).expanduser()).is_file():
+        if not path.parent.is_dir():
+            raise InvalidArgumentError(
+                f"checkpoint={path}: the folder {path.parent} does not exist, so there is nothing to resume; "
+                "correct the path, or remove resume=true."
+            )
+        common.logger.warning("checkpoint=%s does not exist: the fit starts from the beginning.", path)
 
 
 def _checkpoint(config: DictConfig) -> Checkpoint | None:

@@ -12,15 +12,18 @@ from gmmtorch.cli.structured import build
 from gmmtorch.cli.studies import Found, Study
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    from collections.abc import Callable
+    from typing import Any
 
     from gmmtorch.evaluation.events import Event, OnRows, Row
+
+    Figures = Callable[[list[Row]], dict[str, Any]]
 
 
 def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     from gmmtorch.evaluation.studies import initialization_study
     from gmmtorch.evaluation.studies.study_options import InitializationStudy
-    from gmmtorch.report.studies import initialization_figures
+    from gmmtorch.report.studies.fit_study_figures import initialization_figures
 
     study = build(InitializationStudy, common.as_options(config.study), "study")
     data = fit_data(config, device, on_event)
@@ -37,7 +40,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
     """Fields of a fit that this study does not measure are None."""
     from gmmtorch.evaluation.studies import sensor_noise
     from gmmtorch.evaluation.studies.study_options import SensorModelStudy
-    from gmmtorch.report.studies import sensor_noise_figures
+    from gmmtorch.report.studies.fit_study_figures import sensor_model_figures
 
     study = build(SensorModelStudy, common.as_options(config.study), "study")
     with common.naming({name: f"study.{name}" for name in ("sensor", "sensor_options")}):
@@ -55,7 +58,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
     ]
     return _found(
         rows,
-        sensor_noise_figures,
+        sensor_model_figures,
         "variant",
         "held_out_log_likelihood auc auc_near_surface thickness sensor_deviation seconds n_iterations nbytes",
     )
@@ -64,7 +67,7 @@ def _sensor_model(config: DictConfig, device: str, on_event: Event, on_rows: OnR
 def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
     from gmmtorch.evaluation.studies import component_count
     from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
-    from gmmtorch.report.studies import component_count_figures
+    from gmmtorch.report.studies.fit_study_figures import component_count_figures
 
     study = build(ComponentCountStudy, common.as_options(config.study), "study")
     dataset, scans = selected_scans(config, device, on_event)
@@ -79,20 +82,20 @@ def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: 
     )
 
 
-def _found(rows: list[Row], report: ModuleType, line: str, columns: str) -> Found:
+def _found(rows: list[Row], figures: Figures, line: str, columns: str) -> Found:
     """The table shows means over the seeds for each value of the field `line` and number of components."""
     from gmmtorch.evaluation.fit_comparison import means
 
     table = means(rows, (line, "n_components"))
     return Found(
         rows,
-        lambda: report.figures(rows),
+        lambda: figures(rows),
         f"{line} n_components n_seeds {columns}",
         common.headline(rows),
         shown=table,
         line=line,
         step="n_components",
-        scores={"hparam/best_log_likelihood": max(common.log_likelihood(row) for row in table)},
+        scores={"best_log_likelihood": max(common.log_likelihood(row) for row in table)},
     )
 
 

@@ -48,8 +48,9 @@ def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> N
             ) from error
 
 
-def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]:
-    """A factory of empty maps with the options `map.*`; `changes` replaces some of them."""
+def map_factory(config: DictConfig, resolution: float = 0.1, **changes: Any) -> Callable[[], GaussianMap]:
+    """A factory of empty maps with the options `map.*`; `changes` replaces some of them. `resolution`: of
+    queries without one (m)."""
     from gmmtorch.errors import check_choice
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.learning.rules import SOFTMAX_DTYPES
@@ -63,7 +64,7 @@ def map_factory(config: DictConfig, **changes: Any) -> Callable[[], GaussianMap]
 
     def make() -> GaussianMap:
         with common.naming({name: f"map.{name}" for name in options}):
-            return GaussianMap(rule, codec=options["codec"], **query, **limits(config))
+            return GaussianMap(rule, resolution=resolution, codec=options["codec"], **query, **limits(config))
 
     make()  # an invalid option fails here, before any map is built
     return make

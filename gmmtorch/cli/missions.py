@@ -109,7 +109,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     from gmmtorch.exploration.mission.options import TeamOptions
     from gmmtorch.exploration.planning.primitives import Dynamics
     from gmmtorch.exploration.robot.gmm_mapper import FrameRule
-    from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
+    from gmmtorch.exploration.robot.robot_state import StoppingRule
     from gmmtorch.exploration.world.scoring import BeliefRule
     from gmmtorch.mapping.learning.rules import NoveltyRule
     from gmmtorch.simulation.sensors.depth_camera import DepthCamera

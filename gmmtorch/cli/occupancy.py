@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, maps, occupancy_studies, schema, studies
+from gmmtorch.cli import app, common, maps, occupancy_studies, studies
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event, Row
@@ -17,17 +16,12 @@ if TYPE_CHECKING:
     from gmmtorch.mapping.components import Components
     from gmmtorch.scan import Scan
 
-_TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
+TABLE = "method resolution kept auc auc_low auc_high brier n_components nbytes build_seconds query_seconds"
 
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="occupancy")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> float | None:
-    return common.run_guarded(run, config)
+    app.start("occupancy", run)
 
 
 def run(config: DictConfig) -> float | None:
@@ -67,7 +61,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
         lambda rows: common.write_results("occupancy", config, rows, folder),
     )
     _show(config, scans, outcome, folder)
-    common.print_table(outcome.rows, _TABLE.split(), f"{name}: {len(scans)} scans")
+    common.print_table(outcome.rows, TABLE.split(), f"{name}: {len(scans)} scans")
     return outcome.rows
 
 
@@ -89,7 +83,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     from gmmtorch.report.maps.map_figures import map_figure
     from gmmtorch.report.maps.map_images import MapPanel
     from gmmtorch.report.maps.map_regions import busiest_regions, robust_bounds
-    from gmmtorch.report.scenes.cutaway import first_viewpoints
+    from gmmtorch.report.scenes.ellipsoids import first_viewpoints
     from gmmtorch.report.scenes.mixture_figures import mixture_figure
 
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
@@ -186,10 +180,10 @@ def _write_board(
         if surfaces is not None:
             board.ellipsoids("mixture", surfaces.means, surfaces.covariances)
         scores = {
-            f"hparam/auc_{built.row['method']}_{built.row['resolution']:g}m": built.row["auc"]
+            f"auc_{built.row['method']}_{built.row['resolution']:g}m": built.row["auc"]
             for built in outcome.shown
         }
-        board.hparams(common.flat(config), scores)
+        board.hparams(common.chosen_options(config), scores)
 
 
 if __name__ == "__main__":

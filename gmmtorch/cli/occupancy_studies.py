@@ -28,7 +28,7 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRow
     from gmmtorch.evaluation.studies import auc_memory
     from gmmtorch.evaluation.studies.auc_memory import Sized
     from gmmtorch.evaluation.studies.study_options import AucMemoryStudy
-    from gmmtorch.report.studies import auc_memory_figures as report
+    from gmmtorch.report.studies.map_study_figures import auc_memory_figures
 
     protocol = protocol_of(config)
     study = build(AucMemoryStudy, common.as_options(config.study), "study")
@@ -49,7 +49,7 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRow
     name, scans = common.all_scans(config, device, on_event)
     rows = auc_memory.run(name, scans, sized, protocol, config.seed, on_event, on_rows)
     table = "method size resolution auc auc_low auc_high brier nbytes build_seconds query_seconds"
-    return Found(rows, lambda: report.figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, lambda: auc_memory_figures(rows), table, f"{name}: {len(scans)} scans")
 
 
 def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
@@ -59,7 +59,7 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
     from gmmtorch.evaluation.studies import variance_threshold
     from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
     from gmmtorch.mapping.gaussian_map import GaussianMap
-    from gmmtorch.report.studies import variance_threshold_figures as report
+    from gmmtorch.report.studies import map_study_figures as report
 
     study = build(VarianceThresholdStudy, common.as_options(config.study), "study")
     name, scans = common.all_scans(config, device, on_event)
@@ -70,7 +70,7 @@ def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_row
     found = variance_threshold.run(name, scans, new_map, study, config.seed, on_event, on_rows)
 
     def figures() -> dict[str, object]:
-        drawn: dict[str, object] = dict(report.figures(found.rows))
+        drawn: dict[str, object] = dict(report.variance_threshold_figures(found.rows))
         if found.hits.shape[1] == 3:
             low, high = report.closest_look(found.thin if len(found.thin) else found.hits, found.hits)
             occupancies = {
@@ -110,7 +110,7 @@ def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: 
     """Maps from perturbed poses, before and after the correction of the poses."""
     from gmmtorch.evaluation.studies import pose_correction
     from gmmtorch.evaluation.studies.study_options import PoseCorrectionStudy
-    from gmmtorch.report.studies import pose_correction_figures as report
+    from gmmtorch.report.studies.map_study_figures import pose_correction_figures
 
     protocol = protocol_of(config)
     study = build(PoseCorrectionStudy, common.as_options(config.study), "study")
@@ -120,7 +120,7 @@ def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: 
         name, scans, new_map, protocol, study.methods, config.seed, on_event, on_rows
     )
     table = "method resolution auc auc_corrected auc_clean n_components nbytes"
-    return Found(rows, lambda: report.figures(rows), table, f"{name}: {len(scans)} scans")
+    return Found(rows, lambda: pose_correction_figures(rows), table, f"{name}: {len(scans)} scans")
 
 
 STUDIES: dict[str, Study] = {

@@ -12,10 +12,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common, links, maps, missions, schema
+from gmmtorch.cli import app, common, links, maps, missions
 from gmmtorch.cli.outputs import Outputs, terse
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 """Environment variable with the id of the process that started this robot, which ends with that process."""
-_TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
+TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 _SOURCES = ("world", "log")
 _SYNCS = ("snapshot", "always")
 _NO_RESTART = (
@@ -38,13 +37,7 @@ _NO_RESTART = (
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="robot")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> None:
-    with terse():
-        common.run_guarded(run, config)
+    app.start("robot", terse()(run))
 
 
 def run(config: DictConfig) -> None:
@@ -78,7 +71,7 @@ def _option_names(config: DictConfig) -> dict[str, str]:
 def check_options(config: DictConfig) -> None:
     """Raises `InvalidArgumentError` for bad options of a robot or a team, before anything is opened."""
     from gmmtorch.errors import InvalidArgumentError, check_whole
-    from gmmtorch.exploration.mission.clocks import check_pace
+    from gmmtorch.exploration.mission.driver import check_pace
 
     if common.set_up(config) != "cpu":
         raise InvalidArgumentError(
@@ -120,7 +113,7 @@ def _flying(
     config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack
 ) -> tuple[Drivable, RobotView]:
     """A robot with a simulated camera in a simulated world."""
-    from gmmtorch.exploration.mission.clocks import Stopwatch
+    from gmmtorch.exploration.mission.driver import Stopwatch
     from gmmtorch.exploration.mission.mission import Mission
     from gmmtorch.exploration.mission.robot_view import FlyingRobotView
     from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
@@ -240,8 +233,7 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
 def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path) -> None:
     """Runs the mission, waits until the team is quiet, and writes the results."""
     from gmmtorch.cli.robot_report import RobotReport, print_refusals
-    from gmmtorch.exploration.mission.clocks import WallClock
-    from gmmtorch.exploration.mission.driver import drive, settle
+    from gmmtorch.exploration.mission.driver import WallClock, drive, settle
 
     outputs = Outputs(folder)
     with RobotReport(config, view, folder) as report, _stop_requested() as is_stopped:
@@ -262,11 +254,11 @@ def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path)
             row[f"{name}_path"] = str(path)
     outputs.written("results.json", lambda _: common.write_results("robot", config, [row], folder))
     if config.report.figures:
-        from gmmtorch.report.exploration.team_figures import team_run_figure
+        from gmmtorch.report.exploration.network_figures import team_run_figure
         from gmmtorch.report.style import save_figure
 
         outputs.written("run.png", functools.partial(save_figure, team_run_figure([row])))
-    common.print_table([row], _TABLE.split(), f"robot {config.id}")
+    common.print_table([row], TABLE.split(), f"robot {config.id}")
     print_refusals([row])
     outputs.check()
     common.print_files(folder, folder / "results.json")

@@ -1,6 +1,7 @@
-"""The types and defaults of all options; conf/ explains them.
+"""The types and defaults of all options, with a line on each for `--help`.
 
-Options of a library class come from that class, by `schema_of`. Ranges are checked by the library.
+Options of a library class come from that class, by `schema_of`; so do the lines, from its docstring. Ranges
+are checked by the library.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from gmmtorch.cli.structured import schema_of
+from gmmtorch.cli.structured import read_dataclass, schema_of
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
 from gmmtorch.evaluation.studies.study_options import (
     ApproximationErrorStudy,
@@ -23,26 +24,73 @@ from gmmtorch.evaluation.studies.study_options import (
     SensorModelStudy,
     VarianceThresholdStudy,
 )
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
 
 
 @dataclass
 class FileDataset:
+    """A data set in files.
+
+    path: file or folder.
+    max_range: readings at or beyond this distance (m) are beams without return; null: the data set's own.
+    no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
+    stride: use every n-th scan.
+    """
+
     name: str = MISSING
     path: str = MISSING
     max_range: float | None = None
     no_return_range: float | None = None
     stride: int = 1
+    poses: str | None = None
 
 
 @dataclass
 class DepthFramesDataset(FileDataset):
+    """Depth images.
+
+    pixel_stride: every n-th pixel of every n-th row.
+    """
+
+    pixel_stride: int = 1
+    depth_scale: float = 0.001
+
+
+@dataclass
+class RosbagDataset(FileDataset):
+    topic: str | None = None
+    frame: str | None = None
+    sensor_frame: str | None = None
+    extrinsic: list[float] | None = None
+    max_gap: float = 2.0
+    clock: str = "header"
+    deskew: bool = True
+    camera_info: str | None = None
     pixel_stride: int = 1
 
 
 @dataclass
+class KittiDataset(FileDataset):
+    max_gap: float = 2.0
+
+
+@dataclass
+class TumDataset(DepthFramesDataset):
+    intrinsics: list[float] | None = None
+    depth_scale: float = 0.0002
+    max_gap: float = 0.5
+
+
+@dataclass
 class MeshDataset(FileDataset):
+    """Points of a mesh.
+
+    n_points: number of points sampled from the surface.
+    noise: standard deviation (m) of the points along each axis.
+    seed: seed of points and noise.
+    """
+
     n_points: int = 100_000
     noise: float = 0.0
     seed: int = 0
@@ -50,6 +98,13 @@ class MeshDataset(FileDataset):
 
 @dataclass
 class MeshScansDataset(FileDataset):
+    """Simulated scans of a mesh.
+
+    n_scans: number of scans, about 2 m apart.
+    sensor: lidar or depth_camera.
+    seed: seed of the sensor's noise.
+    """
+
     n_scans: int = 100
     sensor: str = "lidar"
     seed: int = 0
@@ -57,6 +112,15 @@ class MeshScansDataset(FileDataset):
 
 @dataclass
 class SyntheticDataset:
+    """A simulated building.
+
+    max_range: readings at or beyond this distance (m) are beams without return; null: the sensor's own.
+    no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
+    stride: use every n-th scan.
+    seed: seed of the simulation.
+    n_scans: number of scans; null: the whole tour.
+    """
+
     name: str = MISSING
     max_range: float | None = None
     no_return_range: float | None = None
@@ -67,11 +131,34 @@ class SyntheticDataset:
 
 @dataclass
 class SyntheticBuildingDataset(SyntheticDataset):
+    """A simulated building in 3D.
+
+    sensor: lidar or depth_camera.
+    """
+
     sensor: str = "lidar"
 
 
 @dataclass
+class MapFile:
+    """codec: quantized, about 9 bytes for each component; or float, exact numbers."""
+
+    name: str = MISSING
+    codec: str = "quantized"
+
+
+@dataclass
 class Stream:
+    """Clouds that are read in chunks.
+
+    chunk_points: points of a chunk.
+    sample_points: size of the random sample for the initialization of EM.
+    max_range: points at this distance (m) from the frame's origin or beyond are dropped; null: none.
+    checkpoint_every: iterations between two checkpoints.
+    checkpoint_seconds: seconds between two checkpoints; null: only by iterations.
+    timeout: seconds that the processes of torchrun wait for each other.
+    """
+
     chunk_points: int = 1 << 17
     sample_points: int = 100_000
     max_range: float | None = None
@@ -82,6 +169,13 @@ class Stream:
 
 @dataclass
 class Report:
+    """What a run shows and writes.
+
+    progress: progress bars, or a status line.
+    figures: figures as PNG.
+    tensorboard: events for TensorBoard.
+    """
+
     progress: bool = True
     figures: bool = True
     tensorboard: bool = True
@@ -89,13 +183,26 @@ class Report:
 
 @dataclass
 class OccupancyReport(Report):
+    """magnify: number of regions of a 2D map with a magnified figure."""
+
     magnify: int = 0
 
 
 @dataclass
 class Runtime:
+    """Where and how a run computes.
+
+    device: cpu, cuda, cuda:1, …
+    threads: CPU threads; null: torch chooses. The same number gives the same results.
+    dtype: type of the exponentials in EM; float64: all computations.
+    compile: use torch.compile; faster for very large runs.
+    kernels: fused kernels: auto, if the extra [fast] is installed; fused, an error if not; torch, never.
+    memory_limit: bytes of a map's cells, at most.
+    """
+
     device: str = "cpu"
     threads: int | None = 1
+    kernels: str = "auto"
     dtype: str = "float32"
     compile: bool = False
     memory_limit: int = 4 << 30
@@ -103,6 +210,13 @@ class Runtime:
 
 @dataclass
 class Occupancy:
+    """Options of gmmtorch-occupancy.
+
+    method: list of point, flux, cone, monte_carlo, occupancy_grid, octomap and other baselines.
+    method_options: options of one baseline, as in +method_options.hilbert.features=nystroem.
+    seed: seed of all random numbers.
+    """
+
     dataset: Any = MISSING
     map: Any = MISSING
     method: list[str] = field(default_factory=list)
@@ -114,7 +228,44 @@ class Occupancy:
 
 
 @dataclass
+class Map:
+    """Options of gmmtorch-map.
+
+    seed: seed of all random numbers.
+    resolution: side (m) of the cells of queries, pictures and exports.
+    export: list of map_server, octomap, cloud, mesh, distance_field.
+    z_min, z_max: height band (m) of map_server and distance_field; null: half a metre around the path.
+    checkpoint_seconds: computing time between two checkpoints.
+    """
+
+    dataset: Any = MISSING
+    map: Any = MISSING
+    seed: int = 0
+    resolution: float = 0.1
+    export: list[str] = field(default_factory=list)
+    view: bool = False
+    z_min: float | None = None
+    z_max: float | None = None
+    checkpoint_seconds: float = 30.0
+    report: Report = field(default_factory=Report)
+    runtime: Runtime = field(default_factory=Runtime)
+
+
+@dataclass
 class Fit:
+    """Options of gmmtorch-fit.
+
+    method: list of em, hierarchical, variational, riemannian, sliced_wasserstein, scikit_learn, ….
+    seed: seed of all random numbers.
+    scans: indices of the scans whose points are fitted together, as in [0,1,2]; null: all scans.
+    max_points: size of a random subset of the points; null: all points.
+    test_share: share of the points that is held out; 0: none.
+    method_options: options of one method, as in +method_options.hierarchical.branching=4.
+    points: file (.npy, .las, .laz, .pcd, .ply) that is read in chunks, instead of a data set.
+    checkpoint: file for the state of the fit; null: none.
+    resume: continue from the checkpoint if it exists; its folder must exist.
+    """
+
     dataset: Any = MISSING
     method: list[str] = field(default_factory=list)
     seed: int = 0
@@ -133,21 +284,44 @@ class Fit:
 
 @dataclass
 class ExportReport:
+    """progress: progress bars."""
+
     progress: bool = True
 
 
 @dataclass
 class ExportRuntime:
+    """device: cpu, cuda, cuda:1, …
+    threads: CPU threads; null: torch chooses.
+    kernels: fused kernels: auto, fused or torch.
+    memory_limit: bytes of the cells' evidence, at most.
+    """
+
     device: str = "cpu"
     threads: int | None = 1
+    kernels: str = "auto"
     memory_limit: int = 4 << 30
 
 
 @dataclass
 class Export:
+    """Options of gmmtorch-export.
+
+    path: map, grid or mixture of gmmtorch (.safetensors), GIRA .csv, or .npz.
+    output: file to write.
+    format: map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture; null: by the ending.
+    method: form of evidence: point, flux, cone, monte_carlo; null: the map's own.
+    resolution: side (m) of the cells; null: the map's own.
+    bounds: [x0,y0,x1,y1], in 3D [x0,y0,z0,x1,y1,z1] (m); null: around the components.
+    z_min, z_max: height band (m); null: for map_server, between the floor and the ceiling of a 3D map.
+    occupied_thresh: cells above this probability are occupied.
+    free_thresh: cells below this probability are free; others are unknown.
+    n_points: number of points from which a mixture without support (GIRA) was learned.
+    """
+
     path: str | None = None
     output: str | None = None
-    format: str = "map_server"
+    format: str | None = None
     method: str | None = None
     resolution: float | None = None
     bounds: list[float] | None = None
@@ -161,7 +335,24 @@ class Export:
 
 
 @dataclass
+class View:
+    path: str | None = None
+    trajectory: str | None = None
+    html: str | None = None
+    shape: str = "ellipsoids"
+    colour: str = "height"
+    host: str = "127.0.0.1"
+    port: int = 8080
+    runtime: ExportRuntime = field(default_factory=ExportRuntime)
+
+
+@dataclass
 class GeneratedWorld:
+    """size: length, width and height (m).
+    seed: seed of the world.
+    resolution: side (m) of the cells of every map and of the evaluation.
+    """
+
     name: str = MISSING
     size: list[float] = field(default_factory=lambda: [50.0, 40.0, 8.0])
     seed: int = 0
@@ -170,6 +361,11 @@ class GeneratedWorld:
 
 @dataclass
 class MeshWorldOptions:
+    """path: triangle mesh (PLY, OBJ, STL) in metres, z up.
+    bounds: part to explore, [x0,y0,z0,x1,y1,z1] (m); null: all.
+    resolution: side (m) of the cells of every map and of the evaluation.
+    """
+
     name: str = MISSING
     path: str = MISSING
     bounds: list[float] | None = None
@@ -178,6 +374,10 @@ class MeshWorldOptions:
 
 @dataclass
 class Team:
+    """size: number of robots.
+    start: [[x,y,z,yaw], …] for each robot (m, rad); null: chosen from the world.
+    """
+
     name: str = MISSING
     size: int = 3
     start: Any = None  # a list of poses
@@ -185,6 +385,10 @@ class Team:
 
 @dataclass
 class PlannerOptions:
+    """prior: occupancy of unobserved cells in the information of a view.
+    rest: a robot stops if two minutes give less than this share of its best two minutes; 0: never.
+    """
+
     name: str = MISSING
     prior: float = 0.125
     rest: float = 0.01
@@ -192,88 +396,73 @@ class PlannerOptions:
 
 @dataclass
 class TreePlannerOptions(PlannerOptions):
+    """beams: beams of a view."""
+
     beams: int = 160
 
 
 @dataclass
-class DepthSensor:
-    width: int = 160
-    height: int = 120
+class SensorRate:
+    """rate: frames per second."""
+
     rate: float = 1.0
-    horizontal_fov: float = 1.5184
-    vertical_fov: float = 1.0123
-    max_range: float = 6.0
-    noise: float = 0.0015
-    dropout: float = 0.01
 
 
 @dataclass
-class RobotBody:
-    radius: float = 0.3
-    speed: float = 1.5
-    climb: float = 0.75
-    yaw_rate: float = 1.2
-    acceleration: float = 1.5
-    yaw_acceleration: float = 3.0
-    duration: float = 2.0
-    step: float = 0.2
+class PlanningWindow:
+    """Options of a robot's maps.
 
+    window: cells along x, y and z of the local map around a robot, for planning.
+    noise: metres; pieces up to twice as thick are flat.
+    length: largest standard deviation (m) along a component.
+    cell: side (m) of the cells into which points are summed before EM.
+    components: components of a frame, at most.
+    iterations: EM iterations.
+    """
 
-@dataclass
-class Belief:
-    prior: float = 1.0
-    clamp: float = 0.05
-    free: float = 0.2
-    occupied: float = 0.65
-
-
-@dataclass
-class TeamMap:
     window: list[int] = field(default_factory=lambda: [80, 80, 40])
-    threshold: float = 1.0
-    observed: float = 0.5
-    distance: float = 2.0
-    noise: float = 0.03
-    length: float = 0.6
-    cell: float = 0.15
-    components: int = 200
-    iterations: int = 4
-    rays: float = 4.0
-    shell: float = 0.5
-    update_at: float = 3.0
-    update_stride: int = 11
+
+
+@dataclass
+class NetworkDelay:
+    """delay: seconds from the end of transmission to arrival, at least.
+    partitions: as in [{begin: 60, end: 120, groups: [[0], [1, 2]]}]; simulated seconds, robots by id."""
+
+    delay: float = 0.05
 
 
 @dataclass
 class RobotNetwork:
+    """loss: share of the datagrams that each receiver loses.
+    announce: seconds between announcements of a robot's records, while these change.
+    budget: bytes per second that each robot sends of its map and views; null: no limit.
+    """
+
     loss: float = 0.0
     announce: float = 5.0
     budget: float | None = None
 
 
 @dataclass
-class SimulatedNetwork(RobotNetwork):
-    delay: float = 0.05
-    jitter: float = 0.0
-    bandwidth: float | None = None
-    duplication: float = 0.0
-    reach: float | None = None
-    partitions: list[Any] = field(default_factory=list)
-
-
-@dataclass
 class RobotEvaluation:
+    """every: seconds between the rows of a mission's curves."""
+
     every: float = 10.0
 
 
 @dataclass
 class ExploreEvaluation(RobotEvaluation):
+    """codecs: further encodings of the novel points, for comparison: octree, draco."""
+
     codecs: list[str] = field(default_factory=list)
 
 
 @dataclass
 class CheckpointOptions:
-    """Removed; `explore` says what to do instead."""
+    """Removed; `explore` says what to do instead.
+
+    every, folder: removed: a killed study continues with hydra.run.dir=RUN.
+    """
 
     every: float | None = None
     folder: str | None = None
@@ -281,38 +470,82 @@ class CheckpointOptions:
 
 @dataclass
 class ExploreReport(Report):
+    """recording: a file for the rerun viewer."""
+
     recording: bool = False
 
 
 @dataclass
 class WorldRuntime:
+    """device: cpu, the only device of missions.
+    threads: CPU threads; null: torch chooses.
+    kernels: fused kernels: auto, fused or torch.
+    cache: store the results that depend only on the world.
+    """
+
     device: str = "cpu"
     threads: int | None = 1
+    kernels: str = "auto"
     cache: bool = True
 
 
 @dataclass
 class ExploreRuntime(WorldRuntime):
+    """workers: missions of an experiment that run in parallel."""
+
     workers: int = 2
 
 
 @dataclass
 class RobotRuntime(WorldRuntime):
+    """memory_limit: bytes of the cells of a replayed log's map, at most."""
+
     memory_limit: int = 4 << 30
 
 
 @dataclass
 class TrialsStudy:
-    """Missions that differ in some options, each with every seed."""
+    """Missions that differ in some options, each with every seed.
+
+    seeds: seeds of each variant.
+    variants: options of each variant, as in [{team: gmm_shared}, {team: grid_shared}].
+    """
 
     name: str = "trials"
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4])
     variants: list[dict[str, Any]] = field(default_factory=list)
 
 
+_SENSOR = schema_of(read_dataclass("simulation.sensors.depth_camera", "DepthCamera"), SensorRate)
+_BODY = schema_of(read_dataclass("exploration.planning.primitives", "Dynamics"))
+_BELIEF = schema_of(read_dataclass("exploration.world.scoring", "BeliefRule"))
+_TEAM_MAP = schema_of(
+    PlanningWindow,
+    NoveltyRule,
+    read_dataclass("exploration.robot.gmm_mapper", "FrameRule"),
+    without=("resolution", "prior", "cutoff", "explained"),
+    observed=0.5,
+    distance=2.0,
+)
+_SIMULATED_NETWORK = schema_of(
+    RobotNetwork,
+    read_dataclass("sharing.transport.link_conditions", "LinkConditions", partitions=list[Any]),
+    NetworkDelay,
+    without=("latency",),
+)
+
+
 @dataclass
 class Exploration:
-    """Options of conf/exploration_base.yaml, which gmmtorch-explore and gmmtorch-robot share."""
+    """Options of conf/exploration_base.yaml, which gmmtorch-explore and gmmtorch-robot share.
+
+    duration: seconds that each robot flies; simulated seconds in gmmtorch-explore.
+    seed: seed of noise, network and planners.
+    information: measure of the information of a view: csqmi or fsmi.
+    coordination: myopic, greedy, distributed_greedy or random_partition.
+    rounds: rounds of distributed_greedy and random_partition.
+    codec: code of components: quantized (about 8.7 bytes each), float, or thesis (57 bytes).
+    """
 
     world: Any = MISSING
     team: Any = MISSING
@@ -323,17 +556,19 @@ class Exploration:
     coordination: str = "greedy"
     rounds: int = 3
     codec: str = "quantized"
-    sensor: DepthSensor = field(default_factory=DepthSensor)
-    robot: RobotBody = field(default_factory=RobotBody)
-    belief: Belief = field(default_factory=Belief)
-    map: TeamMap = field(default_factory=TeamMap)
+    sensor: _SENSOR = field(default_factory=_SENSOR)  # type: ignore[valid-type]
+    robot: _BODY = field(default_factory=_BODY)  # type: ignore[valid-type]
+    belief: _BELIEF = field(default_factory=_BELIEF)  # type: ignore[valid-type]
+    map: _TEAM_MAP = field(default_factory=_TEAM_MAP)  # type: ignore[valid-type]
 
 
 @dataclass
 class Explore(Exploration):
+    """transport: in_process; gmmtorch-team has others."""
+
     transport: str = "in_process"
     study: Any = None
-    network: SimulatedNetwork = field(default_factory=SimulatedNetwork)
+    network: _SIMULATED_NETWORK = field(default_factory=_SIMULATED_NETWORK)  # type: ignore[valid-type]
     evaluation: ExploreEvaluation = field(default_factory=ExploreEvaluation)
     checkpoint: CheckpointOptions = field(default_factory=CheckpointOptions)
     report: ExploreReport = field(default_factory=ExploreReport)
@@ -342,6 +577,22 @@ class Explore(Exploration):
 
 @dataclass
 class Link:
+    """The network of a robot.
+
+    listen: address of this machine, or 0.0.0.0, and port; a key is required except on loopback.
+    peers: addresses of the others, as in [192.168.1.12:7400].
+    group: multicast group that all robots share, as in 239.71.77.7:7400; null: none.
+    interface: this machine's address in the network of the group.
+    ttl: number of networks that datagrams to the group pass.
+    key_file: file of 64 hexadecimal digits; null: $GMMTORCH_TEAM_KEY, if it is set.
+    insecure: allow other machines without a key.
+    team: the team's name, for Zenoh.
+    listen_endpoints: Zenoh endpoints, as in [tcp/0.0.0.0:7447].
+    connect_endpoints: Zenoh endpoints of others, as in [tcp/192.168.1.12:7447].
+    scouting: search for other robots by multicast; null: as Zenoh does.
+    zenoh_config: file with settings of Zenoh; null: none.
+    """
+
     listen: str = "127.0.0.1:7400"
     peers: list[str] = field(default_factory=list)
     group: str | None = None
@@ -358,6 +609,11 @@ class Link:
 
 @dataclass
 class JournalOptions:
+    """enabled: the map is stored on disk and restored at the next start.
+    folder: folder of the store, to restore from; null: the run's folder.
+    sync: snapshot or always; both survive a loss of power.
+    """
+
     enabled: bool = True
     folder: str | None = None
     sync: str = "snapshot"
@@ -365,6 +621,13 @@ class JournalOptions:
 
 @dataclass
 class LogOptions:
+    """dataset: reader of the log, as in dataset@log.dataset=carmen.
+    map: learning of the log.
+    rate: scans per second.
+    every: use every n-th scan of the log.
+    part: consecutive or interleaved part of the log for each robot.
+    """
+
     dataset: Any = None
     map: Any = MISSING
     rate: float = 1.0
@@ -374,7 +637,15 @@ class LogOptions:
 
 @dataclass
 class Robot(Exploration):
-    """Options of gmmtorch-robot and gmmtorch-team."""
+    """Options of gmmtorch-robot and gmmtorch-team.
+
+    id: this robot's id; unique in the team.
+    source: world, a simulated camera in a simulated world, or log, recorded scans.
+    clock: wall, each robot's own clock.
+    speed: seconds of the robot's time per second.
+    settle: seconds without news after the last work, until the robot stops.
+    transport: udp or zenoh.
+    """
 
     id: int = 0
     source: str = "world"
@@ -406,7 +677,7 @@ STUDIES: dict[str, type] = {
 def _map_schema(rule: type) -> type:
     """Options of a map: of its learning rule, and of its queries."""
     runtime = ("dtype", "random_state", "memory_limit", "compiled")
-    return schema_of(rule, QueryOptions, without=runtime, name=MISSING, codec="quantized")
+    return schema_of(MapFile, rule, QueryOptions, without=runtime)
 
 
 @functools.cache  # the tests call it often
@@ -414,8 +685,10 @@ def register() -> None:
     """Store the schemas in Hydra's config store, under the names that the files in conf/ use."""
     store = ConfigStore.instance()
     store.store(name="occupancy_schema", node=schema_of(Occupancy, evaluation=schema_of(Protocol)))
+    store.store(name="map_schema", node=Map)
     mixture = schema_of(FitOptions, without=("dtype", "compiled"))
     store.store(name="fit_schema", node=schema_of(Fit, mixture=mixture))
+    store.store(name="view_schema", node=View)
     store.store(name="export_schema", node=Export)
     store.store(name="explore_schema", node=Explore)
     store.store(name="robot_schema", node=Robot)
@@ -431,6 +704,9 @@ def register() -> None:
         store.store(group="schema/study", name=name, node=schema_of(study, name=name))
     store.store(group="schema/dataset", name="file", node=FileDataset)
     store.store(group="schema/dataset", name="depth_frames", node=DepthFramesDataset)
+    store.store(group="schema/dataset", name="rosbag", node=RosbagDataset)
+    store.store(group="schema/dataset", name="kitti", node=KittiDataset)
+    store.store(group="schema/dataset", name="tum", node=TumDataset)
     store.store(group="schema/dataset", name="mesh", node=MeshDataset)
     store.store(group="schema/dataset", name="mesh_scans", node=MeshScansDataset)
     store.store(group="schema/dataset", name="synthetic", node=SyntheticDataset)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import operator
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING, Field, field, fields, is_dataclass, make_dataclass
+from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import gmmtorch
 from gmmtorch.cli import common
 from gmmtorch.errors import InvalidArgumentError
 
 T = TypeVar("T")
+DOCUMENTED = "documented_fields"
+"""Attribute of a schema: names that its docstring describes, also those that are not options."""
 
 
 def schema_of(*classes: type, without: Collection[str] = (), **more: Any) -> type:
@@ -42,7 +47,39 @@ def schema_of(*classes: type, without: Collection[str] = (), **more: Any) -> typ
         else:
             hint = found[name][1] if name in found else type(value)
             found[name] = (name, hint, field(default=value))
-    return make_dataclass(classes[0].__name__, found.values())
+    made = make_dataclass(classes[0].__name__, found.values())
+    made.__doc__ = "\n\n".join(cls.__doc__ or "" for cls in classes)
+    documented = [name for cls in classes for name in getattr(cls, DOCUMENTED, cls.__annotations__)]
+    setattr(made, DOCUMENTED, documented)
+    return made
+
+
+def read_dataclass(module: str, name: str, **hints: Any) -> type:
+    """A dataclass of a module that loads torch, made from its source: fields, defaults and docstring.
+
+    Args:
+        module: dotted name in gmmtorch.
+        hints: types of fields whose own types are not built in.
+    """
+    path = Path(gmmtorch.__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    (source,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    found: list[Any] = []
+    for item in source.body:
+        if isinstance(item, ast.AnnAssign) and not ast.unparse(item.annotation).startswith("InitVar"):
+            assert isinstance(item.target, ast.Name) and item.value is not None  # noqa: PT018
+            field_name, value = item.target.id, ast.literal_eval(item.value)
+            hint = hints.get(field_name) or eval(ast.unparse(item.annotation))
+            default: Any = field(default_factory=functools.partial(list, value))
+            found.append((field_name, hint, default if isinstance(value, tuple) else field(default=value)))
+    made = make_dataclass(name, found)
+    made.__doc__ = ast.get_docstring(source)
+    setattr(
+        made,
+        DOCUMENTED,
+        [ast.unparse(item.target) for item in source.body if isinstance(item, ast.AnnAssign)],
+    )
+    return made
 
 
 def _accepted(hint: Any) -> Any:

@@ -89,4 +89,4 @@ def _write_board(
         for name, figure in figures.items():
             board.figure(f"figures/{name}", figure)
         if found.scores:
-            board.hparams(common.flat(config), dict(found.scores))
+            board.hparams(common.chosen_options(config), dict(found.scores))

@@ -11,10 +11,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, links, missions, schema
+from gmmtorch.cli import app, common, links, missions
 from gmmtorch.cli.outputs import Outputs, terse
 from gmmtorch.cli.robot import check_options
 from gmmtorch.cli.robot_process import RobotProcess, end_all
@@ -22,7 +21,7 @@ from gmmtorch.cli.robot_process import RobotProcess, end_all
 if TYPE_CHECKING:
     from gmmtorch.report.progress import ProgressBars
 
-_TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_length collisions digest"
+TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_length collisions digest"
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
 """Options that each robot gets from this command."""
@@ -35,13 +34,7 @@ _TURN = 2.0
 
 def main() -> None:
     """Entry point of the command."""
-    schema.register()
-    hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name="team")(_guarded)()
-
-
-def _guarded(config: DictConfig) -> None:
-    with terse():
-        common.run_guarded(run, config)
+    app.start("team", terse()(run))
 
 
 def run(config: DictConfig) -> None:
@@ -62,7 +55,7 @@ def run(config: DictConfig) -> None:
     outputs.written("results.json", lambda _: common.write_results("team", config, [summary, *rows], folder))
     _show(config, rows, outputs)
     same = "all hold the same map" if summary["same_map"] else "their maps differ"
-    common.print_table(rows, _TABLE.split(), f"{len(rows)} robots: {same}")
+    common.print_table(rows, TABLE.split(), f"{len(rows)} robots: {same}")
     print_refusals(rows)
     outputs.check()
     common.print_files(folder, folder / "results.json")
@@ -164,7 +157,7 @@ def _show(config: DictConfig, rows: list[dict[str, Any]], outputs: Outputs) -> N
     """Writes the figure of the run, as a file and for TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.report.exploration.team_figures import team_run_figure
+    from gmmtorch.report.exploration.network_figures import team_run_figure
     from gmmtorch.report.style import save_figure
     from gmmtorch.report.tensorboard_writer import Board
 

@@ -32,6 +32,9 @@ _SOURCES = {
     "pcd_viewpoint": _Source("pcd_viewpoint", "PcdViewpoint"),
     "depth_frames": _Source("depth_frames", "DepthFrames"),
     "octomap_log": _Source("octomap_log", "OctomapLog"),
+    "rosbag": _Source("recordings.rosbag", "open_rosbag"),
+    "kitti": _Source("recordings.kitti", "Kitti"),
+    "tum": _Source("recordings.tum", "TumRgbd"),
     "mesh": _Source("mesh_samples", "MeshSamples"),
     "mesh_scans": _Source("mesh_scans", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
@@ -46,13 +49,14 @@ def load(
     max_range: float | None = None,
     no_return_range: float | None = None,
     stride: int = 1,
+    poses: str | Path | None = None,
     **options: Any,
 ) -> Dataset:
     """The data set `name`: a sequence of `Scan`s, each read when it is accessed.
 
     Args:
-        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, mesh or mesh_scans, which need
-            a `path`; synthetic_building or synthetic_building_2d, which need none.
+        name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, rosbag, kitti, tum, mesh or
+            mesh_scans, which need a `path`; synthetic_building or synthetic_building_2d, which need none.
         path: the file or folder.
         max_range: a reading at this distance (m) or beyond is a beam without return. None: 50 for CARMEN
             logs, the sensor's own maximum for mesh_scans and the synthetic buildings, no limit
@@ -60,9 +64,12 @@ def load(
         no_return_range: length (m) of free space along a beam without return; 0 drops such beams. None: 8
             for CARMEN logs, mesh_scans and the synthetic buildings, 0 for the others.
         stride: every n-th scan is read.
-        options: specific to the data set: `pixel_stride` for depth_frames; `n_points`, `noise` and
-            `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or "depth_camera") for
-            mesh_scans and the synthetic buildings.
+        poses: a trajectory file whose poses replace those of the data set: TUM rows (time x y z qx qy qz qw)
+            for scans with times, or KITTI rows (12 numbers), one for each scan. rosbag also takes "tf",
+            "standing" and topics.
+        options: specific to the data set: `pixel_stride` and `depth_scale` for depth_frames; `n_points`,
+            `noise` and `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or "depth_camera")
+            for mesh_scans and the synthetic buildings.
 
     Raises `InvalidArgumentError` for an unknown name or option or an invalid value, `MissingDataError` for a
     path that does not exist, and `DataError`, now or when a scan is read, for unreadable data.
@@ -76,6 +83,8 @@ def load(
         source.no_return_range if no_return_range is None else no_return_range,
     )
     known = set(inspect.signature(reader).parameters) - {"path", "ranges", "stride"}
+    if poses is not None and "poses" in known:
+        options["poses"] = str(poses)
     for option, value in options.items():
         if option not in known:
             takes = f"takes {', '.join(sorted(known))}" if known else "takes no further options"
@@ -83,8 +92,16 @@ def load(
                 f"{option}={value!r} is not an option of dataset={name}, which {takes}."
             )
     if source.needs_path:
+        if poses is not None and "poses" not in known:
+            from gmmtorch.datasets.recordings.reposed import with_trajectory
+
+            return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
         dataset: Dataset = reader(path, ranges, stride, **options)
         return dataset
+    if poses is not None:
+        raise InvalidArgumentError(
+            f"dataset.poses={poses} is given, but dataset={name} is simulated; drop the poses."
+        )
     if path is not None:
         raise InvalidArgumentError(
             f"dataset.path={path} is given, but dataset={name} is simulated; drop the path, or choose one of "

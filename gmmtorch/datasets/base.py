@@ -21,6 +21,9 @@ from gmmtorch.scan import Scan
 _ROUNDING = 1e-6
 """Upper bound of the relative rounding error of a range recomputed from rotated float32 coordinates."""
 
+_MAX_TEXT_BYTES = 1 << 28
+_GZIP_BLOCK_BYTES = 1 << 20
+
 
 def is_beyond(distance: Tensor, max_range: float) -> Tensor:
     """Whether each distance (m) is at or beyond `max_range`, within rounding."""
@@ -72,10 +75,19 @@ class Ranges:
 
 
 class Dataset(Sequence[Scan]):
-    """Scans in the order of their recording. Subclasses implement `_count` and `_read`.
+    """Scans in the order of their recording.
 
-    name: of the data set. ranges: how readings are interpreted. stride: every n-th scan of the source is
-        read.
+    Subclasses implement `_count` and `_read`. They implement `_known_pose` and `_known_times` if the source
+    has poses and times.
+
+    Attributes:
+        name: of the data set.
+        ranges: how readings are interpreted.
+        stride: every n-th scan of the source is read.
+        times: (N,) times of the scans in seconds, float64; None if the source has no usable times.
+        skipped: reason → number of scans of the source that are left out for it, returned without points
+            because their data is unusable, or not deskewed. Empty if nothing is wrong. Damage inside a
+            scan is counted when that scan is read, so the counts are final after the last scan.
     """
 
     def __init__(self, name: str, ranges: Ranges, stride: int = 1) -> None:
@@ -84,6 +96,7 @@ class Dataset(Sequence[Scan]):
         self.name = name
         self.ranges = ranges
         self.stride = stride
+        self._skipped: dict[str, set[int]] = {}
 
     @abstractmethod
     def _count(self) -> int:
@@ -92,6 +105,34 @@ class Dataset(Sequence[Scan]):
     @abstractmethod
     def _read(self, index: int) -> Scan:
         """Scan `index` of the source."""
+
+    def _known_pose(self, index: int) -> Tensor | None:
+        """Sensor pose of scan `index` of the source; None if the source has no poses."""
+        return None
+
+    def _known_times(self) -> Tensor | None:
+        """Times (s), float64, of all scans of the source; None if the source has no usable times."""
+        return None
+
+    def pose(self, index: int) -> Tensor | None:
+        """Pose (D+1, D+1) of the sensor for scan `index`, world ← sensor, float64, metres.
+
+        None if the source does not state it. The translation is the origin of the scan.
+        """
+        return self._known_pose(self._position(index))
+
+    @property
+    def times(self) -> Tensor | None:
+        times = self._known_times()
+        return None if times is None else times[:: self.stride]
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        return {reason: len(scans) for reason, scans in self._skipped.items()}
+
+    def _skip(self, reason: str, index: int) -> None:
+        """Counts message or file `index` of the source as skipped; once, however often it is read."""
+        self._skipped.setdefault(reason, set()).add(index)
 
     def __len__(self) -> int:
         return -(-self._count() // self.stride)
@@ -152,11 +193,24 @@ def check_pose(matrix: Tensor, where: str) -> Tensor:
 
 
 def gunzip(path: Path) -> bytes | None:
-    """The content of a gzip file; None if the file is not gzip. Raises `DataError` if it is damaged."""
+    """The content of a gzip file; None if the file is not gzip.
+
+    Raises `DataError` if it is damaged or contains more than `_MAX_TEXT_BYTES`.
+    """
     with path.open("rb") as file:
         if file.read(2) != b"\x1f\x8b":
             return None
     try:
-        return gzip.decompress(path.read_bytes())
+        blocks, length = [], 0
+        with gzip.open(path) as file:
+            while block := file.read(_GZIP_BLOCK_BYTES):
+                blocks.append(block)
+                length += len(block)
+                if length > _MAX_TEXT_BYTES:
+                    raise DataError(
+                        f"{path} contains more than {_MAX_TEXT_BYTES:,} bytes; give the text file "
+                        "that gunzip makes of it."
+                    )
+        return b"".join(blocks)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{path} is not a complete gzip file ({error}); fetch it again.") from error

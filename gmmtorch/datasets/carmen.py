@@ -43,7 +43,7 @@ class CarmenLog(Dataset):
             "Such logs are published in the Radish repository and the SLAM benchmarking pages of Freiburg.",
         )
         super().__init__(path.name.split(".")[0], ranges, stride)
-        self._records = _read_records(path)
+        self._records, self._stamps = _read_records(path)
 
     def _count(self) -> int:
         return len(self._records)
@@ -59,18 +59,42 @@ class CarmenLog(Dataset):
         ends = origin + readings[valid, None] * torch.stack([angles.cos(), angles.sin()], 1)[valid]
         return self.ranges.scan(ends, origin)
 
+    def _known_pose(self, index: int) -> Tensor:
+        return planar_pose(*self._records[index][-3:].tolist())
 
-def _read_records(path: Path) -> list[Tensor]:
-    """One tensor [r_1 … r_n, x, y, theta] for each FLASER line."""
+    def _known_times(self) -> Tensor | None:
+        """The logger's stamps; None if a line lacks one, or if they are not in increasing order."""
+        ordered = bool((self._stamps.diff() > 0).all())  # false for NaN
+        return self._stamps if ordered and bool(torch.isfinite(self._stamps).all()) else None
+
+
+def planar_pose(x: float, y: float, theta: float) -> Tensor:
+    """The pose (3, 3), float64, at (x, y) metres with heading theta (rad)."""
+    cos, sin = math.cos(theta), math.sin(theta)
+    return torch.tensor([[cos, -sin, x], [sin, cos, y], [0, 0, 1]], dtype=torch.float64)
+
+
+def _read_records(path: Path) -> tuple[list[Tensor], Tensor]:
+    """One tensor [r_1 … r_n, x, y, theta] for each FLASER line, and their stamps (s); NaN: no stamp."""
     data = gunzip(path)
-    records = []
+    records, stamps = [], []
     with path.open("rb") if data is None else io.BytesIO(data) as file:
         for number, line in enumerate(io.TextIOWrapper(file, errors="replace"), 1):
             if line.startswith("FLASER "):
-                records.append(_parse(line.split(), f"{path}, line {number}"))
+                words = line.split()
+                records.append(_parse(words, f"{path}, line {number}"))
+                stamps.append(_stamp(words))
     if not records:
         raise DataError(f"{path} has no FLASER line, so it is not a CARMEN log of a front laser.")
-    return records
+    return records, torch.tensor(stamps, dtype=torch.float64)
+
+
+def _stamp(words: list[str]) -> float:
+    """The stamp that follows the corrected pose and the odometry of a FLASER line; NaN without one."""
+    try:
+        return float(words[2 + int(words[1]) + 6])
+    except (IndexError, ValueError):
+        return math.nan
 
 
 def _parse(words: list[str], where: str) -> Tensor:

@@ -1,33 +1,48 @@
 """Depth images with poses, in the layout of the 7-Scenes data set.
 
-`frame-*.depth.png`: 16 bit, millimetres along the optical axis. `frame-*.pose.txt`: 4×4 matrix
-camera-to-world, metres. `camera-intrinsics.txt`: 3×3 pinhole matrix in pixels.
+`frame-*.depth.png`: 16 bit, millimetres along the optical axis, or another unit, see `depth_scale`.
+`frame-*.pose.txt`: 4×4 matrix camera-to-world, metres. `camera-intrinsics.txt`: 3×3 pinhole matrix in
+pixels.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError, check_number
+from gmmtorch.pinhole import back_project, check_intrinsics
 from gmmtorch.scan import Scan
 
 _INVALID = (0, 65535)
+MAX_PIXELS = 1 << 23
+"""An image of 4K has 8.3 million; a damaged header may announce billions."""
+_LARGEST_OFFSET = 0.2  # of the principal point from the middle of the image, share of its width or height
 
 
 class DepthFrames(Dataset):
     """Depth images as scans, in the natural order of their names (frame-2 before frame-10).
 
     Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
-    and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `intrinsics` is the pinhole
-    matrix (3, 3) in pixels. `image` returns the full depth image of a scan.
+    and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `depth_scale` is the number of
+    metres per unit of the images. `intrinsics` is the pinhole matrix (3, 3) in pixels. `image` returns the
+    full depth image of a scan. An image whose middle is far from the principal point is refused: it has
+    another size than the intrinsics.
     """
 
-    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, pixel_stride: int = 1) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        pixel_stride: int = 1,
+        depth_scale: float = 0.001,
+    ) -> None:
         path = require_path(
             path,
             "folder",
@@ -37,7 +52,9 @@ class DepthFrames(Dataset):
         if pixel_stride < 1:
             raise InvalidArgumentError(f"pixel_stride={pixel_stride} must be at least 1.")
         super().__init__(path.name, ranges, stride)
+        check_number("depth_scale", depth_scale, above=True)
         self.pixel_stride = pixel_stride
+        self.depth_scale = float(depth_scale)
         self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
         if not self._files:
             raise DataError(f"{path} holds no frame-*.depth.png.")
@@ -46,14 +63,18 @@ class DepthFrames(Dataset):
             raise DataError(
                 f"{path} holds {len(self._files)} depth images, but {len(poses)} poses; each image needs one."
             )
-        self.intrinsics = _matrix(path / "camera-intrinsics.txt", 3)
+        file = path / "camera-intrinsics.txt"
+        try:
+            self.intrinsics = check_intrinsics(_matrix(file, 3))
+        except InvalidArgumentError as error:
+            raise DataError(f"{file}: {error}") from error
 
     def _count(self) -> int:
         return len(self._files)
 
     def _read(self, index: int) -> Scan:
-        pose = self._pose(index)
-        points = back_project(_depth(self._files[index]), self.intrinsics, self.pixel_stride)
+        pose = self._known_pose(index)
+        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
         return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
@@ -62,46 +83,57 @@ class DepthFrames(Dataset):
         The rotation, which is rounded in the file, is made orthonormal.
         """
         position = self._position(index)
-        pose = self._pose(position).clone()
+        pose = self._known_pose(position).clone()
         left, _, right = torch.linalg.svd(pose[:3, :3])
         pose[:3, :3] = left @ right
-        return _depth(self._files[position]), pose
+        return self._depth(position), pose
 
-    def _pose(self, index: int) -> Tensor:
+    def _depth(self, index: int) -> Tensor:
+        """Depth (H, W) in metres, float64; 0 for invalid pixels."""
+        path = self._files[index]
+        depth = _units(path) / (1 / self.depth_scale)  # exact for millimetres
+        size = depth.shape[1], depth.shape[0]
+        center = float(self.intrinsics[0, 2]), float(self.intrinsics[1, 2])
+        offsets = (abs((c + 0.5) / n - 0.5) for c, n in zip(center, size, strict=True))
+        if max(offsets) > _LARGEST_OFFSET:
+            raise DataError(
+                f"{path} has {size[0]}×{size[1]} pixels, but camera-intrinsics.txt is for images of about "
+                f"{2 * center[0]:.0f}×{2 * center[1]:.0f}: its principal point is not near the middle of the "
+                "image. Scale the intrinsics, or give the images in full size."
+            )
+        return depth
+
+    def _known_pose(self, index: int) -> Tensor:
         path = self._files[index]
         path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
         return check_pose(_matrix(path, 4), str(path))
 
 
-def back_project(depth: Tensor, intrinsics: Tensor, pixel_stride: int = 1) -> Tensor:
-    """Camera-frame points (N, 3) of the valid pixels of a depth image (H, W), metres, row by row.
-
-    x = (u − c_x) d / f_x, y = (v − c_y) d / f_y, z = d. Pixels with depth 0 or NaN are omitted. Only every
-    `pixel_stride`-th pixel of every `pixel_stride`-th row is used.
-    """
-    depth = depth[::pixel_stride, ::pixel_stride]
-    v, u = torch.meshgrid(
-        *(torch.arange(n, dtype=depth.dtype) * pixel_stride for n in depth.shape), indexing="ij"
-    )
-    x = (u - intrinsics[0, 2]) / intrinsics[0, 0]
-    y = (v - intrinsics[1, 2]) / intrinsics[1, 1]
-    return torch.stack([x * depth, y * depth, depth], -1)[depth > 0]
-
-
-def _depth(path: Path) -> Tensor:
-    """Depth (H, W) in metres, float64; 0 for invalid pixels."""
+def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:
+    """The pixels (H, W) of a PNG image with one channel of 16 bits. `where` begins the `DataError`s."""
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with Image.open(source, formats=("PNG",)) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise DataError(
+                    f"{where} announces {image.width} × {image.height} pixels; at most "
+                    f"{MAX_PIXELS:,} are read."
+                )
             raw = np.asarray(image)
+    except DataError:
+        raise
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path} is not a complete PNG image: {error}") from error
+        raise DataError(f"{where} is not a complete PNG image: {error}") from error
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
-        raise DataError(
-            f"{path} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel, millimetres."
-        )
-    return torch.from_numpy(np.where(np.isin(raw, _INVALID), 0, raw) / 1000.0)
+        raise DataError(f"{where} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel.")
+    return raw
+
+
+def _units(path: Path) -> Tensor:
+    """The image (H, W) in its own unit, float64; 0 for invalid pixels."""
+    raw = read_png(path, str(path))
+    return torch.from_numpy(np.where(np.isin(raw, _INVALID), 0, raw).astype(np.float64))
 
 
 def _matrix(path: Path, size: int) -> Tensor:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.optional_packages import load_open3d
 from gmmtorch.scan import Scan
 
 
@@ -21,7 +21,7 @@ class MeshSamples(Dataset):
     return.
 
     Args:
-        path: PLY, OBJ, STL or another mesh format that Open3D reads; metres.
+        path: PLY, OBJ or STL; metres.
         ranges: how readings are interpreted.
         stride: see `Dataset`.
         n_points: number of points.
@@ -61,36 +61,6 @@ class MeshSamples(Dataset):
         points += self.noise * torch.randn(points.shape, generator=generator, dtype=points.dtype)
         corners = triangles.reshape(-1, 3)
         return self.ranges.scan(points, (corners.amin(0) + corners.amax(0)) / 2)
-
-
-def read_triangles(path: Path) -> Tensor:
-    """Triangles (T, 3, 3), float64, of a mesh file.
-
-    Raises `DataError` if the file is unreadable or truncated, has no triangle, or has a corner that is not
-    finite.
-    """
-    open3d = load_open3d(f"{path} cannot be read")
-    if path.suffix.lower() == ".obj" and b"\0" in path.read_bytes():
-        # Open3D's reader would crash.
-        raise DataError(f"{path} is not an OBJ file, because it is not text.")
-    try:
-        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            mesh = open3d.t.io.read_triangle_mesh(path)
-    except (RuntimeError, IndexError) as error:
-        raise DataError(f"{path} cannot be read as a mesh: {error}") from error
-    if "positions" not in mesh.vertex or "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
-        raise DataError(
-            f"{path} contains no readable triangles; it is truncated, a point cloud, or not a mesh. "
-            "Give a PLY, OBJ or STL file with faces."
-        )
-    corners = torch.from_numpy(mesh.vertex.positions.numpy()).double()
-    indices = torch.from_numpy(mesh.triangle.indices.numpy()).long()
-    if int(indices.min()) < 0 or int(indices.max()) >= len(corners):
-        raise DataError(f"{path}: a face refers to a missing corner; the file is damaged.")
-    triangles = corners[indices]
-    if not bool(torch.isfinite(triangles).all()):
-        raise DataError(f"{path}: a corner is NaN or infinite; the file is damaged.")
-    return triangles
 
 
 def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, require_path
-from gmmtorch.datasets.mesh_samples import read_triangles
+from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import sense, spinning_lidar
@@ -29,7 +29,7 @@ class MeshScans(Dataset):
     scans and i.
 
     Args:
-        path: PLY, OBJ, STL or another mesh format that Open3D reads; metres, z up.
+        path: PLY, OBJ or STL; metres, z up.
         ranges: how readings are interpreted.
         stride: every n-th scan is read.
         n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
@@ -78,6 +78,9 @@ class MeshScans(Dataset):
         poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
         poses[:, :3, 3] = places
         return poses
+
+    def _known_pose(self, index: int) -> Tensor:
+        return self.poses[index]
 
     def _read(self, index: int) -> Scan:
         generator = torch.Generator().manual_seed(self.seed * _SEEDS_APART + 1 + index)

@@ -17,6 +17,8 @@ from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
 
+_LINE_BYTES = 1 << 12
+
 
 class OctomapLog(Dataset):
     """Scans of an OctoMap log in the order of the file. Only their positions in the file are kept in memory.
@@ -52,12 +54,25 @@ class OctomapLog(Dataset):
             text = file.read() if stop is None else file.read(stop - self._nodes[index])
         where = f"{self._path}, scan {index}"
         head, *lines = text.decode("ascii", errors="replace").splitlines()
-        pose = _numbers([head.removeprefix("NODE")], 6, where + ", NODE line")[0]
-        if not np.isfinite(pose).all():
-            raise DataError(f"{where}: the pose {pose.tolist()} is not finite.")
+        pose = _node_pose(head, where)
         points = _numbers([line for line in lines if line.strip() and not line.startswith("#")], 3, where)
-        origin = torch.from_numpy(pose[:3])
-        return self.ranges.scan(torch.from_numpy(points) @ rotation(*pose[3:]).T + origin, origin)
+        return self.ranges.scan(torch.from_numpy(points) @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+    def _known_pose(self, index: int) -> torch.Tensor:
+        with self._open() as file:
+            file.seek(self._nodes[index])
+            head = file.readline(_LINE_BYTES).decode("ascii", errors="replace")
+        return _node_pose(head, f"{self._path}, scan {index}")
+
+
+def _node_pose(line: str, where: str) -> torch.Tensor:
+    """The pose (4, 4) in a NODE line."""
+    numbers = _numbers([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
+    if not np.isfinite(numbers).all():
+        raise DataError(f"{where}: the pose {numbers.tolist()} is not finite.")
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = rotation(*numbers[3:]), torch.from_numpy(numbers[:3])
+    return pose
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> torch.Tensor:

@@ -34,13 +34,25 @@ class PcdViewpoint(Dataset):
     def _count(self) -> int:
         return len(self._files)
 
+    def _known_pose(self, index: int) -> torch.Tensor:
+        """The position in VIEWPOINT with the rotation of the world frame."""
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = _viewpoint(self._files[index])
+        return pose
+
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        words = pcd_header(path).get("VIEWPOINT", [])
-        try:
-            origin = torch.tensor([float(w) for w in words[:3]], dtype=torch.float64)
-        except ValueError as error:
-            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not consist of numbers.") from error
-        if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
-            raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not begin with a sensor position.")
+        origin = _viewpoint(path)
         return self.ranges.scan(read_cloud(path), origin)
+
+
+def _viewpoint(path: Path) -> torch.Tensor:
+    """The sensor position (3,) in the header of a PCD file."""
+    words = pcd_header(path).get("VIEWPOINT", [])
+    try:
+        origin = torch.tensor([float(w) for w in words[:3]], dtype=torch.float64)
+    except ValueError as error:
+        raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not consist of numbers.") from error
+    if origin.shape != (3,) or not bool(torch.isfinite(origin).all()):
+        raise DataError(f"{path}: VIEWPOINT {' '.join(words)} does not begin with a sensor position.")
+    return origin

@@ -46,6 +46,9 @@ class ScanFolder(Dataset):
     def _count(self) -> int:
         return len(self._files)
 
+    def _known_pose(self, index: int) -> torch.Tensor:
+        return self._poses[index]
+
     def _read(self, index: int) -> Scan:
         pose = self._poses[index]
         points = read_cloud(self._files[index])
@@ -57,7 +60,8 @@ def _read_poses(path: Path) -> torch.Tensor:
     if not path.is_file():
         raise DataError(f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan.")
     try:
-        rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
+        lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
+        rows = np.loadtxt(lines, dtype=np.float64, ndmin=2) if lines else np.empty((0, 12))
     except ValueError as error:
         raise DataError(f"{path} is not a table of numbers: {error}") from error
     if rows.size and rows.shape[1] != 12:

@@ -64,6 +64,9 @@ class _Simulated(Dataset):
     def _count(self) -> int:
         return self.n_scans
 
+    def _known_pose(self, index: int) -> torch.Tensor:
+        return self.poses[index]
+
     def _read(self, index: int) -> Scan:
         pose = self.poses[index]
         ends, no_return = sense(self.sensor, pose, self.world, self._generator(1 + index))

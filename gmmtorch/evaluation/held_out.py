@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import calibration, metrics, queries, split
+from gmmtorch.evaluation import calibration, metrics, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.methods import Form, MapFactory
 from gmmtorch.evaluation.protocol_options import Protocol
@@ -74,8 +74,8 @@ def evaluate(
     """
     if not 0 <= seed < 2**63:
         raise InvalidArgumentError(f"seed={seed} must be a whole number from 0 to 2⁶³ − 1.")
-    train_index, test_index = split.split_indices(len(scans), protocol.test_every)
-    train = split.perturb_poses([scans[i] for i in train_index], protocol.pose_noise, seed)
+    train_index, test_index = queries.split_indices(len(scans), protocol.test_every)
+    train = queries.perturb_poses([scans[i] for i in train_index], protocol.pose_noise, seed)
     origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
     asked = {
         r: _questions(origins, ends, [scans[i] for i in train_index], r, protocol, seed)
@@ -88,7 +88,7 @@ def evaluate(
     outcome = Outcome()
     largest = max(protocol.kept)
     for kept in protocol.kept:
-        shown = split.keep_share(train, kept, protocol.removal, seed)
+        shown = queries.keep_share(train, kept, protocol.removal, seed)
         # A map that serves several resolutions or forms of evidence is built once.
         cache: dict[Any, tuple[OccupancyMap, float]] = {}
         for method, factory in factories.items():

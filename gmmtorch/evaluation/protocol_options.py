@@ -91,6 +91,19 @@ class FitOptions:
     """Options of every estimator, by scikit-learn's names; see `GaussianMixture`.
 
     An estimator takes the options that its constructor has.
+
+    Attributes:
+        n_components: number of components; None: as many as the surfaces need.
+        noise: standard deviation (m) of the range sensor, for n_components=None.
+        init_params: auto, kmeans, kmeans_restarts, random_points, bounding_box or flat_pieces.
+        algorithm: auto, exact, or truncated: each point uses only the components near it.
+        max_cells: sum the points into at most this many cells; None: learn from the points.
+        tol: EM ends when the mean log-likelihood grows by less (nats per point).
+        reg_covar: added to the variances (m²).
+        max_iter: EM iterations, at most.
+        n_init: initializations, of which the best is kept.
+        dtype: type of the exponentials in EM, "float32" or "float64".
+        compiled: use torch.compile for truncated EM.
     """
 
     n_components: int | None = 100

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.overlap import Ascent, Motions, deviations, log_self_overlap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction.merge import simplify
-from gmmtorch.scan import ArrayLike
 
 _ALIKE = 0.2  # squared Hellinger distance up to which blurred components are one
 _BEST_KEPT = 4  # poses that go on from one level to the next,
@@ -221,7 +221,7 @@ def _starts(initial: ArrayLike | None, dim: int) -> Tensor:
     """Initial poses (B, D+1, D+1)."""
     if initial is None:
         return torch.eye(dim + 1, dtype=torch.float64)[None]
-    poses = torch.as_tensor(initial, dtype=torch.float64).detach()
+    poses = as_tensor(initial, "initial", torch.float64).detach()
     poses = poses[None] if poses.ndim == 2 else poses
     if poses.ndim != 3 or not len(poses):
         raise InvalidArgumentError(

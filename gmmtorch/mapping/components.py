@@ -10,18 +10,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import argsort, check_symmetric, safe_cholesky
 from gmmtorch.occupancy.cones import Cones
-from gmmtorch.scan import ArrayLike
+from gmmtorch.scan import check_positions, extent
 
+_DTYPES = dict.fromkeys(("ids", "seen_by", "seen_from"), torch.int64) | {"max_range": torch.bool}
 _PER_COMPONENT = ("means", "covariances", "support", "max_range", "ids")
 
 UNNUMBERED = -1
 """Sequence number, in `ids`, of a component that is new or changed. The owner of the map numbers it."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Components:
     """K components in the world frame (m), S sensor origins, and E viewpoints.
 
@@ -32,6 +34,7 @@ class Components:
     max_range (K,) bool: the component describes ends of no-return beams, not a surface.
     ids (K, 2): robot, sequence number.
     origins (S, D): sensor positions.
+    Fields can be arrays, lists or tensors; they become float64, int64 and bool tensors.
     seen_by, seen_from, seen_count (E,): `seen_count[e]` points of component `seen_by[e]` were observed from
         `origins[seen_from[e]]`. The counts of a component add up to its support.
     """
@@ -45,6 +48,19 @@ class Components:
     seen_by: Tensor
     seen_from: Tensor
     seen_count: Tensor
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            dtype = _DTYPES.get(field.name, torch.float64)
+            object.__setattr__(self, field.name, as_tensor(getattr(self, field.name), field.name, dtype))
+
+    def __repr__(self) -> str:
+        n_bytes = sum(getattr(self, field.name).nbytes for field in fields(self))
+        return (
+            f"Components({len(self)} in {self.dim}D seen from {self.origins.shape[0]} origins"
+            f"{extent(self.means)}, {float(self.support.sum()):.6g} points, {n_bytes} bytes in memory, "
+            f"{self.means.device})"
+        )
 
     @classmethod
     def empty(cls, dim: int, device: torch.device | str | None = None) -> Components:
@@ -121,7 +137,7 @@ class Components:
         """Which components (K,) have one of the ids (J, 2); None: all."""
         if ids is None:
             return torch.ones_like(self.max_range)
-        wanted = torch.as_tensor(ids).to(self.ids)
+        wanted = as_tensor(ids, "ids", torch.int64, self.ids.device)
         wanted = wanted if wanted.numel() else wanted.reshape(0, 2)
         if wanted.ndim != 2 or wanted.shape[1] != 2:
             raise InvalidArgumentError(
@@ -153,6 +169,10 @@ class Components:
 
         Otherwise raises `InvalidArgumentError`, or `NumericalError` for an indefinite covariance.
         """
+        if self.means.ndim != 2 or self.means.shape[1] not in (2, 3):
+            raise InvalidArgumentError(
+                f"means has shape {tuple(self.means.shape)}; expected (K, 2) or (K, 3)."
+            )
         k, dim = self.means.shape
         n_viewpoints = self.seen_by.shape[0]
         expected = {
@@ -171,8 +191,8 @@ class Components:
                 raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {shape}.")
             if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                 raise InvalidArgumentError(f"{name} holds NaN or infinite values.")
-        if not bool(torch.isfinite(self.means).all()):
-            raise InvalidArgumentError("means holds NaN or infinite values.")
+        for name in ("means", "origins"):
+            check_positions(name, getattr(self, name))
         for name, limit in (("seen_by", k), ("seen_from", self.origins.shape[0])):
             value = getattr(self, name)
             if value.numel() and not (int(value.min()) >= 0 and int(value.max()) < limit):
@@ -194,7 +214,7 @@ def viewpoints_of(
             f"origins has {len(origins)} entries for {k} components; give one for each."
         )
     if isinstance(origins, Tensor | np.ndarray) or k == 0 or _is_position(origins[0]):
-        table = torch.as_tensor(origins, dtype=torch.float64).cpu() if k else support.new_zeros(0, dim)
+        table = as_tensor(origins, "origins", torch.float64, "cpu") if k else support.new_zeros(0, dim)
         return table, torch.arange(k), torch.arange(k), support
     rows: list[Tensor] = []
     seen_by: list[int] = []
@@ -206,7 +226,7 @@ def viewpoints_of(
                 f"origins[{component}] needs counts of at least zero that add up to more than zero."
             )
         for origin, count in viewpoints:
-            rows.append(torch.as_tensor(origin, dtype=torch.float64).cpu())
+            rows.append(as_tensor(origin, f"origins[{component}]", torch.float64, "cpu"))
             seen_by.append(component)
             counts.append(float(count) / total * float(support[component]))
             if rows[-1].shape != (dim,):
@@ -221,6 +241,6 @@ def viewpoints_of(
 def _is_position(entry: Any) -> bool:
     """Whether an entry is a position (D,), and not a list of (position, count)."""
     try:
-        return torch.as_tensor(entry).ndim == 1
-    except (TypeError, ValueError, RuntimeError):
+        return as_tensor(entry, "origins").ndim == 1
+    except InvalidArgumentError:
         return False

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
@@ -20,23 +21,35 @@ from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components, viewpoints_of
 from gmmtorch.mapping.learning.incremental import depth_scan
 from gmmtorch.mapping.learning.learner import Learner
-from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, read_rule
+from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import MapOptions, QueryOptions, Sampling, check_method
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
-from gmmtorch.scan import ArrayLike, Scan
+from gmmtorch.scan import Scan, extent
 
 _BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
 
+def _field(name: str) -> Any:
+    """A property: a field of all components, not rounded, those of the unfinished window included."""
+
+    def read(self: GaussianMap) -> Tensor:
+        if self.dim is None:
+            raise AttributeError("The map is empty; insert a scan first.")
+        return cast(Tensor, getattr(self._with_pending(), name))
+
+    return property(read)
+
+
 class GaussianMap(nn.Module):
     """A map that learns Gaussian components from windows of neighbouring scans.
 
-    The components are buffers: means, covariances, support, max_range, ids, origins, seen_by, seen_from,
-    seen_count; see `Components` for shapes. Queries and files use these components as the codec rounds them
+    The components are buffers, and attributes: means, covariances, support, max_range, ids, origins, seen_by,
+    seen_from, seen_count; see `Components` for shapes. The attributes include the components of the
+    unfinished window, the buffers do not. Queries and files use the components as the codec rounds them
     (`components()`), so a loaded map gives the same answers as the saved one.
 
     Args:
@@ -58,7 +71,7 @@ class GaussianMap(nn.Module):
             cells above ℓ lose hits. None: the factor is 1. `evidence` is not affected.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
-        memory_limit: largest number of bytes of Monte Carlo evidence.
+        memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
         compiled: use torch.compile where a compiled form exists.
 
     Queries do not change the map: the scans of an unfinished window are learned for the answer, and learned
@@ -67,15 +80,15 @@ class GaussianMap(nn.Module):
     settings. `state_dict` holds everything that learning continues from, and loads into any map.
     """
 
-    means: Tensor
-    covariances: Tensor
-    support: Tensor
-    max_range: Tensor
-    ids: Tensor
-    origins: Tensor
-    seen_by: Tensor
-    seen_from: Tensor
-    seen_count: Tensor
+    means = _field("means")
+    covariances = _field("covariances")
+    support = _field("support")
+    max_range = _field("max_range")
+    ids = _field("ids")
+    origins = _field("origins")
+    seen_by = _field("seen_by")
+    seen_from = _field("seen_from")
+    seen_count = _field("seen_count")
 
     any_resolution = True
     suffix = ".safetensors"
@@ -102,6 +115,10 @@ class GaussianMap(nn.Module):
         check_method(method)
         check_choice("codec", codec, map_file.CODECS)
         rule = IncrementalRule() if learning is None else learning
+        if not isinstance(rule, WindowedRule | IncrementalRule):
+            raise InvalidArgumentError(
+                f"learning={rule!r} is not a learning rule; give IncrementalRule() or WindowedRule()."
+            )
         rule = rule if window is None else replace(rule, window=window)
         query = QueryOptions(
             prior=prior,
@@ -119,8 +136,21 @@ class GaussianMap(nn.Module):
         self.robot = check_whole("robot", robot, 0)
         self.query_options = query
         self._learner = Learner(rule, random_state)
+        self._learned: Components | None = None
         self._rounded: Components | None = None
         self._query: Query | None = None
+
+    def __repr__(self) -> str:
+        scans = f"{self.n_pending} pending scan{'s' if self.n_pending != 1 else ''}"
+        if self.dim is None:
+            return f"GaussianMap(empty, {type(self.learning).__name__})"
+        known = self._learned or self._final()
+        if self.n_pending and self._learned is None:
+            size = f"{len(known)} components and {scans} not learned yet in {self.dim}D"
+        else:
+            size = f"{len(known)} components in {self.dim}D{extent(known.means)}, {self.nbytes} bytes"
+            size += f", {scans}" if self.n_pending else ""
+        return f"GaussianMap({size}, {type(self.learning).__name__}, {self._device})"
 
     @classmethod
     def from_components(
@@ -141,17 +171,18 @@ class GaussianMap(nn.Module):
             max_range: (K,) True for components of no-return beams. None: no component is.
             options: as for `GaussianMap`; the default `codec` is "float".
         """
-        mean, weight = _tensor(means), _tensor(support)
+        mean, weight = as_tensor(means, "means", torch.float64), as_tensor(support, "support", torch.float64)
         if mean.ndim != 2 or mean.shape[1] not in (2, 3):
             raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
         k = mean.shape[0]
         if weight.shape != (k,):
             raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
-        flags = torch.zeros(k, dtype=torch.bool) if max_range is None else torch.as_tensor(max_range).bool()
+        flags = as_tensor([False] * k if max_range is None else max_range, "max_range", torch.bool)
         robot = check_whole("robot", options.get("robot", 0), 0)
         ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
         viewpoints = viewpoints_of(origins, weight.cpu(), mean.shape[1])
-        parts = (_tensor(covariances), weight, flags, ids, *viewpoints)
+        covariance = as_tensor(covariances, "covariances", torch.float64)
+        parts = (covariance, weight, flags, ids, *viewpoints)
         # Copies: later writes to the given arrays do not change the map.
         copies = (part.to(mean.device, copy=True) for part in parts)
         return cls.of(Components(mean.clone(), *copies), **options)
@@ -171,39 +202,47 @@ class GaussianMap(nn.Module):
         check_scan(scan)
         self._prepare(scan.dim, scan.points.device, "scan is")
         self._forget()
-        learned = self._learner.add(self._final(), scan.copied(self.means.device), self._settings())
+        learned = self._learner.add(self._final(), scan.copied(self._device), self._settings())
         if learned is not None:
             self._set(learned)
 
     def insert_depth(
         self,
-        frames: Sequence[tuple[Tensor, Tensor]],
-        intrinsics: Tensor,
+        frames: Sequence[tuple[ArrayLike, ArrayLike]],
+        intrinsics: ArrayLike,
         pixel_stride: int = 4,
         max_range: float = math.inf,
+        depth_scale: float | None = None,
     ) -> None:
         """Learns from depth images at once, without an unfinished window. Needs an `IncrementalRule`.
 
         Args:
             frames: for each image its depth (H, W), metres along the optical axis, and its pose (4, 4),
                 world ← camera.
-            intrinsics: (3, 3).
+            intrinsics: (3, 3) pinhole matrix of images of this size, in pixels.
             pixel_stride: uses every `pixel_stride`-th pixel of every `pixel_stride`-th row; each counts for
                 `pixel_stride`² points.
             max_range: pixels at or beyond it (m) are left out, as are pixels that are zero or not finite.
+            depth_scale: metres per unit of the images, such as 0.001 for millimetres. Images of integers need
+                it; None: metres, in a floating type.
         """
         if not self.learning.takes_depth:
             raise InvalidArgumentError(
                 "insert_depth needs a map with an IncrementalRule; insert scans instead."
             )
-        if not frames:
+        check_whole("pixel_stride", pixel_stride, 1)
+        if len(frames) == 0:
             return
-        self._prepare(3, frames[0][0].device, "depth images are")
+
+        def scan_of(index: int) -> Scan:
+            return depth_scan(*_frame(frames, index), intrinsics, pixel_stride, max_range, depth_scale)
+
+        first = scan_of(0)
+        self._prepare(3, first.points.device, "depth images are")
         if self.n_pending:
             self._commit(self._with_pending())
-        first = depth_scan(*frames[0], intrinsics, pixel_stride, max_range)
         self._learner.rule = self.learning.fitted([first])
-        scans = (depth_scan(*frame, intrinsics, pixel_stride, max_range) for frame in frames)
+        scans = (scan_of(index).to(self._device) for index in range(len(frames)))
         self._set(self._learner.absorb(self._final(), scans, self._settings(), float(pixel_stride**2)))
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
@@ -233,7 +272,7 @@ class GaussianMap(nn.Module):
         contain are ignored. Nothing is fitted again. An unfinished window is learned first.
         """
         components = self._with_pending()
-        matrix = _tensor(transform).to(components.means.device)
+        matrix = as_tensor(transform, "transform", torch.float64, components.means.device)
         check_rigid(matrix, components.dim)
         self._commit(components.transformed(matrix, components.has_id(ids)))
 
@@ -241,11 +280,14 @@ class GaussianMap(nn.Module):
         """The components without those of the unfinished window, not rounded."""
         if self.dim is None:
             raise InvalidArgumentError("The map is empty; insert a scan first.")
-        return Components(**{name: getattr(self, name) for name in _BUFFERS})
+        buffers = {name: self._buffers[name] for name in _BUFFERS}
+        return Components(**{name: value for name, value in buffers.items() if value is not None})
 
     def _with_pending(self) -> Components:
         """All components, not rounded."""
-        return self._learner.preview(self._final(), self._settings())
+        if self._learned is None:
+            self._learned = self._learner.preview(self._final(), self._settings())
+        return self._learned
 
     def _settings(self) -> map_file.MapSettings:
         return map_file.MapSettings(self.resolution, self.method, self.codec, self.robot, self.query_options)
@@ -257,18 +299,18 @@ class GaussianMap(nn.Module):
 
     def _set(self, components: Components) -> None:
         for name in _BUFFERS:
-            self.register_buffer(name, getattr(components, name))
+            self._buffers[name] = getattr(components, name)  # properties have the names of the buffers
         self._forget()
 
     def _forget(self) -> None:
         """Drops what was computed from the components."""
-        self._rounded, self._query = None, None
+        self._learned, self._rounded, self._query = None, None, None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
         """Moves the map and its pending scans between devices. Types stay: positions need float64."""
         super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
         if self.dim is not None:
-            self._learner.pending = [scan.to(self.means.device) for scan in self._learner.pending]
+            self._learner.pending = [scan.to(self._device) for scan in self._learner.pending]
         self._forget()
         return self
 
@@ -280,7 +322,13 @@ class GaussianMap(nn.Module):
     @property
     def dim(self) -> int | None:
         """2 or 3; None while the map is empty."""
-        return self.means.shape[1] if "means" in self._buffers else None
+        means = self._buffers.get("means")
+        return None if means is None else means.shape[1]
+
+    @property
+    def _device(self) -> torch.device | None:
+        means = self._buffers.get("means")
+        return None if means is None else means.device
 
     @property
     def n_components(self) -> int:
@@ -309,13 +357,17 @@ class GaussianMap(nn.Module):
         if self.dim is None:
             theta = torch.full((query.shape[0],), 0.5, dtype=torch.float64, device=query.device)
         else:
-            theta = self._answers().occupancy(query.to(self.means.device), resolution, method)
-        return theta.to(query.device) if isinstance(points, Tensor) else theta.cpu().numpy()
+            theta = self._answers().occupancy(query.to(self._device), resolution, method)
+        return theta.to(query.device) if isinstance(points, Tensor) else theta.detach().cpu().numpy()
 
     def evidence(self, grid: VoxelGrid, method: str | None = None) -> Evidence:
-        """Hits and misses of every cell of a grid."""
+        """Hits and misses of every cell of a grid.
+
+        Raises `MemoryLimitError` if they take more than `memory_limit` bytes, 16 for each cell.
+        """
         method = self.method if method is None else method
         check_method(method)
+        grid.check_memory(self.query_options.memory_limit)
         if self.dim is None:
             return Evidence.empty(grid)
         if grid.dim != self.dim:
@@ -386,7 +438,7 @@ class GaussianMap(nn.Module):
             components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
         except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"The state of the map is damaged ({error}).") from error
-        device = None if self.dim is None else self.means.device
+        device = self._device
         for name in _BUFFERS:
             self._buffers.pop(name, None)
         self._learner = learner
@@ -398,5 +450,11 @@ class GaussianMap(nn.Module):
         self._forget()
 
 
-def _tensor(value: ArrayLike) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)  # at once: lists would become float32 first
+def _frame(frames: Sequence[tuple[ArrayLike, ArrayLike]], index: int) -> tuple[ArrayLike, ArrayLike]:
+    """Depth and pose of a frame. Raises `InvalidArgumentError` for anything but a pair."""
+    frame = frames[index]
+    if not isinstance(frame, tuple | list) or len(frame) != 2:
+        raise InvalidArgumentError(
+            f"frames[{index}] is a {type(frame).__name__}; give pairs (depth (H, W), pose (4, 4))."
+        )
+    return frame[0], frame[1]

@@ -17,6 +17,7 @@ from gmmtorch.occupancy.index.cone_index import ConeIndex
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
 _RAYS_AT_ONCE = 1 << 20
+_CELLS_AT_ONCE = 1 << 20
 _SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
 
 
@@ -66,8 +67,12 @@ class Query:
         )
 
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
-        """Hits and misses of every cell of a grid: counts, which `hit_length` does not change."""
+        """Hits and misses of every cell of a grid: counts, which `hit_length` does not change.
+
+        Raises `MemoryLimitError` if they take more bytes than the memory limit.
+        """
         check_method(method)
+        grid.check_memory(self.options.memory_limit)
         evidence = Evidence.empty(grid, self.cones.means.device)
         if len(self.cones.counts) == 0:
             return evidence
@@ -76,13 +81,15 @@ class Query:
             return evidence
         if method == "flux":
             return flux_evidence(self.cones, grid, self.cutoff)
-        centers = grid.centers(self.cones.means.device)
-        if method == "point":
-            found = self._form(grid.resolution)(centers)
-        else:
-            half = 0.5 * grid.resolution
-            found = self._in_boxes(centers - half, centers + half, grid.resolution, method)
-        return Evidence(grid, found.hits.view(grid.shape), found.misses.view(grid.shape))
+        half, parts = 0.5 * grid.resolution, []
+        for first in range(0, grid.n_cells, _CELLS_AT_ONCE):  # centres of all cells take more than evidence
+            centers = grid.centers(self.cones.means.device, range(first, first + _CELLS_AT_ONCE))
+            if method == "point":
+                parts.append(self._form(grid.resolution)(centers))
+            else:
+                parts.append(self._in_boxes(centers - half, centers + half, grid.resolution, method))
+        hits, misses = (torch.cat(values).view(grid.shape) for values in zip(*parts, strict=True))
+        return Evidence(grid, hits, misses)
 
     def _form(self, resolution: float) -> PointForm:
         if resolution not in self._forms:

@@ -25,7 +25,7 @@ class QueryOptions:
     cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (the
         median support is at least 50), so that tails do not claim unseen space; otherwise 5, because few
         points do not show where a surface ends.
-    hit_length: ℓ (m). The occupancy of a cell of side h multiplies hits by ℓ/h. A ray ends in one of the
+    hit_length: ℓ (m); the occupancy of a cell of side h multiplies hits by ℓ/h. A ray ends in one of the
         many cells of a thin surface that it could have crossed; the factor puts θ on the right side of ½
         and hardly changes the order of cells. None: the factor is 1.
     n_samples: number of Monte Carlo rays, drawn from the whole map.

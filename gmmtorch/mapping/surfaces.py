@@ -10,13 +10,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import checked_parameter
-from gmmtorch.scan import ArrayLike
 
 Surfaces = Components | GaussianMap | tuple[ArrayLike, ArrayLike, ArrayLike]
 """A map, its components, or (means (K, D), covariances (K, D, D), weights (K,))."""
@@ -41,10 +41,12 @@ def surface_mixture(given: Surfaces, name: str) -> Parameters:
         solid = ~given.max_range
         parts = given.means[solid], given.covariances[solid], given.support[solid]
     elif isinstance(given, tuple) and len(given) == 3:
-        try:  # at once: lists would become float32 first
-            parts = tuple(torch.as_tensor(part, dtype=torch.float64).detach() for part in given)  # type: ignore[assignment]
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidArgumentError(f"{name} is not an array of numbers: {error}.") from error
+        names = ("means", "covariances", "weights")
+        means, covariances, weights = (
+            as_tensor(part, f"{part_name} of {name}", torch.float64).detach()
+            for part, part_name in zip(given, names, strict=True)
+        )
+        parts = means, covariances, weights
     else:
         raise InvalidArgumentError(
             f"{name} is a {type(given).__name__}; give a GaussianMap, Components, or a tuple "

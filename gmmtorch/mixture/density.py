@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from sklearn.base import BaseEstimator, DensityMixin
 from sklearn.exceptions import NotFittedError as ScikitLearnNotFittedError
+from sklearn.utils._param_validation import InvalidParameterError as ScikitLearnInvalidParameterError
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.arrays import check_unmasked
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.covariance_types import compact, count_free_entries
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
 _FAR = 1e4  # distance from the centre (m) beyond which products of features lose digits
 
 
+Self = TypeVar("Self", bound="MixtureDensity")
+
+
 class NotFittedError(GmmTorchError, ScikitLearnNotFittedError):
     """A mixture was used before it was fitted."""
+
+
+class InvalidParameterError(InvalidArgumentError, ScikitLearnInvalidParameterError):
+    """A parameter of an estimator has an invalid value."""
 
 
 class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
@@ -31,15 +42,32 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
 
     Arrays give arrays and tensors give tensors. The buffers `weights` (K,), `means` (K, D) and
     `covariances` (K, D, D) are always float64 tensors, and move with `.to(device)`. The attributes
-    `weights_`, `means_`, `covariances_` and `precisions_` are of the kind (array or tensor) of the
-    points given to `fit`.
+    `weights_`, `means_`, `covariances_`, `precisions_` and `precisions_cholesky_` are of the kind (array or
+    tensor) of the points given to `fit`. The last three have scikit-learn's shape for the covariance type:
+    full (K, D, D), tied (D, D), diag (K, D), spherical (K,).
     """
 
+    training = True  # of the class: scikit-learn allows no attribute but the parameters in __init__
+    covariance_type: str = "full"
     random_state: RandomState
     weights: Tensor
     means: Tensor
     covariances: Tensor
     _tensors: bool  # whether fit was given a tensor
+    _fitted_type: str  # the covariance type of the fit
+
+    def __new__(cls: type[Self], *args: Any, **kwargs: Any) -> Self:
+        estimator = super().__new__(cls)
+        nn.Module.__init__(estimator)
+        del estimator.training
+        return estimator
+
+    def __repr__(self) -> str:
+        """The class and the parameters that differ from their defaults, in one line."""
+        defaults = inspect.signature(type(self).__init__).parameters
+        given = BaseEstimator.get_params(self, deep=False).items()
+        changed = [f"{name}={_short(v)}" for name, v in given if _short(v) != _short(defaults[name].default)]
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     def score_samples(self, X: Array) -> Array:
         """log p(x) of each point, (N,), nats."""
@@ -77,9 +105,9 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         return [em.quadratic_features(part) @ natural for part in centered.split(rows)]
 
     def n_parameters(self) -> int:
-        """Number of free parameters: K(1 + D + D(D+1)/2) − 1."""
+        """Number of free parameters: for full covariances K(1 + D + D(D+1)/2) − 1."""
         k, dim = self._fitted().shape
-        return k * (1 + dim + dim * (dim + 1) // 2) - 1
+        return k * (1 + dim) - 1 + count_free_entries(self._fitted_type, k, dim)
 
     def bic(self, X: Array) -> float:
         """Bayesian information criterion on X; lower is better."""
@@ -96,7 +124,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         same samples.
         """
         means = self._fitted()
-        check_whole("n_samples", n_samples, 1)
+        if not isinstance(n_samples, int | np.integer) or n_samples < 1:
+            raise InvalidArgumentError(
+                f"Invalid value for 'n_samples': {n_samples!r}. Give a whole number of at least 1."
+            )
         generator = as_generator(self.random_state if random_state is None else random_state)
         weights = self.weights.cpu()
         labels = torch.multinomial(weights, n_samples, True, generator=generator).sort().values
@@ -119,22 +150,31 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
 
     @property
     def covariances_(self) -> Array:
-        """Covariances (K, D, D)."""
+        """Covariances, in the shape of the covariance type."""
         self._fitted()
-        return self._as_fit_kind(self.covariances)
+        return self._as_fit_kind(compact(self.covariances, self._fitted_type))
 
     @property
     def precisions_(self) -> Array:
-        """Inverse covariances (K, D, D)."""
+        """Inverse covariances, in the shape of the covariance type."""
+        whiten = self._whiten()
+        return self._as_fit_kind(compact(whiten @ whiten.transpose(-2, -1), self._fitted_type))
+
+    @property
+    def precisions_cholesky_(self) -> Array:
+        """Upper triangular factors U of the precisions U Uᵀ, in the shape of the covariance type."""
+        return self._as_fit_kind(compact(self._whiten(), self._fitted_type))
+
+    def _whiten(self) -> Tensor:
         self._fitted()
-        whiten = inverse_factor(safe_cholesky(self.covariances))
-        return self._as_fit_kind(whiten @ whiten.transpose(-2, -1))
+        return inverse_factor(safe_cholesky(self.covariances))
 
     # -- buffers and conversions ------------------------------------------------------------------
 
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         for name, value in (("weights", weights), ("means", means), ("covariances", covariances)):
             self.register_buffer(name, value)
+        self._fitted_type = self.covariance_type
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MixtureDensity:
         """Moves buffers between devices. They stay float64 if the surrounding network changes its dtype."""
@@ -146,6 +186,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         if not reset:
             self._fitted()
         if not isinstance(X, Tensor):
+            check_unmasked(X, "X")
             checked = validate_data(
                 self, X, reset=reset, dtype=[np.float64, np.float32], ensure_min_samples=1
             )
@@ -156,6 +197,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
             points = points.detach() if reset else points
             if reset:
                 self.n_features_in_ = points.shape[1]
+                self.__dict__.pop("feature_names_in_", None)
         if reset:
             self._tensors = isinstance(X, Tensor)
         elif points.shape[1] != self.n_features_in_:
@@ -168,7 +210,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
     def _fitted(self) -> Tensor:
         """The means. Raises `NotFittedError` if there are none."""
         if "means" not in self._buffers:
-            raise NotFittedError(f"This {type(self).__name__} is not fitted yet; call fit with points first.")
+            raise NotFittedError(
+                f"This {type(self).__name__} instance is not fitted yet. Call 'fit' with appropriate "
+                "arguments before using this estimator."
+            )
         return self.means
 
     def _as_fit_kind(self, value: Tensor) -> Array:
@@ -183,3 +228,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
 
     def __sklearn_is_fitted__(self) -> bool:
         return "means" in self._buffers
+
+
+def _short(value: object) -> str:
+    """The `repr` of a parameter; of an array only the shape."""
+    if isinstance(value, Tensor | np.ndarray):
+        return f"<{type(value).__name__} of shape {tuple(value.shape)}>"
+    return " ".join(repr(value).split())

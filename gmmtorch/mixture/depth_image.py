@@ -16,11 +16,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.em.initialization import flat_pieces, replicated
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.pinhole import check_intrinsics, metric_depth
 
 _BLOCK = 8  # side of the smallest cell in pixels
 _LEVELS = 2  # number of times that the side can double
@@ -29,9 +32,16 @@ _LEAST_VARIANCE = 1e-3  # added to the variance of a cell's pixels along u and v
 
 
 def pool_depth_image(
-    depth: Tensor, intrinsics: Tensor, *, max_range: float = float("inf"), noise: float = 0.01
+    depth: ArrayLike,
+    intrinsics: ArrayLike,
+    *,
+    max_range: float = float("inf"),
+    noise: float = 0.01,
+    depth_scale: float | None = None,
 ) -> Rows:
     """Cells of a depth image (H, W), in metres along the optical axis: mean features and pixel counts.
+
+    `depth_scale`: metres per unit of the image; None: metres, in a floating type.
 
     Excludes pixels that are not finite, not above zero, or not below `max_range`. Four cells become one if
     the root mean square deviation of depth from a plane is at most half of `noise` (m), times z² beyond
@@ -40,8 +50,13 @@ def pool_depth_image(
 
     Raises `InvalidArgumentError` for invalid arguments, and if no pixel remains.
     """
-    _check(depth, intrinsics, max_range, noise)
-    sums, inverse = _block_features(depth.detach(), intrinsics, max_range)
+    image = metric_depth(depth, depth_scale).detach()
+    matrix = check_intrinsics(intrinsics, tuple(image.shape))
+    if not max_range > 0:
+        raise InvalidArgumentError(f"max_range={max_range} must be above zero metres.")
+    if not 0 < noise < float("inf"):
+        raise InvalidArgumentError(f"noise={noise} must be above zero metres.")
+    sums, inverse = _block_features(image, matrix, max_range)
     whole, found = torch.ones_like(sums[0], dtype=torch.bool), []
     for _ in range(_LEVELS):
         parent, inverse = _sum_of_four(sums), _sum_of_four(inverse)
@@ -58,15 +73,19 @@ def pool_depth_image(
 
 
 def fit_depth_image(
-    depth: Tensor,
-    intrinsics: Tensor,
+    depth: ArrayLike,
+    intrinsics: ArrayLike,
     n_components: int = 50,
     *,
     max_range: float = float("inf"),
     noise: float = 0.01,
     max_iter: int = 4,
+    depth_scale: float | None = None,
 ) -> GaussianMixture:
     """A mixture of a depth image (H, W) in the camera frame. `transform(T_world_camera)` moves it.
+
+    `intrinsics` is the pinhole matrix (3, 3) in pixels. `depth_scale` is the number of metres per unit of
+    the image, such as 0.001 for millimetres; an image of integers needs it.
 
     The start is the flat pieces of the cells (see `pool_depth_image`), followed by `max_iter` iterations
     of EM on the cells. `noise` squared is the smallest variance of a component (m²).
@@ -76,7 +95,7 @@ def fit_depth_image(
     check_whole("n_components", n_components, 1)
     check_whole("max_iter", max_iter, 1)
     with torch.inference_mode():  # gradient book-keeping would take a tenth of the time
-        cells = pool_depth_image(depth, intrinsics, max_range=max_range, noise=noise)
+        cells = pool_depth_image(depth, intrinsics, max_range=max_range, noise=noise, depth_scale=depth_scale)
         n_cells = cells.weight.shape[0]
         if n_cells < n_components:
             raise InvalidArgumentError(
@@ -87,8 +106,8 @@ def fit_depth_image(
         features = em.shift_features(cells.values, -center)
         centered = Rows(features, cells.weight, are_points=False)
         first, _ = flat_pieces(centered.points, cells.weight, n_components, noise**2, features)
-        step = em.natural_step(features, cells.weight, noise**2)
-        found = em.run_em(step, replicated(first, n_components)[0], tol=0.0, max_iter=max_iter)
+        step = loop.natural_step(features, cells.weight, noise**2)
+        found = loop.run_em(step, replicated(first, n_components)[0], tol=0.0, max_iter=max_iter)
         weights, means, covariances = found.parameters
         means = means + center
     return GaussianMixture.from_parameters(
@@ -98,24 +117,6 @@ def fit_depth_image(
         lower_bounds=found.lower_bounds,
         reg_covar=noise**2,
     )
-
-
-def _check(depth: Tensor, intrinsics: Tensor, max_range: float, noise: float) -> None:
-    if depth.ndim != 2 or not depth.is_floating_point() or 0 in depth.shape:
-        raise InvalidArgumentError(
-            f"depth has shape {tuple(depth.shape)} and dtype {depth.dtype}; expected a floating (H, W) image "
-            "in metres."
-        )
-    is_pinhole = tuple(intrinsics.shape) == (3, 3) and bool(torch.isfinite(intrinsics).all())
-    if not is_pinhole or not bool((intrinsics.diagonal()[:2] > 0).all()):
-        raise InvalidArgumentError(
-            f"intrinsics={intrinsics.tolist()} must be a finite 3×3 pinhole matrix in pixels with focal "
-            "lengths above zero."
-        )
-    if not max_range > 0:
-        raise InvalidArgumentError(f"max_range={max_range} must be above zero metres.")
-    if not 0 < noise < float("inf"):
-        raise InvalidArgumentError(f"noise={noise} must be above zero metres.")
 
 
 def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tuple[Tensor, Tensor]:

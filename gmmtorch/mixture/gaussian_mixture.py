@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import math
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from sklearn.utils._param_validation import Interval, StrOptions
+from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
-from gmmtorch.linalg import inverse_factor, safe_cholesky
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import stepwise
+from gmmtorch.mixture.em import loop, stepwise
 from gmmtorch.mixture.em.cells import pool_into_cells
-from gmmtorch.mixture.em.exact import EMResult, Parameters
+from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
@@ -22,33 +25,46 @@ from gmmtorch.mixture.em.initialization import (
     replicated,
     surface_pieces,
 )
+from gmmtorch.mixture.em.loop import EMResult, OnIteration
 from gmmtorch.mixture.em.truncated import Settings, fit_truncated
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
+from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, MixtureEstimator
+from gmmtorch.mixture.validation import (
+    Array,
+    RandomState,
+    as_generator,
+    checked_mixing_weights,
+    checked_parameter,
+    checked_precisions,
+)
 
 _KMEANS_IS_CHEAP = 2_000_000  # pairs of point and component: k-means takes about a second
 _MANY_COMPONENTS, _MANY_PAIRS = 48, 4_000_000  # truncated EM is faster from here on
 
 
 class GaussianMixture(MixtureEstimator):
-    """Weighted EM with full covariances (thesis 2.1.1), on any device.
+    """Weighted EM (thesis 2.1.1), on any device, with the interface of scikit-learn's class.
 
-    Arrays give arrays and tensors give tensors.
+    Arrays give arrays and tensors give tensors. With `dtype="float64"`, `algorithm="exact"`,
+    `max_cells=None` and equal initial responsibilities (or `weights_init`, `means_init` and
+    `precisions_init`), the result equals scikit-learn's to 1e-6. Equal seeds do not give equal starts.
 
     Args:
         n_components: K, at most the number of points. None: determined from the cloud, which is
             partitioned into flat pieces until each is as thin as the noise explains (see `partition`).
             EM starts from these pieces, and K is `means_.shape[0]`.
+        covariance_type: "full", "tied" (one covariance for all components), "diag" (diagonal) or
+            "spherical" (one variance for each component). All but "full" use exact EM.
         noise: standard deviation of the sensor, in the unit of the points (m), for n_components=None.
         tol: EM stops when the mean log-likelihood changes by less (nats a point).
         reg_covar: added to each variance, in the squared unit of the points (m²).
-        max_iter: largest number of EM iterations of each start.
+        max_iter: largest number of EM iterations of each start. 0: the mixture is the start of EM.
         n_init: number of starts; the one with the best lower bound is kept.
-        init_params: "kmeans" (scikit-learn's), "kmeans_restarts", "random_points", "bounding_box" or
+        init_params: "kmeans", "k-means++", "random" (random responsibilities) and "random_from_data" are
+            those of scikit-learn; further "kmeans_restarts", "random_points", "bounding_box" and
             "flat_pieces". "auto": k-means for small problems; flat pieces for large ones, where they are
             as good and take a thousandth of the time. Unused for n_components=None.
-        weights_init, means_init, precisions_init: (K,), (K, D), (K, D, D): initial parameters that
-            replace those of the initialization.
+        weights_init, means_init, precisions_init: (K,), (K, D) and, in the shape of the covariance type,
+            precisions: initial parameters that replace those of the initialization.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         algorithm: "exact" compares every point with every component. "truncated" compares it with nearby
             components only, with a momentum (see `truncated`): the method for many components, whose
@@ -61,20 +77,37 @@ class GaussianMixture(MixtureEstimator):
         compiled: run the E-step of truncated EM through torch.compile. The result is the same to rounding.
             Worthwhile from about 10⁵ points and 10³ components on (a tenth of the time), after about five
             seconds for the first use in a process. Needs a C++ compiler. No effect on exact EM.
-        warm_start: `fit` continues from the parameters of the last fit.
+        warm_start: `fit` continues from the parameters and the lower bound of the last fit.
+        verbose, verbose_interval: 1 prints every `verbose_interval`-th iteration, 2 adds time and change.
 
     Fitted attributes: those of every `MixtureEstimator`, and `n_samples_seen_`, the number of points
     that the mixture stands for, or None if unknown.
     """
 
-    _init_choices = ("auto", *INITIALIZATIONS)
-    _optional_n_components = True
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **MixtureEstimator._parameter_constraints,
+        "n_components": [COUNT, None],
+        "covariance_type": [StrOptions(set(COVARIANCE_TYPES))],
+        "noise": [ABOVE_ZERO],
+        "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "init_params": [StrOptions({"auto", *INITIALIZATIONS})],
+        "algorithm": [StrOptions({"auto", "exact", "truncated"})],
+        "max_cells": [COUNT, None],
+        "weights_init": ["array-like", None],
+        "means_init": ["array-like", None],
+        "precisions_init": ["array-like", None],
+        "compiled": ["boolean"],
+        "warm_start": ["boolean"],
+        "verbose": ["verbose"],
+        "verbose_interval": [COUNT],
+    }
     n_samples_seen_: float | None
 
     def __init__(
         self,
         n_components: int | None = 1,
         *,
+        covariance_type: str = "full",
         noise: float = 0.01,
         tol: float = 1e-3,
         reg_covar: float = 1e-6,
@@ -90,9 +123,11 @@ class GaussianMixture(MixtureEstimator):
         dtype: str = "float32",
         compiled: bool = False,
         warm_start: bool = False,
+        verbose: int = 0,
+        verbose_interval: int = 10,
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
+        self.covariance_type = covariance_type
         self.noise = noise
         self.tol = tol
         self.reg_covar = reg_covar
@@ -108,6 +143,8 @@ class GaussianMixture(MixtureEstimator):
         self.dtype = dtype
         self.compiled = compiled
         self.warm_start = warm_start
+        self.verbose = verbose
+        self.verbose_interval = verbose_interval
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -116,21 +153,16 @@ class GaussianMixture(MixtureEstimator):
         X: Array,
         y: Any = None,
         sample_weight: Array | None = None,
-        on_iteration: Callable[[int, float], None] | None = None,
+        on_iteration: OnIteration | None = None,
     ) -> GaussianMixture:
         """Fit the mixture to points X (N, D) by EM. Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
         rows = self._rows(points, weight)
         generator = as_generator(self.random_state)
-        best: EMResult | None = None
-        for _ in range(1 if self._continues() else self.n_init):
-            found = self._run(rows, center, generator, on_iteration)
-            if best is None or found.lower_bounds[-1] > best.lower_bounds[-1]:
-                best = found
-        assert best is not None
+        best = self._best_start(lambda report: self._run(rows, center, generator, report), on_iteration)
         seen = {"n_samples_seen": weight.sum()}
         self._store_fit(best.parameters, center, best.lower_bounds, best.converged, seen)
-        self._warn_unless_converged("EM")
+        self._warn_unless_converged()
         return self
 
     def partial_fit(
@@ -167,12 +199,13 @@ class GaussianMixture(MixtureEstimator):
         if started:
             previous = self._current_parameters(points, center)
         else:
-            previous = self._start(points, weight, center, as_generator(self.random_state))
+            rows, generator = Rows(points, weight), as_generator(self.random_state)
+            previous, _ = self._start(rows, center, generator)
         features, dtype = em.quadratic_features(points), em.SOFTMAX_DTYPES[self.dtype]
-        step = em.natural_step(features, weight, float(self.reg_covar), dtype, points)
+        step = loop.natural_step(features, weight, float(self.reg_covar), dtype, points, self.covariance_type)
         update, bound = step(previous)
         eta = stepwise.step_size(float(weight.sum()), past, kappa)
-        blended = stepwise.blend(previous, update, eta)
+        blended = loop.of_type(stepwise.blend(previous, update, eta), self.covariance_type)
         self._store_fit(blended, center, [bound], False, {"n_samples_seen": past + weight.sum()})
         return self
 
@@ -204,40 +237,65 @@ class GaussianMixture(MixtureEstimator):
         return Rows(cells.features, cells.weight, are_points=False)
 
     def _run(
-        self,
-        rows: Rows,
-        center: Tensor,
-        generator: torch.Generator,
-        on_iteration: Callable[[int, float], None] | None,
-    ) -> EMResult:
+        self, rows: Rows, center: Tensor, generator: torch.Generator, on_iteration: OnIteration | None
+    ) -> EMResult[Parameters]:
         """EM from one start."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
-        first, owner = self._start_and_owner(rows, center, generator)
+        previous_bound = self.lower_bound_ if self._continues() else -math.inf
+        first, owner = self._start(rows, center, generator)
         if not self._truncates(rows.weight.shape[0], first.weights.shape[0]):
-            step = em.natural_step(
-                rows.features(), rows.weight, reg, dtype, rows.points if rows.are_points else None
+            points = rows.points if rows.are_points else None
+            return loop.run_em(
+                loop.natural_step(rows.features(), rows.weight, reg, dtype, points, self.covariance_type),
+                first,
+                tol=self.tol,
+                max_iter=self.max_iter,
+                on_iteration=on_iteration,
+                previous_bound=previous_bound,
             )
-            return em.run_em(step, first, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
-        if owner is None:
-            owner = nearest(rows.points, first.means)
+        owner = nearest(rows.points, first.means) if owner is None else owner
         settings = Settings(
-            reg, self.tol, self.max_iter, dtype, on_iteration=on_iteration, compiled=bool(self.compiled)
+            reg,
+            self.tol,
+            self.max_iter,
+            dtype,
+            on_iteration=on_iteration,
+            compiled=bool(self.compiled),
+            previous_bound=previous_bound,
         )
         return fit_truncated(rows, owner, first, settings)
 
-    def _start_and_owner(
+    def _start(
         self, rows: Rows, center: Tensor, generator: torch.Generator
     ) -> tuple[Parameters, Tensor | None]:
         """Start of EM in the centred frame, and a likely component of each row (N,), if known."""
-        n, k, reg = rows.weight.shape[0], self.n_components, float(self.reg_covar)
-        if self._has_free_start():
-            features = None if rows.are_points else rows.values
-            if k is None:
-                return surface_pieces(rows.points, rows.weight, float(self.noise), reg, features)
-            if self._truncates(n, k) and self._initialization(n, k) == "flat_pieces":
-                found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
-                return replicated(found, k)[0], owner
-        return self._start(rows.points, rows.weight, center, generator), None
+        if self._continues():
+            return loop.of_type(self._current_parameters(rows.points, center), self.covariance_type), None
+        n, k, reg, owner = rows.weight.shape[0], self.n_components, float(self.reg_covar), None
+        features = None if rows.are_points else rows.values
+        given = self._given_start(rows.points.shape[1], center)
+        if k is None:
+            found, owner = surface_pieces(rows.points, rows.weight, float(self.noise), reg, features)
+        elif len(given) == len(Parameters._fields):
+            return Parameters(**given), None
+        elif not given and self._truncates(n, k) and self._initialization(n, k) == "flat_pieces":
+            found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
+            found, _ = replicated(found, k)
+        else:
+            found = initialize(self._initialization(n, k), rows.points, rows.weight, k, reg, generator)
+        return loop.of_type(found, self.covariance_type)._replace(**given), owner
+
+    def _given_start(self, dim: int, center: Tensor) -> dict[str, Tensor]:
+        """Those of the initial `Parameters` that were given, in the centred frame."""
+        k, kind, device = self.n_components, self.covariance_type, center.device
+        given = {}
+        if self.weights_init is not None:
+            given["weights"] = checked_mixing_weights(self.weights_init, k, device)
+        if self.means_init is not None:
+            given["means"] = checked_parameter(self.means_init, (k, dim), "means_init", device) - center
+        if self.precisions_init is not None:
+            given["covariances"] = checked_precisions(self.precisions_init, kind, k, dim, device)
+        return given
 
     def _initialization(self, n_rows: int, n_components: int) -> str:
         """The initialization that `init_params` selects."""
@@ -247,57 +305,15 @@ class GaussianMixture(MixtureEstimator):
 
     def _truncates(self, n_rows: int, n_components: int) -> bool:
         """Whether `algorithm` selects truncated EM."""
+        if self.covariance_type != "full":
+            return False
         if self.algorithm != "auto":
             return self.algorithm == "truncated"
         return n_components >= _MANY_COMPONENTS and n_rows * n_components >= _MANY_PAIRS
 
-    def _has_free_start(self) -> bool:
-        given = (self.weights_init, self.means_init, self.precisions_init)
-        return not self._continues() and all(value is None for value in given)
-
-    def _continues(self) -> bool:
-        return bool(self.warm_start) and hasattr(self, "means")
-
-    def _start(
-        self, points: Tensor, weight: Tensor, center: Tensor, generator: torch.Generator
-    ) -> Parameters:
-        """Start of EM in the centred frame."""
-        if self._continues():
-            return self._current_parameters(points, center)
-        if self.n_components is None:
-            return surface_pieces(points, weight, float(self.noise), float(self.reg_covar))[0]
-        given = (self.weights_init, self.means_init, self.precisions_init)
-        k, dim = self.n_components, points.shape[1]
-        shapes = ((k,), (k, dim), (k, dim, dim))
-        names = ("weights_init", "means_init", "precisions_init")
-        first_weights, first_means, precisions = (
-            None if value is None else checked_parameter(value, shape, name, points.device)
-            for value, shape, name in zip(given, shapes, names, strict=True)
-        )
-        if first_weights is None or first_means is None or precisions is None:
-            method = self._initialization(points.shape[0], k)
-            found = initialize(method, points, weight, k, float(self.reg_covar), generator)
-        else:
-            found = Parameters(first_weights, first_means, precisions)
-        covariances = found.covariances
-        if precisions is not None:
-            whiten = inverse_factor(safe_cholesky(precisions, "precisions_init"))
-            covariances = whiten @ whiten.transpose(-2, -1)
-        return Parameters(
-            found.weights if first_weights is None else first_weights / first_weights.sum(),
-            found.means if first_means is None else first_means - center,
-            covariances,
-        )
-
     def _current_parameters(self, points: Tensor, center: Tensor) -> Parameters:
         """The current parameters, in the centred frame."""
-        k = self.means.shape[0] if self.n_components is None else self.n_components
-        if self.means.shape != (k, points.shape[1]):
-            raise InvalidArgumentError(
-                f"warm_start=True and partial_fit continue from means of shape {tuple(self.means.shape)}, "
-                f"but n_components={self.n_components} and the points have {points.shape[1]} dimensions; "
-                "restore n_components, or start a new fit with warm_start=False."
-            )
+        self._check_continues(points)
         means = self.means.to(points.device) - center
         return Parameters(self.weights.to(points.device), means, self.covariances.to(points.device))
 
@@ -305,15 +321,13 @@ class GaussianMixture(MixtureEstimator):
 
     def check_parameters(self, n_points: int | None = None) -> None:
         super().check_parameters(n_points)
-        check_number("noise", self.noise, above=True)
-        check_choice("algorithm", self.algorithm, ("auto", "exact", "truncated"))
-        if self.max_cells is not None:
-            check_whole("max_cells", self.max_cells, 1)
-        if self.n_components is None:
-            self._check_no_given_start()
-
-    def _check_no_given_start(self) -> None:
-        """Raise `InvalidArgumentError` for initial parameters together with n_components=None."""
+        if self.algorithm == "truncated" and self.covariance_type != "full":
+            raise InvalidArgumentError(
+                "algorithm='truncated' has full covariances only, not "
+                f"covariance_type={self.covariance_type!r}; set algorithm='exact'."
+            )
+        if self.n_components is not None:
+            return
         for name in ("weights_init", "means_init", "precisions_init"):
             if getattr(self, name) is not None:
                 raise InvalidArgumentError(

@@ -8,7 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import inverse_factor
+from gmmtorch.mixture.em.covariance_types import expand, type_shape
 
 _LEAST_MEAN_WEIGHT, _LARGEST_MEAN_WEIGHT = 1e-6, 1e12
 
@@ -42,8 +45,9 @@ def check_component_count(n_components: int, n_points: int | None) -> None:
     """Raise `InvalidArgumentError` if there are more components than points, if that number is known."""
     if n_points is not None and n_points < n_components:
         raise InvalidArgumentError(
-            f"n_components={n_components} is more than the n_samples={n_points} points of "
-            "non-zero weight; use fewer components or more points."
+            f"n_components={n_components} is more than the n_samples={n_points} points of non-zero weight; "
+            "use fewer components or more points. Expected n_samples >= n_components but got n_components = "
+            f"{n_components}, n_samples = {n_points}."
         )
 
 
@@ -67,10 +71,11 @@ def checked_tensor(X: Tensor) -> Tensor:
 
     Raises `InvalidArgumentError` unless N, D ≥ 1 and all values are real and finite.
     """
-    if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
-        raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
     if X.is_complex():
         raise InvalidArgumentError("X is complex; Complex data not supported.")
+    X = as_tensor(X, "X")
+    if X.ndim != 2 or X.shape[0] == 0 or X.shape[1] == 0:
+        raise InvalidArgumentError(f"X has shape {tuple(X.shape)}; expected (N, D) with at least one point.")
     finite = torch.isfinite(X).all(1)
     if not bool(finite.all()):
         row = int((~finite).nonzero()[0])
@@ -82,14 +87,60 @@ def checked_tensor(X: Tensor) -> Tensor:
 
 def checked_parameter(value: Array, shape: tuple[int, ...], name: str, device: torch.device) -> Tensor:
     """`value` as a float64 tensor. Raises `InvalidArgumentError` unless it is finite and has this shape."""
-    tensor = torch.as_tensor(value, dtype=torch.float64, device=device)
-    if tuple(tensor.shape) != shape or not bool(torch.isfinite(tensor).all()):
+    tensor = as_tensor(value, name, torch.float64, device)
+    if tuple(tensor.shape) != shape:
         raise InvalidArgumentError(
-            f"{name} has shape {tuple(tensor.shape)}; expected finite numbers of shape {shape}."
+            f"The parameter '{name.removesuffix('_init')}' should have the shape of {shape}, but got "
+            f"{tuple(tensor.shape)}; change {name}."
         )
-    if name == "weights_init" and (bool((tensor < 0).any()) or float(tensor.sum()) <= 0):
-        raise InvalidArgumentError(f"weights_init={tensor.tolist()} must be at least zero, and not all zero.")
+    if not bool(torch.isfinite(tensor).all()):
+        raise InvalidArgumentError(
+            f"{name} has NaN or infinite entries; expected finite numbers of shape {shape}."
+        )
     return tensor
+
+
+def checked_mixing_weights(value: Array, n_components: int, device: torch.device) -> Tensor:
+    """`weights_init` (K,) as a float64 tensor.
+
+    Raises `InvalidArgumentError` unless the weights are from 0 to 1 and add up to 1.
+    """
+    weights = checked_parameter(value, (n_components,), "weights_init", device)
+    low, high, total = float(weights.min()), float(weights.max()), float(weights.sum())
+    if low < 0 or high > 1:
+        raise InvalidArgumentError(
+            "The parameter 'weights' should be in the range [0, 1], but got max value "
+            f"{high:.5f}, min value {low:.5f} (weights_init)."
+        )
+    if abs(total - 1) > 1e-6:
+        raise InvalidArgumentError(
+            "The parameter 'weights' should be normalized, but got sum(weights) = "
+            f"{total:.5f} (weights_init)."
+        )
+    return weights / total
+
+
+def checked_precisions(value: Array, covariance_type: str, k: int, dim: int, device: torch.device) -> Tensor:
+    """The covariances (K, D, D) of `precisions_init`, given in the shape of the covariance type.
+
+    Raises `InvalidArgumentError` unless the precisions are symmetric and positive definite.
+    """
+    name = f"{covariance_type} precision"
+    try:
+        precisions = checked_parameter(value, type_shape(covariance_type, k, dim), name, device)
+    except InvalidArgumentError as error:
+        raise InvalidArgumentError(f"precisions_init: {error}") from None
+    precisions = expand(precisions, covariance_type, k, dim)
+    factors, info = torch.linalg.cholesky_ex(precisions)
+    asymmetric = (precisions - precisions.mT).abs().amax((1, 2)) > 1e-6 * precisions.abs().amax((1, 2))
+    bad = (info != 0) | asymmetric
+    if bool(bad.any()):
+        what = "symmetric, positive-definite" if covariance_type in ("full", "tied") else "positive"
+        raise InvalidArgumentError(
+            f"'{name}' should be {what}; precisions_init[{int(bad.nonzero()[0])}] is not."
+        )
+    whiten = inverse_factor(factors)
+    return whiten @ whiten.mT
 
 
 def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
@@ -100,9 +151,7 @@ def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
     n = points.shape[0]
     if sample_weight is None:
         return points.new_ones(n)
-    if not isinstance(sample_weight, Tensor):
-        sample_weight = torch.from_numpy(np.array(sample_weight, dtype=np.float64))
-    weight = sample_weight.detach().to(points.device, torch.float64)
+    weight = as_tensor(sample_weight, "sample_weight", torch.float64, points.device).detach()
     if weight.shape != (n,):
         raise InvalidArgumentError(
             f"sample_weight has shape {tuple(weight.shape)}; expected ({n},), one weight for each point."

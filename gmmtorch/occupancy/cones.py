@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import as_tensor
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import safe_cholesky
 
 CUTOFF = 5.0
@@ -35,6 +37,28 @@ class Cones(NamedTuple):
     @property
     def dim(self) -> int:
         return self.means.shape[1]
+
+    def checked(self) -> Cones:
+        """These cones as tensors on the device of the means.
+
+        Raises `InvalidArgumentError` for fields that are not arrays of numbers, or of another shape.
+        """
+        means = as_tensor(self.means, "means")
+        if means.ndim != 2 or means.shape[1] not in (2, 3):
+            raise InvalidArgumentError(f"means has shape {tuple(means.shape)}; expected (C, 2) or (C, 3).")
+        c, dim = means.shape
+        found = Cones(
+            means,
+            as_tensor(self.covariances, "covariances", device=means.device),
+            as_tensor(self.origins, "origins", device=means.device),
+            as_tensor(self.counts, "counts", device=means.device),
+            as_tensor(self.max_range, "max_range", torch.bool, means.device),
+        )
+        shapes = ((c, dim), (c, dim, dim), (c, dim), (c,), (c,))
+        for name, value, shape in zip(self._fields, found, shapes, strict=True):
+            if tuple(value.shape) != shape:
+                raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {shape}.")
+        return found
 
 
 def cone_bounds(cones: Cones, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor]:

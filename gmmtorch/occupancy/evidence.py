@@ -9,10 +9,12 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.errors import check_prior as check_prior
+from gmmtorch.kernels.ray_counting import count_in_grid
+from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS, traverse
 
 
 class CellClass(IntEnum):
@@ -86,7 +88,7 @@ class Thresholds:
         return _labels(probability, self.free, self.occupied)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evidence:
     """Expected number of rays that end in each cell of a grid (`hits`) and that pass through it (`misses`).
 
@@ -96,6 +98,14 @@ class Evidence:
     grid: VoxelGrid
     hits: Tensor
     misses: Tensor
+
+    def __repr__(self) -> str:
+        seen = int(((self.hits != 0) | (self.misses != 0)).sum())
+        return (
+            f"Evidence({seen} of {self.grid.n_cells} cells seen, {float(self.hits.sum()):.6g} hits, "
+            f"{float(self.misses.sum()):.6g} misses, {self.hits.nbytes + self.misses.nbytes} bytes, "
+            f"{self.hits.device}, {self.grid})"
+        )
 
     @classmethod
     def empty(cls, grid: VoxelGrid, device: torch.device | str | None = None) -> Evidence:
@@ -118,18 +128,18 @@ class Evidence:
         """`CellClass` values (int8) of all cells, with the dead band of (3.10)."""
         return classify(self.probability(prior), variance_threshold)
 
-    def lookup(self, points: Tensor, prior: float = 1.0) -> Tensor:
+    def lookup(self, points: ArrayLike, prior: float = 1.0) -> Tensor:
         """Occupancy (M,) of the cells that contain points (M, D), world metres; ½ outside the grid."""
-        cell, inside = self.grid.flat_index(points)
+        cell, inside = self.grid.flat_index(as_tensor(points, "points", device=self.hits.device))
         theta = occupancy_probability(self.hits.flatten()[cell], self.misses.flatten()[cell], prior)
         return torch.where(inside, theta, torch.full_like(theta, 0.5))
 
     def add_rays(
         self,
-        origins: Tensor,
-        ends: Tensor,
-        weights: Tensor | None = None,
-        is_hit: Tensor | None = None,
+        origins: ArrayLike,
+        ends: ArrayLike,
+        weights: ArrayLike | None = None,
+        is_hit: ArrayLike | None = None,
         chunk_visits: int = CHUNK_VISITS,
         compiled: bool = False,
     ) -> None:
@@ -142,16 +152,35 @@ class Evidence:
             is_hit: (R,) bool, False for no-return beams, which add only misses. All True if not given.
             chunk_visits: voxel visits in one pass. It bounds the memory and does not change the result.
             compiled: see `traverse`.
+
+        Raises `InvalidArgumentError` for shapes that do not match.
         """
+        origins, ends, weights, is_hit = self._rays(origins, ends, weights, is_hit)
         starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)
-        misses = self.misses.view(-1)
-        ones = torch.ones((), dtype=torch.float64, device=misses.device)
-        weights = None if weights is None else weights.double()
-        for visit in traverse(starts, stops, self.grid.shape, chunk_visits, compiled=compiled):
-            source = ones.expand(visit.voxel.shape) if weights is None else weights[visit.ray]
-            misses.scatter_add_(0, visit.voxel, source)
+        misses, shape = self.misses.view(-1), self.grid.shape
+        count_in_grid(misses, starts, stops, shape, weights, chunk_visits=chunk_visits, compiled=compiled)
         cell, counted = self.grid.flat_index(ends)
         if is_hit is not None:
             counted = counted & is_hit
         source = torch.ones_like(cell, dtype=torch.float64) if weights is None else weights
         self.hits.view(-1).scatter_add_(0, cell[counted], source[counted])
+
+    def _rays(
+        self, origins: ArrayLike, ends: ArrayLike, weights: ArrayLike | None, is_hit: ArrayLike | None
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        """The arguments of `add_rays` as tensors on the device of the evidence, if their shapes match."""
+        device = self.misses.device
+        starts = as_tensor(origins, "origins", torch.float64, device).detach()
+        stops = as_tensor(ends, "ends", torch.float64, device).detach()
+        counts = None if weights is None else as_tensor(weights, "weights", torch.float64, device)
+        hits = None if is_hit is None else as_tensor(is_hit, "is_hit", torch.bool, device)
+        n = len(stops) if stops.ndim else 0
+        for name, value, expected in (
+            ("origins", starts, (n, self.grid.dim)),
+            ("ends", stops, (n, self.grid.dim)),
+            ("weights", counts, (n,)),
+            ("is_hit", hits, (n,)),
+        ):
+            if value is not None and tuple(value.shape) != expected:
+                raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {expected}.")
+        return starts, stops, counts, hits

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.errors import check_resolution as check_resolution
 
@@ -21,7 +22,7 @@ MEMORY_LIMIT = 4 << 30
 _CELLS_PER_CALL = 1 << 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class VoxelGrid:
     """A grid of `shape` cells of side `resolution` (m), with its lowest corner at `origin` (m, world frame).
 
@@ -37,10 +38,14 @@ class VoxelGrid:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))  # also accepts a tensor
-        if any(int(n) != n for n in self.shape):
+        origin, shape = (
+            as_tensor(value, name, torch.float64).flatten().tolist()
+            for name, value in (("origin", self.origin), ("shape", self.shape))
+        )
+        object.__setattr__(self, "origin", tuple(origin))
+        if not all(n.is_integer() for n in shape):
             raise InvalidArgumentError(f"shape={self.shape} must be whole numbers of cells.")
-        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "shape", tuple(int(n) for n in shape))
         object.__setattr__(self, "resolution", check_resolution(self.resolution))
         if len(self.origin) != len(self.shape) or len(self.shape) not in (2, 3):
             raise InvalidArgumentError(
@@ -50,6 +55,12 @@ class VoxelGrid:
             raise InvalidArgumentError(f"origin={self.origin} must be finite metres.")
         if min(self.shape) < 1:
             raise InvalidArgumentError(f"shape={self.shape} must have at least one cell along each axis.")
+
+    def __repr__(self) -> str:
+        cells = " × ".join(map(str, self.shape))
+        corners = zip("xyz", self.origin, self.shape, strict=False)
+        sides = (f"{axis} {o:.4g} to {o + n * self.resolution:.4g}" for axis, o, n in corners)
+        return f"VoxelGrid({cells} cells of {self.resolution:g} m, {', '.join(sides)} m)"
 
     @property
     def dim(self) -> int:
@@ -62,8 +73,8 @@ class VoxelGrid:
     @classmethod
     def covering(
         cls,
-        low: Sequence[float] | Tensor,
-        high: Sequence[float] | Tensor,
+        low: ArrayLike,
+        high: ArrayLike,
         resolution: float,
         memory_limit: int = MEMORY_LIMIT,
     ) -> VoxelGrid:
@@ -73,7 +84,10 @@ class VoxelGrid:
         names the bytes and a resolution that fits.
         """
         resolution = check_resolution(resolution)
-        low, high = [float(x) for x in low], [float(x) for x in high]
+        low, high = (
+            as_tensor(value, name, torch.float64).flatten().tolist()
+            for name, value in (("low", low), ("high", high))
+        )
         if (
             len(low) != len(high)
             or not all(math.isfinite(x) for x in (*low, *high))
@@ -91,15 +105,20 @@ class VoxelGrid:
             )
         return cls(tuple(i * resolution for i in first), resolution, shape)
 
-    def to_units(self, points: Tensor) -> Tensor:
+    def to_units(self, points: ArrayLike) -> Tensor:
         """Points (M, D), world metres, in grid units, float64: cell (i, j, k) is [i, i+1) × …"""
+        points = as_tensor(points, "points", torch.float64)
+        if points.ndim != 2 or points.shape[1] != self.dim:
+            raise InvalidArgumentError(
+                f"points has shape {tuple(points.shape)}; expected (M, {self.dim}), as the grid has."
+            )
         origin = torch.tensor(self.origin, dtype=torch.float64, device=points.device)
-        return (points.double() - origin) / self.resolution
+        return (points - origin) / self.resolution
 
-    def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def flat_index(self, points: ArrayLike) -> tuple[Tensor, Tensor]:
         """Flat cell index (M,) of points (M, D), world metres, and whether each is inside; else index 0."""
         cell = self.to_units(points).floor()
-        shape = torch.tensor(self.shape, dtype=torch.float64, device=points.device)
+        shape = torch.tensor(self.shape, dtype=torch.float64, device=cell.device)
         inside = ((cell >= 0) & (cell < shape)).all(1)
         cell = torch.where(inside[:, None], cell, torch.zeros_like(cell)).long()
         flat = cell[:, 0]
@@ -107,13 +126,23 @@ class VoxelGrid:
             flat = flat * self.shape[axis] + cell[:, axis]
         return flat, inside
 
-    def centers(self, device: torch.device | str | None = None) -> Tensor:
-        """Centres of all cells (n_cells, D), world metres, float64, row-major."""
-        axes = [
-            o + (torch.arange(n, dtype=torch.float64, device=device) + 0.5) * self.resolution
-            for o, n in zip(self.origin, self.shape, strict=True)
-        ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.dim)
+    def check_memory(self, memory_limit: int) -> None:
+        """Raise `MemoryLimitError` if the evidence of all cells takes more than `memory_limit` bytes."""
+        n_bytes = self.n_cells * BYTES_PER_CELL
+        if n_bytes > memory_limit:
+            raise MemoryLimitError(
+                f"The evidence of a grid of {' × '.join(map(str, self.shape))} cells takes {n_bytes:,} bytes,"
+                f" more than memory_limit={memory_limit:,}; raise memory_limit, or take a smaller grid or a "
+                "larger resolution."
+            )
+
+    def centers(self, device: torch.device | str | None = None, cells: range | None = None) -> Tensor:
+        """Centres (M, D) of cells, world metres, float64; `cells`: their flat indices, None: all."""
+        cells = range(self.n_cells) if cells is None else cells
+        flat = torch.arange(cells.start, min(cells.stop, self.n_cells), device=device)
+        index = torch.stack(torch.unravel_index(flat, self.shape), 1)
+        origin = torch.tensor(self.origin, dtype=torch.float64, device=device)
+        return origin + (index.double() + 0.5) * self.resolution
 
 
 def _covering_cells(
@@ -144,13 +173,9 @@ def rasterize(
         on_event: is called with ("cells", done, total) after each call.
     """
     found = torch.empty(grid.n_cells, dtype=torch.float64)
-    shape = torch.tensor(grid.shape)
-    origin = torch.tensor(grid.origin, dtype=torch.float64)
-    stride = torch.cat([shape.flip(0).cumprod(0).flip(0)[1:], torch.ones(1, dtype=torch.int64)])
     on_event("cells", 0, grid.n_cells)
     for first in range(0, grid.n_cells, _CELLS_PER_CALL):
-        flat = torch.arange(first, min(first + _CELLS_PER_CALL, grid.n_cells))
-        index = flat[:, None] // stride % shape
-        found[flat] = answer(origin + (index.double() + 0.5) * grid.resolution).detach().cpu().double()
-        on_event("cells", int(flat[-1]) + 1, grid.n_cells)
+        centers = grid.centers(cells=range(first, first + _CELLS_PER_CALL))
+        found[first : first + len(centers)] = answer(centers).detach().cpu().double()
+        on_event("cells", first + len(centers), grid.n_cells)
     return found.view(grid.shape)

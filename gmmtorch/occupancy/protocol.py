@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import ArrayLike, Scan
 
@@ -24,7 +25,7 @@ def check_queries(points: ArrayLike, dim: int | None) -> Tensor:
     Raises `InvalidArgumentError` for another shape and for NaN. Infinite points are valid: they are unknown
     space.
     """
-    query = torch.as_tensor(points, dtype=torch.float64)
+    query = as_tensor(points, "points", torch.float64)
     if query.ndim != 2 or query.shape[1] != (dim or query.shape[1]):
         raise InvalidArgumentError(f"points has shape {tuple(query.shape)}; expected (M, {dim or 'D'}).")
     if bool(torch.isnan(query).any()):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
@@ -45,8 +46,8 @@ def first_hit(occupancy: Tensor) -> tuple[Tensor, Tensor]:
 
 def hit_probability(
     cones: Cones | PointForm,
-    origins: Tensor,
-    directions: Tensor,
+    origins: ArrayLike,
+    directions: ArrayLike,
     max_range: float,
     resolution: float,
     prior: float = 1.0,
@@ -70,6 +71,7 @@ def hit_probability(
         MemoryLimitError: R·S cells exceed the memory limit.
     """
     form = _form(cones, resolution)
+    origins, directions = as_tensor(origins, "origins"), as_tensor(directions, "directions")
     depth = _depths(max_range, form, origins)
     if origins.shape[0] * depth.shape[0] * 8 > MEMORY_LIMIT:
         raise MemoryLimitError(
@@ -83,14 +85,15 @@ def hit_probability(
 
 def expected_range(
     cones: Cones | PointForm,
-    origins: Tensor,
-    directions: Tensor,
+    origins: ArrayLike,
+    directions: ArrayLike,
     max_range: float,
     resolution: float,
     prior: float = 1.0,
 ) -> ExpectedRange:
     """Expected range of a beam, Σ p_i d_i + p_none · max_range; arguments as for `hit_probability`."""
     form = _form(cones, resolution)
+    origins, directions = as_tensor(origins, "origins"), as_tensor(directions, "directions")
     depth = _depths(max_range, form, origins)
     reported = depth.clamp_max(max_range)  # the last cell can extend beyond the range
     means, none = [], []

@@ -40,7 +40,7 @@ class ProgressBars:
     def note(self, stage: str, text: str) -> None:
         """Shows text beside the bar of a stage, if that bar is open."""
         if stage in self._bars:
-            self._bars[stage].set_postfix_str(text)
+            self._bars[stage].set_postfix_str(text, refresh=False)  # shown with the next step
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.scenes.ellipsoids import checked_components, ellipsoid_mesh
 from gmmtorch.report.style import as_array, colour, even_sample
+from gmmtorch.report.table import format_value
 from gmmtorch.scan import ArrayLike
 
 if TYPE_CHECKING:
@@ -45,13 +47,42 @@ class Board:
         self.directory = Path(directory)
         self.max_points = max_points
         self._writer = SummaryWriter(str(self.directory))
+        self._first: dict[tuple[str, str], tuple[float, int, float] | None] = {}
+        """Value, step and time of a tag's first value; None once the tag is a curve."""
 
     def scalars(self, row: Mapping[str, Any], prefix: str = "", step: int = 0) -> None:
-        """Writes every finite number of a row with the tag prefix/name; skips all other values."""
+        """Writes every finite number of a row with the tag prefix/name; skips all other values.
+
+        A tag becomes a curve with its second step. Tags that have only one step when the board is closed go
+        to one table of text, `results`, because a chart of one dot shows nothing.
+        """
         for name, value in row.items():
-            if _is_number(value):
-                tag = f"{prefix}/{name}" if prefix else name
-                self._writer.add_scalar(tag, float(value), step)
+            if not _is_number(value):
+                continue
+            tag, now = (prefix, name), (float(value), step, time.time())
+            if tag not in self._first:
+                self._first[tag] = now
+                continue
+            first = self._first[tag]
+            if first is not None and first[1] == step:
+                self._first[tag] = now
+                continue
+            for number, at, moment in (first, now) if first is not None else (now,):
+                self._writer.add_scalar("/".join(filter(None, tag)), number, at, walltime=moment)
+            self._first[tag] = None
+
+    def _write_results(self) -> None:
+        """Writes the numbers that are no curves as one table: a line for each name, a column each prefix."""
+        single = {tag: first[0] for tag, first in self._first.items() if first is not None}
+        if not single:
+            return
+        prefixes = list(dict.fromkeys(prefix for prefix, _ in single))
+        lines = [["", *prefixes], ["---"] * (len(prefixes) + 1)]
+        for name in dict.fromkeys(name for _, name in single):
+            values = (single.get((prefix, name)) for prefix in prefixes)
+            lines.append([name, *("" if value is None else format_value(name, value) for value in values)])
+        self._writer.add_text("results", "\n".join(f"| {' | '.join(line)} |" for line in lines))
+        self._first = {}
 
     def curve(self, tag: str, labels: ArrayLike, probabilities: ArrayLike, step: int = 0) -> None:
         """Writes the precision-recall curve of probabilities (M,) for labels (M,), 1 occupied and 0 free,
@@ -124,10 +155,11 @@ class Board:
         self._add_mesh(tag, mesh.vertices, mesh.colors, mesh.faces, step)
 
     def hparams(self, config_flat: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
-        """Writes the settings of the run and its results for TensorBoard's HPARAMS page, in this same run.
+        """Writes the settings of the run and its results as columns of TensorBoard's HPARAMS page.
 
         Settings other than numbers, truth values and text are written as text; metrics that are not finite
-        numbers are left out.
+        numbers are left out. Metrics are columns like settings, because TensorBoard would show a chart of one
+        dot for each.
         """
         from torch.utils.tensorboard.summary import hparams
 
@@ -137,12 +169,12 @@ class Board:
         results = {key: float(value) for key, value in metrics.items() if _is_number(value)}
         # SummaryWriter.add_hparams would create another run, named after the time.
         file_writer = self._writer._get_file_writer()
-        for summary in hparams(settings, results):
+        for summary in hparams({**settings, **results}, {}):
             file_writer.add_summary(summary)
-        self.scalars(results)
 
     def close(self) -> None:
         """Writes pending events and closes the file."""
+        self._write_results()
         self._writer.close()
 
     def __enter__(self) -> Board:

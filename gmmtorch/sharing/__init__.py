@@ -5,22 +5,12 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from gmmtorch.sharing.replica.replica import Replica as Replica
     from gmmtorch.sharing.store import Store as Store
 
-__all__ = ["Replica", "Store"]
-
-_HOMES = {
-    "Replica": "gmmtorch.sharing.replica.replica",
-    "Store": "gmmtorch.sharing.store",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'gmmtorch.sharing' has no attribute {name!r}")
+__getattr__, __dir__, __all__ = lazy_names(__name__, {"Replica": "replica.replica", "Store": "store"})

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.files import joined_tensors, pack_tensors, split_tensors, unpack_tensors
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, keys_in, keys_of_author
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, Intervals, keys_in, keys_of_author
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store_file import explained, open_file, transaction
 
@@ -208,7 +207,7 @@ class Store:
             self._db.execute(
                 "INSERT OR REPLACE INTO progress VALUES (?, ?, ?)", (n_scans, _digest(data), data)
             )
-            # A damaged state stays until there is a newer one: it says how far the robot was.
+            # A damaged state stays until there is a newer one, because its number of scans is still valid.
             self._db.execute(
                 "DELETE FROM progress WHERE scans < ? AND scans IS NOT ?", (n_scans, self._sound)
             )

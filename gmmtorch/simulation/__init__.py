@@ -6,8 +6,9 @@ World frame: metres, z up. Sensor frame: x forward, y left, z up. All randomness
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from gmmtorch.simulation.sensors.depth_camera import DepthCamera as DepthCamera
@@ -51,16 +52,6 @@ _MODULES = {
     "worlds.tunnels": ("tunnels",),
     "worlds.warehouse": ("warehouse",),
 }
-_HOMES = {name: f"gmmtorch.simulation.{module}" for module, names in _MODULES.items() for name in names}
-
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'gmmtorch.simulation' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__, {name: module for module, names in _MODULES.items() for name in names}
+)

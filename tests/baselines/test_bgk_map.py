@@ -16,7 +16,7 @@ from gmmtorch.baselines.bgk_map import BGKMap, kernel_offsets, sparse_kernel
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
 from gmmtorch.baselines.samples import thinned_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan
 
@@ -157,7 +157,7 @@ def test_bgk_points_map_takes_about_16_bytes_per_point():
     assert 16 * made.n_points < made.nbytes < 24 * made.n_points + 2500
 
 
-# -- bad input ---------------------------------------------------------------------------------------
+# -- bad input ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [BGKMap, BGKPointsMap])
@@ -224,7 +224,7 @@ def test_bgk_map_is_more_accurate_than_a_grid_on_its_authors_data(real_data: Pat
 
     folder = real_data / "la3dm" / world
     scans = list(datasets.load("pcd_viewpoint", folder, max_range=8.0, no_return_range=8.0))
-    train, test = split.split_indices(len(scans), 4)
+    train, test = queries.split_indices(len(scans), 4)
     tested = queries.hit_and_free(*queries.test_beams([scans[i] for i in test], 4000, 0), "uniform", 0.1, 0)
     auc = {}
     for made in (BGKMap(0.1), OccupancyGrid(0.1)):

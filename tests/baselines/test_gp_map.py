@@ -13,7 +13,6 @@ from occupancy.protocol_contract import (
     OccupancyMapContract,
     lattice,
     move,
-    points,
     shifted,
     wall_scan,
 )
@@ -36,8 +35,8 @@ class TestGPMap(OccupancyMapContract):
         return GPMap(RESOLUTION)
 
     @pytest.mark.parametrize("dim", [2, 3])
-    def test_moved_by_whole_cells_it_gives_the_moved_answers(self, dim):
-        """Blocks, which have separate processes, do not move with the scene, so answers match on average."""
+    def test_occupancy_moves_with_a_scene_shifted_by_whole_cells(self, dim):
+        """Blocks have separate processes and do not move with the scene: occupancy matches on average."""
         matrix = shifted(dim, (0.125, -0.375, 0.25))
         expected = self.ask(self.built(wall_scan(dim)), lattice(dim))
         theta = self.ask(self.built(wall_scan(dim).transformed(matrix)), move(matrix, lattice(dim)))
@@ -71,7 +70,7 @@ def test_gp_regression_with_padding_equals_scikit_learn(dim, length, variance, n
         np.testing.assert_allclose(made.variance[row], deviation**2, atol=1e-9)
 
 
-# -- the map ----------------------------------------------------------------------------------------------
+# -- the map --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -111,7 +110,7 @@ def test_gp_map_equals_a_committee_of_scikit_learn_processes(dim):
     assert 0.1 < sum(x == 0.5 for x in expected) / len(expected) < 0.9
 
 
-# -- bad input -----------------------------------------------------------------------------------------
+# -- bad input ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -140,15 +139,6 @@ def test_gp_map_rejects_too_many_samples_per_block():
     scan = Scan(torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(2))
     with pytest.raises(InvalidArgumentError, match="ds_resolution"):
         GPMap(1.0, ds_resolution=1e-6).insert(scan)
-
-
-def test_gp_map_fuses_contradicting_samples_to_an_uncertain_cell():
-    end = torch.tensor([[1.0625, 0.1875]], dtype=torch.float64)
-    made = GPMap(0.125, free_resolution=0.25)
-    made.insert(Scan(end, torch.tensor([0.5, 0.1875])))
-    made.insert(Scan(torch.tensor([[2.0, 0.1875]], dtype=torch.float64), end[0] - torch.tensor([0.25, 0.0])))
-    theta = float(made.occupancy(points([1.0625], 2))[0])
-    assert 0 < theta < 1
 
 
 @pytest.mark.parametrize(

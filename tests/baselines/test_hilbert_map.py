@@ -20,7 +20,7 @@ from gmmtorch.baselines.lattice_features import LatticeFeatures
 from gmmtorch.baselines.logistic_regression import logistic_regression, penalised_loss
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan
 
@@ -178,7 +178,7 @@ def labelled_points(n: int = 400) -> tuple[Tensor, Tensor]:
     return points, torch.rand(n, generator=generator, dtype=torch.float64) < torch.sigmoid(odds)
 
 
-@pytest.mark.parametrize(("kind", "l1_ratio"), [(0, 0.5), (0, 1.0), (1, 0.5), (2, 0.0), (2, 1.0)])
+@pytest.mark.parametrize(("kind", "l1_ratio"), [(0, 1.0), (1, 0.5), (2, 0.0)])
 def test_logistic_regression_reaches_scikit_learns_optimum(kind, l1_ratio):
     points, is_hit = labelled_points()
     features = all_features(points)[kind]
@@ -314,7 +314,7 @@ def test_hilbert_map_load_rejects_damaged_tensors_and_settings(tmp_path, kind):
 def test_hilbert_map_reaches_the_published_auc_on_intel(real_data):
     """The published AUC of Nyström features at 0.1 m is 0.926; sparse features are better."""
     scans = list(load("carmen", path=real_data / "laser2d" / "intel.log.gz"))
-    train, test = split.split_indices(len(scans), 10)
+    train, test = queries.split_indices(len(scans), 10)
     tested = queries.hit_and_free(
         *queries.test_beams([scans[i] for i in test], 4000, 0), free="uniform", resolution=0.1, seed=0
     )

@@ -41,7 +41,7 @@ def moments(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
     return n, mean, (points - mean).T @ (points - mean)
 
 
-# -- moments -------------------------------------------------------------------------------------------
+# -- moments ---------------------------------------------------------------------------------------------
 
 
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 9), min_size=1, max_size=6), st.integers(2, 3))
@@ -138,18 +138,6 @@ def test_a_beam_adds_log_odds_by_its_likelihood_of_crossing_the_gaussian():
     likelihood = 1.0  # the mean lies on the beam, five metres before its end
     free = 0.5 + 0.1 * likelihood
     assert log_odds_at(through, [1.5, 0.5]) == pytest.approx(before + math.log((1 - free) / free), rel=1e-4)
-
-
-def test_a_beam_that_ends_at_a_gaussian_hardly_lowers_its_log_odds():
-    made = NDTMap(1.0, spread=math.inf)
-    made.insert(sheet())
-    down = torch.tensor([[1.5, -0.01]]).double()  # just below the cell
-    made.insert(Scan(down, torch.tensor([1.5, 0.9]).double()))
-    near = log_odds_at(made, [1.5, 0.5])
-    far = NDTMap(1.0, sensor_noise=0.01, spread=math.inf)
-    far.insert(sheet())
-    far.insert(Scan(down - torch.tensor([0.0, 3.0]), torch.tensor([1.5, 0.9]).double()))
-    assert log_odds_at(far, [1.5, 0.5]) < near <= N_RETURNS * math.log(1.5) + 1e-6
 
 
 def test_the_gaussian_of_a_cell_that_becomes_free_is_deleted(tmp_path):

@@ -102,12 +102,6 @@ def load_file(folder: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -
     return OccupancyGrid.load(path)
 
 
-def test_the_valid_file_is_read(tmp_path):
-    made = load_file(tmp_path, *valid_file())
-    query = torch.tensor([[0.25, 0.25], [0.75, 0.25], [-0.25, 0.25]], dtype=torch.float64)
-    assert made.occupancy(query).tolist() == [3 / 5, 0.5, 0.5]
-
-
 @pytest.mark.parametrize(
     "change",
     [

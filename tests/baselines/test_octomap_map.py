@@ -90,7 +90,7 @@ def test_beams_beyond_max_range_add_misses_only():
     assert made.occupancy([[1.2, 0.19, 0.44]])[0] < 0.5
 
 
-# -- files -------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------------
 
 
 def test_octomap_reads_the_file(tmp_path: Path):
@@ -123,7 +123,7 @@ def test_octomap_load_rejects_files_of_other_programs(tmp_path: Path):
         OctoMapMap.load(tmp_path / "map.ot")
 
 
-# -- bad input ---------------------------------------------------------------------------------------------
+# -- bad input -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, math.nan])

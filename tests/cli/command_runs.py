@@ -20,11 +20,11 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, export, fit, occupancy, schema
+from gmmtorch.cli import common, export, fit, map, occupancy, schema, view
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
-COMMANDS = {"occupancy": occupancy, "fit": fit, "export": export}
+COMMANDS = {"occupancy": occupancy, "fit": fit, "export": export, "map": map, "view": view}
 QUIET = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
 TINY = {
     "occupancy": ["dataset.n_scans=10", "map.n_samples=20000"],

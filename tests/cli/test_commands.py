@@ -140,7 +140,10 @@ def test_event_files_contain_scalars_figures_and_hyperparameters(occupancy_run, 
     for done, method in ((occupancy_run, "point"), (fit_run, "em")):
         events = EventAccumulator(str(done.folder / "tensorboard")).Reload()
         tags = events.Tags()
-        assert any(method in tag for tag in tags["scalars"])
+        assert "results/text_summary" in tags["tensors"]
+        for tag in tags["scalars"]:
+            assert len({event.step for event in events.Scalars(tag)}) > 1, f"{tag} is one dot"
+        assert (f"{method}/lower_bound" in tags["scalars"]) == (method == "em")
         assert any(tag.startswith("figures/") for tag in tags["images"])
         assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
 
@@ -463,17 +466,12 @@ def test_a_damaged_file_is_named(monkeypatch, tmp_path):
         ("map.noise=loud", "map.noise=loud could not be converted to Float"),
         ("dataset.stride=two", "dataset.stride=two could not be converted to Integer"),
         ("evaluation.kept=0.5", "evaluation.kept=0.5 list"),
-        ("resolution=0.1", "Could not override 'resolution'"),
-        ("map=mosaic", "Could not find 'map/mosaic' per_scan windowed"),
-        ("dataset=intel", "Could not find 'dataset/intel' carmen"),
     ],
 )
-def test_wrong_types_and_unknown_options_give_no_traceback(option, words, monkeypatch, tmp_path):
-    done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, option)
-    assert done.status == 1
-    assert "Traceback" not in done.stderr
-    assert all(word in done.stderr for word in words.split()), done.stderr
-    assert not done.folder.exists()
+def test_wrong_types_give_a_one_line_error(option, words, monkeypatch, tmp_path):
+    line = refused(run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, option))
+    assert all(word in line for word in words.split()), line
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
@@ -483,12 +481,6 @@ def test_a_process_with_an_error_prints_one_line_and_exits_with_one(tmp_path):
     assert done.stdout == ""
 
 
-def test_an_error_in_a_sweep_ends_it(run, tmp_path):
-    done = run("occupancy", "-m", "evaluation.test_every=1,2", f"hydra.sweep.dir={tmp_path / 'sweep'}")
-    assert "test_every=1" in refused(done)
-    assert not list((tmp_path / "sweep").rglob("results.json"))
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_ctrl_c_leaves_only_complete_files(tmp_path):
@@ -496,6 +488,8 @@ def test_ctrl_c_leaves_only_complete_files(tmp_path):
     shares = ",".join(f"{0.9 - 0.001 * i:.3f}" for i in range(500))
     process = subprocess.Popen(
         [
+            # Shells ignore SIGINT in processes that they start in the background.
+            *("sh", "-c", "trap '' INT; exec \"$@\"", "sh"),
             sys.executable,
             str(CHECKOUT / "scripts" / "occupancy.py"),
             f"hydra.run.dir={folder}",
@@ -511,13 +505,13 @@ def test_ctrl_c_leaves_only_complete_files(tmp_path):
         text=True,
     )
     try:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 150
         while time.monotonic() < deadline and process.poll() is None:
             if len(list(maps.glob("*.safetensors"))) >= 3:
                 break
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=30)
+        _, stderr = process.communicate(timeout=120)
     finally:
         process.kill()
     assert process.returncode == 130

@@ -23,7 +23,7 @@ from gmmtorch import datasets
 from gmmtorch.cli import common, export, fit_studies, maps, missions, occupancy_studies, schema
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.evaluation import methods
-from gmmtorch.evaluation.estimators import ESTIMATORS
+from gmmtorch.evaluation.fit_comparison import ESTIMATORS
 from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.mission.trials import WorldOptions
 from gmmtorch.exploration.planning.planners import PLANNERS
@@ -33,7 +33,7 @@ from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
 
 COMMANDS = ["occupancy", "fit"]
-CONFIGURED = [*COMMANDS, "explore", "robot", "team", "export"]
+CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view"]
 MAPS = {
     "incremental": IncrementalRule(),
     "per_scan": WindowedRule(window=1, max_origins=1),
@@ -169,7 +169,7 @@ def test_an_experiment_can_run_on_another_data_set(command, name):
         assert composed(command, f"experiment={name}", f"dataset={dataset}").dataset.name == dataset
 
 
-@pytest.mark.parametrize("command", CONFIGURED[:-1])
+@pytest.mark.parametrize("command", CONFIGURED[:-2])
 def test_results_go_to_a_folder_in_outputs(command):
     schema.register()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
@@ -292,7 +292,9 @@ def test_the_configuration_file_shows_every_option(command):
     """`--help` prints the composed configuration; the file explains each option."""
     files = [f"{command}.yaml", *(["exploration_base.yaml"] if command in ("explore", "robot") else [])]
     text = "".join((CONF / name).read_text(encoding="utf-8") for name in files)
-    groups = {"dataset", "world", "team", "planner", "study"} | ({"map"} if command == "occupancy" else set())
+    groups = {"dataset", "world", "team", "planner", "study"} | (
+        {"map"} if command in ("occupancy", "map") else set()
+    )
 
     def leaves(node: Any, prefix: str = "") -> Iterator[str]:
         for name in node:
@@ -407,10 +409,12 @@ def test_the_examples_of_the_help_compose(command):
 
 def test_help_names_every_choice_of_every_group():
     """Each experiment is named by the command that runs it, and by no other."""
-    of_occupancy, of_fit, of_explore, *of_robots = map(listed, CONFIGURED[:-1])
+    of_occupancy, of_fit, of_map, of_explore, *of_robots = map(listed, CONFIGURED[:-2])
     assert of_occupancy.keys() == {"dataset", "map", "experiment"}
     assert of_fit.keys() == {"dataset", "experiment"}
-    for groups in (of_occupancy, of_fit):
+    assert of_map.keys() == {"dataset", "map"}
+    assert of_map["map"] == of_occupancy["map"]
+    for groups in (of_occupancy, of_fit, of_map):
         assert sorted(groups["dataset"]) == choices("dataset")
     assert sorted(of_occupancy["map"]) == choices("map") == sorted(MAPS)
     assert of_explore.keys() == {"world", "team", "planner", "experiment"}

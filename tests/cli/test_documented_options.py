@@ -13,7 +13,7 @@ from command_runs import CHECKOUT, as_it_was, composed
 from omegaconf import DictConfig, OmegaConf
 
 LINES = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").splitlines()
-COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team"]
+COMMANDS = ["occupancy", "map", "view", "fit", "export", "explore", "robot", "team"]
 CHOICES = [
     *([command] for command in COMMANDS),
     *(["occupancy", f"dataset={name}"] for name in ("carmen", "depth_frames", "mesh", "mesh_scans")),

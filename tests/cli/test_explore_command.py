@@ -168,6 +168,11 @@ def test_the_event_file_holds_curves_figures_and_growing_scenes(mission, row):
     from tensorboard.util.tensor_util import make_ndarray
 
     events = EventAccumulator(str(mission.folder / "tensorboard")).Reload()
+    curves = {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+    assert all(len(curve) > 1 for curve in curves.values())
+    names = [tag.rpartition("/")[2] for tag in curves if "robot_" not in tag]
+    assert len(set(names)) == len(names)  # each curve once
+    assert "results/text_summary" in events.Tags()["tensors"]
     live = events.Scalars("mission/entropy_bits")
     assert [event.step for event in live] == row["times"]
     assert [event.value for event in live] == pytest.approx(row["entropy_bits"], rel=1e-6)

@@ -146,6 +146,32 @@ def test_point_cloud_of_occupied_cells(kind, dim, form, run, files, tmp_path):
     np.testing.assert_allclose(theta, answers, atol=1e-5)
 
 
+def test_mesh_of_a_height_band_lies_on_the_surfaces_of_the_map(run, files, tmp_path):
+    open3d = pytest.importorskip("open3d")
+    done = succeeded(
+        run(f"path={files / 'map_3.safetensors'}", "format=mesh", "output=a.ply", "resolution=0.1", "z_max=1")
+    )
+    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "a.ply"))
+    corners = np.asarray(mesh.vertices)
+    assert corners[:, 2].max() <= 1
+    assert f"{len(mesh.triangles):,} triangles" in done.stdout
+    theta = GaussianMap.load(files / "map_3.safetensors").occupancy(corners, 0.1)
+    assert np.mean(theta > 0.5) > 0.9
+    error = run(f"path={files / 'grid_3.safetensors'}", "format=mesh", "output=b.ply")
+    assert error.status == 1
+    assert "is an occupancy grid" in error.stderr
+
+
+def test_distance_field_of_a_map_is_zero_in_its_occupied_cells(run, files, tmp_path):
+    source = f"path={files / 'map_2.safetensors'}"
+    succeeded(run(source, "format=distance_field", "output=a.npz", "resolution=0.2"))
+    with np.load(tmp_path / "a.npz") as field:
+        cells = np.stack(np.meshgrid(*map(np.arange, field["distance"].shape), indexing="ij"), -1) + 0.5
+        centers = field["origin"] + cells.reshape(-1, 2) * field["resolution"]
+        theta = GaussianMap.load(files / "map_2.safetensors").occupancy(centers, 0.2)
+        assert np.array_equal(field["distance"].ravel() == 0, theta > 0.65)
+
+
 @pytest.mark.parametrize("name", ["map_3", "grid_3", "log_odds_2"])
 def test_octree_has_the_occupancy_of_the_map(name, run, files, tmp_path):
     pyoctomap = pytest.importorskip("pyoctomap")
@@ -169,6 +195,37 @@ def test_bounds_limit_the_cells(run, files, tmp_path):
         run(f"path={files / 'map_2.safetensors'}", "output=cut.yaml", "bounds=[1,2,4,3]", "resolution=0.1")
     )
     assert read_map_image(tmp_path / "cut.yaml").grid.shape == (30, 10)
+
+
+@pytest.mark.parametrize(
+    ("source", "output", "written"),
+    [
+        ("map_2", "floor.pgm", {"floor.pgm", "floor.yaml"}),
+        ("map_2", "cells.ply", {"cells.ply"}),
+        ("grid_2", "cells.PCD", {"cells.PCD"}),
+        ("map_2", "gira.csv", {"gira.csv"}),
+        ("map_3", "arrays.npz", {"arrays.npz"}),
+        ("mixture", "copy.safetensors", {"copy.safetensors"}),
+    ],
+)
+def test_the_ending_of_the_output_selects_the_format(source, output, written, run, files, tmp_path):
+    resolution = [] if "grid" in source else ["resolution=0.5"]
+    succeeded(run(f"path={files / f'{source}.safetensors'}", f"output={output}", *resolution))
+    assert {path.name for path in tmp_path.iterdir()} == written
+
+
+def test_an_image_of_a_3d_map_is_of_the_space_between_floor_and_ceiling(run, files, tmp_path):
+    source = f"path={files / 'map_3.safetensors'}"
+    done = succeeded(run(source, "output=room.yaml", "resolution=0.25"))
+    said = re.search(r"z_min=([\d.]+) z_max=([\d.]+) \(m\) were chosen: the floor at (\S+) m", done.stdout)
+    low, high, floor = (float(text) for text in said.groups())
+    assert abs(floor) < 0.05  # the floor of the simulated hall, whose ceiling is at 4 m
+    assert low == pytest.approx(floor + 0.5, abs=0.02)
+    assert 2.0 < high < 4.0
+    succeeded(run(source, "output=same.yaml", "resolution=0.25", f"z_min={low}", f"z_max={high}"))
+    chosen, given = (read_map_image(tmp_path / f"{name}.yaml").probability for name in ("room", "same"))
+    assert chosen.shape == given.shape
+    assert float((chosen > 0.65).double().mean()) < 0.3
 
 
 # -- components -----------------------------------------------------------------------------------
@@ -206,6 +263,9 @@ def test_a_fitted_mixture_is_written_as_csv(run, files, tmp_path):
     [
         (["path={map_2}"], "output is not set"),
         (["output=a.yaml"], "path is not set"),
+        (["path={map_2}", "output=a.dwg"], r"none of the endings \.yaml, \.pgm, \.bt.*format="),
+        (["path={map_2}", "output=a"], "none of the endings"),
+        (["path={map_2}", "output=a.yaml", "bounds=[1,1,0,0]"], r"bounds=\[1.0, 1.0, 0.0, 0.0\]: the lowest"),
         (["path={map_2}", "output=a", "format=dwg"], "format='dwg' is not one of map_server"),
         (["path=nowhere.safetensors", "output=a.yaml"], "nowhere.safetensors does not exist"),
         (["path={mixture}", "output=a.yaml"], "is not a map that can be exported"),

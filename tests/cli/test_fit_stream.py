@@ -127,6 +127,7 @@ def test_a_run_resumes_from_its_checkpoint(run, cloud, tmp_path):
         (["points={cloud}", "mixture.n_components=9999"], "n_components=9999"),
         (["points={cloud}", "stream.timeout=0"], "timeout=0"),
         (["resume=true"], "checkpoint=FILE"),
+        (["resume=true", "checkpoint=nowhere/a.safetensors"], "nowhere does not exist"),
     ],
 )
 def test_an_invalid_option_gives_a_one_line_error(run, cloud, options, said):

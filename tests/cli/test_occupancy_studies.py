@@ -40,15 +40,23 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 
 def assert_shown(done: Finished, pictures: set[str], *tags: str) -> None:
-    """The figures exist as files and as events, and scalars have these tags."""
+    """The figures exist as files and as events, and curves or single numbers have these tags."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.util.tensor_util import make_ndarray
 
     assert {Path(name).stem for name in done.files() if name.endswith(".png")} == pictures
     for name in pictures:
         assert (done.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    found = EventAccumulator(str(done.folder / "tensorboard")).Reload().Tags()
+    events = EventAccumulator(str(done.folder / "tensorboard")).Reload()
+    found, single = events.Tags(), set()
+    if "results/text_summary" in found["tensors"]:
+        text = make_ndarray(events.Tensors("results/text_summary")[0].tensor_proto)[0].decode()
+        (_, *prefixes), _, *lines = (
+            [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()
+        )
+        single = {f"{prefix}/{line[0]}" for line in lines for prefix in prefixes}
     assert set(found["images"]) == {f"figures/{name}" for name in pictures}
-    assert set(tags) <= set(found["scalars"])
+    assert set(tags) <= {*found["scalars"], *single}
 
 
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])

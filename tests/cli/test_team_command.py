@@ -177,7 +177,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
 
 
 FAILS = "if number == 1: sys.exit('gmmtorch: error: no more of this')\n"
-WAITS = "time.sleep(600)\n"
+WAITS = "time.sleep(60)\n"
 HYDRA = (
     "if number == 1:\n"
     "  print('ImportError: no module named radio\\n\\nSet the environment variable HYDRA_FULL_ERROR=1 …')\n"
@@ -218,14 +218,20 @@ def test_robots_that_ignore_signals_are_killed(run, robots, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_ends_all_robots(name, run, robots, monkeypatch):
+@pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_signal_ends_all_robots(before, name, run, robots, monkeypatch):
+    """Also in a process that a shell has started in the background, with signals ignored."""
     pretend(monkeypatch, WAITS)
-    before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(team, "_status", lambda _: os.kill(os.getpid(), getattr(signal, name)))
-    done = run(*LOG)
+    number = getattr(signal, name)
+    monkeypatch.setattr(team, "_status", lambda _: os.kill(os.getpid(), number))
+    handler = signal.signal(number, before)
+    try:
+        done = run(*LOG)
+        assert signal.getsignal(number) == before
+    finally:
+        signal.signal(number, handler)
     assert done.status == 130
     assert [robot._process.returncode for robot in robots] == [-signal.SIGTERM] * 2
-    assert signal.getsignal(signal.SIGTERM) == before
 
 
 # -- bad input ------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
 WITH_PATH = ["carmen", "scan_folder", "pcd_viewpoint", "depth_frames", "octomap_log", "mesh", "mesh_scans"]
+WITH_PATH += ["rosbag", "kitti", "tum"]
 
 
 def test_load_lists_the_names_when_the_name_is_unknown():

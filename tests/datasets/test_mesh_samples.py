@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -113,9 +114,35 @@ def test_read_triangles_accepts_obj_and_stl(suffix, tetrahedron, tmp_path):
     np.testing.assert_allclose(np.sort(areas), np.sort(expected), rtol=1e-6)
 
 
+@pytest.mark.parametrize("form", ["<", ">", "ascii"])
+def test_read_triangles_cuts_polygons_of_different_sizes_into_fans(form, tmp_path):
+    corners = np.random.default_rng(0).normal(size=(6, 3)).round(3)
+    faces = [(0, 1, 2), (2, 3, 4, 5, 0), (1, 3, 5, 4)]
+    fans = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}.get(form, form)
+    head = ply(corners, faces).split("end_header")[0].replace("ascii", name) + "end_header\n"
+    if form == "ascii":
+        body = ply(corners.tolist(), faces).split("end_header\n")[1].encode()
+    else:
+        body = corners.astype(f"{form}f8").tobytes()
+        body += b"".join(struct.pack(f"{form}B{len(f)}i", len(f), *f) for f in faces)
+    path = tmp_path / "a.ply"
+    path.write_bytes(head.encode() + body)
+    found = {triangle.tobytes() for triangle in read_triangles(path).numpy()}
+    assert found == {corners[list(fan)].tobytes() for fan in fans}
+
+
+def test_read_triangles_accepts_relative_indices_and_textures(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nvt 0 0\nv 0 1 0\nv 1 1 0\nf -4 -3 -2\nf 2/1 4/1/1 3//1\n")
+    triangles = read_triangles(path).tolist()
+    assert triangles == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (ply(faces=[(0, 1, 9)]), "missing corner"),
         ("not a mesh", "no readable triangles"),
         (ply(faces=[]), "no readable triangles"),
         (ply()[:-12], "no readable triangles"),

@@ -160,6 +160,64 @@ def test_a_damaged_header_is_read_or_rejected_with_a_clear_error(tmp_path, posit
     assert str(path) in message
 
 
+@needs_laspy
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+@pytest.mark.parametrize(
+    ("position", "content", "message"),
+    [
+        (103, b"\xff", "variable-length records"),
+        (96, b"\xff\xff\xff\x7f", "points from byte 2147483647"),
+        (105, b"\x01\x00", "1 bytes"),
+        (25, b"\x09", r"1\.9"),
+    ],
+)
+def test_a_las_header_is_checked_before_anything_is_allocated(tmp_path, name, position, content, message):
+    path = written(tmp_path, name)
+    data = bytearray(path.read_bytes())
+    data[position : position + len(content)] = content
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=message):
+        open_points(path)
+
+
+@needs_laspy
+def test_the_chunk_table_of_a_laz_file_is_checked_before_it_is_allocated(tmp_path):
+    path = written(tmp_path, "a.laz")
+    data = bytearray(path.read_bytes())
+    start = struct.unpack_from("<I", data, 96)[0]
+    table = struct.unpack_from("<q", data, start)[0]
+    struct.pack_into("<I", data, table + 4, 2**31)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="2147483648 chunks"):
+        open_points(path)
+
+
+@needs_laspy
+def test_a_las_file_must_contain_the_points_it_announces(tmp_path):
+    path = written(tmp_path, "a.las")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, 107, 2**32 - 1)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="4294967295 points"):
+        open_points(path)
+
+
+@pytest.mark.parametrize("header", ["{'descr': '<f8', 'shape': (2, 3), ", "((((((", "{}"])
+def test_open_points_rejects_an_npy_header_that_cannot_be_parsed(tmp_path, header):
+    path = tmp_path / "a.npy"
+    text = header.ljust(117).encode() + b"\n"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(48))
+    with pytest.raises(DataError, match="cannot be read as a NumPy array"):
+        open_points(path)
+
+
+def test_open_points_rejects_an_archive_of_arrays(tmp_path):
+    np.savez(tmp_path / "a.npz", a=np.zeros((2, 3)))
+    (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with pytest.raises(DataError, match="zip archive"):
+        open_points(tmp_path / "a.npy")
+
+
 @pytest.mark.parametrize(
     "array",
     [np.zeros(3), np.zeros((2, 0)), np.zeros((2, 3), complex), np.zeros((2, 2, 2)), np.array([["a", "b"]])],

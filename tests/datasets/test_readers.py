@@ -75,7 +75,9 @@ def scan_folder(path: Path, clouds: dict[str, bytes], poses: str) -> Path:
 
 
 def depth_folder(path: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    (path / "camera-intrinsics.txt").write_text("100 0 1\n0 200 1\n0 0 1\n")
+    height, width = frames[0][0].shape[:2]
+    center = (width - 1) / 2, (height - 1) / 2
+    (path / "camera-intrinsics.txt").write_text(f"100 0 {center[0]}\n0 200 {center[1]}\n0 0 1\n")
     for number, (depth, pose) in enumerate(frames):
         Image.fromarray(depth).save(path / f"frame-{number:06d}.depth.png")
         np.savetxt(path / f"frame-{number:06d}.pose.txt", pose)
@@ -307,6 +309,34 @@ def test_depth_frames_apply_max_range_and_pixel_stride(tmp_path):
     assert scan.no_return.shape == (24, 3)
     with pytest.raises(InvalidArgumentError, match="pixel_stride=0"):
         load("depth_frames", folder, pixel_stride=0)
+
+
+def test_depth_frames_scale_their_units(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 5000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder).image(0)[0].unique().tolist() == [5.0]
+    assert load("depth_frames", folder, depth_scale=0.0002).image(0)[0].unique().tolist() == [1.0]
+    with pytest.raises(InvalidArgumentError, match="depth_scale=0"):
+        load("depth_frames", folder, depth_scale=0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_depth_frames_refuse_images_of_another_size_than_the_intrinsics(tmp_path, factor):
+    folder = depth_folder(tmp_path, [(np.full((48, 64), 3000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder)[0].n_beams == 48 * 64
+    other = np.full((int(48 * factor), int(64 * factor)), 3000, dtype=np.uint16)
+    Image.fromarray(other).save(folder / "frame-000000.depth.png")
+    for read in (load("depth_frames", folder).__getitem__, load("depth_frames", folder).image):
+        with pytest.raises(DataError, match=r"depth\.png has .* pixels, but camera-intrinsics\.txt is for"):
+            read(0)
+
+
+def test_depth_frames_refuse_transposed_intrinsics(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
+    np.savetxt(folder / "camera-intrinsics.txt", np.loadtxt(folder / "camera-intrinsics.txt").T)
+    with pytest.raises(
+        DataError, match=r"camera-intrinsics\.txt: .*last row must be 0 0 1\. It looks transp"
+    ):
+        load("depth_frames", folder)
 
 
 def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):

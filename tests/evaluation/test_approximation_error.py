@@ -62,7 +62,7 @@ def test_flux_error_is_below_a_thousandth_unlike_the_approximations(rows):
 
 
 def test_flux_error_is_below_a_thousandth_in_3d():
-    options = ApproximationErrorStudy(n_components=4, n_cells=4, n_samples=64, n_large_samples=64)
+    options = ApproximationErrorStudy(n_components=2, n_cells=2, n_samples=64, n_large_samples=64)
     rows = {row["method"]: row for row in sweep_rows(3, options, torch.Generator().manual_seed(1))}
     assert max(rows["flux"]["hits_max"], rows["flux"]["misses_max"]) < 1e-3
     assert list(rows) == list(methods(1, 1))

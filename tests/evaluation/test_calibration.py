@@ -86,18 +86,6 @@ def test_brier_parts_sum_to_the_brier_score(binning, n_bins, n, seed):
     assert parts.resolution <= parts.uncertainty + 1e-12
 
 
-def test_brier_parts_match_murphy_with_one_value_per_bin():
-    theta = torch.tensor([0.1, 0.1, 0.1, 0.7, 0.7, 0.7, 0.7])
-    labels = torch.tensor([0, 1, 0, 1, 1, 0, 1])
-    parts = brier_parts(theta.double(), labels, 2)
-    share = 4 / 7
-    assert parts.within == pytest.approx(0, abs=1e-15)
-    gap = (3 * (0.1 - 1 / 3) ** 2 + 4 * (0.7 - 0.75) ** 2) / 7
-    assert parts.reliability == pytest.approx(gap, abs=1e-7)
-    assert parts.resolution == pytest.approx((3 * (1 / 3 - share) ** 2 + 4 * (0.75 - share) ** 2) / 7)
-    assert parts.uncertainty == pytest.approx(share * (1 - share))
-
-
 def test_brier_and_log_loss_match_scikit_learn():
     theta, labels = drawn()
     assert brier_parts(theta, labels).brier == pytest.approx(brier_score_loss(labels, theta), abs=1e-12)
@@ -109,12 +97,6 @@ def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
     assert log_loss_bits(torch.tensor([0.5, 0.5]), labels) == 1
     assert log_loss_bits(torch.tensor([0.0, 1.0]), labels) == pytest.approx(0, abs=1e-12)
     assert log_loss_bits(torch.tensor([1.0, 0.0]), labels) == pytest.approx(52)
-
-
-def test_a_probability_of_one_half_counts_half():
-    theta = torch.tensor([0.9, 0.1, 0.9, 0.5, 0.5])
-    labels = torch.tensor([1, 0, 0, 1, 0])
-    assert accuracy(theta, labels) == pytest.approx((2 + 2 * 0.5) / 5)
 
 
 def test_scores_contain_ece_log_loss_and_accuracy():

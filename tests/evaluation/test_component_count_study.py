@@ -155,16 +155,6 @@ def test_rows_are_reported_one_by_one(data, scans):
     assert events == [("components", done, 3) for done in range(4)]
 
 
-def test_no_maps_are_built_from_one_scan(data, scans):
-    study = ComponentCountStudy((2, 10**6), multiples=(), bandwidths=())
-    assert [row["rule"] for row in run(data, scans[:1], study, EM)] == ["fixed", "bic"]
-
-
-def test_middle_returns_the_central_scans():
-    assert middle(range(9), 3) == range(3, 6)  # type: ignore[arg-type]
-    assert middle(range(4), 20) == range(4)  # type: ignore[arg-type]
-
-
 def test_component_bytes_count_four_bytes_per_parameter():
     assert (component_bytes(7, 3), component_bytes(7, 2)) == (280, 168)
 

@@ -193,19 +193,6 @@ def check_progress(events: list[tuple[str, int, int | None]]) -> None:
         assert steps[-1] == (9, 9)
 
 
-def test_near_surface_points_lower_the_auc_of_a_grid(plain_rows):
-    grid = {"occupancy_grid": OccupancyGrid}
-    rows = evaluate("room", room_scans(12), grid, replace(SMALL, free="near_surface")).rows
-    uniform = [row for row in plain_rows if row["method"] == "occupancy_grid"]
-    assert all(near["auc"] < far["auc"] for near, far in zip(rows, uniform, strict=True))
-
-
-def test_pose_noise_lowers_every_auc(plain_rows):
-    rows = run(replace(COARSE, kept=(1.0,), pose_noise=(0.3, 0.2))).rows
-    clean = [row for row in plain_rows if row["resolution"] == 0.2 and row["kept"] == 1]
-    assert all(bad["auc"] < good["auc"] for good, bad in zip(clean, rows, strict=True))
-
-
 # -- invalid input --------------------------------------------------------------------------------
 
 

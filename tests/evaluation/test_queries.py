@@ -212,11 +212,6 @@ def test_saved_points_store_their_resolution(tmp_path):
         np.testing.assert_array_equal(file["points"][2:], some_queries(1.0).points.numpy())
 
 
-def test_saved_queries_get_the_npz_suffix(tmp_path):
-    save_queries(tmp_path / "new" / "queries", {0.1: some_queries()}, [1], [0])
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["queries.npz"]
-
-
 @pytest.mark.parametrize("free", ["uniform", "near_surface"])
 def test_saved_maps_and_queries_reproduce_the_rows(tmp_path, free):
     protocol = Protocol(

@@ -10,7 +10,7 @@ from pillar_room import room_scans
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.split import keep_share, perturb_poses, split_indices
+from gmmtorch.evaluation.queries import keep_share, perturb_poses, split_indices
 from gmmtorch.scan import Scan
 
 SHARES = (0.8, 0.3, 0.1, 0.02)
@@ -75,12 +75,6 @@ def test_a_smaller_share_of_scans_is_a_subset_in_the_same_order():
         assert sensors(kept) == [origin for origin in larger if origin in set(sensors(kept))]
         assert all(any(scan is whole for whole in scans) for scan in kept)  # the same objects
         larger = sensors(kept)
-
-
-@pytest.mark.parametrize("removal", ["beams", "scans"])
-def test_a_share_of_one_keeps_the_scans(removal):
-    scans = room_scans(3)
-    assert all(a is b for a, b in zip(keep_share(scans, 1, removal, seed=0), scans, strict=True))
 
 
 @pytest.mark.parametrize("removal", ["beams", "scans"])

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from gmmtorch.exploration.mission.clocks import Stopwatch
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.team_setup import make_agent, start_poses
 from gmmtorch.exploration.world.world import World
 from gmmtorch.sharing.transport.udp import UdpTransport
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-from gmmtorch.simulation.worlds.solids import box
+from gmmtorch.simulation.worlds.furniture import box
 
 TEAM = TeamOptions(
     size=2,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera
-from gmmtorch.simulation.worlds.solids import box
+from gmmtorch.simulation.worlds.furniture import box
 
 SMALL = TeamOptions(
     size=2,

@@ -22,8 +22,7 @@ import torch
 from exploration.replays import RULES, content, log, mapped
 from sharing.kill_store import die_after_steps
 
-from gmmtorch.exploration.mission.clocks import WallClock
-from gmmtorch.exploration.mission.driver import drive
+from gmmtorch.exploration.mission.driver import WallClock, drive
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.exploration.mission.robot_view import ReplayingRobotView
 from gmmtorch.files import write_json

@@ -9,8 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 import torch
 
 from gmmtorch.datasets import load
-from gmmtorch.exploration.mission.clocks import WallClock
-from gmmtorch.exploration.mission.driver import Drivable, Run, drive, never, settle
+from gmmtorch.exploration.mission.driver import Drivable, Run, WallClock, drive, never, settle
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap

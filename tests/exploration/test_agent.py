@@ -17,10 +17,10 @@ from sharing.message_examples import examples, frame_of_components, views
 from gmmtorch.errors import DataError
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.mission.clocks import Stopwatch
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
@@ -101,14 +101,14 @@ def learned(number: int, kind: str = "replica", places: Sequence[Any] = PLACES) 
 
 
 @pytest.fixture(scope="module")
-def sayings() -> list[list[bytes]]:
-    return [learned(number, places=(PLACES[number:] * 5)[:10]) for number in (1, 2)]
+def recorded() -> list[list[bytes]]:
+    return [learned(number, places=(PLACES[number:] * 2)[:5]) for number in (1, 2)]
 
 
 # -- messages ----------------------------------------------------------------------------------------
 
 
-def odd() -> list[bytes]:
+def unusual_datagrams() -> list[bytes]:
     """Sound datagrams of all kinds that no teammate would send."""
     teammate = Replica(5, dim=3, incarnation=3)
     ids = teammate.add(frame_of_components(6))
@@ -127,7 +127,7 @@ def odd() -> list[bytes]:
     return [*made, *encode_plan(0, 3, 1e6, 0.2, poses, poses), *encode_plan(900, 3, 0.0, 0.2, poses, poses)]
 
 
-SOUND = odd()
+SOUND = unusual_datagrams()
 damaged = st.one_of(
     st.binary(max_size=80),
     st.tuples(st.sampled_from(SOUND), st.integers(0, 1199), st.integers(1, 255)).map(
@@ -179,22 +179,8 @@ def test_all_sound_datagrams_are_accepted(kind: str) -> None:
     one.send_plan(1e3, 1)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_map_does_not_depend_on_the_order_of_arrival(sayings: list[list[bytes]], seed: int) -> None:
-    said = [(number, datagram) for number, some in enumerate(sayings, 1) for datagram in some]
-    order = torch.randperm(len(said), generator=torch.Generator().manual_seed(seed)).tolist()
-    (one, post), (other, its_post) = agent(), agent()
-    hear(one, post, *said)
-    for row in order:
-        hear(other, its_post, said[row])
-    assert one.digest() == other.digest()
-    assert len(one.robot.mapper.components() or []) > 20
-    for a, b in zip(*(each.robot.mapper.belief.grid.dense(BOX) for each in (one, other)), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
-
-
-def test_evidence_is_equal_to_the_bit_whichever_sender_was_faster(sayings: list[list[bytes]]) -> None:
-    one, other = sayings
+def test_evidence_is_equal_to_the_bit_whichever_sender_was_faster(recorded: list[list[bytes]]) -> None:
+    one, other = recorded
     found = []
     for first, second in ((1, 2), (2, 1)):
         listener, post = agent()
@@ -234,17 +220,6 @@ def test_a_much_lower_plan_number_is_accepted() -> None:
     hear(one, post, (1, plan_datagram(0, 2.0)))
     assert one.robot.plans[1].path.tolist() == [[2.0, 0.0, 0.0, 0.0]] * 10
     assert one.robot.plans[2].number == 7
-
-
-@pytest.mark.parametrize("number", [0, 1, 4])
-def test_a_lower_plan_number_is_accepted_once_the_last_path_is_flown(number: int) -> None:
-    one, post = agent()
-    hear(one, post, (1, plan_datagram(4, 1.0)), now=8.0)
-    hear(one, post, (1, plan_datagram(number, 2.0)), now=9.9)  # two seconds of it
-    assert (one.robot.plans[1].number, one.heard_at[1]) == (4, 8.0)
-    hear(one, post, (1, plan_datagram(number, 2.0)), now=10.0)
-    assert one.robot.plans[1].path[0, 0] == 2.0
-    assert one.heard_at[1] == 10.0
 
 
 def test_plans_of_strangers_and_under_another_id_are_ignored() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.beam_templates import beam_templates, cells_along, pinhole_beams
-from gmmtorch.occupancy.voxels.ray_traversal import traverse
+from gmmtorch.kernels.ray_traversal import traverse
 
 FOV = (1.5184, 1.0123)
 
@@ -89,12 +89,6 @@ def test_templates_are_rotations_of_one_camera():
             for k in range(templates.leading.shape[-1]):
                 inside = [abs(int(o)) <= k for o in offsets[:length, axis]] + [False]
                 assert int(templates.leading[yaw, beam, axis, k]) == inside.index(False)
-
-
-def test_template_of_cells_larger_than_the_range_has_one_cell():
-    templates = beam_templates(*FOV, max_range=6.0, resolution=20.0, n_beams=10, n_yaws=4)
-    assert templates.lengths.unique().tolist() == [1]
-    assert not bool(templates.offsets.any())
 
 
 def test_beam_templates_reject_cameras_without_view():

@@ -1,4 +1,4 @@
-"""Robots that are shut in: they look around for as long as it takes, and fly once they are let out."""
+"""Boxed-in robots look around until there is room, and then fly."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, Waiting, is_boxed_in
 from gmmtorch.exploration.robot.agent import Agent
-from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
+from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World
 
 OPTIONS = replace(
-    SMALL, framework="grid_isolated", size=1, duration=160.0, rate=0.5, rest=StoppingRule(0.5, window=40.0)
+    SMALL, framework="grid_isolated", size=1, duration=92.0, rate=0.5, rest=StoppingRule(0.5, window=32.0)
 )
-SHUT = 136.0  # seconds
+BOXED_UNTIL = 72.0  # seconds
 
 
 def around(place: Tensor) -> PeerTrajectories:
-    """Others on all sides of a place (3,): wherever it leads, a way comes closer to one of them."""
+    """Peers on all sides of a place (3,), so that every path comes closer to one of them."""
     sides = torch.cat([torch.eye(3), -torch.eye(3)]).double()
     return PeerTrajectories.of([(place + 0.5 * side)[None] for side in sides], 3.0)
 
@@ -37,24 +37,24 @@ def around(place: Tensor) -> PeerTrajectories:
 
 
 def seen(explorer: Explorer) -> Explorer:
-    """Of a world that is known, as it is."""
+    """An explorer that knows the whole world."""
     explorer.misses[~explorer.solid] = 9.0
     explorer.hits[explorer.solid] = 9.0
     return explorer
 
 
-def test_boxed_in_is_who_can_only_turn() -> None:
+def test_a_robot_is_boxed_in_if_it_can_only_turn() -> None:
     free = seen(Explorer.at(hollow(30, 20, 13), (3.0, 2.0, 1.2, 0.4)))
     generator = torch.Generator()
     assert not is_boxed_in(PRIMITIVES, free.task(generator))
     assert is_boxed_in(PRIMITIVES, free.task(generator, around(free.state[:3])))
     tight = seen(Explorer.at(hollow(9, 9, 9), (0.9, 0.9, 0.9, 0.4)))
-    tight.start = torch.full((3,), -50.0, dtype=torch.float64)  # nothing is free but what was seen to be
+    tight.start = torch.full((3,), -50.0, dtype=torch.float64)  # only observed cells are free
     assert bool(tight.local_map().is_passable(tight.state[:3]))
     assert is_boxed_in(PRIMITIVES, tight.task(generator))
 
 
-def test_it_waits_a_little_and_then_looks_around_until_it_is_let_out() -> None:
+def test_a_boxed_in_robot_waits_then_turns_until_it_is_free() -> None:
     explorer = seen(Explorer.at(hollow(30, 20, 13), (3.0, 2.0, 1.2, 0.0)))
     waiting, generator, shut = Waiting(PRIMITIVES), torch.Generator(), around(explorer.state[:3])
     for _ in range(2):
@@ -71,14 +71,7 @@ def test_it_waits_a_little_and_then_looks_around_until_it_is_let_out() -> None:
         yaw = torch.cat([plan.path[:, 3] for plan in plans if plan is not None])
         assert float(yaw.max() - yaw.min()) > 6.2  # all the way round
         explorer.state[4:] = 0
-        assert waiting.boxed_in(explorer.task(generator)) is None  # and its patience begins anew
-
-
-def test_who_moves_is_not_boxed_in() -> None:
-    explorer = seen(Explorer.at(hollow(30, 20, 13), (3.0, 2.0, 1.2, 0.0)))
-    explorer.state[4] = 0.75
-    waiting = Waiting(PRIMITIVES, patience=0)
-    assert waiting.boxed_in(explorer.task(torch.Generator(), around(explorer.state[:3]))) is None
+        assert waiting.boxed_in(explorer.task(generator)) is None  # and the count of plans starts again
 
 
 # -- a mission --------------------------------------------------------------------------------------------
@@ -89,8 +82,8 @@ def world() -> World:
     return small_room()
 
 
-def shut_in(agent: Agent, until: float) -> None:
-    """Until then others are on all sides of it."""
+def box_in(agent: Agent, until: float) -> None:
+    """Puts peers on all sides of the robot until that time (s)."""
     propose = agent.propose
 
     def boxed(
@@ -102,10 +95,10 @@ def shut_in(agent: Agent, until: float) -> None:
 
 
 @pytest.mark.parametrize("planner", ["mcts", "frontier"])
-def test_shut_in_for_longer_than_the_window_and_let_out_it_flies(world: World, planner: str) -> None:
+def test_a_robot_flies_after_it_was_boxed_in_longer_than_the_window(world: World, planner: str) -> None:
     mission = assemble(world, replace(OPTIONS, planner=planner))
-    shut_in(mission.agents[0], SHUT)
-    advance(mission, SHUT)
+    box_in(mission.agents[0], BOXED_UNTIL)
+    advance(mission, BOXED_UNTIL)
     (robot,) = mission.robots
     assert not robot.stopping.rests
     assert robot.path_length == 0
@@ -120,8 +113,7 @@ def advance(mission: Mission, until: float = math.inf) -> None:
         mission.tick(mission.elapsed)
 
 
-def test_who_could_have_flown_rests(world: World) -> None:
-    """The same rule, of a robot that stands where nothing keeps it."""
+def test_a_robot_that_stands_in_open_space_rests(world: World) -> None:
     mission = assemble(world, OPTIONS)
     agent = mission.agents[0]
 

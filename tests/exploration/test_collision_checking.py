@@ -18,9 +18,9 @@ from gmmtorch.exploration.planning.collision_checking import (
     inflated,
     local_map_of,
 )
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 
 LIBRARY = Primitives(Dynamics())
 RADIUS, CELL = 0.3, 0.2
@@ -88,31 +88,6 @@ def test_inflated_equals_pairwise_comparison(seed, shape, radius, resolution):
     ball = (gap < radius - 1e-9).double()[None, None]
     touched = torch.nn.functional.conv3d(around.double()[None, None], ball)[0, 0] > 0.5
     assert torch.equal(inflated(blocked, radius, resolution), touched)
-
-
-def test_inflated_leaves_only_cells_where_the_body_touches_nothing():
-    blocked = torch.rand(12, 12, 12, generator=seeded(1)) < 0.004
-    left = (~inflated(blocked, RADIUS, CELL)).nonzero()
-    assert len(left) > 20
-    generator = seeded(2)
-    inside = (
-        left.repeat(200, 1) + torch.rand(200 * len(left), 3, generator=generator, dtype=torch.float64)
-    ) * CELL
-    ray = torch.randn(inside.shape, generator=generator, dtype=torch.float64)
-    body = inside + RADIUS * ray / ray.norm(dim=1, keepdim=True)
-    cell = (body / CELL).floor().long()
-    assert bool(((cell >= 0) & (cell < 12)).all())
-    assert not bool(blocked[cell.unbind(1)].any())
-
-
-def test_inflated_is_tight():
-    blocked = torch.zeros(15, 15, 15, dtype=torch.bool)
-    blocked[7, 7, 7] = True
-    found = inflated(blocked, RADIUS, CELL)[3:-3, 3:-3, 3:-3]
-    offset = found.nonzero() - 4
-    # Two cells along two axes: a gap of 0.283 m. Along all three: 0.346 m, which is out of reach.
-    assert len(offset) == 5**3 - 8
-    assert int(offset.abs().max()) == 2
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
@@ -312,43 +287,6 @@ def test_escaping_robot_comes_no_closer_to_obstacles(seed, n):
     now = torch.cdist(points, surface)
     before = torch.cdist(state[None, :3], surface).clamp_max(RADIUS)
     assert bool((now >= before - 1e-4).all())
-
-
-def test_escaping_robot_leaves_through_the_open_side():
-    blocked = torch.zeros(SHAPE, dtype=torch.bool)
-    blocked[22] = True  # a wall at x from −0.4 to −0.2 m; the robot's cell is [0, 0.2)
-    for x, seen in ((0.02, False), (0.19, True)):
-        state = torch.tensor([x, 0.1, 0.1, 0, 0, 0, 0], dtype=torch.float64)
-        local_map = known(blocked)
-        assert not bool(local_map.is_passable(state[:3]))
-        forward = LIBRARY.commands[:, 0] > 0
-        for yaw, leaves in ((0.0, True), (math.pi, False), (math.pi / 2, seen)):
-            state[3] = yaw
-            rollout, braking, whole = with_start(state)
-            good = feasible(rollout, braking, local_map, start=state, radius=RADIUS)
-            straight = int((LIBRARY.commands == torch.tensor([1.5, 0, 0])).all(1).nonzero())
-            assert bool(good[straight]) == leaves
-            if not leaves:
-                assert float(fine_path(whole[good])[..., 0].min()) >= x - 1e-9
-            unaided = feasible(rollout, braking, local_map, start=state)
-            assert not bool(unaided[forward].any())
-
-
-def test_feasible_of_a_batch_equals_single_robots():
-    blocked = torch.rand(SHAPE, generator=seeded(5)) < 0.004
-    local_map = known(blocked)
-    generator = seeded(6)
-    states = torch.rand(12, 7, generator=generator, dtype=torch.float64) * 2 - 1
-    states[:, 4:] = 0
-    rollout = LIBRARY.rollout(states)
-    braking = LIBRARY.braking(rollout[..., -1, :])
-    peers = PeerTrajectories.of([torch.tensor([[0.5, 0.5, 0.0]], dtype=torch.float64)])
-    together = feasible(rollout, braking, local_map, peers, start=states[:, None], radius=RADIUS)
-    stuck = ~local_map.is_passable(states[:, :3])
-    assert 0 < int(stuck.sum()) < 12
-    for i in range(12):
-        alone = feasible(rollout[i], braking[i], local_map, peers, start=states[i], radius=RADIUS)
-        assert torch.equal(together[i], alone)
 
 
 def test_feasible_paths_keep_clear_of_peers():

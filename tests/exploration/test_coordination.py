@@ -117,26 +117,6 @@ def test_random_partition_considers_all_earlier_rounds(seed, n_rounds):
     assert asked == expected
 
 
-def test_random_partitions_lie_between_myopic_and_greedy_on_average():
-    generator = torch.Generator().manual_seed(3)
-    totals = dict.fromkeys(("myopic", "random_partition", "greedy", "distributed_greedy"), 0)
-    for _ in range(200):
-        sets = torch.rand(4, 5, 16, generator=generator) < 0.35
-        choices = [[frozenset(cells.nonzero().flatten().tolist()) for cells in robot] for robot in sets]
-        for name in totals:
-            plan, _ = planner_of(choices)
-            totals[name] += covered(coordinate(name, range(4), plan, generator, 2))
-    assert totals["myopic"] < totals["random_partition"] < totals["greedy"]
-    assert totals["myopic"] < totals["distributed_greedy"]
-
-
-def test_empty_team_has_no_plans():
-    for name in COORDINATIONS:
-        plan, asked = planner_of([])
-        assert coordinate(name, [], plan, torch.Generator()) == {}
-        assert asked == []
-
-
 def test_bad_input_is_named():
     with pytest.raises(InvalidArgumentError, match="coordination='chaos'"):
         Coordination("chaos")

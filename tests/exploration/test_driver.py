@@ -12,8 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.clocks import SimulatedClock, Stopwatch, WallClock, check_pace
-from gmmtorch.exploration.mission.driver import Drivable, Run, drive, settle
+from gmmtorch.exploration.mission.driver import (
+    Drivable,
+    Run,
+    SimulatedClock,
+    Stopwatch,
+    WallClock,
+    check_pace,
+    drive,
+    settle,
+)
 
 
 class Toy:

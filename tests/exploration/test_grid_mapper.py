@@ -17,9 +17,9 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_counts, encode_points
+from gmmtorch.sharing.messages.message_registry import PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 WIDTH = 24
@@ -83,7 +83,7 @@ def said(view: DepthFrame, sender: int = 1, number: int = 0) -> list[bytes]:
 # -- one's own frames ---------------------------------------------------------------------------------
 
 
-def test_own_frames_count_in_full_whether_they_are_shared_or_not() -> None:
+def test_own_frames_count_in_full() -> None:
     for shared in (False, True):
         one = mapper(shared=shared)
         views = [frame(seed) for seed in range(4)]
@@ -93,13 +93,6 @@ def test_own_frames_count_in_full_whether_they_are_shared_or_not() -> None:
         assert bool(sensed[0].novel.all())
         total = sum(float(p.hits.sum() + p.misses.sum()) for s in sensed for p in s.evidence)
         assert total == float(torch.stack(one.belief.grid.dense(one.belief.grid.box)).sum())
-
-
-def test_who_is_isolated_sends_nothing() -> None:
-    alone = mapper(shared=False)
-    for seed in range(3):
-        alone.sense(frame(seed))
-    assert alone.shared.datagrams() == alone.shared.announcements() == []
 
 
 def test_only_novel_beams_are_sent() -> None:
@@ -123,7 +116,7 @@ def test_only_novel_beams_are_sent() -> None:
     torch.testing.assert_close(believed(one), dense_of(beams(*[frame(n % 2) for n in range(12)])))
 
 
-def test_a_frame_without_beams_says_nothing() -> None:
+def test_a_grid_frame_without_beams_sends_nothing() -> None:
     for shared in (False, True):
         one = mapper(shared=shared)
         sensed = one.sense(frame(0, n=0))
@@ -137,7 +130,7 @@ def test_a_frame_without_beams_says_nothing() -> None:
 
 @settings(deadline=None, max_examples=12)
 @given(arrived=st.lists(st.integers(0, 9), unique=True, max_size=10), at_once=st.booleans())
-def test_whatever_parts_of_a_frame_arrive_are_counted(arrived: list[int], at_once: bool) -> None:
+def test_each_part_of_a_frame_counts_when_it_arrives(arrived: list[int], at_once: bool) -> None:
     views = [frame(seed, n=5 * POINTS_PER_DATAGRAM - 17) for seed in range(2)]
     datagrams = [data for number, view in enumerate(views) for data in said(view, number=number)]
     assert len(datagrams) == 10
@@ -157,7 +150,7 @@ def test_whatever_parts_of_a_frame_arrive_are_counted(arrived: list[int], at_onc
     assert (float(believed(one).sum()) > 0) == bool(arrived)
 
 
-def test_frames_of_the_same_number_by_two_robots_are_told_apart() -> None:
+def test_frames_of_two_robots_with_one_number_are_distinguished() -> None:
     far = torch.tensor([1.0, -0.6, 0.4], dtype=torch.float64)
     views = [frame(0, n=200), frame(1, n=200, origin=far)]
     one = mapper()
@@ -165,7 +158,7 @@ def test_frames_of_the_same_number_by_two_robots_are_told_apart() -> None:
     torch.testing.assert_close(believed(one), dense_of(beams(*views)))
 
 
-def test_who_hears_all_that_is_novel_has_what_was_novel() -> None:
+def test_a_listener_has_the_evidence_of_all_novel_beams() -> None:
     speaker, listener = mapper(robot=1), mapper()
     views = [frame(seed) for seed in range(5)]
     parts = []
@@ -178,7 +171,7 @@ def test_who_hears_all_that_is_novel_has_what_was_novel() -> None:
     assert float(believed(listener).sum()) < float(believed(speaker).sum())
 
 
-def test_parts_that_come_twice_count_once() -> None:
+def test_repeated_parts_count_once() -> None:
     view = frame(0, n=3 * POINTS_PER_DATAGRAM)
     first, second, third = said(view)
     one = mapper()
@@ -189,7 +182,7 @@ def test_parts_that_come_twice_count_once() -> None:
     torch.testing.assert_close(believed(one), dense_of(beams(view)))
 
 
-def test_points_of_nobody_in_the_team_are_dropped_and_counted() -> None:
+def test_points_of_strangers_are_dropped_and_counted() -> None:
     one, view = mapper(robot=3), frame(0, n=5)
     for sender in (3, 31, 32, 65535):
         assert one.receive(heard(*said(view, sender=sender))) == []
@@ -200,7 +193,7 @@ def test_points_of_nobody_in_the_team_are_dropped_and_counted() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(numbers=st.lists(st.integers(0, 60), max_size=60), most=st.integers(1, 8))
-def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -> None:
+def test_the_oldest_gaps_are_closed_beyond_the_limit(numbers: list[int], most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", most)
         kept = Intervals.of(np.array(numbers, np.int64))
@@ -213,7 +206,7 @@ def test_of_too_many_gaps_the_oldest_are_closed(numbers: list[int], most: int) -
     assert len(bounded) <= most
 
 
-def test_memory_is_bounded_whatever_frames_are_invented(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gmmtorch.exploration.robot.grid_mapper.MOST_INTERVALS", 20)
     one, view = mapper(), frame(0, n=1)
     datagrams = [said(view, number=7 * k)[0] for k in range(60)]
@@ -224,7 +217,7 @@ def test_memory_is_bounded_whatever_frames_are_invented(monkeypatch: pytest.Monk
     assert MOST_INTERVALS > 3 * 1600  # three parts of each frame of a mission lost
 
 
-def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
+def test_points_beyond_the_budget_are_sent_later() -> None:
     free, bound = mapper(), mapper()
     for one in (free, bound):
         one.sense(frame(0))
@@ -240,18 +233,10 @@ def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
     assert bound.shared.datagrams() == []
 
 
-def test_other_messages_are_ignored() -> None:
-    one = mapper()
-    assert one.receive(heard(*encode_counts(1, {(1, 0): 5.0}))) == []
-    assert one.receive([]) == []
-    assert float(believed(one).sum()) == 0
-    assert one.components() is None
-
-
 # -- the window -----------------------------------------------------------------------------------------
 
 
-def test_a_sliding_window_is_that_of_a_cast_from_scratch() -> None:
+def test_a_moving_window_equals_a_new_cast() -> None:
     one = mapper(shape=(12, 16, 10))
     generator = torch.Generator().manual_seed(0)
     position, views = MIDDLE, []

@@ -1,4 +1,4 @@
-"""Robots set down near walls, near the floor and in corridors fly off, or are refused before they try."""
+"""Robots that start near walls, near the floor and in corridors take off, or are rejected."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.clocks import SimulatedClock
-from gmmtorch.exploration.mission.driver import drive
+from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.team_setup import assemble, start_poses
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.robot.initial_free_space import initial_free_space
 from gmmtorch.exploration.world.world import World
-from gmmtorch.simulation.worlds.solids import box
+from gmmtorch.simulation.worlds.furniture import box
 
 PRIMITIVES = Primitives(Dynamics())
 ALONE = replace(SMALL, framework="grid_isolated", size=1)
@@ -47,7 +46,7 @@ def place(*coordinates: float) -> torch.Tensor:
     return torch.tensor(coordinates, dtype=torch.float64)
 
 
-# -- what it is told --------------------------------------------------------------------------------------
+# -- initial knowledge -------------------------------------------------------------------------------------
 
 
 def test_open_start_knows_only_the_clear_sphere(hall: World) -> None:
@@ -83,11 +82,8 @@ def test_initial_free_cells_are_free_and_the_trail_is_clear(
 @pytest.mark.parametrize(
     "start",
     [
-        (0.46, 4.0, 1.5, 0.0),  # beside a wall
-        (0.46, 4.0, 1.5, 3.1),  # facing it
-        (0.8, 4.0, 1.5, 0.0),
+        (0.46, 4.0, 1.5, 3.1),  # facing a wall
         (3.0, 4.0, 0.42, 0.0),  # on the floor
-        (3.0, 4.0, 0.75, 0.0),
         (0.45, 0.45, 0.45, 0.8),  # in a corner
     ],
 )
@@ -98,7 +94,7 @@ def test_robot_near_a_surface_flies_off(hall: World, start: tuple[float, ...]) -
 
 def test_teams_start_at_the_widest_part_of_a_corridor() -> None:
     world = corridor(1.8, 2.5)
-    mission = flown(world, size=2, duration=20.0)
+    mission = flown(world, size=2, duration=16.0)
     starts = torch.stack([path[0][:3] for path in mission.trajectories])
     assert float(world.mesh.clearance(starts).min()) > 0.75
     assert min(robot.path_length for robot in mission.robots) > 0.3

@@ -1,4 +1,4 @@
-"""Novel beams against each beam of a block on its own, and values that are remembered."""
+"""Novel beams, against a loop over blocks; and the cache of values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RULE = NoveltyRule(resolution=0.2, observed=0.5)
 WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))
 
 
-def known(seed: int) -> RollingWindow:
+def random_window(seed: int) -> RollingWindow:
     """A window with random evidence, of which some cells have none."""
     generator = torch.Generator().manual_seed(seed)
     local = RollingWindow(0.2, (24, 24, 16))
@@ -40,8 +40,8 @@ def frame(width: int, height: int, seed: int, missing: float) -> DepthFrame:
     return DepthFrame(origin, ends, is_hit, pixel)
 
 
-def by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: float) -> list[bool]:
-    """Each beam answers as the beam of the lowest pixel of its three by three that there is."""
+def novel_by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: float) -> list[bool]:
+    """Each beam gets the answer of the beam with the lowest pixel in its 3 × 3 block."""
     speaker: dict[tuple[int, int], int] = {}
     for beam, pixel in enumerate(seen.pixel.tolist()):
         speaker.setdefault((pixel // width // 3, pixel % width // 3), beam)
@@ -58,37 +58,29 @@ def by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: float) 
 @pytest.mark.parametrize("short", [0.0, 0.5])
 @pytest.mark.parametrize("missing", [0.0, 0.3, 0.9])
 @pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (7, 1), (1, 9), (2, 2), (10, 11)])
-def test_the_first_beam_of_nine_pixels_speaks_for_them(
+def test_the_first_beam_of_a_block_decides_for_the_block(
     width: int, height: int, missing: float, short: float
 ) -> None:
-    local, seen = known(width), frame(width, height, height, missing)
+    local, seen = random_window(width), frame(width, height, height, missing)
     found = novel_beams(local, seen, width, RULE, WITHIN, short)
     assert found.dtype == torch.bool
-    assert found.tolist() == by_a_loop(local, seen, width, short)
+    assert found.tolist() == novel_by_a_loop(local, seen, width, short)
 
 
-def test_some_beams_are_novel_and_some_are_not() -> None:
-    found = novel_beams(known(0), frame(20, 16, 1, 0.1), 20, RULE, WITHIN)
+def test_a_random_map_has_novel_and_known_beams() -> None:
+    found = novel_beams(random_window(0), frame(20, 16, 1, 0.1), 20, RULE, WITHIN)
     assert 0.1 < float(found.double().mean()) < 0.9
 
 
-def test_a_frame_without_beams_has_none() -> None:
+def test_a_frame_without_beams_has_no_novel_beams() -> None:
     empty = frame(8, 6, 0, 1.1)
     assert len(empty.pixel) == 0
-    found = novel_beams(known(0), empty, 8, RULE, WITHIN)
+    found = novel_beams(random_window(0), empty, 8, RULE, WITHIN)
     assert found.shape == (0,)
     assert found.dtype == torch.bool
 
 
-def test_the_map_is_left_as_it_was() -> None:
-    local = known(3)
-    before = local.evidence()
-    novel_beams(local, frame(8, 6, 1, 0.0), 8, RULE, WITHIN)
-    for one, other in zip(before, local.evidence(), strict=True):
-        assert torch.equal(one, other)
-
-
-def test_nothing_is_novel_where_everything_is_certain() -> None:
+def test_no_beam_is_novel_in_a_certain_map() -> None:
     local = RollingWindow(0.2, (48, 48, 48))
     local.center_on(torch.zeros(3, dtype=torch.float64))
     sides = torch.meshgrid(*[torch.arange(a, a + 48) for a in local.box.low.tolist()], indexing="ij")
@@ -102,7 +94,7 @@ def test_nothing_is_novel_where_everything_is_certain() -> None:
 
 
 class Maker:
-    """Notes what was made."""
+    """Records the computed values."""
 
     def __init__(self, memo: Memo) -> None:
         self.memo, self.made = memo, ""
@@ -120,7 +112,7 @@ class Maker:
 @pytest.mark.parametrize(
     ("size", "asked", "made"),
     [
-        (3, "aaabbbabab", "ab"),  # what is known is not made again
+        (3, "aaabbbabab", "ab"),  # a stored value is not computed again
         (3, "abcabcabc", "abc"),  # as many as there is room for
         (2, "abcabcabc", "abcabcabc"),  # the least recently used goes
         (2, "abacab", "abcb"),  # asking counts as use
@@ -128,20 +120,13 @@ class Maker:
         (3, "abcadbacd", "abcdbcd"),
     ],
 )
-def test_the_least_recently_used_is_forgotten(size: int, asked: str, made: str) -> None:
+def test_memo_drops_the_least_recently_used_value(size: int, asked: str, made: str) -> None:
     maker = Maker(Memo(size))
     maker(asked)
     assert maker.made == made
 
 
-def test_a_memo_does_not_grow() -> None:
-    memo = Memo(5)
-    for number in range(100):
-        assert memo(number, lambda number=number: number) == number
-        assert len(memo._values) <= 5
-
-
-def test_values_may_be_nothing_and_may_need_others() -> None:
+def test_memo_stores_none_and_nested_values() -> None:
     memo = Memo(2)
     calls = 0
 
@@ -158,7 +143,7 @@ def test_values_may_be_nothing_and_may_need_others() -> None:
         assert nested("outer", lambda: 0) == 5
 
 
-def test_what_fails_is_not_remembered() -> None:
+def test_memo_does_not_store_failures() -> None:
     memo = Memo(2)
     with pytest.raises(ZeroDivisionError):
         memo("a", lambda: 1 // 0)

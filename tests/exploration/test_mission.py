@@ -12,19 +12,18 @@ import torch
 from exploration.furnished_room import SHELF, SMALL, room, without_seconds
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.mission.clocks import SimulatedClock
-from gmmtorch.exploration.mission.driver import drive
+from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
 from gmmtorch.exploration.mission.results import mission_row, with_times
 from gmmtorch.exploration.mission.team_setup import assemble
-from gmmtorch.exploration.robot.stopping_criterion import StoppingRule
+from gmmtorch.exploration.robot.robot_state import StoppingRule
 from gmmtorch.exploration.world.world import World
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.transport.link_conditions import Partition
 from gmmtorch.simulation.sensors.depth_camera import DepthCamera, DepthFrame
-from gmmtorch.simulation.worlds.solids import box
+from gmmtorch.simulation.worlds.furniture import box
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits
@@ -93,19 +92,13 @@ def test_each_framework_sends_what_it_shares(mission: Mission) -> None:
 
 @pytest.mark.parametrize("framework", FRAMEWORKS)
 def test_the_same_seed_gives_the_same_row(world: World, framework: str) -> None:
-    options = replace(SMALL, framework=framework, duration=8.0)
+    options = replace(SMALL, framework=framework, duration=4.0)
     one, other = (without_seconds(mission_row(flown(world, options), 1.0)) for _ in range(2))
     assert one == other
 
 
-def test_another_seed_gives_another_row(world: World) -> None:
-    options = replace(SMALL, duration=6.0)
-    rows = [mission_row(flown(world, replace(options, seed=seed)), 1.0) for seed in (0, 1)]
-    assert rows[0]["entropy_bits"] != rows[1]["entropy_bits"]
-
-
 def test_reach_depends_on_where_robots_are(world: World) -> None:
-    options = replace(SMALL, framework="grid_shared", duration=8.0)
+    options = replace(SMALL, framework="grid_shared", duration=4.0)
     near, far = (flown(world, replace(options, reach=reach)) for reach in (0.1, 1e3))
     row = mission_row(near, 1.0)
     assert row["reception"]["out_of_reach"] == row["datagrams"] > 0
@@ -142,18 +135,17 @@ def test_the_grid_of_one_robot_is_the_sum_of_its_frames(
 
 def test_robots_that_learn_too_little_rest(world: World) -> None:
     # A window must bring 99 % of the best one: the second brings less than the first.
-    mission = flown(world, replace(SMALL, rest=StoppingRule(0.99, window=4.0), duration=64.0))
+    alone = replace(SMALL, framework="grid_isolated", size=1, duration=40.0)
+    mission = flown(world, replace(alone, rest=StoppingRule(0.99, window=4.0)))
     assert all(robot.stopping.rests for robot in mission.robots)
     for robot, path in zip(mission.robots, mission.trajectories, strict=True):
         assert robot.state[4:].tolist() == [0, 0, 0]
         assert torch.equal(path[-1], path[-4])
         assert not torch.equal(path[0], path[-1])
-    awake = flown(world, replace(SMALL, rest=StoppingRule(0.0), duration=24.0))
-    assert not any(robot.stopping.rests for robot in awake.robots)
 
 
 def test_without_losses_robots_hold_the_same_components(world: World) -> None:
-    mission = flown(world, replace(SMALL, duration=11.0))
+    mission = flown(world, replace(SMALL, duration=6.0))
     assert mission.converge(0.0) == 0.0
     one, other = (robot.mapper.components() for robot in mission.robots)
     assert isinstance(one, Components)
@@ -163,22 +155,10 @@ def test_without_losses_robots_hold_the_same_components(world: World) -> None:
     assert mission_row(mission, 1.0)["missing_share"][-1] == 0
 
 
-@pytest.mark.parametrize("codec", ["float", "thesis"])
-def test_broadcast_components_are_equal_without_losses(world: World, codec: str) -> None:
-    mission = flown(world, replace(SMALL, duration=11.0, codec=codec))
-    one, other = (robot.mapper.components() for robot in mission.robots)
-    assert isinstance(one, Components)
-    assert isinstance(other, Components)
-    assert len(one) > 10
-    assert torch.equal(one.ids, other.ids)
-    assert torch.equal(one.means, other.means)
-    torch.testing.assert_close(one.support, other.support)
-
-
 def test_losses_are_repaired_to_the_bit(world: World) -> None:
     """Half of the datagrams are lost; others arrive twice, or late."""
     trouble = {"loss": 0.5, "duplication": 0.3, "jitter": 0.5, "latency": 0.3}
-    mission = flown(world, replace(SMALL, size=3, duration=10.0, **trouble))
+    mission = flown(world, replace(SMALL, size=3, duration=6.0, **trouble))
     row = mission_row(mission, 1.0)
     assert max(row["missing_share"]) > 0
     assert row["reception"]["lost"] > 0 < row["reception"]["duplicated"]
@@ -214,29 +194,21 @@ def test_converge_returns_none_for_robots_that_stay_apart(world: World) -> None:
 
 @pytest.mark.parametrize("framework", ["gmm_shared", "grid_shared"])
 def test_a_budget_bounds_the_bytes_of_maps(world: World, framework: str) -> None:
-    options = replace(SMALL, framework=framework, duration=16.0)
+    options = replace(SMALL, framework=framework, duration=12.0)
     rows = [mission_row(flown(world, replace(options, budget=budget)), 1.0) for budget in (None, 5.0)]
     free, bound = (
         sum(row["bytes_by_kind"].get(kind, 0) for kind in ("components", "counts", "points", "supersessions"))
         for row in rows
     )
-    most = options.size * (5.0 * 15.0 + 1200)  # the burst is one datagram
+    most = options.size * (5.0 * 11.0 + 1200)  # the burst is one datagram
     assert 0 < bound <= most < free
     assert rows[1]["bytes_by_kind"]["plans"] > 0
 
 
-@pytest.mark.parametrize("loss", [0.3, 0.9])
-def test_missions_continue_with_losses(world: World, loss: float) -> None:
-    mission = flown(world, replace(SMALL, duration=10.0, loss=loss))
-    assert mission_row(mission, 1.0)["collisions"] == 0
-    assert mission.score.union.entropy_bits < 0.8 * mission.score.union.observable_bits
-
-
 @pytest.mark.parametrize("coordination", ["myopic", "greedy", "distributed_greedy", "random_partition"])
 def test_no_coordination_collides(world: World, coordination: str) -> None:
-    mission = flown(world, replace(SMALL, size=3, duration=10.0, coordination=coordination))
+    mission = flown(world, replace(SMALL, size=3, duration=6.0, coordination=coordination))
     assert sum(robot.collisions for robot in mission.robots) == 0
-    assert mission.score.union.entropy_bits < 0.8 * mission.score.union.observable_bits
 
 
 def test_a_boxed_in_robot_waits_while_the_mission_continues() -> None:

@@ -14,9 +14,8 @@ import torch
 from exploration.furnished_room import SMALL, without_seconds
 from torch import Tensor
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, OutputError
+from gmmtorch.errors import DataError, GmmTorchError, OutputError
 from gmmtorch.exploration.mission import trials as trials_module
-from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.trials import (
     ROW,
     STAGE,
@@ -27,7 +26,7 @@ from gmmtorch.exploration.mission.trials import (
     run_mission,
     run_trials,
 )
-from gmmtorch.simulation.worlds.solids import box
+from gmmtorch.simulation.worlds.furniture import box
 
 ROOM = box((0.1, 0.1, 0.1), (6.1, 5.1, 3.1))
 
@@ -231,15 +230,3 @@ def test_after_an_interrupt_no_trial_starts(mesh_file: str, monkeypatch: pytest.
     with pytest.raises(KeyboardInterrupt):
         run_trials([trial(mesh_file, None, seed=seed) for seed in range(9)], on_row=interrupt)
     assert begun == [0]
-
-
-def test_a_trial_with_no_workers_is_rejected() -> None:
-    with pytest.raises(InvalidArgumentError, match="workers=0"):
-        run_trials([], 0)
-
-
-def test_missions_keep_nothing_by_themselves(mesh_file: str, tmp_path: Path) -> None:
-    mission, row = run_mission(trial(mesh_file, tmp_path / "kept"))
-    assert isinstance(mission, Mission)
-    assert row["converged_after"] == 0.0
-    assert not (tmp_path / "kept" / ROW).exists()

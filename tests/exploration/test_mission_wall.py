@@ -12,11 +12,10 @@ import torch
 from exploration.flying_robots import TEAM, mission_of, small_room, transports
 from exploration.replays import FakeTime, Together
 
-from gmmtorch.exploration.mission.clocks import WallClock
-from gmmtorch.exploration.mission.driver import drive, settle
+from gmmtorch.exploration.mission.driver import WallClock, drive, settle
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.robot_view import DuplicateIdError, FlyingRobotView
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.world.world import World
 from gmmtorch.sharing.messages.message_registry import PlanMessage, encode_plan
 from gmmtorch.sharing.replica.replica import Replica

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.planning_round import plan_together
-from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import COORDINATIONS, Coordination, PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan
 
 N, NOW, NUMBER = 5, 40.0, 20
@@ -78,7 +77,7 @@ def calls(log: list[tuple[str, int, Any]], name: str) -> list[tuple[int, Any]]:
 
 @every_coordination
 @seeds
-def test_all_look_before_anybody_plans_and_send_views_when_all_have(name: str, seed: int) -> None:
+def test_all_robots_take_snapshots_before_planning_and_send_views_after(name: str, seed: int) -> None:
     _, log, plans = taken(name, seed)
     assert log[:N] == [("begin_planning", robot, (NOW,)) for robot in range(N)]
     assert log[-N:] == [("send_views", robot, (NOW,)) for robot in range(N)]

@@ -149,31 +149,6 @@ def test_limits_hold_at_every_step_and_braking_reaches_rest(
     assert bool(torch.isfinite(whole).all())
 
 
-def test_velocities_reach_the_command_and_stay():
-    paths = LIBRARY.rollout(random_states(8, 4))
-    # 3 m/s at 1.5 m/s² would take the whole two seconds.
-    assert torch.equal(paths[:, :, -1, 4:], LIBRARY.commands.expand(8, 25, 3))
-
-
-def test_slow_command_is_approached_linearly():
-    library = Primitives(Dynamics(acceleration=0.25))
-    path = library.rollout(torch.zeros(1, 7, dtype=torch.float64))[0, 0]
-    torch.testing.assert_close(path[:, 4], 0.05 * torch.arange(1, 11, dtype=torch.float64))
-    assert library.braking(path[-1]).shape == (30, 7)
-
-
-def test_stop_and_turn_keep_the_position_exactly():
-    at_rest = random_states(5, 6)
-    at_rest[:, 4:] = 0
-    paths = LIBRARY.rollout(at_rest)
-    in_place = (LIBRARY.commands[:, :2] == 0).all(1)
-    still = paths[:, in_place, :, :3] == at_rest[:, None, None, :3]
-    assert bool(still.all())
-    assert torch.equal(paths[:, LIBRARY.stop, -1], at_rest)
-    braked = LIBRARY.braking(at_rest)
-    assert torch.equal(braked, at_rest[:, None].expand_as(braked))
-
-
 def test_rollout_is_equivariant_and_independent_of_the_batch():
     states = random_states(6, 7)
     together = LIBRARY.rollout(states)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import local_map_of
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.recovery import retreat, shortened

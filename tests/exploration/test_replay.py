@@ -16,15 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from exploration.replays import RULES, FakeTime, Together, content, log, mapped, run
+from exploration.replays import RULES, Together, content, log, mapped, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.exploration.mission.clocks import WallClock
-from gmmtorch.exploration.mission.driver import settle
+from gmmtorch.exploration.mission.driver import WallClock, settle
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.exploration.mission.robot_view import DuplicateIdError, ReplayingRobotView
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -104,20 +103,6 @@ def test_losses_of_the_network_are_repaired(budget):
     assert content(team[0].replica.components()) == content(*alone)
 
 
-def test_a_budget_bounds_records_and_loses_none():
-    network, rate = Network(2), 300.0
-    mission, listener = robot(0, log(8), network, "per_scan", budget=rate), robot(1, [], network)
-    fake = FakeTime()
-    clock = WallClock(clock=fake, sleep=fake.sleep)
-
-    def check() -> None:
-        records = network.traffic(0).bytes - network.traffic(0, "announcements").bytes
-        assert records <= 1200 + rate * clock.now()
-
-    run(mission, listener, quiet=60.0, clock=clock, on_step=check)
-    assert listener.replica.digest() == mission.replica.digest()
-
-
 def test_a_window_is_published_once_its_components_are_final():
     mission = robot(0, part(0, 1, 6), Network(2))  # windows of four
     counts = []
@@ -151,18 +136,6 @@ def test_a_late_robot_catches_up_after_the_others_have_finished():
     run(late, first, quiet=10.0)
     assert late.replica.digest() == first.replica.digest()
     assert {int(i) for i in late.replica.components().ids[:, 0]} == {0, 1}
-
-
-def test_announced_records_that_have_not_arrived_are_missing():
-    network = Network(2)
-    talker, listener = robot(0, part(0, 1, 8), network), robot(1, [], network)
-    run(talker)
-    assert network.deliver(1, 1e3)  # the records are lost
-    network.send(0, talker.replica.announcements(), 1e3, "announcements")
-    listener.exchange(2e3)
-    assert n_missing(listener) == talker.replica.held.size > 0
-    run(talker, listener, quiet=5.0)
-    assert n_missing(listener) == 0
 
 
 # -- over sockets ------------------------------------------------------------------------------------------
@@ -348,16 +321,6 @@ def test_a_stopped_robot_continues(tmp_path, n_ticks):
     run(again)
     assert content(again.replica.components()) == content(mapped("per_scan", log(6)).components())
     assert (again.replica.digest() == mission.replica.digest()) == (n_ticks == 6)  # nothing is repeated
-
-
-def test_a_stream_continues_where_it_was(tmp_path):
-    mission = stored(tmp_path / "0", iter(log(9)), Network(1), "per_scan", keep_every=2)
-    for tick in range(5):
-        mission.tick(tick / 10)
-    again = stored(killed(tmp_path / "0"), iter(log(9)), Network(1), "per_scan", keep_every=2)
-    assert again.resumed_at == 4
-    run(again)
-    assert content(again.replica.components()) == content(mapped("per_scan", log(9)).components())
 
 
 def test_progress_of_another_log_or_rule_is_rejected(tmp_path):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.exploration.planning.geodesic import geodesic
 from gmmtorch.exploration.planning.roadmap import Roadmap, at_the_rim
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 
 WINDOW = (24, 24, 12)
 

@@ -59,7 +59,7 @@ def zigzag(n: int = 10) -> Tensor:
     return path
 
 
-def test_it_begins_at_rest_where_it_is_put() -> None:
+def test_a_robot_begins_at_rest_at_its_start() -> None:
     one = robot()
     assert one.state.tolist() == [*START.tolist(), 0, 0, 0]
     assert one.position.tolist() == START[:3].tolist()
@@ -67,7 +67,7 @@ def test_it_begins_at_rest_where_it_is_put() -> None:
     assert one.collisions == 0
 
 
-def test_the_way_flown_is_the_sum_of_its_steps() -> None:
+def test_path_length_is_the_sum_of_the_steps() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
     assert torch.equal(one.advance(0, 3), path[:3, :3])
@@ -78,7 +78,7 @@ def test_the_way_flown_is_the_sum_of_its_steps() -> None:
     assert torch.equal(one.state, path[5])
 
 
-def test_beyond_the_end_of_its_path_it_stays() -> None:
+def test_a_robot_stays_at_the_end_of_its_path() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
     one.advance(0, 8)
@@ -103,14 +103,6 @@ def test_a_robot_without_a_plan_stays() -> None:
     assert one.position.tolist() == START[:3].tolist()
 
 
-def test_its_state_is_its_own() -> None:
-    one, path = robot(), zigzag()
-    one.follow(plan(path))
-    one.advance(0, 2)
-    path += 1
-    assert float(one.state[0]) == pytest.approx(float(START[0]) + 0.3)
-
-
 # -- where it fits --------------------------------------------------------------------------------------
 
 
@@ -121,14 +113,14 @@ def everywhere(one: Robot, hits: float, misses: float) -> None:
     )
 
 
-def test_the_trail_is_where_it_flew_and_standing_adds_nothing() -> None:
+def test_the_trail_contains_flown_positions_only() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(torch.cat([path, path[-1:].expand(30, 7)])))
     one.advance(0, 40)
     assert torch.equal(one.trail, torch.cat([START[None, :3], path[:, :3]]))
 
 
-def test_a_long_trail_is_forgotten_from_its_beginning() -> None:
+def test_a_long_trail_loses_its_oldest_positions() -> None:
     one = robot()
     path = torch.zeros(500, 7, dtype=torch.float64)
     path[:, 0] = torch.arange(500) * 0.1
@@ -138,7 +130,7 @@ def test_a_long_trail_is_forgotten_from_its_beginning() -> None:
     assert len(one.trail) < 500
 
 
-def test_a_retreat_takes_its_way_off_the_trail() -> None:
+def test_a_retreat_shortens_the_trail() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
     one.advance(0, 10)
@@ -152,7 +144,7 @@ def test_a_retreat_takes_its_way_off_the_trail() -> None:
     assert torch.equal(one.trail, torch.cat([START[None, :3], path[:7, :3]]))
 
 
-def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
+def test_recent_returns_are_obstacles() -> None:
     one = robot()
     everywhere(one, 0.0, 50.0)
     free = one.local_map(0.125, 0.3)
@@ -180,7 +172,7 @@ def test_returns_are_kept_away_from_whatever_the_map_makes_of_them() -> None:
     assert bool(one.local_map(0.125, 0.3).is_passable(wall).all())
 
 
-def test_around_the_start_it_is_free_though_nothing_was_seen() -> None:
+def test_the_known_sphere_around_the_start_is_free() -> None:
     found = robot(start_radius=1.4).local_map(0.125, 0.3)
     centers = found.centers(found.free.nonzero())
     assert len(centers) > 100

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement, overlap
+from gmmtorch.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 
@@ -48,11 +48,6 @@ def test_belief_entropy_equals_the_sum_over_observable_cells(seeds: list[int], c
     assert belief.entropy_bits == pytest.approx(entropy_by_hand(belief, seen, rule), abs=1e-3)
     h, m = belief.grid.at_cells(seen.nonzero() + BOX.low)
     assert belief.n_observed == int(((h + m) > 0).sum())
-
-
-def test_empty_belief_has_one_bit_a_cell() -> None:
-    belief = BeliefMap(0.5, BOX, observable(), BeliefRule())
-    assert belief.entropy_bits == belief.observable_bits == float(observable().sum())
 
 
 def test_belief_does_not_depend_on_the_order_of_evidence() -> None:
@@ -99,11 +94,6 @@ def test_disagreement_counts_cells_in_different_classes() -> None:
     maps[1].add(CellEvidence(cells[1:2], torch.full((1,), 20.0), torch.zeros(1)))
     assert disagreement(maps, cells) == 0.25
     assert disagreement(maps[:1], cells) is None
-
-
-def test_overlap_is_the_share_of_cells_seen_twice() -> None:
-    assert overlap(torch.tensor([0, 1, 2, 3, 1])) == 0.5
-    assert math.isnan(overlap(torch.zeros(4)))
 
 
 @pytest.mark.parametrize("options", [{"clamp": 0.5}, {"clamp": -0.1}, {"prior": -1.0}, {"free": 0.9}])

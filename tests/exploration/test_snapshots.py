@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gmmtorch.exploration.mission.snapshots import Snapshots
+from gmmtorch.exploration.mission.results import Snapshots
 
 OBSERVABLE = 1e6
 

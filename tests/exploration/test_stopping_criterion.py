@@ -1,4 +1,4 @@
-"""When robots rest, against the rule written out over everything that was noted."""
+"""StoppingCriterion, against its rule evaluated over all notes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.robot.stopping_criterion import StoppingCriterion, StoppingRule
+from gmmtorch.exploration.robot.robot_state import StoppingCriterion, StoppingRule
 
 GAINS = st.lists(st.floats(0, 100), min_size=1, max_size=60)
 
 
-def rests_by_the_book(gains: list[float], every: float, rule: StoppingRule) -> int | None:
-    """After which of the notes a robot rests, that nobody tells anything."""
+def first_rest_by_definition(gains: list[float], every: float, rule: StoppingRule) -> int | None:
+    """The first note after which a robot without news rests."""
     times = [i * every for i in range(len(gains))]
     learned = [sum(gains[: i + 1]) for i in range(len(gains))]
     best = 0.0
@@ -31,7 +31,7 @@ def rests_by_the_book(gains: list[float], every: float, rule: StoppingRule) -> i
 def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
     rule = StoppingRule(share, window=10.0)
     returns, learned = StoppingCriterion(rule), 0.0
-    expected = rests_by_the_book(gains, every, rule)
+    expected = first_rest_by_definition(gains, every, rule)
     for i, gain in enumerate(gains):
         learned += gain
         returns.note(i * every, learned, known=learned)
@@ -45,8 +45,7 @@ def test_a_robot_rests_when_the_rule_says_so(gains, every, share):
     gains=st.lists(st.tuples(st.integers(0, 100), st.booleans()), min_size=1, max_size=60),
     share=st.sampled_from([0.1, 0.9]),
 )
-def test_time_in_which_it_was_boxed_in_does_not_count(gains, share):
-    """What it did otherwise, put end to end, is all that it goes by; what it learned meanwhile counts."""
+def test_time_boxed_in_does_not_count(gains, share):
     rule = StoppingRule(share, window=10.0)
     returns, learned = StoppingCriterion(rule), 0.0
     told: list[float] = []  # of the notes that count
@@ -58,12 +57,12 @@ def test_time_in_which_it_was_boxed_in_does_not_count(gains, share):
         if not boxed_in:
             told.append(since)
             since = 0.0
-        assert returns.rests == (rests_by_the_book(told, 2.0, rule) is not None)
+        assert returns.rests == (first_rest_by_definition(told, 2.0, rule) is not None)
         if returns.rests:
             break
 
 
-def test_boxed_in_for_ever_it_never_rests_and_keeps_nothing_of_it():
+def test_a_robot_that_stays_boxed_in_never_rests():
     returns = StoppingCriterion(StoppingRule(0.9, window=10.0))
     for now in (0, 5, 9):
         returns.note(now, 100.0 * now, 0.0)
@@ -87,7 +86,7 @@ def resting() -> StoppingCriterion:
     return returns
 
 
-def test_news_wake_it_for_a_window_at_least():
+def test_news_wake_a_resting_robot_for_at_least_a_window():
     returns = resting()
     returns.note(32, 110, 170.0)
     assert returns.rests
@@ -100,7 +99,7 @@ def test_news_wake_it_for_a_window_at_least():
     assert returns.rests
 
 
-def test_a_share_of_nothing_never_rests():
+def test_a_zero_share_never_rests():
     returns = StoppingCriterion(StoppingRule(0.0, window=4.0))
     for now in range(50):
         returns.note(now, 0.0, 0.0)
@@ -117,6 +116,6 @@ def test_a_share_of_nothing_never_rests():
         ({"window": float("inf")}, "window=inf"),
     ],
 )
-def test_what_cannot_be(options, message):
+def test_invalid_stopping_rules_are_rejected(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         StoppingRule(**options)

@@ -16,9 +16,9 @@ from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewValues
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.geodesic import DistanceField
-from gmmtorch.exploration.planning.goal import Goal
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
@@ -249,13 +249,6 @@ def test_search_keeps_clear_of_peers_in_time():
     apart = (found.path[:, :3] - other).norm(dim=1)
     assert float(apart.min()) > 0.7
     assert float((found.views[:, :3] - other).norm(dim=1).min()) > 0.7
-
-
-def test_boxed_in_robot_has_no_moving_branch():
-    nowhere = torch.zeros(30, 30, 12, dtype=torch.bool)
-    task = task_in(nowhere, MIDDLE)
-    found = TreeSearch(PRIMITIVES, SearchRule()).search(task, ViewCache(task, MadeUp(0)))
-    assert found is None or bool((found.views[:, :3] == task.state[:3]).all())
 
 
 def test_search_at_the_start_looks_around():

@@ -16,7 +16,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information import view_library
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.sharing.messages.message_registry import ViewsMessage, decode
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 
 
 def poses_of(*rows: tuple[float, ...]) -> torch.Tensor:
@@ -107,7 +107,7 @@ def test_views_are_kept_apart_and_the_best_come_first(seed):
             assert any(float(kept.values[row]) >= value * 0.998 for row in rows)
 
 
-def test_the_own_views_are_bounded_and_the_least_valuable_go():
+def test_own_views_are_bounded_and_the_best_are_kept():
     library = ViewLibrary(0, size=4)
     library.receive(message_of([(1, n, 100.0 + 5 * n, 0.5, 0.0) for n in range(4)], []), 0.0)
     for n in range(10):
@@ -121,7 +121,7 @@ def test_the_own_views_are_bounded_and_the_least_valuable_go():
     assert len(library) == 8
 
 
-def test_values_are_renewed_where_the_window_shows_them_and_worthless_views_go():
+def test_views_in_the_window_are_valued_again_and_worthless_ones_removed():
     library = ViewLibrary(0)
     poses = poses_of((1.0, 1.0, 1.0, 0.0), (3.0, 1.0, 1.0, 0.0), (9.0, 1.0, 1.0, 0.0))
     a, b, c = library.add(poses, torch.tensor([3.0, 2.0, 1.0]), 0.0, 0.0)
@@ -139,7 +139,7 @@ def test_values_are_renewed_where_the_window_shows_them_and_worthless_views_go()
     assert library.covered(here, 40.0, most=9) == []  # nobody can be there
 
 
-def test_visited_views_go():
+def test_visited_views_are_removed():
     library = ViewLibrary(0)
     poses = poses_of((0, 0, 0, 0.1), (0, 0, 0, math.pi), (0.5, 0, 3.0, 0))
     library.add(poses, torch.tensor([1.0, 2.0, 3.0]), 0.0, 0.0)
@@ -147,7 +147,7 @@ def test_visited_views_go():
     assert sorted(library.candidates().values.tolist()) == [2.0, 3.0]
 
 
-def test_the_best_view_is_worth_the_way():
+def test_the_best_view_weighs_value_against_distance():
     library = ViewLibrary(0)
     assert library.best(torch.zeros(0)) is None
     library.add(poses_of((0, 0, 0, 0), (5, 0, 0, 0), (9, 0, 0, 0)), torch.tensor([4.0, 3.0, 9.0]), 0.0, 0.0)
@@ -162,7 +162,7 @@ def test_the_best_view_is_worth_the_way():
 # -- a team ------------------------------------------------------------------------------------------------
 
 
-def test_changes_are_sent_once_and_small_ones_not_at_all():
+def test_only_large_changes_are_sent_and_once():
     library, other = ViewLibrary(0), ViewLibrary(1)
     theirs = other.add(line(2, 50.0), torch.tensor([7.0, 7.5]), 0.5, 0.0)
     exchange([library, other], 0.5)
@@ -204,7 +204,7 @@ def test_without_loss_all_libraries_are_equal_after_a_round(seed):
 
 
 @given(order=st.permutations(range(6)), again=st.lists(st.integers(0, 5), max_size=6))
-def test_a_removed_view_never_comes_back_whatever_the_order(order, again):
+def test_a_removed_view_stays_removed_in_any_order(order, again):
     messages = [message_of([(1, n, 5.0 * n, 5.0, 2.0)], []) for n in range(5)] + [message_of([], [(1, 2)])]
     library = ViewLibrary(0)
     for index in [*order, *again]:
@@ -237,7 +237,7 @@ def test_a_late_robot_receives_all_views_also_without_their_finder(is_gone):
     assert len(team[-1]) == 10
 
 
-def test_a_view_that_nobody_values_again_is_removed():
+def test_a_view_is_removed_after_its_time_to_live():
     team = [ViewLibrary(robot, time_to_live=300.0) for robot in range(2)]
     a, b = team[0].add(line(2), torch.tensor([1.0, 2.0]), 0.0, 0.0)
     for second in range(0, 700, 2):
@@ -251,22 +251,6 @@ def test_a_view_that_nobody_values_again_is_removed():
     for second in range(700, 1000, 2):
         exchange(team, float(second))
     assert [len(library) for library in team] == [0, 0]
-
-
-def test_clocks_may_differ():
-    """Robots count seconds from their own starts."""
-    late, early = ViewLibrary(0), ViewLibrary(1)
-    early.add(line(1), torch.tensor([5.0]), 9000.0, 0.0)
-    for message in sent(early, 9000.0):
-        late.receive(message, 3.0)
-    late.revalue([(1, 0)], torch.tensor([1.0]), 4.0, 0.0)
-    for message in sent(late, 4.0):
-        early.receive(message, 9001.0)
-    assert same(late, early)
-    assert early.candidates().values.tolist() == [1.0]
-    here = surroundings_from(torch.ones(20, 10, 10, dtype=torch.bool))
-    assert late.covered(here, 13.0, most=9) == []
-    assert late.covered(here, 14.0, most=9) == [(1, 0)]
 
 
 def test_repetitions_are_few_and_keep_the_budget():

@@ -11,11 +11,11 @@ from torch import Tensor
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, local_map_of
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
-from gmmtorch.exploration.planning.planners import Plan, Planner, PlanningTask
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 

@@ -1,4 +1,4 @@
-"""Components at random, and plain loops to compare what is done with them."""
+"""Random components, and plain loops as references."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gmmtorch.mapping.components import Components
 def random_components(
     k: int, dim: int, seed: int, n_origins: int = 5, spread: float = 3.0, empty: float = 0.0
 ) -> Components:
-    """k components, some seen from several of `n_origins` places; a share `empty` flagged max_range."""
+    """k components, some with several of `n_origins` origins; a share `empty` is flagged max_range."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Maps to test with: drives towards a wall, given components, motions, and what must be equal."""
+"""Maps for tests: drives towards a wall, given components, motions, and comparisons."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def sensor(x: float, dim: int = 2) -> tuple[float, ...]:
 
 
 def drive(n: int, dim: int = 2) -> list[Scan]:
-    """Scans of the wall from n places on the way to it."""
+    """Scans of the wall from n positions on the way to it."""
     return [wall_scan(dim, seed, sensor(0.25 * seed, dim)) for seed in range(n)]
 
 
 def open_drive(n: int, dim: int = 2) -> list[Scan]:
-    """The same, with some beams without return."""
+    """`drive` with some no-return beams."""
     return [replace(scan, no_return=open_scan(dim).no_return[i::10]) for i, scan in enumerate(drive(n, dim))]
 
 
 def built(scans: list[Scan], learning: LearningRule | None = None, **options: Any) -> GaussianMap:
-    """A map of these scans: windowed, exact and of few rays, unless options say otherwise."""
+    """A map of these scans, by default windowed, with the float codec and few rays."""
     options = {"resolution": RESOLUTION, "n_samples": 20_000, "codec": "float", **options}
     made = GaussianMap(WindowedRule() if learning is None else learning, **options)
     for scan in scans:
@@ -74,7 +74,7 @@ def some_motion(dim: int) -> Tensor:
 
 
 def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
-    """For each component: origin → count."""
+    """Origin → count of each component."""
     table: list[dict[tuple[float, ...], float]] = [{} for _ in range(len(made))]
     for k, s, count in zip(
         made.seen_by.tolist(), made.seen_from.tolist(), made.seen_count.tolist(), strict=True
@@ -86,20 +86,20 @@ def sightings(made: Components) -> list[dict[tuple[float, ...], float]]:
 
 
 def names(ids: Tensor) -> set[tuple[int, ...]]:
-    """Ids (K, 2) as a set, which are all different."""
+    """Ids (K, 2) as a set; asserts that they are distinct."""
     found = {tuple(row) for row in ids.tolist()}
     assert len(found) == len(ids)
     return found
 
 
 def assert_same_components(one: Components, other: Components) -> None:
-    """To the bit."""
+    """Bit by bit."""
     for field in fields(Components):
         assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
 
 
 def assert_close_components(one: Components, other: Components, atol: float = 1e-9) -> None:
-    """In the same order, with the same sightings."""
+    """In the same order, with the same origins and counts."""
     for name in ("means", "covariances", "support"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=atol)
     assert torch.equal(one.max_range, other.max_range)

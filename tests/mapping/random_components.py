@@ -1,4 +1,4 @@
-"""Components of any shape, size and place, for tests of how they are stored."""
+"""Random components of any shape, size and position, for tests of codecs and messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def random_components(
     max_sightings: int = 3,
     robot: int = 0,
 ) -> Components:
-    """K components, turned at random, deviations and counts log-uniform, some of beams without return."""
+    """K randomly rotated components with log-uniform deviations and counts; some are flagged max_range."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

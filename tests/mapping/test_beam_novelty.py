@@ -1,4 +1,4 @@
-"""beam_novelty against beams walked cell by cell."""
+"""beam_novelty against a cell-by-cell walk of each beam."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def entropy(hits: float, misses: float, prior: float) -> float:
 
 
 def novelty_by_a_walk(window: RollingWindow, origin, ends, is_hit, rule, short: float = 0.0):
-    """As `beam_novelty`, one beam and one cell at a time."""
+    """Like `beam_novelty`, one beam and one cell at a time."""
     counts, low = window.evidence(), window.box.low.tolist()
     bits, unobserved = [], []
     for end, hit in zip(ends, is_hit.tolist(), strict=True):
@@ -77,7 +77,7 @@ def check(
 
 
 @pytest.mark.parametrize(("origin", "spread"), [(INSIDE, 0.5), (INSIDE, 4.0), (OUTSIDE, 5.0)])
-def test_novelty_is_that_of_a_walk(origin, spread):
+def test_beam_novelty_equals_a_cell_by_cell_walk(origin, spread):
     # Beams within the window, beams that leave it, and a sensor outside.
     window = window_with(random_evidence(13_700, 0))  # of 24³ cells
     place = torch.tensor(origin, dtype=torch.float64)
@@ -90,7 +90,7 @@ def test_novelty_is_that_of_a_walk(origin, spread):
 
 @pytest.mark.parametrize("short", [0.2, 2.0, 1e6])
 @pytest.mark.parametrize(("origin", "spread"), [(INSIDE, 0.5), (INSIDE, 4.0), (OUTSIDE, 5.0)])
-def test_the_last_metres_of_a_beam_do_not_count_as_free_space(short, origin, spread):
+def test_a_hit_beam_frees_no_cells_within_short_of_its_end(short, origin, spread):
     window = window_with(random_evidence(13_700, 5))
     place = torch.tensor(origin, dtype=torch.float64) + 0.005
     ends, is_hit = random_beams(60, 7, spread)
@@ -98,7 +98,7 @@ def test_the_last_metres_of_a_beam_do_not_count_as_free_space(short, origin, spr
 
 
 @pytest.mark.parametrize("corner", [(-3, -5, -2), (0, -40, -4), (-90, -90, -90), (30, 0, 0)])
-def test_cells_outside_the_given_box_do_not_count(corner):
+def test_cells_outside_the_given_box_have_no_novelty(corner):
     low = torch.tensor(corner)
     within = Box(low, low + torch.tensor([6, 60, 95]))
     evidence = random_evidence(13_700, 5)
@@ -112,7 +112,7 @@ def test_cells_outside_the_given_box_do_not_count(corner):
     check(window, CENTER, ends, is_hit, NoveltyRule(observed=3.0), known, within=within)
 
 
-def test_known_space_is_not_novel():
+def test_observed_space_is_not_novel():
     window = window_with()
     ends = torch.tensor([[1.1, 0.1, 0.2], [0.3, -1.4, 0.1]], dtype=torch.float64)
     beams = (at(0, 0, 0), ends, torch.tensor([True, False]))

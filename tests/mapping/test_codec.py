@@ -1,4 +1,4 @@
-"""The codec: what comes back is near, always a mixture, and the same whatever batch it went in."""
+"""The codec: rounding errors, valid components from any bytes, and independence of the batches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mapping.random_components import random_components, rotations
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.mapping.codec import batch_stream
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
 from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
@@ -64,7 +64,7 @@ def part(components: Components, begin: int, end: int) -> Components:
 
 
 def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
-    """Of each component: counts by place."""
+    """Origin → count of each component."""
     found: list[dict[tuple[float, ...], float]] = [{} for _ in range(len(components))]
     c = components
     for by, place, count in zip(
@@ -74,26 +74,21 @@ def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
     return found
 
 
-# -- what comes back ---------------------------------------------------------------------------------------
+# -- encoded and decoded ---------------------------------------------------------------------------------
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(components=drawn)
-def test_decoded_is_what_quantized_says_to_the_bit(components):
-    assert_same(decode(encode(components)), quantized(components))
-
-
-@settings(max_examples=60)
-@given(components=drawn)
-def test_quantizing_again_changes_nothing(components):
+def test_decoded_components_equal_quantized_ones_and_quantization_is_idempotent(components):
     once = quantized(components)
+    assert_same(decode(encode(components)), once)
     assert_same(quantized(once), once)
     assert encode(once) == encode(components)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(components=drawn)
-def test_errors_stay_within_their_bounds(components):
+def test_codec_rounds_within_the_stated_bounds(components):
     found = quantized(components)
     for i in range(len(components)):
         meant, stored = components.covariances[i].numpy(), found.covariances[i].numpy()
@@ -115,7 +110,7 @@ def test_errors_stay_within_their_bounds(components):
 
 @settings(max_examples=40)
 @given(components=drawn)
-def test_origins_and_shares_come_back(components):
+def test_origins_and_their_shares_are_decoded_within_a_step(components):
     for meant, found in zip(sightings(components), sightings(quantized(components)), strict=True):
         total = sum(meant.values())
         places, stored = np.array(list(meant)), np.array(list(found))
@@ -130,7 +125,7 @@ def test_origins_and_shares_come_back(components):
 
 @settings(max_examples=40)
 @given(components=drawn)
-def test_counts_add_up_to_the_support_and_flags_and_ids_are_kept(components):
+def test_decoded_counts_sum_to_the_support_and_flags_and_ids_are_exact(components):
     found = quantized(components)
     total = torch.zeros_like(found.support).index_add_(0, found.seen_by, found.seen_count)
     torch.testing.assert_close(total, found.support)
@@ -145,7 +140,7 @@ def test_counts_add_up_to_the_support_and_flags_and_ids_are_kept(components):
     rank=st.integers(0, 2),
     negative=st.sampled_from([0.0, 1e-12, 1e-7]),
 )
-def test_covariances_that_are_flat_or_hardly_definite_come_back_definite(seed, dim, rank, negative):
+def test_nearly_singular_covariances_are_decoded_positive_definite(seed, dim, rank, negative):
     components = random_components(dim, seed=seed)
     generator = torch.Generator().manual_seed(seed)
     turn = rotations(len(components), dim, generator)
@@ -159,8 +154,7 @@ def test_covariances_that_are_flat_or_hardly_definite_come_back_definite(seed, d
 
 
 @dims
-def test_the_lattice_is_that_of_the_world(dim):
-    """Whole metres change nothing, nor do quarter turns: a map moves with its scans."""
+def test_quantization_commutes_with_whole_metre_shifts_and_quarter_turns(dim):
     components = random_components(dim, deviations=(1e-3, 2.0))
     here = quantized(components)
     shift = torch.tensor([512.0, -4096.0, 64.0], dtype=torch.float64)[:dim]
@@ -185,7 +179,7 @@ def test_the_lattice_is_that_of_the_world(dim):
 
 @pytest.mark.parametrize("size", [1, 7, 40])
 @dims
-def test_batches_may_be_split_and_joined(dim, size):
+def test_splitting_a_batch_does_not_change_its_decoded_components(dim, size):
     whole = quantized(random_components(dim))
     parts = [decode(encode(part(whole, i, min(i + size, 40)))) for i in range(0, 40, size)]
     joined = quantized(Components.concatenate(parts))
@@ -194,16 +188,16 @@ def test_batches_may_be_split_and_joined(dim, size):
     assert torch.equal(joined.origins[joined.seen_from], whole.origins[whole.seen_from])
 
 
-# -- edges -------------------------------------------------------------------------------------------------
+# -- edges -----------------------------------------------------------------------------------------------
 
 
 @dims
-def test_no_components_are_a_batch(dim):
+def test_an_empty_batch_is_encoded(dim):
     empty = decode(encode(Components.empty(dim)))
     assert_same(empty, Components.empty(dim))
 
 
-def test_counts_of_nothing_stay_nothing():
+def test_zero_counts_stay_zero():
     components = random_components(3, k=3)
     nothing = replace(components, support=torch.tensor([0.0, 1e-9, 0.01], dtype=torch.float64))
     nothing = replace(nothing, seen_count=nothing.support[components.seen_by] / 3)
@@ -214,7 +208,7 @@ def test_counts_of_nothing_stay_nothing():
     assert encode(found) == encode(nothing)
 
 
-def test_sightings_of_one_place_are_one_and_unused_origins_are_dropped():
+def test_equal_origins_are_merged_and_unused_origins_are_dropped():
     c = random_components(2, k=1, n_origins=4, max_sightings=1)
     places = [[9.0, 9.0], [1.0, 2.0], [1.0, 2.0 + ORIGIN_STEP / 4], [3.0, 4.0]]
     c = replace(
@@ -229,7 +223,7 @@ def test_sightings_of_one_place_are_one_and_unused_origins_are_dropped():
     assert (found.seen_count / found.support).tolist() == [0.5, 0.5]
 
 
-def test_a_component_that_nothing_saw_is_kept():
+def test_a_component_without_origins_is_kept():
     c = random_components(2, k=2)
     seen = c.seen_by == 0
     c = replace(c, seen_by=c.seen_by[seen], seen_from=c.seen_from[seen], seen_count=c.seen_count[seen])
@@ -237,7 +231,7 @@ def test_a_component_that_nothing_saw_is_kept():
     assert len(quantized(c)) == 2
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(
     dim=st.sampled_from([2, 3]),
     center=st.sampled_from([0.0, lattice.FARTHEST, -lattice.FARTHEST]),
@@ -245,8 +239,8 @@ def test_a_component_that_nothing_saw_is_kept():
     deviations=st.sampled_from([(2.0**-21, 1.0), (1.0, 2.0**19), (2.0**19, 2.0**19.9), (2.0**19.9, 2.0**20)]),
     seed=st.integers(0, 10**6),
 )
-def test_at_the_ends_of_the_world_what_is_written_is_read(dim, center, extent, deviations, seed):
-    """Rounding may lead out of it, which is an error; cells may stick out of it, which is none."""
+def test_encoded_components_at_the_coordinate_limit_are_decoded(dim, center, extent, deviations, seed):
+    """Rounding beyond the limit is an error; cells that extend beyond it are allowed."""
     far = lattice.FARTHEST
     made = random_components(dim, k=8, extent=extent, deviations=deviations, seed=seed)
     moved = {name: (getattr(made, name) + center).clamp(-far, far) for name in ("means", "origins")}
@@ -260,9 +254,9 @@ def test_at_the_ends_of_the_world_what_is_written_is_read(dim, center, extent, d
     assert_same(quantized(decode(batch)), decode(batch))
 
 
-@pytest.mark.parametrize("exponent", range(9, 31))  # 2⁹ m: more cells than are numbered, if smaller
-def test_cells_as_large_as_the_world_are_read(monkeypatch, exponent):
-    """Two corners of the world in cells of any side: the writer may take it where it is the shortest."""
+@pytest.mark.parametrize("exponent", [9, 10, 15, 20, 29, 30])  # 2⁹ m: smaller cells exceed the cell numbers
+def test_cells_as_large_as_the_coordinate_range_are_decoded(monkeypatch, exponent):
+    """Two corners of the coordinate range in cells of any size that the encoder may choose."""
     corners = torch.tensor([[-lattice.FARTHEST] * 3, [lattice.FARTHEST] * 3], dtype=torch.float64)
     wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
     components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
@@ -270,8 +264,8 @@ def test_cells_as_large_as_the_world_are_read(monkeypatch, exponent):
     assert_same(decode(encode(components)), components)
 
 
-def test_deviations_that_are_equal_but_for_rounding_errors_are_written_falling():
-    """Half a step between two of the lattice's: each may go either way."""
+def test_nearly_equal_deviations_are_encoded_in_descending_order():
+    """The deviations lie halfway between two steps, so that each may be rounded either way."""
     turns = rotations(300, 3, torch.Generator().manual_seed(0))
     for deviation in 2.0 ** ((torch.arange(8) + 0.5) / lattice.PER_OCTAVE):
         covariances = turns @ (deviation.double() ** 2 * torch.eye(3, dtype=torch.float64)) @ turns.mT
@@ -295,7 +289,7 @@ def test_deviations_that_are_equal_but_for_rounding_errors_are_written_falling()
         ("ids", 2**62),
     ],
 )
-def test_what_cannot_be_stored_is_named(name, value):
+def test_components_that_cannot_be_stored_are_refused(name, value):
     components = random_components(3, k=5, max_sightings=1, n_origins=1)
     changed = getattr(components, name).clone()
     changed.view(-1)[0] = value
@@ -308,19 +302,19 @@ def test_what_cannot_be_stored_is_named(name, value):
         st.tuples(st.integers(0, 2**40), st.integers(0, 2**60), st.integers(1, 9)), min_size=1, max_size=5
     )
 )
-def test_any_ids_come_back(runs):
+def test_any_ids_are_decoded_exactly(runs):
     ids = torch.tensor([[robot, first + i] for robot, first, n in runs for i in range(n)])
     components = replace(random_components(2, k=len(ids)), ids=ids)
     assert torch.equal(decode(encode(components)).ids, ids)
 
 
-def test_components_thinner_than_a_micrometre_get_one():
+def test_components_thinner_than_a_micrometre_are_widened_to_one():
     c = random_components(3, k=1)
     flat = replace(c, covariances=torch.diag(torch.tensor([1e-4, 1e-4, 1e-16], dtype=torch.float64))[None])
     assert torch.linalg.eigvalsh(quantized(flat).covariances)[0, 0].sqrt() == pytest.approx(2.0**-20)
 
 
-# -- size --------------------------------------------------------------------------------------------------
+# -- size ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("dim", "most"), [(2, 8.0), (3, 12.0)])
@@ -332,23 +326,23 @@ def test_a_component_with_one_origin_takes_few_bytes(dim, most):
 
 
 @dims
-def test_a_batch_by_itself_is_short(dim):
+def test_a_small_batch_is_short(dim):
     assert len(encode(random_components(dim, k=1, n_origins=1, max_sightings=1))) <= 80
     fits = part(random_components(dim, k=200, extent=5.0, max_sightings=1), 0, 90)
     assert len(encode(fits)) <= 1200
 
 
-def test_the_spatial_order_is_one():
+def test_spatial_order_is_a_permutation():
     components = random_components(3)
     order = spatial_order(components)
     assert torch.equal(order.sort().values, torch.arange(len(components)))
 
 
-# -- what is no batch --------------------------------------------------------------------------------------
+# -- damaged batches -------------------------------------------------------------------------------------
 
 
 def sealed(body: bytes) -> bytes:
-    """A body with a checksum that is right."""
+    """The body with a valid checksum."""
     return body + zlib.crc32(body).to_bytes(4, "little")
 
 
@@ -357,7 +351,7 @@ def sound() -> bytes:
     return encode(random_components(3, k=12))
 
 
-def test_every_cut_and_every_flipped_bit_is_noticed(sound):
+def test_every_cut_and_every_flipped_bit_is_refused(sound):
     for length in range(len(sound)):
         with pytest.raises(DataError):
             decode(sound[:length])
@@ -368,7 +362,7 @@ def test_every_cut_and_every_flipped_bit_is_noticed(sound):
             decode(bytes(damaged))
 
 
-def test_more_than_a_batch_is_refused(sound):
+def test_bytes_after_a_batch_are_refused(sound):
     for longer in (sound + b"\0", sealed(sound[:-4] + b"\0"), sealed(sound[:-4] + b"\1\2\3")):
         with pytest.raises(DataError):
             decode(longer)
@@ -379,14 +373,14 @@ def test_another_version_is_refused_by_name(sound):
         decode(sealed(b"\x09" + sound[1:-4]))
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(
     changes=st.lists(
         st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
     ),
     cut=st.sampled_from([0, 0, 1, 8]),
 )
-def test_forged_batches_are_refused_or_are_components(sound, changes, cut):
+def test_forged_batches_are_refused_or_decode_to_valid_components(sound, changes, cut):
     body = bytearray(sound[:-4])
     for place, value in changes:
         body[1 + int(place * (len(body) - 1))] = value
@@ -401,7 +395,7 @@ def test_forged_batches_are_refused_or_are_components(sound, changes, cut):
 
 @settings(max_examples=150)
 @given(body=st.binary(max_size=200))
-def test_noise_is_refused_or_is_components(body):
+def test_noise_is_refused_or_decodes_to_valid_components(body):
     try:
         decode(sealed(b"\x01" + body)).checked()
     except DataError:
@@ -410,7 +404,7 @@ def test_noise_is_refused_or_is_components(body):
 
 @pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
 @pytest.mark.parametrize("what", ["components", "origins"])
-def test_counts_that_nothing_backs_take_no_memory(k, what):
+def test_forged_array_lengths_allocate_no_memory(k, what):
     writer = BitWriter()
     for number in (3, k, 1) if what == "components" else (3, 1, k):
         writer.number(number)
@@ -418,20 +412,20 @@ def test_counts_that_nothing_backs_take_no_memory(k, what):
         decode(sealed(b"\x01" + writer.to_bytes() + bytes(2000)))
 
 
-def test_errors_of_the_codec_are_one_family():
+def test_codec_errors_are_data_errors():
     assert issubclass(DataError, GmmTorchError)
     with pytest.raises(DataError, match="too few"):
         decode(b"")
 
 
-# -- bits --------------------------------------------------------------------------------------------------
+# -- bits ------------------------------------------------------------------------------------------------
 
 whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
 
 
 @settings(max_examples=100)
 @given(values=whole_numbers)
-def test_columns_come_back(values):
+def test_integer_columns_are_decoded_exactly(values):
     column = np.array(values, np.int64)
     writer = BitWriter()
     writer.column(column)
@@ -441,7 +435,7 @@ def test_columns_come_back(values):
 
 
 @given(values=st.lists(st.integers(-(2**40), 2**40)), scales=st.data())
-def test_scaled_numbers_and_single_ones_come_back(values, scales):
+def test_scaled_and_single_numbers_are_decoded(values, scales):
     scale = np.array(
         [max(abs(v).bit_length() + scales.draw(st.integers(-3, 3)), 0) for v in values], np.int64
     )
@@ -460,8 +454,8 @@ def test_scaled_numbers_and_single_ones_come_back(values, scales):
     reader.finish()
 
 
-def test_a_rice_code_by_hand():
-    """5 with 2 low bits is 1 above and 01 below: 0 1, then 01; 2 is none above and 10 below: 1, then 10."""
+def test_rice_codes_equal_those_by_hand():
+    """With 2 low bits, 5 = 1·4 + 01 is 0 1 01 and 2 = 0·4 + 10 is 1 10."""
     writer = BitWriter()
     writer.rice(np.array([5, 2]), 2)
     assert writer.to_bytes() == bytes([0b011_01_10_0])
@@ -476,7 +470,7 @@ def test_a_rice_code_by_hand():
         ([3, 0, 2, 1] * 12, Code.FIXED),
     ],
 )
-def test_the_shortest_code_is_taken(values, code):
+def test_the_shortest_column_code_is_chosen(values, code):
     column = np.array(values, np.int64)
     coding = best_code(column)
     assert coding.code is code
@@ -490,8 +484,8 @@ def test_the_shortest_code_is_taken(values, code):
     n=st.integers(1, 40),
     rises=st.booleans(),
 )
-def test_what_a_column_writes_it_reads(ends, n, rises):
-    """To and fro over a wide gap the steps add up to more than is read, however few bits they take."""
+def test_every_encodable_column_is_decoded(ends, n, rises):
+    """Alternating extreme values overflow the sum of differences, however few bits they take."""
     column = np.array([ends[number % 2] for number in range(n)], np.int64)
     column = np.sort(column) if rises else column
     writer = BitWriter()
@@ -505,13 +499,13 @@ def test_what_a_column_writes_it_reads(ends, n, rises):
     reader.finish()
 
 
-def test_zigzag_is_its_inverse():
+def test_unzigzag_inverts_zigzag():
     values = np.array([0, -1, 1, -2, 2, 2**60, -(2**60)], np.int64)
     assert zigzag(values).tolist()[:5] == [0, 1, 2, 3, 4]
     assert unzigzag(zigzag(values)).tolist() == values.tolist()
 
 
-# -- a real map --------------------------------------------------------------------------------------------
+# -- a real map ------------------------------------------------------------------------------------------
 
 
 def auc(components: Components, asked: queries.Queries, resolution: float) -> float:
@@ -522,9 +516,9 @@ def auc(components: Components, asked: queries.Queries, resolution: float) -> fl
 
 @pytest.mark.slow
 @pytest.mark.real_data
-def test_a_real_map_loses_nothing(real_data):
+def test_quantization_of_a_real_map_keeps_its_occupancy(real_data):
     frames = load("depth_frames", path=real_data / "kinect", pixel_stride=8)
-    train, test = split.split_indices(len(frames), 5)
+    train, test = queries.split_indices(len(frames), 5)
     rule = WindowedRule(n_components=300, max_origins=2)
     learned = learn_window([frames[i] for i in train], rule, torch.Generator().manual_seed(0))
     learned = learned.rearranged(spatial_order(learned))
@@ -532,9 +526,9 @@ def test_a_real_map_loses_nothing(real_data):
     learned = replace(learned, ids=ids)
     origins, ends = queries.test_beams([frames[i] for i in test], 2000, 0)
     asked = queries.hit_and_free(origins, ends, "uniform", 0.05, 0)
-    # Single roundings move the score up or down; their mean over four places of the lattice shows a loss.
+    # Single roundings move the score up or down; their mean over three places of the lattice shows a loss.
     losses = []
-    for shift in torch.rand(4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64):
+    for shift in torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64):
         moved = replace(learned, means=learned.means + shift, origins=learned.origins + shift)
         back = quantized(moved)
         back = replace(back, means=back.means - shift, origins=back.origins - shift)

@@ -47,7 +47,7 @@ def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (Fals
     limit=st.integers(2, 60),
     empty=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_keeps_the_moments_of_either_kind_and_the_budget(k, dim, seed, limit, empty):
+def test_merging_keeps_the_moments_of_hits_and_no_returns_and_the_budget(k, dim, seed, limit, empty):
     given_ = random_components(k, dim, seed, empty=empty)
     left = compact(given_, limit).checked()
     assert len(left) == min(k, limit)
@@ -59,7 +59,7 @@ def test_keeps_the_moments_of_either_kind_and_the_budget(k, dim, seed, limit, em
             torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_not_merged_keeps_every_bit_and_its_number():
+def test_unmerged_components_keep_every_bit_and_their_id():
     far = random_components(12, 3, 0, spread=100.0)
     near = replace(far, means=far.means.clone())
     near.means[1] = near.means[0] + 0.01
@@ -72,7 +72,7 @@ def test_what_is_not_merged_keeps_every_bit_and_its_number():
             assert torch.equal(getattr(left, name)[row], getattr(near, name)[old])
 
 
-def test_merged_origins_are_united():
+def test_a_merged_component_has_the_origins_of_both():
     given_ = random_components(6, 2, 1)
     labels = torch.tensor([0, 1, 0, 2, 1, 0])
     found = merged(given_, labels)
@@ -88,7 +88,7 @@ def test_merged_origins_are_united():
     assert all(math.isclose(got[key], expected[key]) for key in got)
 
 
-def test_surfaces_never_merge_with_empty_ends():
+def test_surface_components_never_merge_with_no_return_components():
     both = pair(0.0, flags=(False, True))
     assert len(compact(both, max_cost=0.9)) == 2
     left = compact(both, 1)
@@ -97,7 +97,7 @@ def test_surfaces_never_merge_with_empty_ends():
     assert counts_add_up(left)
 
 
-def test_a_cheap_merge_is_made_and_a_dear_one_is_not():
+def test_merges_above_the_cost_limit_are_not_made():
     # Equal covariances: H² = 1 − exp(−δ²/8σ²).
     offset, deviation = 0.05, 0.1
     squared = 1 - math.exp(-((offset / deviation) ** 2) / 8)
@@ -115,7 +115,7 @@ def test_the_cheapest_pair_by_support_is_merged_first():
     assert sorted(left.support.tolist()) == [2.0, 10.0, 10.0]
 
 
-def test_far_from_the_origin_the_same_pairs_merge():
+def test_merging_is_the_same_far_from_the_world_origin():
     near = random_components(40, 3, 5)
     shift = torch.tensor([5e5, -4e5, 100.0], dtype=torch.float64)
     far = replace(near, means=near.means + shift, origins=near.origins + shift)
@@ -127,12 +127,12 @@ def test_far_from_the_origin_the_same_pairs_merge():
 
 
 @pytest.mark.parametrize("bad", [{}, {"max_components": 0}, {"max_components": 2, "max_cost": -1.0}])
-def test_bad_limits_are_refused(bad):
+def test_invalid_limits_are_refused(bad):
     with pytest.raises(InvalidArgumentError):
         compact(random_components(3, 2, 0), **bad)
 
 
-def test_nothing_to_merge():
+def test_empty_and_single_components_are_returned_unchanged():
     nothing = Components.empty(3)
     assert len(compact(nothing, 5, 0.5)) == len(limit_origins(nothing, 2)) == 0
     assert len(compact_to_bytes(nothing, 1, 2)) == 0
@@ -142,7 +142,7 @@ def test_nothing_to_merge():
 
 
 def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> set[tuple[int, int]]:
-    """The sightings to keep, one after the other."""
+    """The origins to keep, found greedily one after the other."""
     first, further = set(), []
     for k in range(len(components)):
         rows = [e for e in range(len(components.seen_by)) if int(components.seen_by[e]) == k]
@@ -172,7 +172,7 @@ def kept_by_a_loop(components: Components, limit: int, mean: float | None) -> se
     limit=st.integers(1, 6),
     mean=st.sampled_from([None, 1.0, 1.7, 3.0]),
 )
-def test_origins_that_see_much_and_lie_apart_are_kept(k, dim, seed, limit, mean):
+def test_limit_origins_equals_a_greedy_loop(k, dim, seed, limit, mean):
     given_ = random_components(k, dim, seed, n_origins=7)
     left = limit_origins(given_, limit, mean).checked()
     table = {tuple(row): i for i, row in enumerate(given_.origins.tolist())}
@@ -191,7 +191,7 @@ def test_origins_that_see_much_and_lie_apart_are_kept(k, dim, seed, limit, mean)
     )
 
 
-def test_counts_of_what_is_kept_stay_in_proportion():
+def test_kept_origins_keep_the_proportions_of_their_counts():
     given_ = random_components(8, 2, 3, n_origins=6)
     left = limit_origins(given_, 2)
     count = {(int(b), tuple(given_.origins[f].tolist())): float(c) for b, f, c in sightings(given_)}
@@ -215,7 +215,7 @@ def sightings(components: Components):
     max_bytes=st.integers(330, 2500),
     empty=st.sampled_from([0, 0.5]),
 )
-def test_the_budget_in_bytes_is_kept(k, seed, max_bytes, empty):
+def test_compact_to_bytes_keeps_the_byte_budget(k, seed, max_bytes, empty):
     given_ = random_components(k, 3, seed, empty=empty)
     left = compact_to_bytes(given_, max_bytes, 3)
     assert len(left) >= 1
@@ -223,18 +223,18 @@ def test_the_budget_in_bytes_is_kept(k, seed, max_bytes, empty):
     if estimated_bytes(limit_origins(given_, 3)) <= max_bytes:
         assert len(left) == k
     else:
-        # No more is given up than one more component would take, and what goes with it.
+        # The unused bytes are fewer than one more component takes.
         assert len(left) == 1 or estimated_bytes(left) > 0.7 * max_bytes - 100
 
 
-def test_any_measure_of_size_is_respected():
+def test_compact_to_bytes_accepts_any_measure_of_size():
     given_ = random_components(50, 2, 0)
     left = compact_to_bytes(given_, 1000, 2, size=lambda c: len(c) ** 2)
     assert 10 <= len(left) <= 31
 
 
 @pytest.mark.parametrize(("limit", "mean"), [(0, None), (2, 0.5), (2, math.nan)])
-def test_bad_numbers_of_origins_are_refused(limit, mean):
+def test_invalid_numbers_of_origins_are_refused(limit, mean):
     with pytest.raises(InvalidArgumentError, match="_origins="):
         limit_origins(random_components(3, 2, 0), limit, mean)
 

@@ -1,4 +1,4 @@
-"""Parts of components, sums of their counts, and the free space that they do not speak of."""
+"""Selected and summed components, and the shell of surfaces that frees no cells."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RESOLUTION = 0.2
 
 
 def sightings(components: Components, row: int) -> list[tuple[tuple[float, ...], float]]:
-    """(origin, count) of each sighting of a component, in order."""
+    """(origin, count) pairs of a component, in order."""
     return [
         (tuple(components.origins[viewpoint].tolist()), count)
         for by, viewpoint, count in zip(
@@ -38,7 +38,7 @@ def sightings(components: Components, row: int) -> list[tuple[tuple[float, ...],
 
 
 @pytest.mark.parametrize("rows", [[4, 0, 11, 7], [], list(range(12)), list(range(11, -1, -1)), [5]])
-def test_selected_is_what_a_loop_picks(rows: list[int]) -> None:
+def test_selected_components_equal_those_of_a_loop(rows: list[int]) -> None:
     components = random_components(12, 3, seed=1, empty=0.3)
     # Sightings in any order, and a component without any.
     order = torch.randperm(len(components.seen_by), generator=torch.Generator().manual_seed(0))
@@ -56,7 +56,7 @@ def test_selected_is_what_a_loop_picks(rows: list[int]) -> None:
 
 
 def batch(ids: list[tuple[int, int]], counts: list[float], seed: int) -> Components:
-    """Components seen from one place, all of their counts given."""
+    """Components with these ids and counts and one origin."""
     components = random_components(len(ids), 3, seed, n_origins=1)
     support = torch.tensor(counts, dtype=torch.float64)
     return replace(
@@ -64,7 +64,7 @@ def batch(ids: list[tuple[int, int]], counts: list[float], seed: int) -> Compone
     )
 
 
-def test_summed_adds_what_a_dictionary_adds() -> None:
+def test_summed_counts_equal_those_of_a_dictionary() -> None:
     parts = [
         batch([(1, 0), (1, 1), (1, 2)], [3.0, 5.0, 7.0], 0),
         batch([(0, 9), (0, 3)], [11.0, 13.0], 1),
@@ -83,7 +83,7 @@ def test_summed_adds_what_a_dictionary_adds() -> None:
     assert counts_add_up(found)
 
 
-def test_summed_leaves_what_is_distinct_and_nothing_alone() -> None:
+def test_summing_distinct_or_no_components_changes_nothing() -> None:
     alone = batch([(0, 0), (0, 4), (2, 1)], [1.0, 2.0, 3.0], 0)
     found = summed(alone)
     for name in ("means", "support", "ids", "seen_by", "seen_from", "seen_count"):
@@ -104,7 +104,7 @@ def rotation_to(normal: Tensor) -> Tensor:
 def sheet(
     normal: tuple[float, ...], origin: tuple[float, ...], count: float = 1000.0
 ) -> tuple[Components, Tensor, float]:
-    """A component that is all but a plane, and the unit normal (3,) and offset of that plane."""
+    """A component that is almost a plane, with the unit normal (3,) and offset of the plane."""
     unit = torch.tensor(normal, dtype=torch.float64)
     unit = unit / unit.norm()
     q = rotation_to(unit)
@@ -158,9 +158,11 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize("shell", [0.5, 1.0, 2.5])
-@pytest.mark.parametrize("view", VIEWS)
-def test_a_surface_is_not_called_free(view: str, shell: float) -> None:
+@pytest.mark.parametrize(
+    ("view", "shell"),
+    [("frontal", 2.5), ("grazing", 1.0), ("tilted", 0.5), ("tilted", 2.5), ("tilted and grazing", 1.0)],
+)
+def test_no_cell_that_a_surface_cuts_is_freed(view: str, shell: float) -> None:
     component, unit, offset = sheet(*VIEWS[view])
     plain = dense(component_evidence(component, RESOLUTION, AROUND), AROUND)
     found = dense(component_evidence(component, RESOLUTION, AROUND, shell=shell), AROUND)
@@ -171,14 +173,14 @@ def test_a_surface_is_not_called_free(view: str, shell: float) -> None:
     assert float(found[1][within].sum()) == 0
     if shell > 1 or (shell == 1 and view != "frontal"):
         assert float(plain[1][within].sum()) > 0
-    # Where a ray is stopped the plane is exactly as far as the shell: cells further off do not notice.
+    # Rays stop at the distance of the shell from the plane: cells farther away are unaffected.
     beyond = nearest > shell + 1e-3
     assert float(plain[1][beyond].sum()) > 100
     torch.testing.assert_close(found[1][beyond], plain[1][beyond], rtol=1e-6, atol=1e-4)
 
 
 @pytest.mark.parametrize("view", ["frontal", "grazing"])
-def test_cells_that_a_surface_along_the_lattice_cuts_are_not_missed(view: str) -> None:
+def test_all_cells_along_a_lattice_aligned_surface_are_kept(view: str) -> None:
     component, unit, offset = sheet(*VIEWS[view])
     nearest, _ = distances(unit, offset)
     plain = dense(component_evidence(component, RESOLUTION, AROUND), AROUND)
@@ -188,7 +190,7 @@ def test_cells_that_a_surface_along_the_lattice_cuts_are_not_missed(view: str) -
     assert (float(plain[1][cut].sum()) > 100) == (view == "grazing")
 
 
-def test_beams_without_return_have_no_shell() -> None:
+def test_no_return_components_have_no_shell() -> None:
     component, _, _ = sheet(*VIEWS["tilted"])
     empty = replace(component, max_range=torch.tensor([True]))
     one, other = (component_evidence(empty, RESOLUTION, AROUND, shell=shell) for shell in (0.0, 3.0))
@@ -196,7 +198,7 @@ def test_beams_without_return_have_no_shell() -> None:
         assert torch.equal(a, b)
 
 
-def test_a_sensor_within_the_shell_frees_nothing() -> None:
+def test_a_sensor_within_the_shell_frees_no_cells() -> None:
     component, _, _ = sheet((0.0, 0.0, 1.0), (2.0, 0.5, 0.55))  # half a cell above the plane
     evidence = component_evidence(component, RESOLUTION, AROUND, shell=1.0)
     assert float(evidence.misses.sum()) == 0
@@ -208,7 +210,7 @@ def test_a_sensor_within_the_shell_frees_nothing() -> None:
 LARGE = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 
 
-def test_all_counts_are_hits_however_many_are_drawn() -> None:
+def test_hits_sum_to_the_counts_for_any_number_of_rays() -> None:
     components = random_components(25, 3, seed=2)
     for n in (1, 3, 8):
         evidence = component_evidence(components, RESOLUTION, LARGE, hits_per_ray=n)
@@ -216,7 +218,7 @@ def test_all_counts_are_hits_however_many_are_drawn() -> None:
 
 
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_rays_that_are_followed_stay_the_same(shell: float) -> None:
+def test_hits_per_ray_does_not_change_the_misses(shell: float) -> None:
     components = random_components(25, 3, seed=2, empty=0.3)
     once, often = (
         component_evidence(components, RESOLUTION, LARGE, shell=shell, hits_per_ray=n) for n in (1, 8)
@@ -226,25 +228,24 @@ def test_rays_that_are_followed_stay_the_same(shell: float) -> None:
         assert missed[0].get(cell, 0.0) == pytest.approx(missed[1].get(cell, 0.0), rel=1e-5)
 
 
-def test_denser_hits_come_closer_to_the_limit() -> None:
+def test_denser_hits_are_more_accurate() -> None:
     near = Box(torch.tensor([-15, -25, -25]), torch.tensor([60, 35, 35]))
     errors: dict[int, float] = {1: 0.0, 8: 0.0}
-    for number in range(12):
+    for number in range(6):
         component, _, _ = sheet(*VIEWS["tilted"])
         component = replace(component, ids=torch.tensor([[1, number]]))
         limit = dense(component_evidence(component, RESOLUTION, near, least=50_000, most=50_000), near)[0]
         for n in errors:
             hits = dense(component_evidence(component, RESOLUTION, near, hits_per_ray=n), near)[0]
-            errors[n] += float((hits - limit).abs().sum()) / 12
+            errors[n] += float((hits - limit).abs().sum()) / 6
     assert 0 < errors[8] < 0.5 * errors[1]
 
 
 # -- fewer rays near the sensor -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("empty", [False, True])
-def test_thinned_rays_miss_the_same_cells_as_often(view: str, empty: bool) -> None:
+@pytest.mark.parametrize(("view", "empty"), [("frontal", True), ("grazing", False), ("tilted", False)])
+def test_thinned_rays_have_the_same_expected_misses(view: str, empty: bool) -> None:
     component, _, _ = sheet(*VIEWS[view])
     component = replace(component, max_range=torch.tensor([empty]))
     options = {"least": 20_000, "most": 20_000, "shell": 1.0}
@@ -259,7 +260,7 @@ def test_thinned_rays_miss_the_same_cells_as_often(view: str, empty: bool) -> No
     assert float(found[1].sum()) == pytest.approx(float(limit[1].sum()), rel=2e-3)
 
 
-def test_all_rays_count_where_they_begin_however_few_are_followed() -> None:
+def test_all_rays_count_as_misses_in_the_cell_of_the_sensor() -> None:
     component, _, _ = sheet(*VIEWS["tilted"])
     for least in range(1, 10):
         plain, thinned = (
@@ -268,7 +269,6 @@ def test_all_rays_count_where_they_begin_however_few_are_followed() -> None:
         )
         if least == 1:
             assert torch.equal(plain.cells, thinned.cells)
-        # However many there are, all count where they begin.
         sensor = (component.origins[0] / RESOLUTION).floor().long()
         begun = [float(e.misses[(e.cells == sensor).all(1)]) for e in (plain, thinned)]
         assert begun == pytest.approx([1000.0, 1000.0], rel=1e-5)
@@ -276,7 +276,7 @@ def test_all_rays_count_where_they_begin_however_few_are_followed() -> None:
 
 @pytest.mark.parametrize("thinned", [False, True])
 @pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_disjoint_boxes_add_up(shell: float, thinned: bool) -> None:
+def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: bool) -> None:
     options = {"shell": shell, "hits_per_ray": 8, "thinned": thinned}
     components = random_components(30, 3, seed=4, empty=0.2)
     whole = Box(torch.tensor([-12] * 3), torch.tensor([12] * 3))
@@ -293,7 +293,7 @@ def test_disjoint_boxes_add_up(shell: float, thinned: bool) -> None:
 
 
 @pytest.mark.parametrize("thinned", [False, True])
-def test_company_changes_nothing(thinned: bool) -> None:
+def test_evidence_of_a_component_does_not_depend_on_the_others(thinned: bool) -> None:
     components = random_components(20, 3, seed=6, empty=0.2)
     options = {"shell": 1.0, "hits_per_ray": 8, "thinned": thinned}
     alone = sum_evidence(
@@ -305,7 +305,7 @@ def test_company_changes_nothing(thinned: bool) -> None:
     torch.testing.assert_close(dense(together, AROUND), dense(alone, AROUND), rtol=1e-5, atol=1e-4)
 
 
-def test_what_cannot_be() -> None:
+def test_invalid_arguments_are_refused() -> None:
     component, _, _ = sheet(*VIEWS["frontal"])
     for options, message in (
         ({"shell": -0.1}, "shell=-0.1"),

@@ -1,22 +1,24 @@
-"""GaussianMap: learning by windows, ids, and the module. What every map does: see test_protocol."""
+"""GaussianMap: learning by windows, settings, ids, and the module."""
 
 from __future__ import annotations
 
 import copy
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 from mapping.map_cases import FINE, assert_same_components, built, drive, given_parts, names, sightings
-from occupancy.protocol_contract import RESOLUTION, dims, lattice, open_scan, wall_scan
+from occupancy.protocol_contract import dims, lattice, open_scan, wall_scan
 
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.scan import Scan
 
 BUFFERS = [
@@ -37,7 +39,7 @@ BUFFERS = [
 
 @dims
 @pytest.mark.parametrize("learning", [WindowedRule(), FINE])
-def test_components_describe_the_points(dim, learning):
+def test_components_have_the_moments_of_the_points(dim, learning):
     scan = wall_scan(dim)
     parts = built([scan], learning).components()
     cloud = scan.points.numpy()
@@ -55,7 +57,7 @@ def test_components_describe_the_points(dim, learning):
 
 @dims
 @pytest.mark.parametrize("window", [1, 3, 20])
-def test_counts_of_sightings_add_up_to_the_support(dim, window):
+def test_origin_counts_sum_to_the_support(dim, window):
     parts = built(drive(5, dim), window=window).components()
     total = np.bincount(parts.seen_by.numpy(), weights=parts.seen_count.numpy(), minlength=len(parts))
     np.testing.assert_allclose(total, parts.support.numpy(), rtol=1e-9)
@@ -64,7 +66,7 @@ def test_counts_of_sightings_add_up_to_the_support(dim, window):
 
 
 @pytest.mark.parametrize("max_origins", [1, 2, 8])
-def test_components_keep_a_few_origins_and_real_ones(max_origins):
+def test_components_keep_at_most_max_origins_sensor_origins(max_origins):
     scans = drive(6)
     parts = built(scans, WindowedRule(max_origins=max_origins, window=6)).components()
     real = {tuple(scan.origin.tolist()) for scan in scans}
@@ -74,7 +76,7 @@ def test_components_keep_a_few_origins_and_real_ones(max_origins):
     assert {place for seen in table for place in seen} <= real
 
 
-def test_with_room_for_every_origin_the_counts_are_those_of_the_points():
+def test_with_all_origins_kept_counts_equal_the_numbers_of_points():
     near, far = drive(5)[::4]
     half = Scan(far.points[::2], far.origin)
     parts = built([near, half], WindowedRule(max_origins=2, window=2)).components()
@@ -83,7 +85,7 @@ def test_with_room_for_every_origin_the_counts_are_those_of_the_points():
         assert counts[0] / counts[1] == pytest.approx(2, rel=0.15)
 
 
-def test_the_thesis_map_has_one_origin_a_component_that_of_its_scan():
+def test_a_window_of_one_scan_gives_each_component_its_sensor_origin():
     scans, rule = drive(3), WindowedRule(max_origins=1, window=1)
     made = built(scans, rule)
     one_by_one = [built([scan], rule) for scan in scans]
@@ -92,19 +94,97 @@ def test_the_thesis_map_has_one_origin_a_component_that_of_its_scan():
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(), FINE])
-def test_a_window_is_closed_when_it_is_full(learning):
+def test_a_full_window_is_learned(learning):
     made = built([], learning, window=3)
     sizes = []
     for scan in drive(7):
         made.insert(scan)
-        sizes.append(made.means.shape[0])
+        sizes.append(len(made.state_dict()["means"]))
     assert sizes[:2] == [0, 0]
     assert 0 < sizes[2] == sizes[3] == sizes[4] < sizes[5] == sizes[6]
-    assert made.n_components > sizes[6]  # the unfinished window counts at once
+    assert made.n_components > sizes[6]  # n_components includes the pending window
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_attributes_show_the_unfinished_window(finish):
+    made = built(drive(1), FINE)
+    if finish:
+        made.finish()
+    assert made.n_pending == 1
+    known = made.components()
+    assert len(made.means) == len(made.support) == len(known) > 0
+    for name in vars(known):
+        assert torch.equal(getattr(made, name), getattr(known, name)), name
+    made.insert(drive(2)[1])  # the window of two is full
+    assert made.n_pending == 0
+    assert torch.equal(made.means, made.state_dict()["means"])
+    assert not hasattr(GaussianMap(), "means")
+
+
+def test_repr_is_true_before_and_after_the_window_is_learned():
+    made = GaussianMap(FINE)
+    assert repr(made) == "GaussianMap(empty, IncrementalRule)"
+    made.insert(drive(1)[0])
+    assert repr(made) == (
+        "GaussianMap(0 components and 1 pending scan not learned yet in 2D, IncrementalRule, cpu)"
+    )
+    made.finish()
+    assert re.fullmatch(
+        rf"GaussianMap\({made.n_components} components in 2D, x .* to .*, y .* to .* m, {made.nbytes} bytes, "
+        r"1 pending scan, IncrementalRule, cpu\)",
+        repr(made),
+    )
+    made.insert(drive(2)[1])
+    assert "pending" not in repr(made)
+
+
+@pytest.mark.parametrize("learning", ["incremental", 3, IncrementalRule])
+def test_learning_that_is_no_rule_is_refused_at_construction(learning):
+    with pytest.raises(InvalidArgumentError, match=r"^learning=.* give IncrementalRule\(\)"):
+        GaussianMap(learning)
+
+
+@pytest.mark.parametrize("method", ["point", "monte_carlo"])
+def test_evidence_of_a_grid_honours_the_memory_limit(method):
+    made = GaussianMap.from_components(**given_parts(), memory_limit=16_000, n_samples=100)
+    assert made.evidence(VoxelGrid((0.0, 0.0), 0.1, (10, 100)), method).hits.shape == (10, 100)
+    large = VoxelGrid((0.0, 0.0), 0.001, (1 << 16, 1 << 16))
+    for asked in (made, GaussianMap(memory_limit=16_000)):
+        with pytest.raises(MemoryLimitError, match=r"68,719,476,736 bytes, more than memory_limit=16,000"):
+            asked.evidence(large, method)
+        with pytest.raises(MemoryLimitError, match="memory_limit"):
+            asked.evidence(VoxelGrid((0.0, 0.0), 0.1, (10, 101)), method)
+
+
+@pytest.mark.parametrize("method", ["point", "cone"])
+def test_evidence_in_parts_is_that_of_the_whole(method, monkeypatch):
+    made = GaussianMap.from_components(**given_parts())
+    grid = VoxelGrid((-2.0, -2.0), 0.5, (9, 7))
+    whole = made.evidence(grid, method)
+    monkeypatch.setattr("gmmtorch.mapping.query._CELLS_AT_ONCE", 10)
+    parts = made.evidence(grid, method)
+    torch.testing.assert_close(parts.hits, whole.hits, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(parts.misses, whole.misses, rtol=1e-9, atol=1e-12)
+    assert float(whole.hits.sum()) > 0
+
+
+@pytest.mark.parametrize("far", [1e300, -1e12, 2.0**27 * 1.01])
+def test_coordinates_beyond_the_largest_are_refused_with_its_value(far):
+    allowed = r"largest allowed coordinate is 134217728 m"
+    for points, origin in (([[far, 0.0]], [0.0, 0.0]), ([[1.0, 0.0]], [0.0, far])):
+        with pytest.raises(InvalidArgumentError, match=allowed):
+            Scan(points, origin)
+    for name in ("means", "origins"):
+        parts = given_parts()
+        parts[name][1, 0] = far
+        with pytest.raises(InvalidArgumentError, match=rf"^{name}\[1\] = .*{allowed}"):
+            GaussianMap.from_components(**parts)
+    made = built([Scan([[2.0**27, 1.0], [2.0**27, 2.0]], [2.0**27 - 3, 1.0])])
+    assert made.n_components > 0
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(), FINE])
-def test_each_window_is_learned_alone(learning):
+def test_windows_are_learned_independently(learning):
     scans = drive(6)
     both, first, second = (built(part, learning, window=3) for part in (scans, scans[:3], scans[3:]))
     assert torch.equal(both.means, torch.cat([first.means, second.means]))
@@ -114,14 +194,14 @@ def test_each_window_is_learned_alone(learning):
         assert sightings(both.components()) == sightings(first.components()) + sightings(second.components())
 
 
-def test_ids_name_the_robot_and_count_on():
+def test_ids_contain_the_robot_and_ascend():
     ids = built(drive(5), window=2, robot=3).components().ids
     assert ids[:, 0].unique().tolist() == [3]
     assert ids[:, 1].tolist() == list(range(len(ids)))
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(), FINE])
-def test_beams_without_return_become_flagged_components_of_their_own(learning):
+def test_no_return_beams_become_separate_max_range_components(learning):
     parts = built([wall_scan(2), open_scan(2)], learning).components()
     support = float(parts.support[parts.max_range].sum())
     assert support == pytest.approx(len(open_scan(2).no_return), rel=1e-6)
@@ -129,12 +209,7 @@ def test_beams_without_return_become_flagged_components_of_their_own(learning):
     assert not bool(built([wall_scan(2)], learning).components().max_range.any())
 
 
-def test_a_bound_on_the_components_of_a_window_is_kept():
-    assert built(drive(4), WindowedRule(n_components=5, length=0.05), window=2).n_components <= 10
-    assert built(drive(4), WindowedRule(length=0.05), window=2).n_components > 20
-
-
-def test_the_seed_decides_which_origins_are_kept():
+def test_random_state_determines_the_kept_origins():
     rule = WindowedRule(max_origins=1, window=6)
     first, again, other = (built(drive(6), rule, random_state=seed) for seed in (0, 0, 1))
     assert torch.equal(first.seen_from, again.seen_from)
@@ -142,7 +217,7 @@ def test_the_seed_decides_which_origins_are_kept():
 
 
 @dims
-def test_what_is_answered_from_is_the_rounded_map_and_learning_goes_on_from_the_exact_one(dim):
+def test_queries_use_quantized_components_and_learning_uses_exact_ones(dim):
     rounded, exact = (built(drive(4, dim), window=2, codec=codec) for codec in ("quantized", "float"))
     assert torch.equal(rounded.means, exact.means)
     assert_same_components(rounded.components(), quantized(exact.components()))
@@ -176,7 +251,7 @@ def test_what_is_answered_from_is_the_rounded_map_and_learning_goes_on_from_the_
         ("hit_length", -1.0),
     ],
 )
-def test_bad_settings_are_named_when_the_map_is_made(name, value):
+def test_invalid_settings_are_refused_at_construction(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
         GaussianMap(**{name: value})
 
@@ -185,31 +260,31 @@ def test_bad_settings_are_named_when_the_map_is_made(name, value):
     "name", ["noise", "length", "min_points", "n_components", "max_origins", "iterations", "max_cells"]
 )
 @pytest.mark.parametrize("value", [0, -1])
-def test_bad_learning_rules_are_named(name, value):
+def test_invalid_learning_rules_are_refused(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
         WindowedRule(**{name: value})
 
 
 @pytest.mark.parametrize("name", ["noise", "length", "min_points"])
-def test_learning_rules_that_are_no_numbers_are_named(name):
+def test_learning_rules_with_non_numeric_values_are_refused(name):
     with pytest.raises(InvalidArgumentError, match=name):
         WindowedRule(**{name: math.nan})
 
 
-def test_the_window_given_is_the_rules():
+def test_the_window_argument_sets_that_of_the_rule():
     assert GaussianMap(window=3).learning == IncrementalRule(window=3)
     assert GaussianMap(WindowedRule(noise=0.02), window=3).learning == WindowedRule(noise=0.02, window=3)
 
 
-# -- what is inserted ------------------------------------------------------------------------------------
+# -- insert ----------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_scan_is_refused():
+def test_insert_refuses_what_is_no_scan():
     with pytest.raises(InvalidArgumentError, match=r"Tensor.*Scan"):
         GaussianMap().insert(torch.zeros(3, 2))
 
 
-def test_arrays_that_are_used_again_do_not_change_what_was_inserted():
+def test_overwriting_inserted_arrays_does_not_change_the_map():
     points = np.random.default_rng(0).normal(size=(50, 2)) * 0.01 + [3.0, 0.0]
     for empty in (GaussianMap(window=2), OccupancyGrid(0.1)):
         buffer = points.copy()
@@ -222,11 +297,11 @@ def test_arrays_that_are_used_again_do_not_change_what_was_inserted():
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(window=2), IncrementalRule(window=2)])
-def test_a_scan_that_cannot_be_learned_from_is_refused_and_the_map_goes_on_without_it(learning):
+def test_an_unusable_scan_is_refused_and_later_scans_are_learned(learning):
     scans = drive(3)
     made = built(scans[:1], learning, codec="quantized")
     before = made.occupancy(lattice(2))
-    for _ in range(2):  # 10⁹ m away: neither learned from with the other scan, nor stored
+    for _ in range(2):  # 10⁹ m away: beyond the codec
         with pytest.raises(GmmTorchError):
             made.insert(Scan(torch.full((5, 2), 1e9, dtype=torch.float64), torch.zeros(2)))
     assert torch.equal(made.occupancy(lattice(2)), before)
@@ -252,7 +327,7 @@ def test_an_empty_map_has_no_evidence_nor_components():
 
 
 @pytest.mark.parametrize("change", ["float", "half", "double", "to_cpu", "deepcopy"])
-def test_a_change_of_dtype_or_place_leaves_the_components_and_the_waiting_scans_as_they_are(change):
+def test_module_dtype_and_device_changes_keep_components_and_pending_scans_exact(change):
     made = built(drive(3), FINE)
     assert sorted(made.state_dict()) == ["_extra_state", *BUFFERS]
     buffers, answers = committed(made), made.occupancy(lattice(2))
@@ -267,32 +342,18 @@ def test_a_change_of_dtype_or_place_leaves_the_components_and_the_waiting_scans_
     assert_same_components(committed(other), committed(built(drive(4), FINE)))
 
 
-def test_networks_of_another_dtype_leave_positions_exact_far_from_the_origin():
+def test_module_dtype_changes_keep_distant_positions_exact():
     made = GaussianMap(window=1)
     made.insert(Scan(np.random.default_rng(0).normal(5e5, size=(50, 2)), np.full(2, 5e5)))
     before = made.means.clone()
     assert torch.equal(made.half().means, before)
 
 
-@dims
-def test_a_state_restores_the_components_and_the_answers(dim, tmp_path):
-    first, other = (
-        GaussianMap.from_components(**given_parts(dim, seed=seed), resolution=RESOLUTION) for seed in (0, 1)
-    )
-    expected, before = (made.occupancy(lattice(dim)) for made in (first, other))
-    assert not torch.equal(expected, before)
-    torch.save(first.state_dict(), tmp_path / "state.pt")
-    other.insert(wall_scan(dim))  # waits, and is none of what is restored
-    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    assert torch.equal(other.occupancy(lattice(dim)), expected)
-    assert_same_components(other.components(), first.components())
-
-
-def test_ids_go_on_from_those_of_a_restored_state():
+def test_new_ids_continue_those_of_a_restored_state():
     first = GaussianMap.from_components(**given_parts())
     first.ids += torch.tensor([0, 100])
     other = GaussianMap.from_components(**given_parts(seed=1))
     other.load_state_dict(first.state_dict())
     other.insert(wall_scan(2))
     assert min(names(other.components().ids) - names(first.ids)) == (0, 104)
-    assert other.means.shape == first.means.shape  # the window is not full yet
+    assert other.state_dict()["means"].shape == first.means.shape  # the window is not full yet

@@ -1,4 +1,4 @@
-"""Maps of given components: what is kept, what it means, and what is refused."""
+"""GaussianMap.from_components: stored values, evidence and bad input."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_given_components_are_kept_exactly_with_one_origin_each(dim):
 
 
 @dims
-def test_they_are_rounded_if_the_codec_says_so(dim):
+def test_given_components_are_rounded_by_the_quantized_codec(dim):
     exact = GaussianMap.from_components(**given_parts(dim))
     made = GaussianMap.from_components(**given_parts(dim), codec="quantized")
     assert_same_components(made.components(), quantized(exact.components()))
@@ -50,7 +50,7 @@ def test_given_components_may_be_arrays_and_lists():
 
 
 @pytest.mark.parametrize("as_array", [False, True])
-def test_arrays_that_are_written_to_again_do_not_change_the_map(as_array):
+def test_overwriting_given_arrays_does_not_change_the_map(as_array):
     parts = given_parts()
     flags = torch.zeros(4, dtype=torch.bool)
     given = {k: v.numpy() if as_array else v for k, v in parts.items()}
@@ -60,7 +60,7 @@ def test_arrays_that_are_written_to_again_do_not_change_the_map(as_array):
     assert_same_components(made.components(), GaussianMap.from_components(**given_parts()).components())
 
 
-def test_several_origins_share_the_support_in_proportion():
+def test_several_origins_share_the_support_in_proportion_to_their_counts():
     parts = given_parts(k=2)
     a, b, c = ([0.0, 0.0], [1.0, 0.0], [0.0, 2.0])
     made = GaussianMap.from_components(
@@ -70,7 +70,7 @@ def test_several_origins_share_the_support_in_proportion():
 
 
 @pytest.mark.parametrize(("method", "tolerance"), [("flux", 1e-3), ("monte_carlo", 0.05)])
-def test_given_components_hit_where_their_density_is(method, tolerance):
+def test_hits_of_given_components_follow_their_density(method, tolerance):
     mean, covariance = np.array([2.0, 0.4]), np.array([[0.02, 0.01], [0.01, 0.05]])
     made = GaussianMap.from_components(
         mean[None], covariance[None], [100.0], [[0.1, 0.1]], n_samples=1 << 17, cutoff=5.0
@@ -110,14 +110,14 @@ def test_given_components_hit_where_their_density_is(method, tolerance):
         ("robot", 1.5),
     ],
 )
-def test_given_components_that_do_not_fit_are_refused(name, value):
+def test_inconsistent_components_are_refused(name, value):
     with pytest.raises(GmmTorchError, match=name if name == "robot" else None):
         GaussianMap.from_components(**{**given_parts(), name: value})
 
 
 @dims
 @pytest.mark.parametrize("method", METHODS)
-def test_no_given_components_are_an_empty_map(dim, method):
+def test_zero_given_components_make_an_empty_map(dim, method):
     none = torch.zeros(0, dim)
     made = GaussianMap.from_components(none, torch.zeros(0, dim, dim), torch.zeros(0), none)
     assert made.occupancy(lattice(dim), method=method).unique().tolist() == [0.5]
@@ -127,26 +127,14 @@ def test_no_given_components_are_an_empty_map(dim, method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("sampling", ["sobol", "stratified", "plain"])
-def test_components_that_stand_for_no_points_say_nothing(sampling, method):
+def test_components_of_zero_support_give_no_evidence(sampling, method):
     made = GaussianMap.from_components(
         torch.zeros(1, 2), torch.eye(2)[None], torch.zeros(1), torch.ones(1, 2), sampling=sampling
     )
     assert made.occupancy(lattice(2), method=method).unique().tolist() == [0.5]
 
 
-@dims
-@pytest.mark.parametrize("codec", ["float", "quantized"])
-def test_given_components_answer_the_same_once_saved(dim, codec, tmp_path):
-    made = GaussianMap.from_components(**given_parts(dim), codec=codec)
-    made.save(tmp_path / "m.safetensors")
-    loaded = GaussianMap.load(tmp_path / "m.safetensors")
-    assert loaded.codec == codec
-    assert_same_components(loaded.components(), made.components())
-    assert torch.equal(loaded.occupancy(lattice(dim)), made.occupancy(lattice(dim)))
-    assert made.nbytes == (tmp_path / "m.safetensors").stat().st_size
-
-
-def test_more_than_255_origins_and_sightings_are_stored(tmp_path):
+def test_more_than_255_origins_are_stored(tmp_path):
     k, n = 2, 300
     parts = given_parts(k=k)
     seen = [[([0.01 * i, float(j)], 1.0 + i) for i in range(n)] for j in range(k)]

@@ -1,22 +1,22 @@
-"""Maps that grow under a budget: what is counted, what is kept, and what they answer."""
+"""absorb: support, budgets, origins and occupancy of incremental learning."""
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.component_cases import counts_add_up
-from occupancy.protocol_contract import WALL, dims, empty_scan, open_scan, points, quarter_turn, wall_scan
+from occupancy.protocol_contract import WALL, dims, open_scan, points, wall_scan
 from torch import Tensor
 
 import gmmtorch
-from gmmtorch.datasets.depth_frames import back_project
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.incremental import absorb, depth_scan
@@ -24,6 +24,7 @@ from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan
 
 RULE = IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=2, window_components=30)
@@ -31,7 +32,7 @@ INTRINSICS = torch.tensor([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]
 
 
 def drive(n: int, dim: int) -> list[Scan]:
-    """The wall from n places along it, and some open beams."""
+    """The wall from n positions along it, with some no-return beams."""
     places = [(0.3125, -1.0 + 0.25 * i, 0.0625 * i) for i in range(n)]
     scans = [wall_scan(dim, i, place) for i, place in enumerate(places)]
     return [replace(scan, no_return=open_scan(dim).no_return[::20]) for scan in scans]
@@ -56,7 +57,7 @@ def equal(a: Components, b: Components) -> bool:
     window=st.integers(1, 3),
 )
 @settings(max_examples=15)
-def test_every_point_is_counted_and_the_budget_is_kept(n, dim, limit, window):
+def test_support_equals_the_number_of_points_within_the_budget(n, dim, limit, window):
     scans = drive(n, dim)
     found = grown(scans, replace(RULE, n_components=limit, window=window, max_origins=2, mean_origins=None))
     assert counts_add_up(found)
@@ -71,15 +72,6 @@ def test_every_point_is_counted_and_the_budget_is_kept(n, dim, limit, window):
 
 
 @dims
-def test_the_budget_in_bytes_is_kept_after_every_scan(dim):
-    rule = replace(RULE, max_bytes=500, window=1)
-    found = Components.empty(dim)
-    for scan in drive(5, dim):
-        found = absorb(found, [scan], rule)
-        assert 330 < estimated_bytes(found) <= 500
-
-
-@dims
 def test_the_same_scans_give_the_same_map(dim):
     scans = drive(4, dim)
     rule = replace(RULE, n_components=8, max_cost=0.01)
@@ -90,7 +82,7 @@ def test_the_same_scans_give_the_same_map(dim):
 
 
 @dims
-def test_walls_are_occupied_and_what_lies_before_them_is_free(dim):
+def test_walls_are_occupied_and_the_space_before_them_is_free(dim):
     scans = [Scan(scan.points, scan.origin) for scan in drive(5, dim)]
     found = grown(scans, replace(RULE, n_components=6, max_origins=3))
     theta = occupancy(found, points([1.0, 2.0, 2.8, WALL, 3.9], dim))
@@ -99,27 +91,8 @@ def test_walls_are_occupied_and_what_lies_before_them_is_free(dim):
     assert abs(float(theta[4]) - 0.5) < 0.05
 
 
-@dims
-def test_scans_with_nothing_in_them_add_nothing(dim):
-    before = grown(drive(2, dim))
-    assert equal(absorb(before, [empty_scan(dim)] * 3, RULE), before)
-    assert equal(absorb(before, [], RULE), before)
-    assert len(grown([empty_scan(dim)])) == 0
-
-
-@dims
-def test_beams_without_return_alone(dim):
-    found = grown([open_scan(dim), open_scan(dim)], replace(RULE, n_components=4))
-    assert bool(found.max_range.all())
-    middle = open_scan(dim).origin.expand(2, -1) + torch.tensor([[2.0, 0, 0], [4.3, 0, 0]])[:, :dim]
-    theta = occupancy(found, middle.double())
-    assert float(theta[0]) < 0.2
-    assert 0.2 < float(theta[1]) <= 0.5
-
-
-@dims
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_a_few_points_are_enough(dim, n):
+@pytest.mark.parametrize(("dim", "n"), [(2, 1), (2, 2), (3, 3)])
+def test_scans_of_few_points_are_learned(dim, n):
     scan = wall_scan(dim)
     few = Scan(scan.points[:: len(scan.points) // n][:n], scan.origin)
     found = grown([few], replace(RULE, n_components=1))
@@ -127,28 +100,7 @@ def test_a_few_points_are_enough(dim, n):
     assert float(found.support.sum()) == pytest.approx(n)
 
 
-def test_far_from_the_origin_the_map_is_the_same():
-    shift = torch.tensor([524_288.0, -262_144.0, 1024.0], dtype=torch.float64)
-    scans = drive(4, 3)
-    rule = replace(RULE, n_components=8)
-    near = grown(scans, rule)
-    far = grown([Scan(s.points + shift, s.origin + shift, s.no_return + shift) for s in scans], rule)
-    assert len(near) == len(far)
-    x = points([1.0, 2.0, 2.9, WALL, 3.3], 3)
-    torch.testing.assert_close(occupancy(far, x + shift), occupancy(near, x), rtol=0, atol=1e-3)
-
-
-@dims
-def test_a_motion_moves_components_and_their_origins(dim):
-    found = grown(drive(4, dim), replace(RULE, n_components=8))
-    turn = quarter_turn(dim, (2.0, -1.0, 0.5))
-    moved = found.transformed(turn, torch.ones(len(found), dtype=torch.bool))
-    x = points([1.0, 2.0, 2.9, WALL, 3.3], dim)
-    there = x @ turn[:dim, :dim].T + turn[:dim, dim]
-    torch.testing.assert_close(occupancy(moved, there), occupancy(found, x), rtol=0, atol=1e-6)
-
-
-def test_new_components_have_no_number_and_old_ones_keep_theirs():
+def test_old_components_keep_their_ids_and_new_ones_have_none():
     scans = drive(4, 3)
     first = grown(scans[:2])
     assert bool((first.ids[:, 1] == UNNUMBERED).all())
@@ -160,13 +112,13 @@ def test_new_components_have_no_number_and_old_ones_keep_theirs():
     assert torch.equal(second.means[: len(first)], first.means)
 
 
-# -- the thesis's way -----------------------------------------------------------------------------
+# -- novelty --------------------------------------------------------------------------------------
 
 NOVEL = replace(RULE, novelty=NoveltyRule(resolution=0.125, threshold=0.5, distance=0.3), window=1)
 
 
 @dims
-def test_seeing_the_same_again_adds_little(dim):
+def test_repeated_scans_add_few_components(dim):
     once = grown([wall_scan(dim, seed) for seed in range(2)], NOVEL)
     again = absorb(once, [wall_scan(dim, seed) for seed in range(2, 6)], NOVEL)
     without = grown([wall_scan(dim, seed) for seed in range(6)], replace(RULE, window=1))
@@ -175,7 +127,7 @@ def test_seeing_the_same_again_adds_little(dim):
 
 
 @dims
-def test_new_space_is_learned(dim):
+def test_scans_of_new_space_add_components(dim):
     once = grown([wall_scan(dim)], NOVEL)
     beyond = wall_scan(dim, 1)
     beyond = Scan(beyond.points + 8.0, beyond.origin + 8.0)
@@ -185,8 +137,8 @@ def test_new_space_is_learned(dim):
     torch.testing.assert_close(occupancy(both, x + 8.0), occupancy(once, x), rtol=0, atol=0.1)
 
 
-def test_novel_points_that_are_explained_are_counted_not_learned():
-    # Nothing is old news under a threshold of zero bits; what is explained is counted all the same.
+def test_explained_novel_points_are_counted_instead_of_learned():
+    # With a threshold of zero bits every beam is novel; explained points are still counted.
     rule = replace(NOVEL, novelty=NoveltyRule(resolution=0.125, threshold=0.0, distance=0.3, explained=1e9))
     once = grown([wall_scan(3)], rule)
     scan = wall_scan(3, 1)
@@ -220,7 +172,7 @@ def depth_frames(n: int = 3) -> list[tuple[Tensor, Tensor]]:
 
 
 @pytest.mark.parametrize("stride", [1, 3])
-def test_depth_images_are_learned_as_their_points_are(stride):
+def test_depth_images_give_the_same_evidence_as_their_points(stride):
     frames = depth_frames()
     found = absorb_depth(Components.empty(3), frames, INTRINSICS, RULE, pixel_stride=stride)
     scans = []
@@ -233,7 +185,7 @@ def test_depth_images_are_learned_as_their_points_are(stride):
     torch.testing.assert_close(found.support, expected.support * stride**2, rtol=1e-6, atol=1e-6)
 
 
-def test_far_pixels_are_left_out_and_an_empty_image_is_nothing():
+def test_pixels_beyond_the_range_and_empty_images_add_nothing():
     near = absorb_depth(Components.empty(3), depth_frames(1), INTRINSICS, RULE, 1, max_range=2.3)
     scan_points = back_project(torch.nan_to_num(depth_frames(1)[0][0]).double(), INTRINSICS)
     assert float(near.support.sum()) == pytest.approx(int((scan_points[:, 2] < 2.3).sum()))
@@ -241,7 +193,7 @@ def test_far_pixels_are_left_out_and_an_empty_image_is_nothing():
     assert len(absorb_depth(Components.empty(3), blank, INTRINSICS, RULE)) == 0
 
 
-def test_a_map_learns_depth_images_as_its_rule_does():
+def test_a_map_learns_depth_images_like_its_rule():
     made, frames = GaussianMap(RULE, codec="float"), depth_frames()
     made.insert_depth(frames, INTRINSICS, pixel_stride=2)
     expected = absorb_depth(Components.empty(3), frames, INTRINSICS, RULE, pixel_stride=2)
@@ -281,7 +233,7 @@ def test_a_map_learns_depth_images_as_its_rule_does():
         {"max_cost": -0.1},
     ],
 )
-def test_rules_that_cannot_be_are_refused(bad):
+def test_invalid_incremental_rules_are_refused(bad):
     with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
         IncrementalRule(**bad)
 
@@ -295,9 +247,9 @@ def test_scans_of_another_dimension_are_refused():
 
 @pytest.mark.slow
 @pytest.mark.real_data
-def test_a_hall_in_eight_kilobytes(real_data: Path):
+def test_a_map_of_the_hall_fits_in_eight_kilobytes(real_data: Path):
     scans = list(gmmtorch.datasets.load("scan_folder", path=real_data / "hall"))
-    train, test = split.split_indices(len(scans), 5)
+    train, test = queries.split_indices(len(scans), 5)
     rule = IncrementalRule(
         noise=0.02, length=1.0, cell=0.15, window=12, window_components=500, max_bytes=8000
     )
@@ -307,3 +259,18 @@ def test_a_hall_in_eight_kilobytes(real_data: Path):
     theta = occupancy(found, asked.points, 0.2)
     assert estimated_bytes(found) <= 8000
     assert metrics.roc(theta[asked.of(queries.OCCUPIED)], theta[asked.of(queries.FREE)]).auc > 0.985
+
+
+def test_insert_depth_takes_arrays_and_asks_for_the_unit_of_whole_numbers():
+    metres, pose = depth_frames(1)[0]
+    millimetres = (torch.nan_to_num(metres) * 1000).round().numpy().astype(np.uint16)
+    made, expected = GaussianMap(RULE), GaussianMap(RULE)
+    made.insert_depth([(millimetres, pose.numpy())], INTRINSICS.numpy(), depth_scale=0.001)
+    expected.insert_depth([(torch.from_numpy(millimetres / 1000.0), pose)], INTRINSICS)
+    torch.testing.assert_close(made.means, expected.means, rtol=0, atol=1e-6)
+    with pytest.raises(InvalidArgumentError, match=r"^depth is an image of whole numbers.*depth_scale"):
+        GaussianMap(RULE).insert_depth([(millimetres, pose)], INTRINSICS)
+    with pytest.raises(InvalidArgumentError, match=r"^intrinsics=.*looks transposed"):
+        made.insert_depth([(metres, pose)], INTRINSICS.T)
+    with pytest.raises(InvalidArgumentError, match=r"^frames\[0\] is a Tensor; give pairs"):
+        made.insert_depth([metres], INTRINSICS)

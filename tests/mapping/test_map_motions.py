@@ -1,4 +1,4 @@
-"""Motions of a map: pose corrections move components and what is answered, and nothing is fitted again."""
+"""Motions of a GaussianMap: transform moves components and occupancy without learning again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from gmmtorch.mapping.learning.rules import WindowedRule
 
 
 @dims
-def test_moving_a_map_is_moving_its_components_and_their_origins(dim):
+def test_transform_equals_a_map_of_moved_components_and_origins(dim):
     parts, matrix = given_parts(dim), some_motion(dim)
     made = GaussianMap.from_components(**parts)
     made.transform(matrix)
@@ -38,7 +38,7 @@ def test_moving_a_map_is_moving_its_components_and_their_origins(dim):
 
 
 @dims
-def test_moving_some_components_leaves_the_others(dim):
+def test_transform_of_some_ids_leaves_other_components_unchanged(dim):
     parts, matrix = given_parts(dim), some_motion(dim)
     chosen = torch.tensor([False, True, False, True])
     made = GaussianMap.from_components(**parts)
@@ -53,7 +53,7 @@ def test_moving_some_components_leaves_the_others(dim):
         assert torch.equal(getattr(made, name)[~chosen], parts[name][~chosen])
 
 
-def test_an_origin_that_moved_and_unmoved_components_share_becomes_two():
+def test_an_origin_shared_by_moved_and_unmoved_components_is_split():
     parts = given_parts(k=2)
     shared = torch.zeros(2, 2, dtype=torch.float64)
     made = GaussianMap.from_components(parts["means"], parts["covariances"], parts["support"], shared)
@@ -62,7 +62,7 @@ def test_an_origin_that_moved_and_unmoved_components_share_becomes_two():
 
 
 @pytest.mark.parametrize("ids", [[], [[5, 0]], [[0, 99]]])
-def test_ids_that_name_nothing_move_nothing(ids):
+def test_transform_of_unknown_ids_moves_nothing(ids):
     made = GaussianMap.from_components(**given_parts())
     before = made.means.clone()
     made.transform(quarter_turn(2), ids=ids)
@@ -90,7 +90,7 @@ def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
     wrong = made.occupancy(lattice(dim))
     made.transform(matrix, ids=of_window[1])
     expected = built([scans[0], scans[1].transformed(matrix), scans[2]], rule)
-    # New components are numbered by place, which a turn may change: they are compared by their nearest.
+    # New ids follow the position, which the rotation changes: components are matched by their means.
     ours, theirs = made.components(), expected.components()
     distance, nearest = torch.cdist(theirs.means, ours.means).min(1)
     assert sorted(nearest.tolist()) == list(range(len(ours)))
@@ -101,9 +101,8 @@ def test_a_pose_correction_equals_learning_from_the_corrected_scans(dim):
     assert float((wrong - right).abs().max()) > 0.1
 
 
-@dims
-@pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_the_answers_of_an_incremental_map_move_with_it(dim, codec):
+@pytest.mark.parametrize(("dim", "codec"), [(2, "float"), (3, "quantized")])
+def test_the_occupancy_of_an_incremental_map_moves_with_it(dim, codec):
     made = built(drive(3, dim), FINE, codec=codec)
     before, ids = made.occupancy(lattice(dim)), made.components().ids
     matrix = quarter_turn(dim, (0.37, -1.21, 0.3))  # the cube at a point has the axes of the world
@@ -112,12 +111,12 @@ def test_the_answers_of_an_incremental_map_move_with_it(dim, codec):
     moved = made.occupancy(move(matrix, lattice(dim)))
     if codec == "float":
         torch.testing.assert_close(moved, before, rtol=0, atol=1e-6)
-    assert float((moved - before).abs().mean()) < 0.02  # rounded anew, where it is now
+    assert float((moved - before).abs().mean()) < 0.02  # quantized again at the new position
     assert float((made.occupancy(lattice(dim)) - before).abs().max()) > 0.1
 
 
 @pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_moving_a_map_back_restores_it(codec):
+def test_the_inverse_motion_restores_the_map(codec):
     made = built(drive(3), window=2, codec=codec)
     before = made.occupancy(lattice(2))
     made.transform(quarter_turn(2))
@@ -127,7 +126,7 @@ def test_moving_a_map_back_restores_it(codec):
 
 
 @pytest.mark.parametrize("codec", ["quantized", "float"])
-def test_a_moved_map_answers_the_same_once_saved(codec, tmp_path):
+def test_a_saved_moved_map_has_the_same_components_and_occupancy(codec, tmp_path):
     made = built(drive(3, 3), window=2, codec=codec)
     made.transform(some_motion(3))
     made.save(tmp_path / "m.safetensors")
@@ -136,7 +135,7 @@ def test_a_moved_map_answers_the_same_once_saved(codec, tmp_path):
     assert torch.equal(loaded.occupancy(lattice(3)), made.occupancy(lattice(3)))
 
 
-def test_a_motion_far_away_keeps_its_place():
+def test_a_distant_motion_is_exact_to_10_nm():
     parts, matrix = given_parts(), shifted(2, (500_000.0, 4_000_000.0))
     made = GaussianMap.from_components(**parts)
     made.transform(matrix)
@@ -144,7 +143,7 @@ def test_a_motion_far_away_keeps_its_place():
 
 
 @pytest.mark.parametrize("learning", [WindowedRule(window=20), FINE])
-def test_moving_closes_the_unfinished_window_and_learning_goes_on(learning):
+def test_transform_closes_the_pending_window_and_learning_continues(learning):
     made = built(drive(3), learning)
     ids = made.components().ids
     made.transform(shifted(2, (0.0, 1.0)))
@@ -166,7 +165,7 @@ def test_moving_closes_the_unfinished_window_and_learning_goes_on(learning):
     ],
     ids=["3D", "2x2", "scaled", "mirror", "nan", "nan translation", "perspective"],
 )
-def test_what_is_no_rigid_motion_is_refused_and_moves_nothing(matrix):
+def test_a_matrix_that_is_no_rigid_motion_is_refused(matrix):
     made = GaussianMap.from_components(**given_parts())
     before = made.means.clone()
     with pytest.raises(InvalidArgumentError, match="transform"):
@@ -177,7 +176,7 @@ def test_what_is_no_rigid_motion_is_refused_and_moves_nothing(matrix):
 @pytest.mark.parametrize(
     ("matrix", "ids"), [(torch.eye(3), [[0, 1, 2]]), (2 * torch.eye(3), None)], ids=["ids", "matrix"]
 )
-def test_a_transform_that_fails_leaves_the_window_open(matrix, ids):
+def test_a_refused_transform_keeps_the_pending_window(matrix, ids):
     scans = drive(3)
     made = built(scans[:2], window=3)
     with pytest.raises(InvalidArgumentError, match=r"ids has shape|transform"):

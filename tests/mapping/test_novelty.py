@@ -1,4 +1,4 @@
-"""Novelty of beams, against a walk through the cells of each by exact arithmetic."""
+"""Novelty of beams against a cell-by-cell walk in exact arithmetic."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def entropy(hits: float, misses: float, prior: float) -> float:
 
 
 def bits_by_a_walk(components: Components, scan: Scan, rule: NoveltyRule) -> tuple[list[float], list[bool]]:
-    """As `entropy_reduction`, one beam and one cell at a time."""
+    """Like `entropy_reduction`, one beam and one cell at a time."""
     bits, unobserved = [], []
     ends, is_hit = scan.ends()
     for end, hit in zip(ends, is_hit.tolist(), strict=True):
@@ -49,13 +49,12 @@ def bits_by_a_walk(components: Components, scan: Scan, rule: NoveltyRule) -> tup
     return bits, unobserved
 
 
-@dims
-@pytest.mark.parametrize("seed", [0, 1])
-def test_bits_are_those_of_a_walk(dim, seed):
+@pytest.mark.parametrize(("dim", "seed"), [(2, 0), (3, 1)])
+def test_entropy_reduction_equals_an_exact_walk(dim, seed):
     components = random_components(6, dim, seed, empty=0.3)
     generator = torch.Generator().manual_seed(seed)
-    ends = 1.5 * torch.randn(8, dim, generator=generator, dtype=torch.float64)
-    scan = Scan(ends[:5], torch.tensor([0.1, -0.2, 0.3][:dim], dtype=torch.float64), ends[5:])
+    ends = 1.2 * torch.randn(6, dim, generator=generator, dtype=torch.float64)
+    scan = Scan(ends[:4], torch.tensor([0.1, -0.2, 0.3][:dim], dtype=torch.float64), ends[4:])
     bits, unobserved = entropy_reduction(components, scan, RULE)
     expected, new = bits_by_a_walk(components, scan, RULE)
     torch.testing.assert_close(bits, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-9)
@@ -63,7 +62,7 @@ def test_bits_are_those_of_a_walk(dim, seed):
 
 
 @dims
-def test_what_was_learned_is_no_news(dim):
+def test_beams_through_learned_space_are_not_novel(dim):
     scans = [wall_scan(dim, seed) for seed in range(3)]
     learned = absorb(Components.empty(dim), scans, LEARNING)
     again = wall_scan(dim, 9)
@@ -80,7 +79,7 @@ def _turn(dim: int) -> torch.Tensor:
 
 
 @dims
-def test_an_empty_map_learns_from_every_beam(dim):
+def test_every_beam_is_novel_to_an_empty_map(dim):
     assert bool(novel_beams(Components.empty(dim), wall_scan(dim), RULE).all())
     assert novel_beams(Components.empty(dim), empty_scan(dim), RULE).shape == (0,)
     known = absorb(Components.empty(dim), [wall_scan(dim)], LEARNING)
@@ -99,7 +98,7 @@ def test_one_unobserved_cell_makes_a_beam_novel():
 
 
 @dims
-def test_beams_without_return_tell_of_free_space_alone(dim):
+def test_no_return_beams_reduce_the_entropy_of_free_space(dim):
     open_ = open_scan(dim)
     learned = absorb(Components.empty(dim), [open_, open_, open_], LEARNING)
     assert bool(learned.max_range.all())
@@ -108,7 +107,7 @@ def test_beams_without_return_tell_of_free_space_alone(dim):
     assert float(novel_beams(learned, open_, RULE).double().mean()) < 0.25
 
 
-def test_nothing_depends_on_where_the_world_begins():
+def test_novelty_is_the_same_far_from_the_world_origin():
     shift = torch.tensor([512_000.0, -256_000.0, 1024.0], dtype=torch.float64)
     scans = [wall_scan(3, seed) for seed in range(2)]
     moved = [Scan(scan.points + shift, scan.origin + shift) for scan in scans]
@@ -132,6 +131,6 @@ def test_nothing_depends_on_where_the_world_begins():
         {"distance": -0.1},
     ],
 )
-def test_rules_that_cannot_be_are_refused(bad):
+def test_invalid_novelty_rules_are_refused(bad):
     with pytest.raises(InvalidArgumentError, match=next(iter(bad))):
         NoveltyRule(**bad)

@@ -1,4 +1,4 @@
-"""Registration against known motions, automatic differentiation and sums over all pairs."""
+"""Registration against known motions, automatic differentiation and dense sums."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ dims = pytest.mark.parametrize("dim", [2, 3])
 
 
 def scene(dim: int, seed: int = 0, k: int = 30) -> Parameters:
-    """Flat pieces in all directions, as of a cluttered room of some ten metres."""
+    """Flat components in all directions within 8 m, as in a cluttered room."""
     generator = torch.Generator().manual_seed(seed)
     turn = torch.linalg.qr(torch.randn(k, dim, dim, generator=generator, dtype=torch.float64))[0]
     sigma = 0.1 + 0.5 * torch.rand(k, dim, generator=generator, dtype=torch.float64)
@@ -39,7 +39,7 @@ def scene(dim: int, seed: int = 0, k: int = 30) -> Parameters:
 
 
 def motion(dim: int, metres: float, degrees: float, seed: int = 0) -> Tensor:
-    """A shift and a turn of this size in a direction at random."""
+    """A shift and a rotation of this size in a random direction."""
     generator = torch.Generator().manual_seed(seed)
     shift = torch.randn(dim, generator=generator, dtype=torch.float64)
     axis = torch.randn(len(generators(dim)), generator=generator, dtype=torch.float64)
@@ -50,7 +50,7 @@ def motion(dim: int, metres: float, degrees: float, seed: int = 0) -> Tensor:
 
 
 def given_as(mixture: Parameters, transform: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """What `register` takes, moved."""
+    """The moved mixture as an argument of `register`."""
     weights, means, covariances = mixture
     if transform is not None:
         rotation, shift = transform[:-1, :-1], transform[:-1, -1]
@@ -64,7 +64,7 @@ def all_pairs(n: int, f: Parameters, g: Parameters) -> Pairs:
 
 
 def dense_log_score(f: Parameters, g: Parameters, rotation: Tensor, shift: Tensor) -> Tensor:
-    """log Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j), by torch's own normal."""
+    """log Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j), by torch.distributions."""
     covariance = (rotation @ f.covariances @ rotation.T)[:, None] + g.covariances
     there = (f.means @ rotation.T + shift)[:, None].expand(-1, len(g.weights), -1)
     normal = torch.distributions.MultivariateNormal(g.means, covariance)
@@ -88,7 +88,7 @@ def assert_close(found: Tensor, expected: Tensor, metres: float = 1e-4, radians:
 
 
 @dims
-def test_the_score_is_that_of_all_pairs_and_its_gradient_that_of_autograd(dim):
+def test_score_and_gradient_equal_dense_sums_and_autograd(dim):
     f, g, motions = scene(dim, 1, 7), scene(dim, 2, 9), some_motions(dim, 3)
     found = overlap(f, g, motions, all_pairs(3, f, g))
     n_free = found.gradient.shape[1]
@@ -106,8 +106,8 @@ def test_the_score_is_that_of_all_pairs_and_its_gradient_that_of_autograd(dim):
 
 
 @dims
-def test_where_mixtures_coincide_the_hessian_is_that_of_autograd(dim):
-    # One component on itself: no residual, for which alone Fisher's information leaves terms out.
+def test_the_hessian_at_the_optimum_equals_autograd(dim):
+    # One component on itself has no residual, so that Fisher's information equals the Hessian.
     f = Parameters(*(value[:1] for value in scene(dim, 3)))
     here = f._replace(means=f.means - f.means)
     still = Motions(torch.eye(dim).double()[None], torch.zeros(1, dim).double())
@@ -123,7 +123,7 @@ def test_where_mixtures_coincide_the_hessian_is_that_of_autograd(dim):
 
 
 @dims
-def test_pairs_that_are_left_out_do_not_matter(dim):
+def test_the_score_does_not_depend_on_omitted_pairs(dim):
     f, g, motions = scene(dim, 1, 40), scene(dim, 1, 40), some_motions(dim, 4)
     ascent = Ascent(f, g, 3.0)
     pairs = ascent.pairs(motions)
@@ -134,7 +134,7 @@ def test_pairs_that_are_left_out_do_not_matter(dim):
 
 @pytest.mark.slow
 @dims
-def test_the_score_never_falls(dim):
+def test_the_score_never_decreases(dim):
     f, g = scene(dim, 5), scene(dim, 5)
     starts = torch.stack([motion(dim, metres, degrees) for metres, degrees in ((0.3, 5), (1, 30), (3, 90))])
     motions = Motions(starts[:, :dim, :dim], starts[:, :dim, dim])
@@ -143,9 +143,9 @@ def test_the_score_never_falls(dim):
         reached = Ascent(f, g, 3.0).run(motions, n_steps, 1e-6)[0]
         return [float(dense_log_score(f, g, r, t)) for r, t in zip(*reached, strict=True)]
 
-    table = np.array([scores(n) for n in range(1, 25)])
+    table = np.array([scores(n) for n in range(1, 25, 2)])
     rises = np.diff(table, axis=0)
-    assert rises.min() > -1e-3  # what pairs beyond the cutoff amount to
+    assert rises.min() > -1e-3  # the contribution of pairs beyond the cutoff
     assert (table[-1] - table[0] > 0.05).all()
 
 
@@ -153,7 +153,7 @@ def test_the_score_never_falls(dim):
 
 
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]), st.floats(0, 1.0), st.floats(0, 25))
-@settings(max_examples=12)
+@settings(max_examples=8)
 def test_known_motions_are_recovered(seed, dim, metres, degrees):
     f, expected = scene(dim, seed % 7), motion(dim, metres, degrees, seed)
     found = register(given_as(f), given_as(f, expected))
@@ -164,7 +164,7 @@ def test_known_motions_are_recovered(seed, dim, metres, degrees):
 
 
 @dims
-def test_parts_of_one_scene_are_laid_over_each_other(dim):
+def test_overlapping_parts_of_a_scene_are_aligned(dim):
     f, expected = scene(dim, 2, 60), motion(dim, 0.5, 10)
     half = Parameters(*(value[:40] for value in f)), Parameters(*(value[20:] for value in f))
     found = register(given_as(half[0]), given_as(half[1], expected))
@@ -174,8 +174,8 @@ def test_parts_of_one_scene_are_laid_over_each_other(dim):
 
 @pytest.mark.slow
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
-@settings(max_examples=6)
-def test_source_and_target_may_be_swapped_and_components_shuffled(seed, dim):
+@settings(max_examples=4)
+def test_swapping_source_and_target_inverts_the_result(seed, dim):
     f = scene(dim, seed % 5, 40)
     parts = Parameters(*(v[:32] for v in f)), Parameters(*(v[8:] for v in f))
     there = given_as(parts[1], motion(dim, 0.4, 8, seed))
@@ -189,15 +189,15 @@ def test_source_and_target_may_be_swapped_and_components_shuffled(seed, dim):
 
 
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
-@settings(max_examples=6)
-def test_moving_the_target_moves_the_result(seed, dim):
+@settings(max_examples=3)
+def test_the_result_moves_with_the_target(seed, dim):
     f, first, more = scene(dim, seed % 5), motion(dim, 0.3, 6, seed), motion(dim, 30.0, 170, seed + 1)
     near = register(given_as(f), given_as(f, first))
     far = register(given_as(f), given_as(f, more @ first), more)
     assert_close(far.transform, more @ near.transform)
 
 
-def test_far_from_the_origin_nothing_is_lost():
+def test_registration_is_the_same_far_from_the_world_origin():
     f, shift = scene(3, 4), torch.eye(4).double()
     shift[:3, 3] = torch.tensor([5e5, -4e6, 120.0])
     there = shift @ motion(3, 0.6, 12) @ torch.linalg.inv(shift)
@@ -208,7 +208,7 @@ def test_far_from_the_origin_nothing_is_lost():
 
 
 @dims
-def test_an_unknown_heading_is_found_among_several_starts(dim):
+def test_several_starts_recover_an_unknown_heading(dim):
     f, expected = scene(dim, 6), torch.eye(dim + 1).double()
     c, s = math.cos(2.5), math.sin(2.5)
     expected[:2, :2] = torch.tensor([[c, -s], [s, c]])
@@ -220,7 +220,7 @@ def test_an_unknown_heading_is_found_among_several_starts(dim):
     assert not register(source, target).reliable
 
 
-def test_maps_and_components_are_taken_without_the_ends_of_empty_beams():
+def test_no_return_components_of_maps_are_ignored():
     c = random_components(40, 3, seed=8, empty=0.3)
     moved = c.transformed(some_motion(3), torch.ones(40, dtype=torch.bool))
     solid = ~c.max_range
@@ -236,7 +236,7 @@ def test_maps_and_components_are_taken_without_the_ends_of_empty_beams():
     torch.testing.assert_close(register(made, moved, some_motion(3)).transform, by_hand.transform)
 
 
-def test_weights_count_only_if_asked_for():
+def test_component_weights_are_used_only_with_the_option():
     f = scene(3, 1)
     heavy = f._replace(weights=f.weights * torch.linspace(0.01, 100, 30).double())
     target = given_as(f, motion(3, 0.2, 4))
@@ -246,10 +246,10 @@ def test_weights_count_only_if_asked_for():
     assert by_support[0].score != pytest.approx(by_support[1].score, rel=0.01)
 
 
-# -- what cannot be registered --------------------------------------------------------------------
+# -- unreliable results and bad input -------------------------------------------------------------
 
 
-def test_results_that_nothing_holds_say_so():
+def test_unobservable_directions_are_reported():
     f = scene(3, 0, 12)
     flat = f.means * torch.tensor([1.0, 0.0, 0.0])
     round_ones = torch.eye(3).double().expand(12, 3, 3) * 0.01
@@ -263,7 +263,7 @@ def test_results_that_nothing_holds_say_so():
         assert found.width == math.inf or found.width > 1
 
 
-def test_covariances_without_any_thickness_give_numbers():
+def test_covariances_of_zero_thickness_give_finite_results():
     f = scene(3, 0, 12)
     flat = f._replace(covariances=f.covariances * 0 + torch.diag(torch.tensor([1.0, 0.1, 0.0])).double())
     found = register(given_as(flat), given_as(flat, motion(3, 0.1, 1)), finest=0.0)
@@ -271,7 +271,7 @@ def test_covariances_without_any_thickness_give_numbers():
     assert not math.isnan(found.score + found.overlap + found.width)
 
 
-def test_mixtures_that_are_nowhere_near_each_other_say_so():
+def test_mixtures_without_overlap_are_reported():
     f, away = scene(3, 0), motion(3, 1000.0, 0)
     found = register(given_as(f), given_as(f, away))
     torch.testing.assert_close(found.transform, torch.eye(4).double())
@@ -280,12 +280,12 @@ def test_mixtures_that_are_nowhere_near_each_other_say_so():
     assert found.overlap == found.score == 0
 
 
-def test_different_places_overlap_little():
+def test_different_places_have_a_low_overlap():
     found = register(given_as(scene(3, 0)), given_as(scene(3, 9)))
     assert not found.reliable
 
 
-def test_two_poses_that_fit_alike_are_ambiguous():
+def test_two_equally_good_poses_are_reported_as_ambiguous():
     f = scene(2, 0, 20)
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
     both = [torch.cat(pair) for pair in zip(given_as(f), given_as(f, half_turn), strict=True)]
@@ -322,7 +322,7 @@ def bad_calls():
 
 
 @pytest.mark.parametrize("call", list(bad_calls()))
-def test_what_cannot_be_registered_is_refused(call):
+def test_invalid_arguments_are_refused(call):
     with pytest.raises(InvalidArgumentError):
         call()
 

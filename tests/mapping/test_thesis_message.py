@@ -1,4 +1,4 @@
-"""The thesis's message, whose size is its point."""
+"""Thesis messages: size, bytes by hand, and damaged messages."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ dims = pytest.mark.parametrize("dim", [2, 3])
 
 
 @pytest.mark.parametrize(("dim", "size"), [(2, 37), (3, 57)])
-def test_a_message_has_the_thesis_s_size(dim, size):
+def test_a_thesis_message_has_the_size_of_the_thesis(dim, size):
     components = random_components(dim)
     assert len(encode_thesis(components)) == size * len(components.seen_by)
     assert len(encode_thesis_updates(components.ids, components.support)) == 8 * len(components)
 
 
-def test_a_message_by_hand():
+def test_a_thesis_message_equals_bytes_by_hand():
     components = random_components(3, k=1, max_sightings=1, robot=2)
     components = replace(components, ids=torch.tensor([[2, 5]]), max_range=torch.tensor([True]))
     number, count, *floats = struct.unpack("<If12fB", encode_thesis(components))
@@ -40,7 +40,7 @@ def test_a_message_by_hand():
 
 
 @dims
-def test_what_was_sent_is_received(dim):
+def test_decoded_thesis_components_equal_the_sent_ones(dim):
     components = random_components(dim)
     found = decode_thesis(encode_thesis(components), dim)
     for name in ("means", "covariances", "support", "seen_count"):
@@ -53,7 +53,7 @@ def test_what_was_sent_is_received(dim):
     )
 
 
-def test_updates_are_received():
+def test_support_updates_are_decoded():
     ids = torch.tensor([[0, 1], [255, 2**24 - 1]])
     found, counts = decode_thesis_updates(encode_thesis_updates(ids, torch.tensor([1.5, 7.0])))
     assert torch.equal(found, ids)
@@ -61,20 +61,20 @@ def test_updates_are_received():
 
 
 @dims
-def test_nothing_is_no_message(dim):
+def test_zero_components_are_an_empty_message(dim):
     components = random_components(dim, k=0)
     assert encode_thesis(components) == b""
     assert len(decode_thesis(b"", dim)) == 0
 
 
 @pytest.mark.parametrize("ids", [[256, 0], [0, 2**24], [-1, 0], [0, -1]])
-def test_ids_that_do_not_fit_are_refused(ids):
+def test_ids_outside_the_field_width_are_refused(ids):
     components = replace(random_components(2, k=1), ids=torch.tensor([ids]))
     with pytest.raises(InvalidArgumentError, match=r"id \["):
         encode_thesis(components)
 
 
-def test_places_that_float32_would_blur_are_refused():
+def test_positions_that_float32_rounds_too_much_are_refused():
     with pytest.raises(InvalidArgumentError, match="millimetre"):
         encode_thesis(random_components(3, center=5e5))
 

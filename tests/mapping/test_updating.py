@@ -1,4 +1,4 @@
-"""Fractional counts of explained points, against a loop over points and components."""
+"""Association: counts of explained points against a loop over points and components."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def counts_by_a_loop(components, points, origin, distance, limit, max_range):
     limit=st.sampled_from([None, 2.0]),
     max_range=st.booleans(),
 )
-def test_counts_are_those_of_a_loop(dim, seed, distance, limit, max_range):
+def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range):
     components = random_components(7, dim, seed, spread=0.5, empty=0.3)
     generator = torch.Generator().manual_seed(seed + 1)
     points = torch.randn(15, dim, generator=generator, dtype=torch.float64)
@@ -64,7 +64,7 @@ def test_counts_are_those_of_a_loop(dim, seed, distance, limit, max_range):
     assert math.isclose(gained, sum(explained), abs_tol=1e-6)
 
 
-def test_moments_stay_and_weights_count():
+def test_association_keeps_moments_and_adds_beam_weights():
     components = random_components(4, 3, 0)
     at_mean = components.means[:1]  # where the thesis's shares divide by zero
     found = count_explained(components, at_mean, components.origins[0], 100.0, weight=16.0)
@@ -87,7 +87,7 @@ def test_without_components_or_points_nothing_is_explained():
 
 
 @pytest.mark.parametrize("k", [1, 300])
-def test_many_points_are_counted_in_portions_alike(k, monkeypatch):
+def test_association_counts_do_not_depend_on_the_portion_size(k, monkeypatch):
     components = random_components(k, 2, 1)
     points = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = count_explained(components, points, components.origins[0], 100.0)

@@ -431,7 +431,7 @@ class MixtureContract(ABC):
         usual += [{"random_state": value} for value in (-1, 1.5, "seed", 2**64)]
         for options in [*usual, *self.bad_parameters]:
             name = next(iter(options))
-            with pytest.raises(InvalidArgumentError, match=f"^{name}"):
+            with pytest.raises(InvalidArgumentError, match=name):
                 self.make(**options).fit(blobs(2))
 
     def test_every_parameter_is_stored_and_documented(self):
@@ -455,7 +455,7 @@ class MixtureContract(ABC):
         points, motion = blobs(dim), rigid_motion(dim)
         mixture = self.make().fit(kind(points))
         before = mixture.means.clone()
-        moved = mixture.transform(motion)
+        moved = mixture.moved(motion)
         assert type(moved) is type(mixture)
         assert type(moved.means_) is type(mixture.means_)
         expected = mixture.score_samples(kind(points))
@@ -464,12 +464,12 @@ class MixtureContract(ABC):
         assert moved.get_params() == mixture.get_params()
         assert moved.lower_bounds_ == mixture.lower_bounds_
         assert moved.state_dict().keys() == mixture.state_dict().keys()
-        self.same(mixture.transform(np.eye(dim + 1)), mixture)
+        self.same(mixture.moved(np.eye(dim + 1)), mixture)
         with pytest.raises(InvalidArgumentError, match="transform"):
-            mixture.transform(2 * motion)
+            mixture.moved(2 * motion)
 
     def test_unfitted_mixture_has_no_fitted_attributes(self, tmp_path):
-        for name in ("transform", "means_", "weights_", "covariances_", "precisions_", "lower_bound_"):
+        for name in ("means_", "weights_", "covariances_", "precisions_", "lower_bound_"):
             assert not hasattr(self.make(), name)
         with pytest.raises(NotFittedError):
             self.make().save(tmp_path / "m.safetensors")
@@ -505,10 +505,10 @@ class MixtureContract(ABC):
         self.same(loaded, mixture)
         loaded.save(tmp_path / "again.safetensors")
         assert (tmp_path / "again.safetensors").read_bytes() == path.read_bytes()
-        self.same(loaded.transform(np.eye(4)).fit(kind(blobs(3))), mixture)
+        self.same(loaded.moved(np.eye(4)).fit(kind(blobs(3))), mixture)
 
     def test_moved_mixture_can_be_saved(self, tmp_path):
-        mixture = self.make().fit(blobs(2)).transform(rigid_motion(2))
+        mixture = self.make().fit(blobs(2)).moved(rigid_motion(2))
         mixture.save(tmp_path / "m.safetensors")
         self.same(type(mixture).load(tmp_path / "m.safetensors"), mixture)
 

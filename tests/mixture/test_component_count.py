@@ -235,7 +235,7 @@ def test_n_components_none_is_kept_by_files_states_and_copies(tmp_path):
     numbered = GaussianMixture(2)
     numbered.load_state_dict(mixture.state_dict())
     assert numbered.n_components == k
-    for other in (loaded, taken, mixture.transform(np.eye(4))):
+    for other in (loaded, taken, mixture.moved(np.eye(4))):
         assert other.n_components is None
         assert torch.equal(other.means, mixture.means)
     assert loaded.get_params() == mixture.get_params()

@@ -12,7 +12,7 @@ from mixture.estimator_contract import MixtureContract
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
 
 BAD_LOOP_PARAMETERS: list[dict[str, Any]] = [
-    *({"max_iter": value} for value in (0, 2.5, "long")),
+    *({"max_iter": value} for value in (-1, 2.5, "long")),
     *({"n_init": value} for value in (0, -1)),
     *({"tol": value} for value in (-1e-3, math.nan, "small")),
     *({"reg_covar": value} for value in (-1.0, math.inf, None)),

@@ -194,9 +194,9 @@ def test_thin_pieces_500_km_apart_are_fitted_in_one_cloud(init, length):
     ],
     ids=["3D", "2x3", "scaled", "nan", "nan translation", "mirror"],
 )
-def test_transform_rejects_a_matrix_that_is_not_rigid(matrix):
+def test_moved_rejects_a_matrix_that_is_not_rigid(matrix):
     with pytest.raises(InvalidArgumentError, match="transform"):
-        fitted().transform(matrix)
+        fitted().moved(matrix)
 
 
 # -- starts ----------------------------------------------------------------------------------------
@@ -339,7 +339,7 @@ def test_invalid_given_starts_are_named(name, value):
 
 
 def test_indefinite_precisions_init_is_named():
-    with pytest.raises(NumericalError, match=r"precisions_init\[1\]"):
+    with pytest.raises(InvalidArgumentError, match=r"precisions_init\[1\]"):
         GaussianMixture(2, precisions_init=np.stack([np.eye(2), -np.eye(2)])).fit(blobs())
 
 

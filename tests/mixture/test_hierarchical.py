@@ -22,7 +22,7 @@ from gmmtorch import datasets
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
-from gmmtorch.mixture.estimators.trees.growth import GrowthRule, Tree, grow
+from gmmtorch.mixture.estimators.trees.growth import Tree, grow
 from gmmtorch.mixture.estimators.trees.hierarchical import check_tree
 from gmmtorch.mixture.estimators.trees.nested import (
     Children,
@@ -326,11 +326,13 @@ def test_points_are_assigned_by_responsibility_and_keep_their_weight(seed, thres
 
 
 @pytest.mark.parametrize("soft_threshold", [0.0, 0.1, 1.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_every_level_has_the_whole_weight_of_each_point(soft_threshold, dtype):
     points = torch.from_numpy(room(600))
     weight = torch.rand(600, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
-    rule = GrowthRule(60, 4, 3, soft_threshold=soft_threshold, dtype=dtype)
+    rule = HierarchicalGaussianMixture(
+        60, branching=4, max_levels=3, soft_threshold=soft_threshold, dtype=dtype
+    )
     held: list[tuple[Tensor, Members]] = []
     tree = grow(
         points, weight, rule, on_level=lambda nodes, members: held.append((nodes.place, members))
@@ -616,9 +618,9 @@ def test_files_states_and_copies_keep_the_tree(tmp_path):
     assert torch.equal(flat.means, tree.means)
 
 
-def test_transform_moves_the_tree():
+def test_moved_moves_the_tree():
     tree, motion = deep(), rigid_motion(3)
-    moved = tree.transform(motion)
+    moved = tree.moved(motion)
     points = room(50, seed=2) + FAR[:3]
     at = points @ motion[:3, :3].T + motion[:3, 3]
     for level in range(1, tree.n_levels_ + 1):

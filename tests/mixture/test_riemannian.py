@@ -23,6 +23,7 @@ from torch import Tensor
 from gmmtorch.errors import NumericalError
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimators.ascent import LBFGS, SOLVERS, ascend, search
@@ -328,14 +329,14 @@ def overlapping(seed: int = 0, n: int = 1500) -> np.ndarray:
     )
 
 
-def blurred_em_step(points: np.ndarray, reg_covar: float) -> em.Step:
+def blurred_em_step(points: np.ndarray, reg_covar: float) -> loop.Step:
     """EM on the objective of the ascent: points as cells of covariance ε I."""
     x = torch.from_numpy(points)
     features = em.quadratic_features(x)
     dim = x.shape[1]
     rows, cols = torch.triu_indices(dim, dim)
     features[:, 1 + dim :] += reg_covar * (rows == cols)
-    return em.natural_step(features, torch.ones(len(x)).double(), 0.0, torch.float64)
+    return loop.natural_step(features, torch.ones(len(x)).double(), 0.0, torch.float64)
 
 
 @solvers
@@ -366,7 +367,7 @@ def test_em_does_not_improve_the_result(solver, init_params, reg_covar):
     ).fit(points)
     assert fit.converged_
     parameters = Parameters(fit.weights, fit.means, fit.covariances)
-    again = em.run_em(blurred_em_step(points, reg_covar), parameters, tol=0, max_iter=30)
+    again = loop.run_em(blurred_em_step(points, reg_covar), parameters, tol=0, max_iter=30)
     assert again.lower_bounds[0] == pytest.approx(fit.lower_bound_, abs=1e-8)
     assert 0 <= again.lower_bounds[-1] - again.lower_bounds[0] < 1e-7
     place = Likelihood(torch.from_numpy(points), torch.ones(len(points)).double(), reg_covar).at(parameters)
@@ -415,8 +416,8 @@ def test_overlapping_clusters_need_a_fifth_of_the_steps_of_em():
     weight = torch.ones(len(points)).double()
     x = torch.from_numpy(points)
     first = initialize("kmeans", x, weight, 4, 1e-6, torch.Generator().manual_seed(0))
-    run = em.run_em(
-        em.natural_step(em.quadratic_features(x), weight, 1e-6, torch.float64),
+    run = loop.run_em(
+        loop.natural_step(em.quadratic_features(x), weight, 1e-6, torch.float64),
         first,
         tol=0,
         max_iter=5 * calls,

@@ -267,7 +267,7 @@ def test_partial_fit_of_given_parameters_needs_memory():
     [
         copy.deepcopy,
         lambda g: pickle.loads(pickle.dumps(g)),
-        lambda g: g.transform(np.eye(3)),
+        lambda g: g.moved(np.eye(3)),
         lambda g: (g.save("m.safetensors"), GaussianMixture.load("m.safetensors"))[1],
     ],
     ids=["deepcopy", "pickle", "transform", "file"],
@@ -349,8 +349,8 @@ def test_partial_fit_commutes_with_motions():
     rotation[:, 0] *= np.sign(np.linalg.det(rotation))
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, [1.0, -2.0, 5.0]
-    one = exact().partial_fit(blobs(100, 3)).partial_fit(blobs(50, 3, seed=1)).transform(motion)
-    other = exact().partial_fit(blobs(100, 3)).transform(motion)
+    one = exact().partial_fit(blobs(100, 3)).partial_fit(blobs(50, 3, seed=1)).moved(motion)
+    other = exact().partial_fit(blobs(100, 3)).moved(motion)
     other.partial_fit(blobs(50, 3, seed=1) @ rotation.T + motion[:3, 3])
     assert_same(one, other)
 

@@ -23,7 +23,7 @@ from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mixture import GaussianMixture, gaussian_mixture
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em import grouping, truncated
+from gmmtorch.mixture.em import grouping, loop, truncated
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import (
     Rows,
@@ -248,7 +248,7 @@ def test_nearest_equals_brute_force():
 # -- the loop --------------------------------------------------------------------------------------
 
 
-def check_run(found: em.EMResult, max_iter: int, slack: float = 0.0) -> None:
+def check_run(found: loop.EMResult, max_iter: int, slack: float = 0.0) -> None:
     assert 1 <= found.n_iter <= max_iter
     assert np.isfinite(found.lower_bounds).all()
     assert (np.diff(found.lower_bounds) >= -slack).all()
@@ -316,7 +316,7 @@ def test_one_iteration_equals_one_em_step():
     points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
     setup = Settings(1e-6, 0.0, 1, torch.float64)
     found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, setup)
-    step = em.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
+    step = loop.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
     expected, bound = step(parameters)
     assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
     torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
@@ -340,8 +340,8 @@ def test_converges_to_the_result_of_em():
     found, *_ = run_truncated(
         rows, owner, parameters, Settings(tol=1e-10, max_iter=2000, dtype=torch.float64)
     )
-    step = em.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
-    plain = em.run_em(step, parameters, tol=1e-10, max_iter=5000)
+    step = loop.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
+    plain = loop.run_em(step, parameters, tol=1e-10, max_iter=5000)
     assert found.converged
     assert found.lower_bounds[-1] == pytest.approx(plain.lower_bounds[-1], abs=1e-5)
     torch.testing.assert_close(tuple(found.parameters), tuple(plain.parameters), rtol=0, atol=2e-2)
@@ -361,11 +361,11 @@ def test_momentum_converges_faster_than_em(n_iter, share):
         torch.full((2, 1, 1), 2.0, dtype=torch.float64),
     )
     rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
-    step = em.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
-    plain = em.run_em(step, parameters, tol=0.0, max_iter=n_iter)
+    step = loop.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
+    plain = loop.run_em(step, parameters, tol=0.0, max_iter=n_iter)
     found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
     assert found.n_iter == n_iter
-    best = em.run_em(step, parameters, tol=0.0, max_iter=1500).lower_bounds[-1]
+    best = loop.run_em(step, parameters, tol=0.0, max_iter=1500).lower_bounds[-1]
     assert best - plain.lower_bounds[-1] > 1e-5  # plain EM converges slowly
     assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
 
@@ -378,7 +378,7 @@ def test_momentum_undo_gives_the_em_step_and_resets():
         groups = group_rows(rows, nearest(rows.points, at.means), at.means, torch.float64)
         return truncated_expectation(groups, choose_candidates(groups, at, 16), at).statistics
 
-    step = em.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
+    step = loop.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
     for moves in (False, False, True, True):
         plain = step(parameters)[0]
         following = momentum.step(expect(parameters), parameters)
@@ -412,7 +412,7 @@ class Spy:
         return found
 
 
-def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: int = 12) -> em.EMResult:
+def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: int = 12) -> loop.EMResult:
     points, _ = beads(1500, k)
     rows = rows_of(torch.from_numpy(points - points.mean(0)))
     first, owner = flat_pieces(rows.points, rows.weight, k, 1e-6)
@@ -886,7 +886,7 @@ def test_processes_that_share_rows_give_the_result_of_one(n):
     separate = fit_truncated(Rows(points, weight), owner, first, setup)
     barrier, board = threading.Barrier(2), [None, None]
 
-    def work(rank: int) -> em.EMResult:
+    def work(rank: int) -> loop.EMResult:
         mine = slice(rank, None, 2)
         shared = replace(setup, processes=Halves(rank, barrier, board))
         return fit_truncated(Rows(points[mine], weight[mine]), owner[mine], first, shared)

@@ -484,7 +484,7 @@ def test_attributes_have_the_kind_of_the_points(kind):
 
 @types
 @pytest.mark.parametrize("dim", [2, 3])
-def test_transform_moves_the_whole_posterior(prior_type, dim):
+def test_moved_moves_the_whole_posterior(prior_type, dim):
     x, motion, prior = blobs(dim), rigid_motion(dim), priors(dim)
     rotation = motion[:dim, :dim]
     turned = {
@@ -492,7 +492,7 @@ def test_transform_moves_the_whole_posterior(prior_type, dim):
         "mean_prior": move(motion, prior["mean_prior"][None])[0],
         "covariance_prior": rotation @ prior["covariance_prior"] @ rotation.T,
     }
-    moved = variational(3, prior_type, **prior).fit(x).transform(motion)
+    moved = variational(3, prior_type, **prior).fit(x).moved(motion)
     other = variational(3, prior_type, **turned).fit(move(motion, x))
     for name, value in moved.state_dict().items():
         torch.testing.assert_close(value, other.state_dict()[name], rtol=1e-8, atol=1e-8)
@@ -533,7 +533,7 @@ def test_mixture_of_given_parameters_has_no_posterior(tmp_path):
         bare.score_samples_predictive(blobs(2))
     bare.save(tmp_path / "m.safetensors")
     assert not hasattr(VariationalGaussianMixture.load(tmp_path / "m.safetensors"), "mean_precision_")
-    assert not hasattr(bare.transform(np.eye(3)), "mean_precision_")
+    assert not hasattr(bare.moved(np.eye(3)), "mean_precision_")
     fitted.load_state_dict(bare.state_dict())  # removes the posterior, which is of another mixture
     assert not hasattr(fitted, "mean_precision_")
     with pytest.raises(NotFittedError, match="fit"):

@@ -1,4 +1,4 @@
-"""Cones and boxes for the tests of face flux, and what rays say of them."""
+"""Cones for tests of the flux form, and the evidence of a box by counted rays."""
 
 from __future__ import annotations
 

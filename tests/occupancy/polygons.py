@@ -1,4 +1,4 @@
-"""Convex polygons at random, and which points lie in them."""
+"""Random convex polygons, and which points they contain."""
 
 from __future__ import annotations
 

@@ -25,10 +25,10 @@ def mass(mean, covariance, low, high, **options):
 
 
 @given(start=st.floats(-9, 9), span=st.floats(1e-12, 20), single=st.booleans())
-def test_normal_mass_keeps_its_digits_in_the_tails(start, span, single):
+def test_normal_mass_is_accurate_in_the_tails(start, span, single):
     dtype = torch.float32 if single else torch.float64
     a, s = torch.tensor([start], dtype=dtype), torch.tensor([span], dtype=dtype)
-    # exact to what rounding the end points themselves costs
+    # relative to the rounding of the end points
     middle = abs(float(a)) + float(s)
     lower, upper = (
         (float(a), float(a) + float(s)) if start + span / 2 < 0 else (-float(a) - float(s), -float(a))
@@ -70,7 +70,7 @@ def test_box_mass_equals_scipy(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("ratio", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("ratio", [1e-6, 1.0, 1e6])
 def test_box_mass_is_exact_from_1e_6_to_1e6_component_sizes(dim, ratio):
     """Along the axes of a component its mass is a product."""
     deviations = torch.tensor([[0.001, 0.2, 2.0][:dim]], dtype=torch.float64)

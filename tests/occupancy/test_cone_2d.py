@@ -49,7 +49,7 @@ def wedge_share(p: float, nearest: float, first: float, last: float) -> float:
 
 
 @pytest.mark.parametrize(("p", "worst"), [(2.0, 0.134), (5.0, 0.051), (50.0, 0.0050)])
-def test_the_error_of_3_3_falls_with_distance(p, worst):
+def test_the_error_of_equation_3_3_falls_with_distance(p, worst):
     """The largest error over cells that begin at r' and are seen from θ₁ to θ₂."""
     angles = [k * 0.5 / p for k in range(-7, 8) if abs(k * 0.5 / p) <= math.pi / 2] + [math.pi / 2]
     errors = []
@@ -64,7 +64,7 @@ def test_the_error_of_3_3_falls_with_distance(p, worst):
     assert 0.9 * worst < max(errors) < 1.01 * worst
 
 
-def test_the_angles_and_the_nearest_point_of_a_cell_are_found():
+def test_cell_angles_and_nearest_points_equal_brute_force():
     p, cell = 4.0, [(2.0, 0.5), (3.0, 0.5), (3.0, 1.5), (2.0, 1.5)]
     first, last = math.atan2(0.5, 3.0), math.atan2(1.5, 2.0)
     nearest = math.hypot(2.0, 0.5)
@@ -77,7 +77,7 @@ def test_the_angles_and_the_nearest_point_of_a_cell_are_found():
     assert share(p, ahead) == pytest.approx(expected, rel=1e-12)
 
 
-def test_cells_behind_the_sensor_get_nothing_and_wide_ones_are_clipped():
+def test_cells_behind_the_sensor_get_no_evidence_and_wide_cells_are_clipped():
     behind = [(-2.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (-2.0, 1.0)]
     assert share(3.0, behind) == 0
     beside = [(-2.0, 0.5), (0.0, 0.5), (0.0, 1.5), (-2.0, 1.5)]  # up to 90° exactly
@@ -115,7 +115,7 @@ def test_evidence_scales_with_counts_and_no_return_beams_give_only_misses():
     torch.testing.assert_close(free[1], many[1])
 
 
-def test_only_the_given_pairs_count():
+def test_evidence_sums_only_the_given_pairs():
     first = one_cone((5.0, 0.0), ROUND)
     both = Cones(*(torch.cat([part, part]) for part in first))
     low, high = boxes((2.0, -0.5, 3.0, 0.5), (3.0, -0.5, 4.0, 0.5))

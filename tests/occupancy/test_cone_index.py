@@ -1,4 +1,4 @@
-"""Tests of gmmtorch.occupancy.index.cone_index: nothing that matters is missed, and little else is listed."""
+"""ConeIndex: candidates contain all cones that meet a box, and few others."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from gmmtorch.occupancy.index.cone_index import ConeIndex
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """n places on the segments from the sensor to the ellipsoid, many on their rim, and whose they are."""
+    """n points on segments from the sensor to the ellipsoid, many on the rim, and the cone of each."""
     generator = torch.Generator().manual_seed(seed)
     dim = cones.dim
     which = torch.randint(len(cones.counts), (n,), generator=generator)
@@ -44,7 +44,7 @@ def test_candidates_contain_all_cones_that_meet_a_box(dim, seed, extent, entries
     index = ConeIndex(cones, extent, cutoff, entries_per_cone=entries)
     places, which = places_on_rays(cones, 400, cutoff, seed)
     generator = torch.Generator().manual_seed(seed)
-    # Boxes that just hold the place: anywhere inside, corners more often than not.
+    # Boxes that contain the point, often close to a corner.
     side = extent * torch.rand(400, dim, generator=generator, dtype=torch.float64)
     corner = torch.rand(400, dim, generator=generator, dtype=torch.float64).mul(3).sub(1).clamp(0.001, 0.999)
     low = places - corner * side
@@ -60,7 +60,7 @@ def test_boxes_far_from_all_rays_have_no_candidates():
 
 
 def test_lists_contain_few_unneeded_cones():
-    """Mean list length near what brute force finds at the very points."""
+    """Mean list length at points on the rays."""
     cones = random_cones(3, 300, 1, room=True)
     index = ConeIndex(cones, 0.05)
     places, _ = places_on_rays(cones, 500, CUTOFF, 0)

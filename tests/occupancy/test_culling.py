@@ -39,7 +39,7 @@ def some_cones(dim: int, n: int, seed: int, inside: bool = False) -> Cones:
 
 
 def ends_within(cones: Cones, n: int) -> torch.Tensor:
-    """Ends of rays, those beyond the cutoff left out."""
+    """Ends of rays within the cutoff."""
     ends = draw_ends(cones, n)
     white = WhitenedCones.of(cones)
     return ends[(white.apply((ends - cones.means).T).norm(dim=0) < CUTOFF)]
@@ -83,7 +83,7 @@ def test_a_face_that_a_ray_crosses_is_visited(dim, seed):
                 sign = 1 if forward else -1
                 through = (sign * (plane - start[axis]) > 0) & (sign * (stop[:, axis] - plane) > 0)
                 if plane == (0 if forward else grid.shape[axis]):
-                    continue  # it closes no cell of the grid on the side that the ray comes from
+                    continue  # no cell of the grid lies before this plane
                 share = (plane - start[axis]) / (stop[through, axis] - start[axis])
                 place = (start + share[:, None] * (stop[through] - start)).floor().long()
                 others = [b for b in range(dim) if b != axis]

@@ -1,4 +1,4 @@
-"""Evidence: what rays add, and the occupancy that follows."""
+"""Evidence: counts of rays, and the occupancy that follows from them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def brute_force(grid: VoxelGrid, origins: Tensor, ends: Tensor, weights: list[fl
 
 
 @given(hits=counts, misses=counts, prior=st.floats(1e-3, 100))
-def test_theta_is_equation_3_9(hits, misses, prior):
+def test_occupancy_probability_equals_equation_3_9(hits, misses, prior):
     pair = torch.tensor([[hits], [misses]], dtype=torch.float64)
     theta = float(occupancy_probability(pair[0], pair[1], prior))
     assert theta == pytest.approx((hits + prior) / (hits + misses + 2 * prior), rel=1e-12)
@@ -64,12 +64,12 @@ def test_theta_is_equation_3_9(hits, misses, prior):
 
 @pytest.mark.parametrize("prior", [0, 1e-300, 0.1, 1 / 3, 1, 7.7])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_without_evidence_theta_is_exactly_half(prior, dtype):
+def test_occupancy_without_evidence_is_exactly_half(prior, dtype):
     zero = torch.zeros(3, dtype=dtype)
     assert occupancy_probability(zero, zero, prior).tolist() == [0.5] * 3
 
 
-def test_with_prior_zero_theta_is_the_share_of_hits():
+def test_occupancy_with_prior_zero_is_the_share_of_hits():
     theta = occupancy_probability(torch.tensor([3.0, 0.0, 2.0]), torch.tensor([1.0, 5.0, 0.0]), 0)
     assert theta.tolist() == [0.75, 0.0, 1.0]
 

@@ -1,4 +1,4 @@
-"""Face flux against brute-force integration of the angular form, against rays, and in the worst places."""
+"""Flux form against brute-force integration of the angular form, against counted rays, and at edge cases."""
 
 from __future__ import annotations
 
@@ -51,34 +51,34 @@ def evaluated(cones, low, high, **options):
 # -- accuracy ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_flux_evidence_equals_the_angular_form(dim, dtype):
+def test_flux_evidence_equals_the_angular_form(dim):
     n = 40 if dim == 2 else 16
     cones, low, high = cases(dim, n, seed=5, deviations=(0.01, 0.3), distances=(3.2, 10.0))
     parts = zip(cones.means, cones.covariances, cones.origins, low, high, strict=True)
     exact = torch.tensor([exact_evidence(*part, panels=60) for part in parts], dtype=torch.float64)
-    assert float((exact > 0.02).double().mean()) > 0.4  # the cells are where something happens
-    error = (evaluated(cones, low, high, dtype=dtype) - exact).abs()
-    assert float(error.max()) < 2e-4
-    assert float(error.median()) < 1e-5
+    assert float((exact > 0.02).double().mean()) > 0.4  # most cells have evidence
+    for dtype in (torch.float64, torch.float32):
+        error = (evaluated(cones, low, high, dtype=dtype) - exact).abs()
+        assert float(error.max()) < 2e-4
+        assert float(error.median()) < 1e-5
     finer = (evaluated(cones, low, high, tolerance=1e-8) - exact).abs()
-    assert float(finer.max()) < 5e-6  # what the cutoff takes: exp(−12.5)
+    assert float(finer.max()) < 5e-6  # the cutoff removes exp(−12.5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_flux_evidence_equals_sampled_rays_from_1_mm_to_2_m(dim, dtype):
-    cones, low, high = cases(dim, 60, seed=7)
+def test_flux_evidence_equals_sampled_rays_from_1_mm_to_2_m(dim):
+    cones, low, high = cases(dim, 50, seed=7)
     counted = torch.tensor([count_rays(only(cones, i), low[i], high[i]) for i in range(len(low))])
-    error = (evaluated(cones, low, high, dtype=dtype) - counted.double()).abs()
-    assert float(error.max()) < 1e-3
-    assert float(error.median()) < 1e-4
+    for dtype in (torch.float64, torch.float32):
+        error = (evaluated(cones, low, high, dtype=dtype) - counted.double()).abs()
+        assert float(error.max()) < 1e-3
+        assert float(error.median()) < 1e-4
 
 
-@pytest.mark.parametrize("incidence", [0.0, 0.6, 1.2, 1.5])
+@pytest.mark.parametrize("incidence", [0.0, 0.6, 1.5])
 def test_a_thin_sheet_that_cuts_the_faces_is_integrated_exactly(incidence):
-    """The case that defeats a fixed number of nodes: 1 cm, then 1 mm, against a 0.2 m voxel."""
+    """1 cm and 1 mm sheets in a 0.2 m voxel, which a fixed number of nodes misses."""
     turn = torch.tensor(
         [
             [math.cos(incidence), -math.sin(incidence), 0],
@@ -182,14 +182,13 @@ def test_evidence_is_the_same_in_utm_coordinates():
     torch.testing.assert_close(a.hits, b.hits, atol=1e-4, rtol=0)
 
 
-# -- conservation and bad places -----------------------------------------------------------------------
+# -- conservation and edge cases -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("size", [1e-4, 0.1, 100.0])
-@pytest.mark.parametrize("spread", [1e-3, 0.1, 2.0])
+@pytest.mark.parametrize(("size", "spread"), [(1e-4, 0.1), (0.1, 1e-3), (0.1, 2.0), (100.0, 0.1)])
 def test_cells_at_the_sensor_origin_have_finite_evidence(dim, size, spread):
-    """All positions −½ … 1½ of the sensor about a cell in half steps: corners, edges, faces, inside."""
+    """The sensor at all positions −½ … 1½ cells in half steps: corners, edges, faces, inside."""
     steps = torch.tensor(list(itertools.product((-0.5, 0.0, 0.5, 1.0, 1.5), repeat=dim)), dtype=torch.float64)
     low = -steps * size
     mean = torch.tensor([[0.5, 0.2, -0.3][:dim]], dtype=torch.float64)
@@ -212,7 +211,7 @@ def test_cells_at_the_sensor_origin_have_finite_evidence(dim, size, spread):
     inside=st.booleans(),
 )
 def test_evidence_is_at_most_the_number_of_rays(dim, seed, scale, inside):
-    """Cells a thousand times larger and smaller than the component, sensors anywhere."""
+    """Cells a thousand times larger and smaller than the component, sensors at any position."""
     generator = torch.Generator().manual_seed(seed)
     deviations = 10 ** uniform(generator, 1, dim, low=-2, high=0)
     mean = normal(generator, 1, dim)

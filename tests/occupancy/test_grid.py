@@ -1,4 +1,4 @@
-"""VoxelGrid: indices, centres, covering a box, and refusals that say what would work."""
+"""VoxelGrid: indices, centres, covering a box, and bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The projection on a component's plane against samples, the exact form, and hulls found by SciPy."""
+"""Cone form in 3D: projections on the plane of a component against samples, exact flux and convex hulls."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_approximate_error_function_has_an_error_below_0_014():
         [(-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)],
     ],
 )
-def test_the_closed_form_is_the_integral_of_the_approximation(corners):
+def test_the_closed_form_equals_the_integral_of_the_approximation(corners):
     """P = ∬ φ(x) ½ d/dy ê(y/√2) dx dy over the polygon, edge by edge with adaptive quadrature."""
     total = 0.0
     for (x1, y1), (x2, y2) in itertools.pairwise([*corners, corners[0]]):
@@ -125,7 +125,7 @@ def test_the_outline_is_the_convex_hull_of_the_projected_corners(seed, region):
 
 
 def test_corners_behind_the_viewpoint_are_clipped():
-    """Of a floor under the eye one sees, looking ahead, what is below the horizon."""
+    """The image of a floor below the viewpoint, clipped at the horizon, against samples."""
     corners, _ = outline(column(-5.0, -5.0, -2.0), column(5.0, 5.0, -1.0))
     ahead = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)  # y, z, depth x
     starts, ends = image((corners.squeeze(2) @ ahead.T)[..., None])
@@ -162,9 +162,9 @@ def test_facing_rotates_the_third_axis_to_the_direction(seed):
 
 
 def test_a_thin_wall_far_away_has_the_exact_evidence(generator):
-    """Where the form holds: cells that end before a wall, which is seen at an angle."""
+    """Cells that end before a wall seen at an angle, where the approximation holds."""
     cones = one_cone((8.0, 3.0, 1.0), (0.02, 0.5, 0.35), angles=(0.5, 0.3))
-    spread = torch.tensor([0.5, 0.5, 0.4]) * torch.randn(60, 3, generator=generator).double()
+    spread = torch.tensor([0.5, 0.5, 0.4]) * torch.randn(30, 3, generator=generator).double()
     low = 0.6 * cones.means + 0.6 * spread
     truth = angular_evidence(of_each(cones, len(low)), low, low + 0.3, tolerance=1e-6)
     errors = {}
@@ -176,17 +176,17 @@ def test_a_thin_wall_far_away_has_the_exact_evidence(generator):
     assert errors[True] < 1e-3 < errors[False] < 0.01
 
 
-def test_a_small_far_perpendicular_wall_equals_samples_to_1e_4(generator):
+def test_a_small_far_perpendicular_wall_equals_samples(generator):
     cones = one_cone((0.0, 0.0, 100.0), (0.5, 0.4, 0.001))
     low = torch.tensor([[-0.3, -0.2, 90.0], [0.1, 0.1, 50.0]], dtype=torch.float64)
     _, misses = cone_evidence(cones, low, low + 0.4, exact=True)
-    ends = cones.means + torch.randn(4_000_000, 3, generator=generator).double() * torch.tensor(
+    ends = cones.means + torch.randn(1_000_000, 3, generator=generator).double() * torch.tensor(
         [0.5, 0.4, 0.001]
     )
     for found, corner in zip(misses, low, strict=True):
         first, second = corner / ends, (corner + 0.4) / ends
         enter, leave = torch.minimum(first, second).amax(1), torch.maximum(first, second).amin(1)
-        assert float(found) == pytest.approx(float((enter < leave).double().mean()), abs=1e-3 / 2)
+        assert float(found) == pytest.approx(float((enter < leave).double().mean()), abs=2e-3)
 
 
 def test_the_plane_contains_the_long_axes_and_its_normal_points_away():
@@ -219,14 +219,16 @@ def test_all_rays_leave_the_voxel_of_the_sensor_origin():
     low = torch.full((1, 3), -0.1, dtype=torch.float64)
     assert float(cone_evidence(cones, low, low + 0.25)[1]) == pytest.approx(1.0)
     corners = torch.cartesian_prod(*[torch.tensor([-0.25, 0.0], dtype=torch.float64)] * 3)
-    _, misses = cone_evidence(cones, corners, corners + 0.25, exact=True)  # they meet in the sensor
+    _, misses = cone_evidence(
+        cones, corners, corners + 0.25, exact=True
+    )  # they share the corner at the sensor
     truth = angular_evidence(of_each(cones, 8), corners, corners + 0.25, tolerance=1e-6)[1]
     assert float(misses.sum()) == pytest.approx(1.0, abs=1e-4)
     assert (misses - truth).abs().max() < 2e-3
 
 
 def test_a_plane_through_the_sensor_origin_gives_valid_shares():
-    """A floor that the sensor stands in: its image is a line, which no cell above or below is hidden by."""
+    """The image of a floor that contains the sensor is a line that hides no cell above or below."""
     cones = one_cone((3.0, 0.0, 0.0), (0.5, 0.5, 0.01))
     low = torch.tensor([[1.0, -0.2, -0.2], [1.0, -0.2, 0.5], [-2.0, -0.2, -0.2]], dtype=torch.float64)
     for exact in (True, False):

@@ -230,7 +230,7 @@ def test_near_interval_contains_all_hulls_that_meet_the_box(seed):
     met = ((point >= within.low) & (point <= within.high)).all(2).any(0)
     assert bool((first <= last)[met].all())
     assert 0 < int(met.sum()) <= int((first <= last).sum()) < 300
-    # What is near comes within half a cell: a box larger by more than that is met by a draw.
+    # Near hulls come within half a cell, so that samples meet a box that is larger by 1.5 cells.
     wide = ((point >= within.low - 1.5) & (point <= within.high + 1.5)).all(2).any(0)
     assert float((first <= last)[~wide].double().mean()) < 0.05
 
@@ -239,7 +239,7 @@ def test_near_interval_contains_all_hulls_that_meet_the_box(seed):
 
 
 def walk_until(starts, until, struck, weights, counts_struck, within: Box) -> Counts:
-    """As `by_a_walk`, misses along one set of rays and hits in places of their own."""
+    """Like `by_a_walk`, with misses along the rays to `until` and hits at the points `struck`."""
     missed = by_a_walk(starts, until, torch.zeros(len(starts), dtype=torch.bool), within, weights)
     hits = by_a_walk(struck, struck, torch.ones(len(struck), dtype=torch.bool), within, counts_struck)
     return {

@@ -1,4 +1,4 @@
-"""Regions of any shape against cells, against rays with the same definition, and what is refused."""
+"""Flux of regions of any shape against box flux and against counted rays; bad input."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def box_mesh(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def prism_mesh(polygon: Tensor, height: float) -> tuple[Tensor, Tensor]:
-    """A counter-clockwise polygon that is a fan about vertices (0 and its like) drawn out along z."""
+    """The mesh of a horseshoe polygon extruded along z."""
     n = len(polygon)
     vertices = torch.cat([torch.cat([polygon, torch.full((n, 1), z).double()], 1) for z in (0.0, height)])
     fans = [[0, 1, 5], [1, 2, 4], [2, 3, 4], [0, 5, 6], [1, 4, 5], [0, 6, 7]]
@@ -51,7 +51,7 @@ def prism_mesh(polygon: Tensor, height: float) -> tuple[Tensor, Tensor]:
 
 
 def count_exits(cones: Cones, polygon: Tensor, height: float | None = None, n: int = 1 << 18):
-    """Hits, and how often segments leave the region: by sorting nothing, one boundary edge at a time.
+    """Mean hits and exits of sampled rays, one boundary edge at a time.
 
     Rays leave where they cross an edge of a counter-clockwise polygon from left to right. A prism's
     ends are crossed where the ray is inside the polygon at that height.
@@ -89,7 +89,7 @@ def count_exits(cones: Cones, polygon: Tensor, height: float | None = None, n: i
     return float(held.double().mean()), float(exits.double().mean())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_regions_that_are_boxes_equal_box_flux(seed):
     for dim in (2, 3):
         cone = cone_of(dim, seed)
@@ -104,14 +104,14 @@ def test_regions_that_are_boxes_equal_box_flux(seed):
         torch.testing.assert_close(region, box, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_nonconvex_polygon_counts_each_exit_of_a_ray(seed, dtype):
+@pytest.mark.parametrize("seed", range(3))
+def test_a_nonconvex_polygon_counts_each_exit_of_a_ray(seed):
     cone = cone_of(2, seed)
-    hits, misses = region_flux(cone, Boundary.of_polygon(HORSESHOE), dtype=dtype)
     counted = count_exits(cone, HORSESHOE)
-    assert float(hits) == pytest.approx(counted[0], abs=5e-4)
-    assert float(misses) == pytest.approx(counted[1], abs=5e-4)
+    for dtype in (torch.float64, torch.float32):
+        hits, misses = region_flux(cone, Boundary.of_polygon(HORSESHOE), dtype=dtype)
+        assert float(hits) == pytest.approx(counted[0], abs=5e-4)
+        assert float(misses) == pytest.approx(counted[1], abs=5e-4)
 
 
 def test_some_rays_leave_the_nonconvex_polygon_twice():
@@ -120,7 +120,7 @@ def test_some_rays_leave_the_nonconvex_polygon_twice():
     assert float(region_flux(cone, Boundary.of_polygon(HORSESHOE))[1]) == pytest.approx(2, abs=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_nonconvex_mesh_equals_counted_rays(seed):
     cone = cone_of(3, seed)
     boundary = Boundary.of_mesh(*prism_mesh(HORSESHOE, 0.7))
@@ -167,7 +167,7 @@ def test_gradients_of_region_flux_equal_finite_differences(dim):
     assert torch.autograd.gradcheck(evidence, inputs, atol=1e-5)
 
 
-# -- what is refused -----------------------------------------------------------------------------------
+# -- bad input -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""RollingWindow: where it moves, what it removes, and its evidence against one made from scratch."""
+"""RollingWindow: its motion, the removed cells, and its evidence against a new window."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 
 
 def at(*cell: float, resolution: float = 0.25) -> torch.Tensor:
-    """The middle of a cell, world metres."""
+    """The centre of a cell, in metres in the world frame."""
     return (torch.tensor(cell, dtype=torch.float64) + 0.5) * resolution
 
 
@@ -45,7 +45,7 @@ def random_evidence(n: int, seed: int, reach: int = 12) -> CellEvidence:
 # -- position -----------------------------------------------------------------------------------------
 
 
-def test_at_first_all_cells_are_new_and_the_robot_is_near_the_middle():
+def test_the_first_window_is_all_new_and_centred_on_the_robot():
     for cell in itertools.product((-1000, -7, 0, 2501), repeat=3):
         window = new_window()
         (box,) = window.center_on(at(*cell))
@@ -108,7 +108,7 @@ def test_the_window_moves_only_by_whole_steps():
 
 @settings(deadline=None, max_examples=5)
 @given(seed=st.integers(0, 10**6), far=st.booleans())
-def test_a_moved_window_equals_one_made_from_scratch(seed, far):
+def test_a_moved_window_equals_a_new_window(seed, far):
     """Rays are trimmed to the uncovered cells, so that nothing is counted twice (thesis Fig 4.2)."""
     generator = torch.Generator().manual_seed(seed)
     window, rays = new_window(), []
@@ -172,7 +172,7 @@ def test_boxes_outside_the_window_are_refused():
         window.around(at(0, 0, 0), (12, 99, 7))
 
 
-def test_a_window_needs_a_position_first():
+def test_an_unplaced_window_is_refused():
     window = new_window()
     with pytest.raises(InvalidArgumentError, match="call center_on"):
         window.add(random_evidence(5, 0))

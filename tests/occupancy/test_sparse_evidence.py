@@ -196,7 +196,7 @@ def test_rays_that_span_too_large_a_table_are_refused_with_a_resolution_that_fit
         assert "table" not in str(error)  # noqa: PT017
 
 
-def test_a_refusal_keeps_earlier_evidence():
+def test_a_refused_insert_keeps_earlier_evidence():
     origins, ends = random_rays(100, 2, size=3.0)
     store = SparseEvidence(RESOLUTION, 2, memory_limit=1 << 20)
     store.add_rays(origins, ends)
@@ -299,7 +299,7 @@ def random_evidence(n: int, seed: int, spread: int = 3) -> CellEvidence:
 
 
 def filled(n_times: int = 4, n: int = 2000) -> tuple[SparseEvidence, dict[Cell, tuple[float, float]]]:
-    """A bounded store, and what it must contain."""
+    """A bounded store, and its expected content as a dictionary."""
     store, reference = SparseEvidence(0.2, box=box(), dtype=torch.float32), {}
     for seed in range(n_times):
         evidence = random_evidence(n, seed)
@@ -377,7 +377,7 @@ def test_cropping_removes_the_evidence_outside_the_new_box(low, high):
     store, reference = filled()
     store.crop(box(low, high))
     assert counts_of(store) == {cell: pair for cell, pair in reference.items() if is_in(cell, low, high)}
-    store.crop(box())  # what was removed does not come back
+    store.crop(box())  # removed evidence is not restored
     assert counts_of(store) == {cell: pair for cell, pair in reference.items() if is_in(cell, low, high)}
     evidence = random_evidence(500, 9)
     store.add(evidence)

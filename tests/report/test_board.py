@@ -30,8 +30,10 @@ def test_board_writes_the_finite_numbers_of_a_row(tmp_path):
         board.scalars({"auc": np.float32(0.75)}, prefix="occupancy", step=4)
         board.scalars({"bare": 1})
     events = read(tmp_path)
-    assert sorted(events.Tags()["scalars"]) == ["bare", "occupancy/auc", "occupancy/n"]
+    assert events.Tags()["scalars"] == ["occupancy/auc"]
     assert [(e.step, e.value) for e in events.Scalars("occupancy/auc")] == [(0, 0.5), (4, 0.75)]
+    table = tensor(events, "results/text_summary")[0].decode().splitlines()
+    assert table == ["|  | occupancy |  |", "| --- | --- | --- |", "| n | 3 |  |", "| bare |  | 1 |"]
 
 
 def test_board_writes_figures_and_precision_recall_curves(tmp_path):
@@ -93,13 +95,14 @@ def test_hparams_are_written_to_the_same_run(tmp_path):
         board.hparams(config, {"auc": 0.9, "missing": None})
     assert [p.is_file() for p in tmp_path.iterdir()] == [True]
     events = read(tmp_path)
-    assert events.Scalars("auc")[0].value == pytest.approx(0.9)
+    assert not events.Tags()["scalars"]  # a chart of one dot
     content = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     start = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info
     assert start.hparams["method"].string_value == "point"
     assert start.hparams["path"].string_value == "None"
     assert start.hparams["kept"].string_value == "[1.0, 0.3]"
     assert start.hparams["flag"].number_value == 1
+    assert start.hparams["auc"].number_value == pytest.approx(0.9)
 
 
 def test_board_errors_name_the_argument(tmp_path):

@@ -74,13 +74,6 @@ def test_meshes_are_closed_and_face_outwards():
     assert all((b, a) in edges for a, b in edges)
 
 
-def test_mesh_colours_follow_height():
-    means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [5.0, 0.0, 0.0]])
-    low, high, same = ellipsoid_mesh(means, torch.eye(3).expand(3, 3, 3)).colors.reshape(3, -1, 3)[:, 0]
-    assert (low == same).all()
-    assert (low != high).any()
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_components_and_singular_ones_have_meshes_and_outlines(dim):
     empty = ellipsoid_mesh(torch.empty(0, dim), torch.empty(0, dim, dim))

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from gmmtorch.report.maps.fitting_figures import comparison_figure
-from gmmtorch.report.studies import sensor_noise_figures as sensor_noise
-from gmmtorch.report.studies.component_count_figures import figures as count_figures
-from gmmtorch.report.studies.initialization_figures import figures
+from gmmtorch.report.studies.fit_study_figures import (
+    component_count_figures,
+    initialization_figures,
+    sensor_model_figures,
+)
 
 
 def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]:
@@ -34,7 +36,7 @@ STUDY = [study_row(i, k, s) for s in (0, 1) for k in (8, 4) for i in ("random_po
 
 
 def test_initialization_figure_draws_mean_and_range_of_each_initialization():
-    figure = figures(STUDY)["initialization"]
+    figure = initialization_figures(STUDY)["initialization"]
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == ["initialization time", "iterations of EM", "time of initialization and EM", "PSNR2"]
     assert "bunny, 5,000 points" in figure.get_suptitle()
@@ -53,7 +55,7 @@ def test_initialization_figure_draws_mean_and_range_of_each_initialization():
 
 
 def test_quality_is_relative_to_the_first_initialization():
-    figure = figures(STUDY)["initialization_quality"]
+    figure = initialization_figures(STUDY)["initialization_quality"]
     assert "Gain over random points" in figure.get_suptitle()
     first, other = figure.axes[3].lines
     assert first.get_ydata() == pytest.approx([0.0, 0.0])
@@ -63,7 +65,7 @@ def test_quality_is_relative_to_the_first_initialization():
 def test_values_that_are_none_are_left_out():
     rows = [study_row("kmeans", k, 0, psnr2_db=None if k == 4 else 60.0) for k in (4, 8)]
     rows = [{**row, "held_out_psnr2_db": None, "held_out_log_likelihood": None} for row in rows]
-    drawn = figures(rows)
+    drawn = initialization_figures(rows)
     for figure in drawn.values():
         figure.canvas.draw()
     assert [int(x) for x in drawn["initialization"].axes[3].lines[0].get_xdata()] == [8]
@@ -108,10 +110,6 @@ def test_comparison_uses_training_points_if_none_are_held_out():
     assert np.isnan(right.lines[0].get_ydata()).all()
 
 
-def test_comparison_of_no_rows_is_an_empty_figure():
-    comparison_figure([]).canvas.draw()
-
-
 def test_sensor_model_figure_draws_variants_against_bytes():
     rows = [
         {
@@ -127,7 +125,7 @@ def test_sensor_model_figure_draws_variants_against_bytes():
         for nbytes in (30_000, 9_000)
         for shift, variant in enumerate(("plain", "noise_planar"))
     ]
-    figure = sensor_noise.figures(rows)["sensor_model"]
+    figure = sensor_model_figures(rows)["sensor_model"]
     assert len(figure.axes) == 4
     for axes in figure.axes:
         assert axes.get_xlabel() == "map size [bytes]"
@@ -162,7 +160,7 @@ COUNTS = [
 
 
 def test_component_count_marks_each_rule_with_its_setting():
-    figure = count_figures(COUNTS)["component_count"]
+    figure = component_count_figures(COUNTS)["component_count"]
     psnr, likelihood, seconds, auc = figure.axes
     names = [line.get_label() for line in psnr.lines]
     assert names == ["fixed number", "flat pieces (multiple of the noise)", "lowest BIC"]
@@ -181,10 +179,5 @@ def test_component_count_marks_each_rule_with_its_setting():
 
 def test_component_count_limits_the_likelihood_axis():
     far = count_row("fixed", 64, 64, held_out_log_likelihood=-900.0)
-    figure = count_figures([*COUNTS, far])["component_count"]
+    figure = component_count_figures([*COUNTS, far])["component_count"]
     assert -5 < figure.axes[1].get_ylim()[0] < -0.3
-
-
-def test_component_count_hides_the_map_panel_without_maps():
-    figure = count_figures(COUNTS[:6])["component_count"]
-    assert [axes.get_visible() for axes in figure.axes] == [True, True, True, False]

@@ -8,7 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.report.exploration.mission_curves import entropy_figure
-from gmmtorch.report.exploration.mission_tensorboard import write_exploration_board
+from gmmtorch.report.exploration.mission_summary import write_exploration_board
 from gmmtorch.report.tensorboard_writer import Board
 
 
@@ -32,7 +32,9 @@ def test_trials_and_figures_are_written_with_their_tags(tmp_path):
     assert robots == {"robot_0", "robot_1", "robot_2"}
     assert "gmm_shared/seed_0/octree_bytes_over_time" in tags
     assert "grid_isolated/seed_1/octree_bytes_over_time" not in tags
-    assert events.Scalars("grid_isolated/seed_1/auc")[0].step == 50
+    assert "grid_isolated/seed_1/auc" not in tags  # one number, which is in the table
+    table = make_ndarray(events.Tensors("results/text_summary")[0].tensor_proto)[0].decode()
+    assert "| auc |" in table
     assert events.Tags()["images"] == ["figures/entropy"]
 
 

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import mean_band
-from gmmtorch.report.exploration.loss_figures import loss_figure
+from gmmtorch.report.exploration.network_figures import loss_figure
 from gmmtorch.report.exploration.trial_groups import by_variant
 from gmmtorch.report.style import PALETTE
 

@@ -16,7 +16,7 @@ from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.exploration.world.scoring import BeliefRule
 from gmmtorch.report.exploration.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure
 from gmmtorch.report.maps.map_images import MapImage, highest_occupancy
-from gmmtorch.report.scenes.cutaway import cut_away
+from gmmtorch.report.scenes.ellipsoids import cut_away
 from gmmtorch.report.scenes.paths import smooth_path
 from gmmtorch.report.scenes.scene import mixture_scene_figure
 from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
@@ -62,10 +62,10 @@ def test_coverage_is_shaded_by_the_number_of_robots():
     np.testing.assert_allclose(pixels[2, 1], pixels[2, 2])
     np.testing.assert_allclose(pixels[0, 1], to_rgb(UNKNOWN))
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) == 4  # not seen, one, two, surface
-    said = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "seen by 1 robot: 67 %" in said
-    assert "seen by 2 robots: 33 %" in said
-    assert [name for name in said if name.startswith("robot ")] == ["robot 0", "robot 1"]
+    shown_texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "seen by 1 robot: 67 %" in shown_texts
+    assert "seen by 2 robots: 33 %" in shown_texts
+    assert [name for name in shown_texts if name.startswith("robot ")] == ["robot 0", "robot 1"]
 
 
 @pytest.mark.parametrize(("n_robots", "n_poses"), [(0, 5), (1, 0), (1, 1), (16, 5)])
@@ -76,9 +76,9 @@ def test_figures_accept_any_number_of_robots_and_poses(n_robots, n_poses):
     trajectories_figure(world, paths, coverage).canvas.draw()
     scene = mixture_scene_figure(*components(3), trajectories=paths, max_pixels=200)
     scene.canvas.draw()
-    said = [text.get_text() for legend in scene.legends for text in legend.get_texts()]
-    named = [name for name in said if name.startswith("robot ")]
-    assert named == [f"robot {i}" for i in range(min(n_robots, 7))]
+    shown_texts = [text.get_text() for legend in scene.legends for text in legend.get_texts()]
+    named = [name for name in shown_texts if name.startswith(("robot ", "path"))]
+    assert named == (["path"] if n_robots == 1 else [f"robot {i}" for i in range(min(n_robots, 7))])
 
 
 def test_team_map_outlines_components_within_the_band():
@@ -115,16 +115,16 @@ def test_team_map_classifies_cells_by_the_belief_rule():
         np.testing.assert_allclose(np.asarray(image.get_array())[:, 0], expected)
 
 
-@pytest.mark.parametrize(("height", "said"), [(1.0, []), (3.0, ["path above or below these heights"])])
-def test_paths_outside_the_band_have_a_white_core(height, said):
+@pytest.mark.parametrize(("height", "shown_texts"), [(1.0, []), (3.0, ["path above or below these heights"])])
+def test_paths_outside_the_band_have_a_white_core(height, shown_texts):
     world = MapImage(torch.zeros(8, 8), (0.0, 0.0), 1.0, (0.8, 1.8))
     poses = np.array([[1.0, 1, 1.0, 0], [3, 1, height, 0], [5, 1, 1.0, 0]])
     figure = trajectories_figure(world, [poses])
     assert figure.get_suptitle() == "Robot paths\nsurfaces between z = 0.8 m and 1.8 m"
-    assert [t.get_text() for t in figure.legends[0].get_texts() if "path" in t.get_text()] == said
+    assert [t.get_text() for t in figure.legends[0].get_texts() if "heights" in t.get_text()] == shown_texts
     paths = [line for line in figure.axes[0].lines if line.get_linestyle() != "None"]
     above = [line for line in paths if len(line.get_path_effects()) == 3]
-    assert len(above) == len(said)
+    assert len(above) == len(shown_texts)
     for line in above:
         crossed = np.interp(line.get_xdata()[[0, -1]], [1, 3, 5], [1.0, height, 1.0])
         np.testing.assert_allclose(crossed, 1.8, atol=0.5)
@@ -163,19 +163,6 @@ def test_smooth_paths_without_forward_heading_are_straight():
         assert np.minimum(np.abs(path[:, 0] - 2), np.abs(path[:, 1])).max() < 1e-12
     assert smooth_path(np.empty((0, 4))).shape == (0, 3)
     assert smooth_path(poses[:1]).shape == (1, 3)
-
-
-@pytest.mark.parametrize("n_robots", [1, 16])
-def test_legends_fit_the_figure_width(n_robots):
-    view = MapImage(torch.rand(12, 30), (0.0, 0.0), 1.0, (0.8, 1.8))
-    paths = flights(n_robots, 30)
-    for figure in (
-        team_map_figure([TeamSnapshot(1.0, view, paths, *components(5))]),
-        trajectories_figure(view, paths, torch.randint(0, n_robots + 1, (12, 30))),
-    ):
-        figure.canvas.draw()
-        box = figure.legends[0].get_window_extent()
-        assert 0 <= box.x0 < box.x1 <= figure.bbox.width
 
 
 def test_map_errors_name_the_argument():

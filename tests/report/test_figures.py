@@ -24,12 +24,13 @@ def mixture(k: int, dim: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize(("n", "k"), [(200, 5), (1, 1), (0, 0), (5, 0), (0, 3)])
+@pytest.mark.parametrize(("n", "k"), [(200, 5), (5, 0), (0, 3)])
 def test_mixture_figure_states_the_numbers_drawn(dim, n, k):
     points = torch.randn(n, dim, generator=torch.Generator().manual_seed(1))
     figure = mixture_figure(points, *mixture(k, dim), origins=torch.zeros(1, dim))
     title = figure.get_suptitle()
-    assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}, {n} point{'s' * (n != 1)}"
+    points_said = f", {n} point{'s' * (n != 1)}" if n else ""
+    assert title == f"Gaussian mixture: {k} component{'s' * (k != 1)}{points_said}"
     plane = figure.axes[dim - 2]
     assert [plane.get_xlabel(), plane.get_ylabel()] == ["x [m]", "y [m]"]
 
@@ -85,7 +86,7 @@ def test_auc_against_kept_draws_a_panel_per_resolution_and_a_line_per_method():
         for resolution in (0.02, 0.1)
         for kept in (0.1, 1.0, 0.3)
     ]
-    figure = auc_against_kept_figure([*rows, row("broken", 0.1, 0.5, None)], "lab")
+    figure = auc_against_kept_figure([*rows, row("broken", 0.1, 0.5, None)])
     assert [axes.get_title() for axes in figure.axes] == ["cells of 0.1 m", "cells of 0.02 m"]
     axes = figure.axes[0]
     assert axes.get_xscale() == "log"

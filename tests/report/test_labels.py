@@ -23,7 +23,7 @@ def is_under(points: np.ndarray, box) -> bool:
 
 
 @given(st.lists(st.floats(0, 1), min_size=4, max_size=5), st.booleans())
-@settings(max_examples=4)
+@settings(max_examples=2)
 def test_labels_do_not_overlap_marks_lines_or_labels(heights, has_legend):
     figure = new_figure(7.0, 5.0)
     axes = figure.subplots()

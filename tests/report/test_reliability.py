@@ -8,7 +8,6 @@ import pytest
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.calibration import Reliability
 from gmmtorch.report.maps.accuracy_figures import reliability_figure
-from gmmtorch.report.style import save_figure
 
 CURVE = Reliability(np.array([0.1, 0.4, 0.9]), np.array([0.0, 0.5, 1.0]), np.array([50, 25, 25]))
 
@@ -32,14 +31,6 @@ def test_reliability_markers_grow_with_the_share_of_points():
     (markers,) = [c for c in figure.axes[0].collections if len(c.get_sizes()) == 3]
     sizes = markers.get_sizes()
     assert sizes[0] > sizes[1] == sizes[2]
-
-
-@pytest.mark.parametrize("n_methods", [1, 9])
-def test_reliability_accepts_any_number_of_methods(n_methods, tmp_path):
-    single = Reliability(np.array([0.5]), np.array([1.0]), np.array([7]))
-    figure = reliability_figure({f"method_{i}": single for i in range(n_methods)})
-    path = save_figure(figure, tmp_path / "reliability.png")
-    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_reliability_needs_a_curve():

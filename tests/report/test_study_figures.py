@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.report.maps.map_regions import busiest_regions
-from gmmtorch.report.studies import auc_memory_figures as auc_memory
-from gmmtorch.report.studies import variance_threshold_figures as variance_threshold
+from gmmtorch.report.studies import map_study_figures
 
 
 def memory_rows() -> list[dict]:
@@ -30,7 +29,7 @@ def memory_rows() -> list[dict]:
 
 
 def test_auc_memory_draws_each_method_through_its_sizes():
-    (figure,) = auc_memory.figures(memory_rows()).values()
+    (figure,) = map_study_figures.auc_memory_figures(memory_rows()).values()
     (axes,) = figure.axes
     lines = {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
     assert list(lines) == ["point", "bgk points", "occupancy grid"]
@@ -55,7 +54,7 @@ def test_variance_threshold_draws_a_line_per_number_of_components():
         for n in (200, 850)
         for v in (0.06, 0.2)
     ]
-    (figure,) = variance_threshold.figures(rows).values()
+    (figure,) = map_study_figures.variance_threshold_figures(rows).values()
     first, thin, free, _ = figure.axes
     assert [list(line.get_ydata()) for line in first.lines] == [[0.06, 0.2]] * 2
     assert [list(line.get_ydata()) for line in free.lines] == [[0.12, 0.4]] * 2
@@ -68,7 +67,7 @@ def test_cells_figure_shows_cells_classified_occupied(generator):
 
     hits = torch.rand(100, 3, generator=generator, dtype=torch.float64)
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    figure = variance_threshold.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
+    figure = map_study_figures.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
     titles = [axes.get_title() for axes in figure.axes[:3]]
     assert titles == ["20 components:\nheld-out points", "v = 0.06:\n500 cells", "v = 0.2:\n1,000 cells"]
     assert figure.axes[3].get_ylabel() == "height z [m]"
@@ -81,7 +80,7 @@ def test_cells_figure_shows_cells_classified_occupied(generator):
 def test_closest_look_contains_the_most_thin_points():
     thin = torch.tensor([[x, 9.0, 1.0] for x in torch.linspace(8.2, 9.8, 50)] + [[1.0, 1.0, 1.0]])
     hits = torch.cat([thin, torch.tensor([[9.0, 9.0, 3.0]])]).double()
-    low, high = variance_threshold.closest_look(thin.double(), hits, side=4.0)
+    low, high = map_study_figures.closest_look(thin.double(), hits, side=4.0)
     assert low[:2] == (8.0, 8.0)
     assert high[:2] == (12.0, 12.0)
     assert low[2] == pytest.approx(0.8, abs=0.02)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gmmtorch.report.progress import ProgressBars
-from gmmtorch.report.quantities import byte_text, ratio_text
-from gmmtorch.report.table import format_table, format_value
+from gmmtorch.report.table import byte_text, format_table, format_value, ratio_text
 
 
 def test_table_is_aligned():

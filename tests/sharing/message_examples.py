@@ -1,4 +1,4 @@
-"""Messages that the tests of messages send."""
+"""Example messages of every kind."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ from gmmtorch.sharing.messages.record_messages import (
     encode_record,
     pose_of,
 )
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import first_key
+from gmmtorch.sharing.replica.record_keys import Intervals, first_key
 
 codecs = pytest.mark.parametrize("codec", CODECS)
 numbers = st.integers(0, 300) | st.integers(0, (1 << 60) - 1)
@@ -41,7 +40,7 @@ places = st.sampled_from([0.0, -37.25, 5e5])
 
 
 def sealed(data: bytes) -> bytes:
-    """A first byte and a body with a checksum that is right."""
+    """The data with a valid checksum."""
     return data + zlib.crc32(data).to_bytes(4, "little")
 
 
@@ -52,7 +51,7 @@ def assert_same(one: object, other: object) -> None:
 
 
 def frame_of_components(k: int, **options) -> Components:
-    """Components of one frame: near one another, seen from one place, numbered in spatial order."""
+    """Components of one frame: near one another, with one origin, numbered in spatial order."""
     made = random_components(
         3, k=k, extent=6.0, n_origins=1, max_sightings=1, deviations=(5e-3, 0.5), **options
     )
@@ -72,12 +71,12 @@ def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> Vie
 
 
 def span(robot: int, begin: int, end: int) -> Intervals:
-    """Keys of a robot's."""
+    """Keys of a robot."""
     return Intervals.span(first_key(robot) + begin, first_key(robot) + end)
 
 
 def records() -> list[RecordMessage]:
-    """One of every kind that is no component."""
+    """One record of every kind except components."""
     return [
         SupersessionMessage(first_key(2, 5), span(2, 0, 3) | span(2, 7, 8), span(2, 30, 32)),
         counters_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
@@ -86,7 +85,7 @@ def records() -> list[RecordMessage]:
 
 
 def examples() -> list[bytes]:
-    """A sound datagram of every kind, in the order of their numbers."""
+    """A valid datagram of every kind, in the order of the kinds."""
     components, counts = frame_of_components(9), {(0, 3): 5.0, (0, 4): 7.5, (2, 900): 0.0}
     ends = torch.arange(30, dtype=torch.float64).reshape(10, 3)
     made = [encode_components(components, codec) for codec in CODECS]

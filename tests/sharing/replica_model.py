@@ -1,4 +1,4 @@
-"""What a replica should hold, said once more with plain dictionaries: nothing is ever forgotten."""
+"""A model of a replica with plain dictionaries that never forgets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gmmtorch.sharing.messages.message_registry import (
 
 
 def rows(components: Components) -> dict[int, tuple]:
-    """Of each component by its key: mean, covariance, support, flag, sightings."""
+    """Mean, covariance, support, flag and (origin, count) pairs of each component by its key."""
     found = {}
     for row, (robot, sequence) in enumerate(components.ids.tolist()):
         seen = [
@@ -32,7 +32,7 @@ def rows(components: Components) -> dict[int, tuple]:
 
 
 class Model:
-    """The union of what came, and what follows from it."""
+    """The union of all received records, and the components that follow from it."""
 
     def __init__(self) -> None:
         self.records: dict[int, object] = {}
@@ -75,7 +75,7 @@ class Model:
         return self.components()[key][2] + sum(largest[life] for life in sorted(largest))
 
     def shift(self, key: int) -> tuple[float, ...]:
-        """Of a component, where all corrections are shifts."""
+        """The shift of a component by corrections without rotation."""
         latest: dict[tuple[int, int], CorrectionMessage] = {}
         for record in self.counting().values():
             if isinstance(record, CorrectionMessage):

@@ -1,6 +1,6 @@
-"""Random schedules of what can happen to a team: loss, repetition, reordering, partitions, crashes, restarts.
+"""Random schedules of loss, duplication, reordering, partitions, crashes and restarts of a team.
 
-`run_schedule(seed)` runs one and says how it ended; a script may run as many as it likes:
+`run_schedule(seed)` runs one and returns its outcome:
 
     for seed in range(1000):
         assert run_schedule(seed).converged
@@ -18,19 +18,19 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.replica import authorship
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.sharing.replica.replica import Replica
 
 MOST_ROUNDS = 8
-"""Of announcing and answering without loss, until all should hold the same."""
+"""Rounds of announcements and answers without loss after which all replicas agree."""
 _LONGEST_DELAY = 6  # steps; so datagrams overtake one another
 _SNAPSHOT_EVERY = 5
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """converged: all digests equal; rounds without loss that it took; complete: what anybody held at the end
-    of the trouble, all hold; refused: datagrams by reason, all robots together."""
+    """converged: all digests are equal; complete: all robots hold every record that any robot held before the
+    network healed; rounds: exchanges without loss until then; refused: datagrams by reason, of all robots."""
 
     converged: bool
     complete: bool
@@ -71,7 +71,7 @@ class _Team:
             self.replicas[receiver].receive(datagram)
 
     def restart(self, robot: int, keeps_disk: bool) -> None:
-        """A new process: with an old snapshot of its disk, or with nothing."""
+        """A new process with an old snapshot of its disk or without records."""
         self.crashes += 1
         self.note_refused(robot)
         self.replicas[robot] = Replica(robot, incarnation=self.rng.getrandbits(24))
@@ -88,7 +88,7 @@ def components(rng: random.Random, n: int) -> Components:
 
 
 def act(rng: random.Random, replica: Replica) -> None:
-    """Something that a robot may do to its own map."""
+    """A random change of the map of a robot: add, supersede, count or correct."""
     known = replica.components().ids
     own = known[known[:, 0] == replica.robot]
     kind = rng.choice(["add", "add", "supersede", "supersede", "count", "count", "correct"])
@@ -109,9 +109,9 @@ def _some(rng: random.Random, rows: Tensor) -> Tensor:
 
 
 def run_schedule(seed: int, n_robots: int = 3, n_steps: int = 40) -> Outcome:
-    """A team in trouble for so many steps, then a network that works.
+    """A team with network trouble for `n_steps`, then without.
 
-    With odd seeds robots tidy up what they said as soon as they can, which else takes long missions.
+    With odd seeds robots compact their records as soon as possible, which otherwise takes long missions.
     """
     tidy = {"_MOST_SUPERSESSIONS": 1, "_MOST_OUTDATED": 1} if seed % 2 else {"_MOST_SUPERSESSIONS": 32}
     with mock.patch.multiple(authorship, **tidy):
@@ -155,7 +155,7 @@ def _trouble(team: _Team) -> None:
 
 
 def _heal(team: _Team, held: Intervals) -> int:
-    """How many rounds it takes until all hold all, and the same."""
+    """The number of rounds until all replicas agree."""
     team.loss, team.cut = 0.0, set()
     for done in range(MOST_ROUNDS + 1):
         if not team.flying and _agree(team.replicas):

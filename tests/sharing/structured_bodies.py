@@ -1,7 +1,7 @@
-"""Datagrams as who knows the formats would make them up: zero counts, extreme numbers, sound checksums.
+"""Hostile datagrams that follow the formats: zero counts, extreme numbers, valid checksums.
 
-Most fields say what they usually say, so that readers get far; a few say what they should not. What they are
-made of is drawn from a `random.Random`, so a benchmark may draw millions, and hypothesis shrinks them.
+Most fields have usual values, so that decoders read far; a few have invalid ones. All values are drawn from a
+`random.Random`, so that a benchmark can draw millions and hypothesis can shrink them.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ WIDE = 1 << 62
 _WHOLE = [0, 1, -1, 2, 63, 255, 1023, 1024, 1 << 24, 1 << 28, 1 << 31, 1 << 52, 1 << 60, END - 1, -END + 1]
 _REAL = [0.0, -0.0, 1.0, -1.0, 5e-324, 1e-30, 5e5, 2.0**14, 2.0**24, 2.0**27, 2.0**40, 2.0**53, 1e30, 1e155]
 _REAL += [1e300, -1e300, math.inf, -math.inf, math.nan]
-_ODD = 0.06  # share of fields that say what they should not
+_ODD = 0.06  # share of fields with an unusual value
 
 
 def structured(kind: Kind, rng: Random) -> bytes:
-    """A datagram of a kind, with checksums that are right."""
+    """A datagram of a kind with valid checksums."""
     body = _BODIES[kind](rng)[: MAX_BYTES - 5]
     head = bytes([VERSION << 4 | kind])
     if kind == Kind.COMPONENTS:
@@ -42,7 +42,7 @@ def structured(kind: Kind, rng: Random) -> bytes:
     return head + body + zlib.crc32(head + body).to_bytes(4, "little")
 
 
-# -- numbers -----------------------------------------------------------------------------------------------
+# -- numbers ---------------------------------------------------------------------------------------------
 
 
 def _whole(rng: Random, usual: int) -> int:
@@ -50,12 +50,12 @@ def _whole(rng: Random, usual: int) -> int:
 
 
 def _size(rng: Random, most: int = 12) -> int:
-    """How many of something are there."""
+    """A random number of items."""
     return rng.choice([0, 1, 1, 2, rng.randint(0, most)])
 
 
 def _reals(rng: Random, *shape: int, scale: float = 10.0) -> np.ndarray:
-    """Numbers of that order; in some arrays one is extreme, in some all are."""
+    """Numbers of this scale; in some arrays one or all are extreme."""
     values = np.array([rng.uniform(-scale, scale) for _ in range(math.prod(shape))])
     if len(values) and rng.random() < 3 * _ODD:
         values[rng.randrange(len(values)) if rng.random() < 0.7 else slice(None)] = rng.choice(_REAL)
@@ -63,7 +63,7 @@ def _reals(rng: Random, *shape: int, scale: float = 10.0) -> np.ndarray:
 
 
 def _number(writer: BitWriter, rng: Random, usual: int) -> int:
-    """Writes a number, and returns what it may well be taken for."""
+    """Writes a number and returns it before it is clipped to the format."""
     value = _whole(rng, usual)
     writer.number(max(-WIDE + 1, min(value, WIDE - 1)))
     return value
@@ -74,7 +74,7 @@ def _noise(writer: BitWriter, rng: Random, n: int) -> None:
 
 
 def _column(writer: BitWriter, rng: Random, n: int, least: int, largest: int) -> None:
-    """Numbers from `least` to `largest`; or as many of one as there are, which takes no bits; or bits."""
+    """Numbers from `least` to `largest`, or n equal numbers, which take no bits, or random bits."""
     choice = rng.random()
     if choice < 0.5:
         writer.column(np.array([rng.randint(least, largest) for _ in range(min(n, 400))], np.int64))
@@ -90,7 +90,7 @@ def _column(writer: BitWriter, rng: Random, n: int, least: int, largest: int) ->
 
 
 def _ids(writer: BitWriter, rng: Random, most: int = 12) -> int:
-    """Some robots with some ids each; how many ids there are."""
+    """Ids of some robots; returns their number."""
     n_robots, total, robot = _size(rng, 3), 0, -1
     _number(writer, rng, n_robots)
     for _ in range(n_robots):
@@ -100,7 +100,7 @@ def _ids(writer: BitWriter, rng: Random, most: int = 12) -> int:
         _number(writer, rng, rng.randint(0, 50))
         if n > 1:
             if rng.random() < 0.5:
-                writer.one(0, 6)  # gaps of nothing take a bit each
+                writer.one(0, 6)  # gaps of zero take one bit each
                 writer.fixed(np.ones(n - 1, np.int64), 1)
             else:
                 writer.rice_column(np.array([rng.randint(0, 5) for _ in range(n - 1)], np.int64))
@@ -120,11 +120,11 @@ def _key(writer: BitWriter, rng: Random) -> None:
     _number(writer, rng, rng.randrange(4) << 52 | rng.randrange(3) << 28 | rng.randrange(50))
 
 
-# -- bodies ------------------------------------------------------------------------------------------------
+# -- bodies ----------------------------------------------------------------------------------------------
 
 
 def _batch(rng: Random) -> bytes:
-    """A sound batch of which some numbers are others; or of many components that are the same."""
+    """A valid batch with some changed numbers or with many equal components."""
     values = made = _sound(rng.choice([2, 3, 3]), rng.randint(1, 9))
     if rng.random() < 0.3:
         values = _many(values, rng.choice([200, 1024, 1025, 3000]))
@@ -133,7 +133,7 @@ def _batch(rng: Random) -> bytes:
     try:
         with np.errstate(invalid="raise"):
             batch = encode_quantized(values)
-    except (ValueError, RuntimeError, LookupError, ArithmeticError):  # more than can be written at all
+    except (ValueError, RuntimeError, LookupError, ArithmeticError):  # the encoder refuses it
         batch = encode_quantized(made)
     body = bytearray(batch[:-4])
     if rng.random() < 0.2:
@@ -147,7 +147,7 @@ def _sound(dim: int, k: int) -> Quantized:
 
 
 def _many(values: Quantized, k: int) -> Quantized:
-    """The first component k times, each seen from the same place or places: a few bits each."""
+    """The first component k times, with the same origins; a few bits each."""
     n = max(int(values.n_viewpoints[0]), 1)
     rows = torch.zeros(k, dtype=torch.int64)
     numbered = values.ids[rows] + torch.stack([rows, torch.arange(k)], 1)
@@ -163,7 +163,7 @@ def _many(values: Quantized, k: int) -> Quantized:
     )
 
 
-_OTHERS = {  # the first ones take as many bits to write as they are large
+_OTHERS = {  # the first three take as many bits as their value
     "shear": [0, 1, -1, 9, 500],
     "n_viewpoints": [0, 1, 2, 49, 1025],
     "axis_order": [0, 1, 5, 6, 7],
@@ -178,7 +178,7 @@ _OTHERS = {  # the first ones take as many bits to write as they are large
 
 
 def _altered(values: Quantized, rng: Random) -> Quantized:
-    """With one field, or a field of the places, changed in one row or all."""
+    """With one field of the batch or its places changed in one row or all rows."""
     name = rng.choice(list(_OTHERS))
     in_places = name in {f.name for f in fields(Lattice)}
     whole = values.places if in_places else values

@@ -1,4 +1,4 @@
-"""Broadcast: what comes is held, against plain dictionaries of what datagrams say."""
+"""Broadcast, against plain dictionaries of the decoded messages."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_components,
     encode_counts,
 )
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 
 seeds = st.integers(0, 10**6)
 
 
 class Model:
-    """What should be held: of each id what was said first, and the sum of all counts that came after it."""
+    """The expected map: the first component of each id, and the sum of the counts that arrive after it."""
 
     def __init__(self) -> None:
         self.shapes: dict[int, tuple] = {}
@@ -62,8 +62,8 @@ class Model:
         )
 
 
-def history(seed: int, codec: str, n_acts: int = 12) -> list[bytes]:
-    """All that three robots say, who hear one another now and then."""
+def history(seed: int, codec: str, n_acts: int = 8) -> list[bytes]:
+    """All datagrams of three robots that receive some of each other's."""
     rng = random.Random(seed)
     robots = [Broadcast(robot, codec) for robot in range(3)]
     said: list[bytes] = []
@@ -85,11 +85,11 @@ def history(seed: int, codec: str, n_acts: int = 12) -> list[bytes]:
 
 
 @codecs
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=seeds, order=st.randoms(use_true_random=False))
-def test_whatever_comes_in_whatever_order_is_held(codec: str, seed: int, order: random.Random) -> None:
+def test_messages_in_any_order_equal_a_plain_model(codec: str, seed: int, order: random.Random) -> None:
     said = [datagram for datagram in history(seed, codec) if order.random() < 0.85]
-    said += order.sample(said, len(said) // 2)  # some come twice
+    said += order.sample(said, len(said) // 2)  # some arrive twice
     order.shuffle(said)
     one, model = Broadcast(9, codec), Model()
     for datagram in said:
@@ -100,9 +100,9 @@ def test_whatever_comes_in_whatever_order_is_held(codec: str, seed: int, order: 
 
 
 @codecs
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(seed=seeds, order=st.randoms(use_true_random=False))
-def test_who_follows_the_changes_has_the_map(codec: str, seed: int, order: random.Random) -> None:
+def test_changes_of_a_broadcast_are_its_map(codec: str, seed: int, order: random.Random) -> None:
     said = history(seed, codec)
     order.shuffle(said)
     one, support, shapes = Broadcast(9, codec), {}, {}
@@ -130,10 +130,10 @@ def test_who_follows_the_changes_has_the_map(codec: str, seed: int, order: rando
 
 
 @codecs
-def test_the_sender_holds_what_it_says(codec: str) -> None:
+def test_the_sender_holds_the_decoded_components(codec: str) -> None:
     one, model = Broadcast(3, codec), Model()
     ids = [one.add(frame_of_components(40, seed=seed)) for seed in range(3)]
-    one.count({(3, 0): 5.0, (3, 119): 7.0, (3, 120): 9.0, (2, 0): 1.0})  # the last two are of nobody
+    one.count({(3, 0): 5.0, (3, 119): 7.0, (3, 120): 9.0, (2, 0): 1.0})  # the last two ids are unknown
     for datagram in one.datagrams():
         model.receive(datagram)
     assert torch.cat(ids).tolist() == [[3, number] for number in range(120)] == one.components().ids.tolist()
@@ -143,7 +143,7 @@ def test_the_sender_holds_what_it_says(codec: str) -> None:
     assert one.digest() == b""
 
 
-def test_counts_count_whenever_they_come() -> None:
+def test_repeated_counts_are_added() -> None:
     one = Broadcast(0, "float")
     one.add(frame_of_components(3))
     before = one.components().support
@@ -153,7 +153,7 @@ def test_counts_count_whenever_they_come() -> None:
     assert (one.components().support - before).tolist() == pytest.approx([0.0, 15.0, 0.0])
 
 
-def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
+def test_datagrams_beyond_the_budget_are_sent_later() -> None:
     one, other = Broadcast(0, "float"), Broadcast(0, "float")
     for each in (one, other):
         each.add(frame_of_components(40))
@@ -168,10 +168,10 @@ def test_a_budget_is_kept_and_what_waits_comes_later() -> None:
     assert got == due
 
 
-# -- what is not taken in ----------------------------------------------------------------------------------
+# -- refused messages ------------------------------------------------------------------------------------
 
 
-def test_what_does_not_fit_is_refused_and_counted() -> None:
+def test_unfit_messages_are_refused_and_counted() -> None:
     one = Broadcast(0, "float")
     flat = replace(random_components(2, k=3, n_origins=1, max_sightings=1, robot=1))
     gaps = frame_of_components(4, robot=1)
@@ -189,7 +189,7 @@ def test_what_does_not_fit_is_refused_and_counted() -> None:
 
 
 @pytest.mark.parametrize(("name", "most"), [("MOST_ROWS", 12), ("MOST_BATCHES", 3)])
-def test_more_than_is_held_is_refused_from_others_and_said_all_the_same(
+def test_a_full_broadcast_refuses_others_and_sends_its_own(
     name: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"gmmtorch.sharing.broadcast.{name}", most)
@@ -210,7 +210,7 @@ def test_more_than_is_held_is_refused_from_others_and_said_all_the_same(
 
 
 @pytest.mark.parametrize(("first", "size"), [(0, 12), (4, 2), (3, 9), (0, 6), (5, 5), (9, 20)])
-def test_what_is_here_in_part_is_not_taken_twice(first: int, size: int) -> None:
+def test_overlapping_batches_are_ignored(first: int, size: int) -> None:
     one = Broadcast(0, "float")
     (datagram,) = encode_components(shifted(frame_of_components(5, robot=1), 5), "float")
     one.receive(datagram)
@@ -225,7 +225,7 @@ def shifted(components: Components, first: int) -> Components:
     return replace(components, ids=components.ids + torch.tensor([0, first]))
 
 
-def test_what_is_damaged_or_asked_wrongly_says_so() -> None:
+def test_damaged_messages_and_invalid_arguments_are_errors() -> None:
     one = Broadcast(0)
     with pytest.raises(DataError):
         one.receive(b"\x11nonsense")

@@ -1,4 +1,4 @@
-"""Messages: whatever comes in that nobody sent is refused, and takes no memory."""
+"""Messages: damaged and forged datagrams are refused, and take no memory."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def sound() -> list[bytes]:
     return examples()
 
 
-def test_every_kind_says_what_it_is(sound):
+def test_every_kind_decodes_to_its_message(sound):
     kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
     kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage]
     assert [type(decode(datagram)) for datagram in sound] == kinds
     assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 14)]
 
 
-def test_every_cut_flipped_bit_and_added_byte_is_noticed(sound):
+def test_every_damage_of_a_datagram_is_detected(sound):
     for datagram in sound:
         for length in range(len(datagram)):
             with pytest.raises(DataError):
@@ -89,7 +89,7 @@ def test_other_versions_kinds_and_sizes_are_refused_by_name():
 
 
 def assert_sound(message: Message) -> None:
-    """No NaN, nothing infinite, absurd or indefinite, and no more than a datagram can hold."""
+    """Finite, bounded and positive definite, and no larger than a datagram can hold."""
     for value in vars(message.components if isinstance(message, ComponentsMessage) else message).values():
         if isinstance(value, torch.Tensor):
             assert value.numel() <= 1 << 17
@@ -120,8 +120,8 @@ def places_of(message: Message) -> list[torch.Tensor]:
     return [message.pose[: message.dim]] if isinstance(message, CorrectionMessage) else []
 
 
-def written_again(message: Message, kind: Kind) -> list[bytes]:
-    """What a robot that holds this would say."""
+def encoded_again(message: Message, kind: Kind) -> list[bytes]:
+    """The datagrams of a decoded message."""
     if isinstance(message, ComponentsMessage):
         return encode_components(message.components, _CODEC[kind])
     if isinstance(message, CountsMessage):
@@ -146,11 +146,11 @@ _CODEC = {
 
 
 def content(message: Message) -> list[object]:
-    """What is said, comparable."""
+    """The values of a message, comparable."""
     if isinstance(message, ComponentsMessage):
         c = message.components
         return [getattr(c, name).tolist() for name in ("ids", "means", "covariances", "support", "max_range")]
-    if isinstance(message, PointsMessage):  # which part of its frame it is, is not asked
+    if isinstance(message, PointsMessage):  # except the part number
         return [message.sender, message.origin.tolist(), message.ends.tolist(), message.is_hit.tolist()]
     if isinstance(message, AnnouncementMessage):
         return [message.sender, message.incarnation, message.held.pairs()]
@@ -159,7 +159,7 @@ def content(message: Message) -> list[object]:
 
 
 def joined(found: list[Message]) -> list[object]:
-    """The content of what had to be written as several datagrams."""
+    """The content of a message that takes several datagrams."""
     if len(found) > 1 and all(isinstance(message, ComponentsMessage) for message in found):
         return content(ComponentsMessage(Components.concatenate([m.components for m in found])))
     return content(found[0]) if len(found) == 1 else []
@@ -174,38 +174,38 @@ def try_decode(datagram: bytes) -> bool:
     return True
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(data=st.binary(max_size=1300))
 def test_noise_is_refused(data):
     assert not try_decode(data)
 
 
-@settings(max_examples=600)
+@settings(max_examples=300)
 @given(kind=st.integers(1, 14), body=st.binary(max_size=400))
-def test_noise_with_a_sound_checksum_is_refused_or_sound(kind, body):
+def test_noise_with_a_valid_checksum_is_refused_or_valid(kind, body):
     try_decode(sealed(b"\x11" + sealed(b"\x01" + body)) if kind == 1 else sealed(bytes([0x10 | kind]) + body))
 
 
 def forged(datagram: bytes, body: bytes) -> bytes:
-    """A datagram of the same kind with another body and checksums that are right."""
+    """A datagram of the same kind with another body and valid checksums."""
     return datagram[:1] + sealed(body) if datagram[0] == 0x11 else sealed(datagram[:1] + body)
 
 
-def test_thousands_of_forged_datagrams_are_refused_or_sound(sound):
+def test_forged_datagrams_are_refused_or_valid(sound):
     rng, n_accepted = np.random.default_rng(0), 0
-    for trial in range(3000):
+    for trial in range(1500):
         datagram = sound[trial % len(sound)]
         body = bytearray(datagram[1:-4])
         for place in rng.integers(0, len(body), rng.integers(1, 5)):
             body[place] = rng.integers(0, 256)
         n_accepted += try_decode(forged(datagram, bytes(body[: len(body) - rng.choice([0, 0, 0, 1, 7])])))
-    assert n_accepted > 100  # so that what is accepted was looked at
+    assert n_accepted > 50  # so that enough accepted messages are checked
 
 
 @pytest.mark.parametrize("n", [2**20, 2**40, 2**61])
 @pytest.mark.parametrize("kind", [4, 8, 9])
-def test_numbers_that_nothing_backs_take_no_memory(n, kind):
-    """As many ids of one robot, or poses, as the format can announce."""
+def test_false_lengths_take_no_memory(n, kind):
+    """The largest number of ids or poses that the format can state."""
     writer = BitWriter()
     for value in {4: (1, 1, 0, n, 0), 8: (1, 0, n, 0), 9: (1, 1, 1, 1, n)}[kind]:
         writer.number(value)
@@ -214,8 +214,8 @@ def test_numbers_that_nothing_backs_take_no_memory(n, kind):
 
 
 @pytest.mark.parametrize(("kind", "place"), [(3, 8), (6, 5), (7, 40)])
-def test_a_nan_that_signals_is_refused_without_a_warning(sound, kind, place):
-    """As any other is; to cast such a float32 is what warns."""
+def test_a_signalling_nan_is_refused_without_a_warning(sound, kind, place):
+    """A cast of such a float32 would warn."""
     (datagram,) = (each for each in sound if each[0] & 15 == kind)
     body = datagram[1:-4]
     changed = body[:place] + struct.pack("<I", 0x7F800001) + body[place + 4 :]
@@ -225,7 +225,7 @@ def test_a_nan_that_signals_is_refused_without_a_warning(sound, kind, place):
             decode(forged(datagram, changed))
 
 
-def test_float_components_that_are_none_are_refused(sound):
+def test_invalid_float_components_are_refused(sound):
     datagram = sound[1]
     body = datagram[1:-4]
     for place, value in ((13, math.nan), (13 + 9 * 24, -1.0)):  # the first mean, the first variance
@@ -236,7 +236,7 @@ def test_float_components_that_are_none_are_refused(sound):
         decode(forged(datagram, struct.pack("<BIII", 3, 0, 1 << 31, 1 << 31)))
 
 
-# -- made up by who knows the format ---------------------------------------------------------------------
+# -- forged by a stranger that knows the format ----------------------------------------------------------
 
 
 class Listeners:
@@ -253,9 +253,9 @@ class Listeners:
 
 
 @pytest.mark.parametrize("kind", list(Kind))
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(rng=st.randoms(use_true_random=False))
-def test_structured_bodies_are_refused_or_sound_and_can_be_said_again(kind, rng):
+def test_structured_bodies_are_refused_or_can_be_encoded_again(kind, rng):
     datagram = structured(kind, rng)
     try:
         message = decode(datagram)
@@ -264,28 +264,28 @@ def test_structured_bodies_are_refused_or_sound_and_can_be_said_again(kind, rng)
         return
     assert_sound(message)
     Listeners().hear(datagram, message)
-    again = [decode(each) for each in written_again(message, kind)]
+    again = [decode(each) for each in encoded_again(message, kind)]
     if len(again) == 1 or isinstance(message, ComponentsMessage):
         assert joined(again) == content(message)
 
 
-def test_of_structured_bodies_many_are_read_and_many_are_not():
-    """So that what is read, and what is refused, has been looked at; nobody raises, whatever came before."""
+def test_many_structured_bodies_are_accepted_and_many_refused():
+    """Both outcomes occur often enough, and no state of the receivers raises."""
     listeners = Listeners()
     for kind in Kind:
         found: Counter[bool] = Counter()
-        for seed in range(60):
+        for seed in range(30):
             datagram = structured(kind, Random(seed))
             found[try_decode(datagram)] += 1
             try:
                 listeners.hear(datagram, decode(datagram))
             except DataError:
                 assert not listeners.replica.receive(datagram)
-        assert min(found[True], found[False]) >= 5, (kind, found)
+        assert min(found[True], found[False]) >= 2, (kind, found)
 
 
-def test_no_components_at_all_are_refused():
-    """K, S and E are zero, which numpy would not have; and the other codecs' way of saying so."""
+def test_messages_without_components_are_refused():
+    """In every codec; in float64, K, S and E are zero."""
     with pytest.raises(DataError, match="0 components"):
         decode(bytes.fromhex("1203000000000000000000000000c8edadeb"))
     assert not Replica(0).receive(bytes.fromhex("1203000000000000000000000000c8edadeb"))
@@ -308,7 +308,7 @@ def test_no_components_at_all_are_refused():
         (6, 36, "<f"),  # a point
     ],
 )
-def test_places_that_are_absurd_are_refused(sound, number, place, layout, value):
+def test_absurd_positions_are_refused(sound, number, place, layout, value):
     body = sound[number][1:-4]
     stored = struct.pack(layout, min(value, 3e38) if layout == "<f" else value)
     with pytest.raises(DataError):
@@ -318,22 +318,22 @@ def test_places_that_are_absurd_are_refused(sound, number, place, layout, value)
 @pytest.mark.parametrize(
     ("place", "value"), [(13 + 9 * 24, 1e300), (13 + 9 * 72, 1e300), (13 + 9 * 72, 1e13)]
 )
-def test_float_components_that_are_absurd_are_refused(sound, place, value):
-    """The first variance, and the support of the first."""
+def test_absurd_float_components_are_refused(sound, place, value):
+    """The variance and the support of the first component."""
     body = sound[1][1:-4]
     with pytest.raises(DataError, match="is the most"):
         decode(forged(sound[1], body[:place] + struct.pack("<d", value) + body[place + 8 :]))
 
 
 @pytest.mark.parametrize("shift", [1.0, 1.01])
-def test_what_lies_farther_out_than_is_told_can_be_stored_and_not_heard(shift):
-    """The codec of files reaches farther than messages do."""
+def test_positions_beyond_the_limit_of_messages_are_refused(shift):
+    """Files may contain positions that messages may not."""
     one = random_components(3, k=1, extent=0.0, n_origins=1, max_sightings=1, deviations=(0.01, 0.1))
     far = replace(one, means=one.means + shift * FARTHEST)
     assert try_decode(b"\x11" + batches.encode(far)) == (shift == 1.0)
 
 
-def test_what_nobody_has_thought_of_is_refused_too(sound, monkeypatch):
+def test_unexpected_errors_of_a_reader_refuse_the_datagram(sound, monkeypatch):
     for error in (ValueError, OverflowError, ZeroDivisionError, IndexError, RuntimeError):
 
         def careless(body: bytes, error: type[Exception] = error) -> Message:

@@ -1,4 +1,4 @@
-"""Intervals: sets of whole numbers, against Python's sets."""
+"""Intervals against sets of integers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.replica.intervals import Intervals, evict
+from gmmtorch.sharing.replica.record_keys import Intervals, evict
 
 numbers = st.sets(st.integers(0, 40))
 
@@ -22,7 +22,7 @@ def members(intervals: Intervals) -> set[int]:
 
 
 @given(one=numbers, other=numbers)
-def test_operations_are_those_of_sets(one, other):
+def test_operations_equal_those_of_sets(one, other):
     a, b = of(one), of(other)
     assert members(a) == one
     assert members(a | b) == one | other
@@ -43,7 +43,7 @@ def test_contains(one, asked):
 
 
 @given(one=numbers, other=numbers)
-def test_intervals_never_touch_and_are_as_few_as_can_be(one, other):
+def test_intervals_are_as_few_as_possible(one, other):
     joined = of(one) | of(other)
     assert (np.diff(joined.edges) > 0).all()
     starts = [number for number in one | other if number - 1 not in one | other]
@@ -51,14 +51,14 @@ def test_intervals_never_touch_and_are_as_few_as_can_be(one, other):
 
 
 @given(sets=st.lists(numbers, max_size=5))
-def test_the_union_of_many_is_that_of_one_after_another(sets):
+def test_union_of_many_equals_repeated_unions(sets):
     found = Intervals.union(map(of, sets))
     assert members(found) == set().union(*sets)
     assert found == of(members(found))
 
 
 @given(sets=st.dictionaries(st.integers(0, 9), numbers), most=st.integers(0, 30))
-def test_who_has_most_is_forgotten_first_and_no_more_than_need_be(sets, most):
+def test_evict_removes_the_largest_sets_first(sets, most):
     intervals = {name: of(values) for name, values in sets.items()}
     gone = evict(intervals, most)
     sizes = {name: len(one) for name, one in intervals.items()}
@@ -69,7 +69,7 @@ def test_who_has_most_is_forgotten_first_and_no_more_than_need_be(sets, most):
 
 
 @given(one=numbers, most=st.integers(0, 20))
-def test_a_set_of_more_intervals_is_none(one, most):
+def test_up_to_empties_larger_sets(one, most):
     assert members(of(one).up_to(most)) == (one if len(of(one)) <= most else set())
 
 
@@ -84,6 +84,6 @@ def test_long_intervals_take_no_memory():
 
 
 @pytest.mark.parametrize("edges", [[1], [2, 1], [1, 1], [0, 2, 2, 3]])
-def test_edges_that_are_none_are_refused(edges):
+def test_invalid_edges_are_refused(edges):
     with pytest.raises(InvalidArgumentError, match="edges"):
         Intervals(np.array(edges, np.int64))

@@ -1,4 +1,4 @@
-"""Messages: what comes out is what went in, to the stated step."""
+"""Messages: decoded content equals encoded content within the stated steps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import (
@@ -43,9 +43,9 @@ from gmmtorch.sharing.messages.message_registry import (
     quantized_poses,
 )
 from gmmtorch.sharing.messages.point_messages import POINTS_PER_DATAGRAM
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 
-# -- components --------------------------------------------------------------------------------------------
+# -- components ------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25)
@@ -58,7 +58,7 @@ from gmmtorch.sharing.replica.intervals import Intervals
     max_sightings=st.integers(1, 3),
     robot=st.integers(0, 9),
 )
-def test_components_arrive_as_the_codec_quantizes_them(**options):
+def test_decoded_components_equal_the_quantized_ones(**options):
     components = random_components(**options)
     datagrams = encode_components(components)
     assert all(len(datagram) <= MAX_BYTES for datagram in datagrams)
@@ -73,7 +73,7 @@ def test_components_arrive_as_the_codec_quantizes_them(**options):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_float_components_arrive_as_they_are(dim):
+def test_float_components_are_decoded_exactly(dim):
     components = random_components(dim, k=40, center=5e5)
     datagrams = encode_components(components, "float")
     assert len(datagrams) > 1
@@ -97,7 +97,7 @@ def test_thesis_components_are_57_bytes_each_and_float32():
 
 
 @codecs
-def test_encoding_what_was_decoded_changes_nothing(codec):
+def test_encoding_decoded_components_is_idempotent(codec):
     datagrams = encode_components(frame_of_components(20), codec)
     assert [encode_components(decode(datagram).components, codec) for datagram in datagrams] == [
         [datagram] for datagram in datagrams
@@ -109,7 +109,7 @@ def test_a_component_of_a_frame_takes_ten_bytes():
 
 
 @codecs
-def test_a_component_seen_from_too_many_places_is_named(codec):
+def test_a_component_with_too_many_origins_is_refused(codec):
     one = random_components(3, k=1, n_origins=900, max_sightings=1)
     many = replace(
         one,
@@ -123,7 +123,7 @@ def test_a_component_seen_from_too_many_places_is_named(codec):
 
 
 @pytest.mark.parametrize("codec", ["float", "thesis"])
-def test_covariances_that_would_arrive_indefinite_are_not_sent(codec):
+def test_covariances_that_round_to_indefinite_are_refused(codec):
     components = frame_of_components(3)
     flat = components.covariances.clone()
     flat[1] = torch.diag(torch.tensor([1.0, 1.0, -1e-12], dtype=torch.float64))
@@ -133,7 +133,7 @@ def test_covariances_that_would_arrive_indefinite_are_not_sent(codec):
 
 
 def with_one(components: Components, name: str, value: float) -> Components:
-    """The components, of one of which a number is another."""
+    """The components with the first number of one field replaced."""
     changed = getattr(components, name).clone()
     changed.view(-1)[0] = value
     return replace(components, **{name: changed})
@@ -154,9 +154,9 @@ def with_one(components: Components, name: str, value: float) -> Components:
     ],
 )
 @codecs
-def test_components_that_nobody_would_take_are_not_sent(name, value, codec):
+def test_invalid_components_are_refused_before_sending(name, value, codec):
     one = random_components(3, k=3, n_origins=1, max_sightings=1)
-    if name == "support":  # thesis messages have the counts of sightings alone
+    if name == "support":  # thesis messages contain only the counts of origins
         one = replace(one, seen_count=with_one(one, "support", value).support)
     with pytest.raises(InvalidArgumentError, match=name):
         encode_components(with_one(one, name, value), codec)
@@ -170,13 +170,13 @@ def test_components_that_nobody_would_take_are_not_sent(name, value, codec):
     codec=st.sampled_from(["quantized", "float"]),
     seed=st.integers(0, 99),
 )
-def test_at_the_ends_of_the_world_what_is_sent_is_taken(center, extent, deviation, dim, codec, seed):
+def test_components_at_the_coordinate_limit_are_decoded(center, extent, deviation, dim, codec, seed):
     made = random_components(dim, k=5, extent=extent, deviations=(deviation / 50, deviation), seed=seed)
     moved = {name: (getattr(made, name) + center).clamp(-FARTHEST, FARTHEST) for name in ("means", "origins")}
     components = replace(made, **moved)
     try:
         datagrams = encode_components(components, codec)
-    except InvalidArgumentError:  # rounding led out of it
+    except InvalidArgumentError:  # rounding beyond the limit
         assert codec == "quantized"
         assert center or extent > 1e4
         return
@@ -184,8 +184,8 @@ def test_at_the_ends_of_the_world_what_is_sent_is_taken(center, extent, deviatio
 
 
 @pytest.mark.parametrize("max_sightings", [1, 5])
-def test_components_that_take_no_bits_are_in_datagrams_of_bounded_work(max_sightings):
-    """Equal components, one after another: thousands would fit."""
+def test_datagrams_of_equal_components_are_bounded(max_sightings):
+    """Thousands of equal components would fit into a datagram."""
     n = 3000
     one = random_components(3, k=1, n_origins=max_sightings, max_sightings=1)
     many = replace(
@@ -207,7 +207,7 @@ def test_components_that_take_no_bits_are_in_datagrams_of_bounded_work(max_sight
 
 
 @codecs
-def test_a_component_seen_from_more_places_than_a_datagram_has_is_named(codec):
+def test_a_component_too_large_for_a_datagram_is_refused(codec):
     n = MOST_COMPONENTS_SENT + 1
     one = random_components(3, k=1, n_origins=n, max_sightings=1)
     many = replace(
@@ -223,7 +223,7 @@ def test_a_component_seen_from_more_places_than_a_datagram_has_is_named(codec):
         list(fitted(quantize(many)))
 
 
-def test_unknown_codecs_are_named():
+def test_unknown_codecs_are_refused():
     for encode in (
         lambda: encode_components(Components.empty(3), "zip"),
         lambda: encode_counts(0, {}, "zip"),
@@ -232,16 +232,18 @@ def test_unknown_codecs_are_named():
             encode()
 
 
-# -- counts ------------------------------------------------------------------------------------------------
+# -- counts ----------------------------------------------------------------------------------------------
 
 
+@example(sender=0, counts={(0, 0): 0.0, (0, 65): 0.0, (0, (1 << 60) - 125): 0.0})
+@example(sender=0, counts={(0, 0): 0.0, (0, (1 << 60) - 1): 0.0})
 @given(
     sender=numbers,
     counts=st.dictionaries(
         st.tuples(st.integers(0, 3) | numbers, numbers), st.just(0.0) | st.floats(1e-3, 1e12), max_size=60
     ),
 )
-def test_counts_arrive_within_their_step(sender, counts):
+def test_counts_are_decoded_within_their_step(sender, counts):
     found: dict[tuple[int, int], float] = {}
     for datagram in encode_counts(sender, counts):
         assert len(datagram) <= MAX_BYTES
@@ -275,12 +277,12 @@ def test_counts_take_less_than_three_bytes_each():
 
 @pytest.mark.parametrize("count", [-1.0, math.nan, math.inf, 1e13])
 @codecs
-def test_counts_that_are_none_are_named(count, codec):
+def test_invalid_counts_are_refused(count, codec):
     with pytest.raises(InvalidArgumentError, match=r"counts\[\(1, 2\)\]"):
         encode_counts(0, {(1, 2): count}, codec)
 
 
-# -- points ------------------------------------------------------------------------------------------------
+# -- points ----------------------------------------------------------------------------------------------
 
 
 @given(
@@ -289,7 +291,7 @@ def test_counts_that_are_none_are_named(count, codec):
     center=places,
     sender=st.integers(0, 65535),
 )
-def test_points_arrive_to_float32_of_their_distance(n, seed, center, sender):
+def test_points_are_decoded_to_float32_of_their_range(n, seed, center, sender):
     generator = torch.Generator().manual_seed(seed)
     ends = center + torch.rand(n, 3, generator=generator, dtype=torch.float64) * 12 - 6
     origin = torch.full((3,), center, dtype=torch.float64) + 0.123
@@ -332,7 +334,7 @@ def test_points_take_12_bytes_a_bit_and_a_header():
         {"is_hit": torch.ones(3, dtype=torch.bool)},
     ],
 )
-def test_points_that_cannot_be_sent_are_named(changed):
+def test_invalid_points_are_refused(changed):
     sound = {
         "sender": 0,
         "frame": 0,
@@ -345,11 +347,11 @@ def test_points_that_cannot_be_sent_are_named(changed):
         encode_points(**{**sound, **changed})
 
 
-# -- views and plans ---------------------------------------------------------------------------------------
+# -- views and plans -------------------------------------------------------------------------------------
 
 
 @given(poses=st.lists(st.tuples(*[st.floats(-FARTHEST, FARTHEST)] * 3, st.floats(-1e3, 1e3)), max_size=20))
-def test_quantized_poses_are_near_and_stay(poses):
+def test_pose_quantization_is_close_and_idempotent(poses):
     rows = torch.tensor(poses, dtype=torch.float64).reshape(-1, 4)
     found = quantized_poses(rows)
     assert float((found[:, :3] - rows[:, :3]).abs().max() if len(rows) else 0) <= 0.005 + 1e-7
@@ -359,7 +361,7 @@ def test_quantized_poses_are_near_and_stay(poses):
     assert torch.equal(quantized_poses(found), found)
 
 
-def test_a_pose_in_centimetres_comes_back_to_the_bit():
+def test_poses_in_whole_centimetres_are_decoded_exactly():
     poses = torch.tensor(
         [[0.29, -1.15, 4.35, math.pi / 2], [500000.07, 0.0, 0.01, -math.pi]], dtype=torch.float64
     )
@@ -372,7 +374,7 @@ def test_a_pose_in_centimetres_comes_back_to_the_bit():
     seed=st.integers(0, 99),
     center=places,
 )
-def test_views_arrive(n, n_removed, seed, center):
+def test_views_are_decoded_within_their_step(n, n_removed, seed, center):
     sent = views(n, n_removed, seed, center)
     datagrams = encode_views(sent)
     assert bool(datagrams) == bool(n + n_removed)
@@ -413,7 +415,7 @@ def test_a_view_takes_few_bytes():
         ("stamps", torch.zeros(3)),
     ],
 )
-def test_views_that_cannot_be_sent_are_named(name, value):
+def test_invalid_views_are_refused(name, value):
     with pytest.raises(InvalidArgumentError, match=name):
         encode_views(replace(views(2, 2), **{name: value}))
 
@@ -427,7 +429,7 @@ def test_views_that_cannot_be_sent_are_named(name, value):
     n_views=st.integers(0, 20),
     speed=st.floats(0, 2),
 )
-def test_plans_arrive(sender, number, time, step, n, n_views, speed):
+def test_plans_are_decoded_within_their_step(sender, number, time, step, n, n_views, speed):
     along = torch.arange(n, dtype=torch.float64) * 0.2
     path = torch.stack([speed * along, 3 - along, along * 0 + 1.5, 1.2 * along], 1)
     (datagram,) = encode_plan(sender, number, time / 1000, step / 1000, path, views(n_views).poses)
@@ -444,7 +446,7 @@ def test_a_plan_of_four_seconds_is_short():
     assert len(encode_plan(1, 17, 842.0, 0.2, path)[0]) <= 60
 
 
-def test_plans_that_cannot_be_sent_are_named():
+def test_invalid_plans_are_refused():
     path = torch.zeros(4, 4)
     for changed, message in (
         ({"step": 0.0}, "step=0.0"),
@@ -462,11 +464,11 @@ def test_plans_that_cannot_be_sent_are_named():
             encode_plan(**{**sound, **changed})
 
 
-# -- the format, by hand from docs/messages.md -------------------------------------------------------------
+# -- the format, by hand from docs/messages.md -----------------------------------------------------------
 
 
-def test_counts_by_hand():
-    """Of robot 1: components 3 and 5 of robot 0 have gained a point each."""
+def test_a_counts_message_equals_bytes_by_hand():
+    """From robot 1: components 3 and 5 of robot 0 gained a point each."""
     stream = "00000010" + "00000010" + "00000000" + "00000100" + "00000110"  # sender; robots; 0, two ids, 3
     stream += "000000" + "01"  # b = 0; a gap of 2, less one
     stream += "00" + "000000" + "00000000"  # a column of no bits each, all 0: log2 of 1
@@ -477,11 +479,11 @@ def test_counts_by_hand():
     assert encode_counts(1, {(0, 5): 1.0, (0, 3): 1.0}) == [datagram]
 
 
-def test_a_path_by_hand():
-    """Two poses a metre apart, the second turned right by an eighth, of robot 0; no views."""
+def test_a_path_message_equals_bytes_by_hand():
+    """Two poses of robot 0, a metre apart, the second turned right by 45°; no views."""
     poses = torch.tensor([[0.0, 0.01, 0.0, 0.0], [1.0, 0.01, 0.0, -math.pi / 4]], dtype=torch.float64)
     stream = "".join(f"{byte:08b}" for byte in (0, 2, 2, 4, 4))  # robot 0, plan 1, 1 ms, 2 ms, 2 poses
-    fixed = "00" + "000000"  # a column of one number: its base is all
+    fixed = "00" + "000000"  # a column of one number is its base
     stream += "00000000" + fixed + "11001000" + "00000001"  # x: 0, then 100 = 200 zigzag = 72 + 128 · 1
     stream += "00000010" + fixed + "00000000" + "00000000" + fixed + "00000000"
     stream += "00000000" + fixed + f"{2 * 32 - 1:08b}"  # yaw: 0, then -32 of 256
@@ -491,7 +493,7 @@ def test_a_path_by_hand():
     assert torch.equal(decode(datagram).path, poses)
 
 
-def test_points_by_hand():
+def test_a_points_message_equals_bytes_by_hand():
     body = struct.pack("<HI3dHHH6fB", 7, 9, 500.0, 0.5, 1.0, 1, 3, 2, 1, 2, 3, -1, -2, -3, 0b01000000)
     message = decode(sealed(b"\x17" + body))
     assert (message.sender, message.frame, message.part, message.n_parts) == (7, 9, 1, 3)
@@ -499,11 +501,11 @@ def test_points_by_hand():
     assert message.is_hit.tolist() == [False, True]
 
 
-# -- kinds --------------------------------------------------------------------------------------------------
+# -- kinds -----------------------------------------------------------------------------------------------
 
 
-def test_every_kind_has_a_name():
-    """Named here in the order of their numbers, so that a new one cannot be forgotten."""
+def test_every_message_kind_has_a_name():
+    """In the order of the kinds, so that a new kind needs a name here."""
     names = ["components"] * 3 + ["counts"] * 3 + ["points", "views", "plans", "announcements"]
     names += ["supersessions", "counts", "corrections"]
     assert [kind_of(bytes([VERSION << 4 | kind])) for kind in sorted(Kind)] == names

@@ -1,4 +1,4 @@
-"""Codecs of points: what comes back is what went in, to the error each is allowed."""
+"""Codecs of points: decoded points are within the error limit of each codec."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def sorted_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def cells_of(points: Tensor, resolution: float) -> np.ndarray:
-    """The codecs' lattice, worked out point by point."""
+    """The lattice cell of each point, one point at a time."""
     return np.array([[math.floor(x / resolution) for x in row] for row in points.tolist()]).reshape(-1, 3)
 
 
@@ -70,7 +70,7 @@ def test_raw_points_are_float32_in_order(points):
 
 
 @given(points=clouds, resolution=resolutions)
-def test_every_point_comes_back_as_its_cell(points, resolution):
+def test_every_point_is_decoded_as_its_cell_centre(points, resolution):
     codec = QuantizedPoints(resolution)
     found = codec.decode(codec.encode(points)).numpy()
     expected = (cells_of(points, resolution) + 0.5) * resolution
@@ -85,7 +85,7 @@ def test_an_octree_holds_each_cell_once(points, resolution, level):
     np.testing.assert_array_equal(sorted_rows(found), sorted_rows(expected))
 
 
-def test_the_occupancy_bytes_of_an_octree_are_those_of_a_recursion():
+def test_octree_bytes_equal_a_recursion():
     import zstandard
 
     points = cloud(200)
@@ -113,19 +113,19 @@ def test_the_occupancy_bytes_of_an_octree_are_those_of_a_recursion():
 
 @settings(max_examples=60)
 @given(points=clouds, error=st.sampled_from([0.002, 0.01, 0.1, 1.0]))
-def test_draco_stays_within_the_error_it_is_allowed(points, error):
+def test_draco_errors_are_within_the_limit(points, error):
     codec = Draco(error)
     found = codec.decode(codec.encode(points))
     assert len(found) <= len(points)  # equal ones become one
     if len(points):
-        # Draco gives no order: each point's nearest is at most as far as its own, and the other way round.
+        # Draco does not keep the order; the nearest point is at most as far as the own one.
         for one, other in ((points, found), (found, points)):
             distances = cKDTree(other.numpy()).query(one.numpy())[0]
             assert math.sqrt(np.square(distances).mean()) <= error * (1 + 1e-3) + 1e-5
 
 
-def test_the_error_that_draco_is_allowed_is_used_up():
-    """Points so far apart that each one's nearest is its own."""
+def test_draco_uses_the_coarsest_allowed_quantization():
+    """Points so far apart that the nearest decoded point is their own."""
     points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 60
     for error in (0.005, 0.1):
         found = Draco(error).decode(Draco(error).encode(points)).numpy()
@@ -140,7 +140,7 @@ def test_the_error_that_draco_is_allowed_is_used_up():
     share=st.sampled_from([0.0, 0.3, 1.0]),
     farthest=st.sampled_from([0.01, 6.0, 65.0]),
 )
-def test_depths_come_back_in_millimetres(shape, seed, share, farthest):
+def test_depths_are_decoded_in_whole_millimetres(shape, seed, share, farthest):
     generator = torch.Generator().manual_seed(seed)
     depths = 0.001 + torch.rand(shape, generator=generator, dtype=torch.float64) * farthest
     depths[torch.rand(shape, generator=generator) >= share] = 0.0
@@ -149,7 +149,7 @@ def test_depths_come_back_in_millimetres(shape, seed, share, farthest):
     assert torch.equal(found > 0, depths > 0)
 
 
-def test_the_compressed_are_smaller_than_the_raw_and_the_octree_is_smallest():
+def test_compressed_points_are_smaller_than_raw_and_the_octree_is_smallest():
     points = cloud(5000)
     depths = torch.zeros(120, 160, dtype=torch.float64)
     depths.view(-1)[:5000] = 2 + torch.arange(5000, dtype=torch.float64) / 1e4
@@ -168,7 +168,7 @@ def test_no_points_take_no_bytes():
 
 
 @pytest.mark.parametrize("step", [0.001, 0.0125, 0.2])
-def test_depths_come_back_to_half_a_step(step):
+def test_depths_are_decoded_within_half_a_step(step):
     depths = torch.rand(24, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 5
     depths[depths < 0.5] = 0.0
     codec = DepthImage(step=step)
@@ -178,31 +178,31 @@ def test_depths_come_back_to_half_a_step(step):
     np.testing.assert_allclose(found / step, (found / step).round(), atol=1e-9)
 
 
-# -- what cannot be encoded or decoded ---------------------------------------------------------------------
+# -- what cannot be encoded or decoded -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", POINT_CODECS)
 @pytest.mark.parametrize(
     "points", [torch.full((3, 3), math.nan), torch.full((3, 3), math.inf), torch.zeros(3, 2), torch.zeros(3)]
 )
-def test_points_that_are_none_are_named(name, points):
+def test_invalid_points_are_refused(name, points):
     with pytest.raises(InvalidArgumentError, match="points"):
         point_codec(name, 0.2, 0.1).encode(points)
 
 
 @pytest.mark.parametrize("codec", [QuantizedPoints(0.001), Octree(0.001), Draco(1e-7)])
-def test_points_too_far_apart_for_the_step_are_named(codec):
+def test_points_too_far_apart_for_the_step_are_refused(codec):
     with pytest.raises(InvalidArgumentError, match=r"coarser|larger error"):
         codec.encode(torch.tensor([[0.0, 0.0, 0.0], [1e6, 0.0, 0.0]]))
 
 
 @pytest.mark.parametrize("depth", [math.nan, -1.0, 65.6, math.inf])
-def test_depths_that_are_none_are_named(depth):
+def test_invalid_depths_are_refused(depth):
     with pytest.raises(InvalidArgumentError, match="depths"):
         DepthImage().encode(torch.full((2, 2), depth))
 
 
-def test_codecs_that_cannot_be_are_named():
+def test_invalid_codec_options_are_refused():
     for make, message in (
         (lambda: Draco(0.0), "error=0.0"),
         (lambda: Draco(math.nan), "error=nan"),
@@ -216,7 +216,7 @@ def test_codecs_that_cannot_be_are_named():
             make()
 
 
-def test_damaged_bytes_are_refused_or_are_points():
+def test_damaged_bytes_are_refused_or_decode_to_points():
     """Draco's own reader is not put to this: it may end the process."""
     rng = np.random.default_rng(0)
     depths = torch.rand(12, 16, dtype=torch.float64)
@@ -238,7 +238,7 @@ def test_damaged_bytes_are_refused_or_are_points():
 
 
 @pytest.mark.parametrize(("codec", "library"), [(Octree(0.2), "zstandard"), (Draco(0.1), "DracoPy")])
-def test_a_missing_library_is_named_with_its_remedy(codec, library, monkeypatch):
+def test_a_missing_library_is_reported_with_its_extra(codec, library, monkeypatch):
     def missing(name: str) -> None:
         raise ImportError(f"No module named {name!r}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
 import torch
 from exploration.replays import content
@@ -16,7 +15,7 @@ from gmmtorch.sharing.replica.replica import Replica
 
 
 def changed(rng: random.Random, before: Components) -> Components:
-    """A map without some components and with some new ones, perhaps twice."""
+    """The map without some components and with some new ones, perhaps twice."""
     kept = [row for row in range(len(before)) if rng.random() < 0.8]
     new = components(rng, rng.randint(0, 4))
     parts = [before.selected(torch.tensor(kept, dtype=torch.int64)), new]
@@ -27,9 +26,9 @@ def empty() -> Components:
     return components(random.Random(0), 1).selected(torch.zeros(0, dtype=torch.int64))
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 10**6))
-def test_in_one_session_records_equal_the_map_and_only_changes_are_sent(seed):
+def test_records_equal_the_map_and_only_changes_are_sent(seed):
     rng, replica, observer = random.Random(seed), Replica(3), Replica(9)
     known = empty()
     for _ in range(6):
@@ -45,9 +44,9 @@ def test_in_one_session_records_equal_the_map_and_only_changes_are_sent(seed):
     assert observer.digest() == replica.digest()
 
 
-@settings(max_examples=2)
+@settings(max_examples=1)
 @given(seed=st.integers(0, 10**6))
-def test_a_session_continues_another_one_that_was_killed(seed):
+def test_a_session_continues_a_killed_one(seed):
     """Some datagrams are lost with the disk; teammates send them later."""
     rng, team, known = random.Random(seed), Replica(9), empty()
     for _ in range(3):
@@ -93,16 +92,3 @@ def test_counts_of_other_robots_do_not_repeat_records():
     version = replica.version
     replica.publish(known, whole=True)
     assert replica.version == version
-
-
-def test_components_of_other_robots_stay():
-    replica, other = Replica(3), Replica(4)
-    other.add(components(random.Random(1), 5))
-    for datagram in other.datagrams():
-        assert replica.receive(datagram)
-    known = components(random.Random(2), 3)
-    replica.publish(known, whole=True)
-    assert content(replica.components()) == content(known, other.components())
-    again = replace(known, support=known.support * 2, seen_count=known.seen_count * 2)
-    replica.publish(again, whole=True)
-    assert content(replica.components()) == content(again, other.components())

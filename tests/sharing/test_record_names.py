@@ -1,4 +1,4 @@
-"""keys_in: what a datagram holds, without what it says of it, against the decoder."""
+"""keys_in: the keys of a datagram without decoding its content, against the decoder."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from sharing.schedules import act
 
 from gmmtorch.errors import DataError
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, decode, encode_components
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, keys_in, keys_of
+from gmmtorch.sharing.replica.record_keys import RECORD_KINDS, Intervals, keys_in, keys_of
 from gmmtorch.sharing.replica.replica import Replica
 
 
-def decoded_names(datagram: bytes) -> Intervals:
+def decoded_keys(datagram: bytes) -> Intervals:
     message = decode(datagram)
     if isinstance(message, ComponentsMessage):
         return Intervals.of(keys_of(message.components.ids))
     return Intervals.span(message.key, message.key + 1)
 
 
-def test_names_are_those_that_the_decoder_finds():
+def test_keys_in_datagrams_equal_the_decoded_keys():
     rng, replica = random.Random(3), Replica(5)
     datagrams: list[bytes] = []
-    for _ in range(40):
+    for _ in range(25):
         act(rng, replica)
         datagrams += replica.datagrams()
     for dim in (2, 3):
@@ -37,10 +36,10 @@ def test_names_are_those_that_the_decoder_finds():
             datagrams += encode_components(made)
     assert {datagram[0] & 15 for datagram in datagrams} == RECORD_KINDS
     for datagram in datagrams:
-        assert keys_in(datagram) == decoded_names(datagram)
+        assert keys_in(datagram) == decoded_keys(datagram)
 
 
-def test_what_is_no_record_is_refused():
+def test_datagrams_without_records_are_refused():
     components = encode_components(random_components(3, k=20))[0]
     others = [datagram for datagram in examples() if datagram[0] & 15 not in RECORD_KINDS]
     assert len(others) >= 8

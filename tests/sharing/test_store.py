@@ -1,4 +1,4 @@
-"""Store: what was kept is restored, wherever the process or its disk stops."""
+"""Store: kept records are restored, wherever the process or its disk stops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,6 @@ from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.schedules import act, components, run_schedule
 
-import gmmtorch as gt
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.sharing import store as store_module
 from gmmtorch.sharing import store_file
@@ -31,10 +29,10 @@ from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Restored, Store
 
 N_KILLS = 6
-"""`scripts/soak.sh` has more."""
+"""`scripts/soak.sh` runs more."""
 
 
-def spoken(robot: int, n: int, seed: int = 0) -> list[bytes]:
+def recorded(robot: int, n: int, seed: int = 0) -> list[bytes]:
     """The first n datagrams of a robot that adds, supersedes, counts and corrects."""
     rng, replica = random.Random(seed), Replica(robot)
     datagrams: list[bytes] = []
@@ -52,7 +50,7 @@ def received(datagrams: list[bytes], robot: int = 1000) -> Replica:
 
 
 def killed(path: Path, copy: Path) -> Path:
-    """The files at `path`, as they are left by a process that is killed now."""
+    """A copy of the files at `path`, as a process leaves them that is killed now."""
     copy.mkdir()
     for file in path.parent.glob(f"{path.name}*"):
         shutil.copy(file, copy)
@@ -90,13 +88,13 @@ def altered(path: Path, *statements: str) -> Path:
     return path
 
 
-# -- stored and loaded -------------------------------------------------------------------------------------
+# -- stored and loaded -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_loaded_replica_equals_the_stored_one(seed):
     """With supersessions, counters and corrections, after loss and restarts."""
-    for replica in run_schedule(seed, n_steps=25).replicas:
+    for replica in run_schedule(seed, n_steps=20).replicas:
         again = Replica(replica.robot)
         assert again.load(*replica.stored()) == 0
         assert again.held == replica.held
@@ -106,7 +104,7 @@ def test_a_loaded_replica_equals_the_stored_one(seed):
 
 
 def test_load_refuses_what_is_damaged_or_has_no_room():
-    full = received(spoken(1, 8), robot=0)
+    full = received(recorded(1, 8), robot=0)
     batches, datagrams = full.stored()
     damaged = [data[:-1] + bytes([data[-1] ^ 1]) for data in (*batches, *datagrams)]
     empty = Replica(0)
@@ -116,16 +114,16 @@ def test_load_refuses_what_is_damaged_or_has_no_room():
     assert Replica(0, most_components=2).load(batches, []) == 1
     own = Replica(0)
     own.add(components(random.Random(0), 5))
-    assert Replica(0, most_components=2).load(own.stored()[0], []) == 0  # no limit on its own
+    assert Replica(0, most_components=2).load(own.stored()[0], []) == 0  # own components have no limit
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(seed=st.integers(0, 10**6))
-def test_a_restarted_robot_has_all_that_was_kept(tmp_path_factory, seed):
+def test_a_restarted_robot_has_all_kept_records(tmp_path_factory, seed):
     rng, folder = random.Random(seed), tmp_path_factory.mktemp("store")
     path, kept = folder / "0" / "robot.sqlite", []
-    for life in range(3):
-        robot, heard = Replica(0), spoken(1, 4, seed + life)
+    for life in range(2):
+        robot, heard = Replica(0), recorded(1, 4, seed + life)
         with Store(path, 0) as store:
             assert store.restore(robot).n_refused == 0
             assert robot.digest() == received(kept).digest()
@@ -141,7 +139,7 @@ def test_a_restarted_robot_has_all_that_was_kept(tmp_path_factory, seed):
     assert reopened(path)[0].digest() == received(kept).digest()
 
 
-def test_close_keeps_what_was_not_sent_and_a_restart_supersedes_it(tmp_path):
+def test_close_keeps_unsent_records(tmp_path):
     first, again = Replica(0), Replica(0)
     with Store(tmp_path / "s", 0) as store:
         store.restore(first)
@@ -150,7 +148,7 @@ def test_close_keeps_what_was_not_sent_and_a_restart_supersedes_it(tmp_path):
     with Store(tmp_path / "s", 0) as store:
         store.restore(again)
         assert again.digest() == first.digest()
-        assert again.datagrams() == []  # until a teammate announces that it lacks it
+        assert again.datagrams() == []  # until a teammate announces that it lacks them
         for datagram in Replica(1).announcements():
             again.receive(datagram)
         assert received(again.datagrams()).digest() == first.digest()
@@ -160,14 +158,14 @@ def test_close_keeps_what_was_not_sent_and_a_restart_supersedes_it(tmp_path):
 
 
 def test_only_new_records_are_written(tmp_path):
-    datagrams, replica = spoken(1, 5), Replica(0)
+    datagrams, replica = recorded(1, 5), Replica(0)
     with Store(tmp_path / "s", 0) as store:
         store.restore(replica)
         for datagram in [*datagrams, *datagrams]:
             assert replica.receive(datagram)
             assert store.keep([datagram])
         deaf = Replica(1000)
-        for number in range(12):  # again, in other datagrams than before
+        for number in range(12):  # the same records in other datagrams
             for datagram in deaf.announcements():
                 replica.receive(datagram)
             again = replica.datagrams(max_bytes=1000 + 10 * number)
@@ -178,16 +176,16 @@ def test_only_new_records_are_written(tmp_path):
 
 def test_a_long_log_is_compacted(tmp_path, monkeypatch):
     monkeypatch.setattr(store_module, "_MOST_LOG_BYTES", 1000)
-    datagrams = spoken(1, 40)
+    datagrams = recorded(1, 40)
     path = filled(tmp_path, datagrams)
     assert sum(len(data) for _, data in rows(path)) < sum(map(len, datagrams)) - 500
     assert len(rows(path, "batch")) == 1
     assert reopened(path)[0].digest() == received(datagrams).digest()
 
 
-def test_names_in_memory_are_bounded(tmp_path, monkeypatch):
+def test_keys_in_memory_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(store_module, "_MOST_NAMES", 20)
-    parts = [components(random.Random(seed), 1) for seed in range(50)]
+    parts = [components(random.Random(seed), 1) for seed in range(30)]
     for number, part in enumerate(parts):
         part.ids[:] = torch.tensor([[3, 2 * number]])
     datagrams = [encode_components(part)[0] for part in parts]
@@ -196,7 +194,7 @@ def test_names_in_memory_are_bounded(tmp_path, monkeypatch):
     assert reopened(path)[0].digest() == received(datagrams).digest()
 
 
-# -- sessions and progress ---------------------------------------------------------------------------------
+# -- sessions and progress -------------------------------------------------------------------------------
 
 
 def test_earlier_sessions_are_remembered_up_to_a_limit(tmp_path, monkeypatch):
@@ -234,17 +232,17 @@ def test_the_newest_undamaged_progress_is_found(tmp_path):
     assert [n for n, *_ in rows(tmp_path / "s", "progress")] == [40, 110]
 
 
-# -- damage ------------------------------------------------------------------------------------------------
+# -- damage ----------------------------------------------------------------------------------------------
 
 
 def test_any_prefix_of_the_log_is_a_prefix_of_the_commits(tmp_path):
-    """A write-ahead log that is cut at any byte, as by a loss of power."""
-    datagrams = spoken(1, 5)
+    """A write-ahead log cut at any byte, as by a loss of power."""
+    datagrams = recorded(1, 5)
     path = filled(tmp_path, datagrams)
     log = Path(f"{path}-wal").read_bytes()
     expected = [received(datagrams[:n]).digest() for n in range(len(datagrams) + 1)]
     last, rng = 0, random.Random(0)
-    for number, end in enumerate(sorted([0, len(log), *rng.sample(range(len(log)), 25)])):
+    for number, end in enumerate(sorted([0, len(log), *rng.sample(range(len(log)), 12)])):
         cut = killed(path, tmp_path / str(number))
         os.truncate(f"{cut}-wal", end)
         if end < 40_000:  # the tables are created in the log, too
@@ -259,7 +257,7 @@ def test_any_prefix_of_the_log_is_a_prefix_of_the_commits(tmp_path):
 
 
 def test_a_damaged_row_is_skipped_and_logged(tmp_path, caplog):
-    datagrams = spoken(1, 6)
+    datagrams = recorded(1, 6)
     path = filled(tmp_path, datagrams)
     altered(path, "UPDATE record SET datagram = substr(datagram, 2) WHERE number = 3")
     found, restored = reopened(path)
@@ -272,13 +270,13 @@ def test_a_damaged_row_is_skipped_and_logged(tmp_path, caplog):
 
 def test_flipped_bytes_are_refused_or_restored_in_part(tmp_path, caplog):
     caplog.set_level(logging.ERROR)
-    datagrams = spoken(1, 6)
+    datagrams = recorded(1, 6)
     with Store(filled(tmp_path, datagrams), 0) as store:
         store.restore(Replica(0))
         store.save_progress(3, state(3))
     data, rng, n_refused = bytearray(store.path.read_bytes()), random.Random(0), 0
     held = received(datagrams).held
-    for _ in range(60):
+    for _ in range(25):
         flipped = bytearray(data)
         for _ in range(rng.randint(1, 30)):
             flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
@@ -291,7 +289,7 @@ def test_flipped_bytes_are_refused_or_restored_in_part(tmp_path, caplog):
             assert held.covers(replica.held)
         except (DataError, InvalidArgumentError):
             n_refused += 1
-    assert 5 < n_refused < 55
+    assert 2 < n_refused < 23
 
 
 @pytest.mark.parametrize(
@@ -307,8 +305,8 @@ def test_flipped_bytes_are_refused_or_restored_in_part(tmp_path, caplog):
         ("UPDATE fact SET value = '7'", "robot was 7 and is 0"),
     ],
 )
-def test_a_file_that_is_no_store_of_this_robot_is_refused_and_left(tmp_path, statement, match):
-    path = altered(filled(tmp_path, spoken(1, 2)), statement)
+def test_a_foreign_file_is_refused_and_unchanged(tmp_path, statement, match):
+    path = altered(filled(tmp_path, recorded(1, 2)), statement)
     before = rows(path, "sqlite_master")
     with pytest.raises((DataError, InvalidArgumentError), match=match):
         Store(path, 0)
@@ -316,7 +314,7 @@ def test_a_file_that_is_no_store_of_this_robot_is_refused_and_left(tmp_path, sta
     altered(path, "PRAGMA user_version")  # it is not locked
 
 
-def test_what_is_no_database_is_refused(tmp_path):
+def test_a_file_that_is_no_database_is_refused(tmp_path):
     (tmp_path / "noise").write_bytes(b"x" * 5000)
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "huge").open("wb") as file:
@@ -328,7 +326,7 @@ def test_what_is_no_database_is_refused(tmp_path):
             Store(tmp_path / name, 0)
 
 
-# -- whose it is -------------------------------------------------------------------------------------------
+# -- owner -----------------------------------------------------------------------------------------------
 
 
 def test_a_store_of_another_robot_world_or_log_is_refused(tmp_path):
@@ -354,12 +352,12 @@ def test_an_incarnation_that_was_used_is_refused(tmp_path):
     with Store(tmp_path / "s", 0) as store:
         store.restore(first)
         first.add(components(random.Random(0), 2))
-    for _ in range(2):  # however long ago it was
+    for _ in range(2):  # also one of an earlier session
         with Store(tmp_path / "s", 0) as store, pytest.raises(InvalidArgumentError, match="incarnation=7"):
             store.restore(Replica(0, incarnation=7))
         reopened(tmp_path / "s")
     with Store(tmp_path / "s", 0) as store, pytest.raises(InvalidArgumentError, match="records already"):
-        store.restore(received(spoken(1, 2), robot=0))
+        store.restore(received(recorded(1, 2), robot=0))
 
 
 @pytest.mark.slow
@@ -382,23 +380,23 @@ def test_one_process_at_a_time_and_the_lock_ends_with_it(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"robot": -1}, {"robot": 0, "max_bytes": 10}])
-def test_bad_options(tmp_path, options):
+def test_invalid_store_options_are_named(tmp_path, options):
     with pytest.raises(InvalidArgumentError, match=list(options)[-1]):
         Store(tmp_path / "s", **options)
 
 
 @pytest.mark.parametrize("datagram", [b"", b"\x11" * 1201, bytearray(b"\x11"), "text", None])
-def test_what_is_no_datagram_is_refused(tmp_path, datagram):
+def test_invalid_datagrams_are_refused(tmp_path, datagram):
     with Store(tmp_path / "s", 0) as store, pytest.raises(InvalidArgumentError, match="datagram"):
         store.keep([datagram])
 
 
-# -- a disk that fails -------------------------------------------------------------------------------------
+# -- a disk that fails -----------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def file_limit(n_bytes: int):
-    """No file of this process can grow beyond that: the kernel does what a full disk does."""
+    """The kernel refuses to let files of this process grow beyond that, as on a full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, limits[1]))
     try:
@@ -408,7 +406,7 @@ def file_limit(n_bytes: int):
 
 
 def test_a_full_disk_is_logged_once_and_all_is_kept_when_there_is_room(tmp_path, caplog):
-    datagrams, replica = spoken(1, 60), Replica(0)
+    datagrams, replica = recorded(1, 60), Replica(0)
     with Store(tmp_path / "s", 0) as store:
         store.restore(replica)
         with file_limit(100_000):
@@ -443,9 +441,9 @@ def test_a_store_has_a_largest_size(tmp_path):
 
 
 @pytest.mark.parametrize("code", [sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN])
-def test_a_disk_that_cannot_be_written_is_read(tmp_path, monkeypatch, caplog, code):
-    """Log included, without a change."""
-    datagrams = spoken(1, 5)
+def test_a_read_only_disk_is_read(tmp_path, monkeypatch, caplog, code):
+    """The write-ahead log is read too, and no file changes."""
+    datagrams = recorded(1, 5)
     path = filled(tmp_path, datagrams)
     before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
     connect, replica = store_file.connect, Replica(0)
@@ -461,7 +459,7 @@ def test_a_disk_that_cannot_be_written_is_read(tmp_path, monkeypatch, caplog, co
     with Store(path, 0) as store:
         assert not store.is_writable
         store.restore(replica)
-        assert not store.keep(spoken(2, 1))
+        assert not store.keep(recorded(2, 1))
         assert not store.save_progress(1, state(1))
         assert (store.progress(), store.begin_session(b"12345678")) == (None, frozenset())
     assert replica.digest() == received(datagrams).digest()
@@ -470,7 +468,7 @@ def test_a_disk_that_cannot_be_written_is_read(tmp_path, monkeypatch, caplog, co
     assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
 
 
-def test_a_place_that_cannot_be_used_starts_an_empty_store(tmp_path, monkeypatch):
+def test_an_unusable_path_gives_an_empty_store(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for full in (False, True):
         with monkeypatch.context() as patch, Store(tmp_path / "file" / "below" / "s", 0) as store:
@@ -484,12 +482,12 @@ def _raise_full(*_, **__):
     raise OSError(28, "No space left on device")
 
 
-# -- killed, and restarted ---------------------------------------------------------------------------------
+# -- kills and restarts ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_after_a_kill_at_any_time_all_that_was_acknowledged_is_there():
-    """In a process of its own, as it forks; see `kill_store`."""
+def test_acknowledged_records_survive_a_kill_at_any_time():
+    """In a separate process, because it forks; see `kill_store`."""
     done = subprocess.run(
         [sys.executable, "-m", "sharing.kill_store", str(N_KILLS)],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"},
@@ -504,26 +502,19 @@ def test_after_a_kill_at_any_time_all_that_was_acknowledged_is_there():
     assert kills["lost"] == kills["unequal"] == kills["refused"] == kills["failed"] == 0
 
 
-@pytest.mark.slow
-def test_a_restart_with_20000_components_takes_little_more_than_to_load_them(tmp_path):
-    replica = Replica(0)
-    replica.add(random_components(3, k=20_000))
+def test_a_restart_loads_few_more_bytes_than_the_replica_has(tmp_path, monkeypatch):
+    replica, loaded, load = Replica(0), [], Replica.load
     with Store(tmp_path / "s", 0) as store:
-        store.restore(Replica(0))
+        store.restore(replica)
+        replica.add(random_components(3, k=3000))
         store.keep(replica.datagrams())
-    with Store(tmp_path / "s", 0) as store:
-        store.restore(Replica(0))
-    content, loads, restarts = replica.stored(), [], []
-    for _ in range(3):
-        begin = time.perf_counter()
-        Replica(0).load(*content)
-        loads.append(time.perf_counter() - begin)
-        with Store(tmp_path / "s", 0) as store:
-            begin = time.perf_counter()
-            store.restore(Replica(0))
-            restarts.append(time.perf_counter() - begin)
-    assert sorted(restarts)[1] < 3 * sorted(loads)[1]
+    reopened(tmp_path / "s")
 
+    def counted(again: Replica, batches: list[bytes], datagrams: list[bytes]) -> int:
+        loaded.append(sum(map(len, [*batches, *datagrams])))
+        return load(again, batches, datagrams)
 
-def test_it_is_public():
-    assert gt.sharing.Store is Store
+    monkeypatch.setattr(Replica, "load", counted)
+    assert reopened(tmp_path / "s")[0].digest() == replica.digest()
+    batches, datagrams = replica.stored()
+    assert loaded[0] <= 1.2 * sum(map(len, [*batches, *datagrams]))

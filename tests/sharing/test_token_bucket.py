@@ -1,4 +1,4 @@
-"""TokenBucket: what may be sent, against exact fractions and over every span of time."""
+"""TokenBucket: available bytes against exact fractions and over all time spans."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.sharing.transport.token_bucket import TokenBucket
+from gmmtorch.exploration.robot.radio import TokenBucket
 
 LEAST = 1200
 rates = st.integers(1, 5000)
 steps = st.lists(st.tuples(st.integers(0, 80), st.integers(0, 4000)), min_size=1, max_size=40)
-"""Eighths of a second to the next time, and how many bytes are wanted there."""
+"""Eighths of a second until the next time, and the bytes wanted then."""
 
 
 def spent(bucket: TokenBucket, steps: list[tuple[int, int]]) -> list[tuple[float, int]]:
-    """(time, bytes) of who takes what it wants, as far as it may."""
+    """(time, bytes) of a user that takes as many of the wanted bytes as available."""
     now, found = 0.0, []
     for eighths, wanted in steps:
         now += eighths / 8
@@ -30,7 +30,7 @@ def spent(bucket: TokenBucket, steps: list[tuple[int, int]]) -> list[tuple[float
 
 
 @given(rate=rates, steps=steps)
-def test_no_span_has_more_than_the_rate_and_a_burst(rate: int, steps: list[tuple[int, int]]) -> None:
+def test_any_span_takes_at_most_the_rate_and_a_burst(rate: int, steps: list[tuple[int, int]]) -> None:
     taken = spent(TokenBucket(rate), steps)
     for i, j in itertools.combinations_with_replacement(range(len(taken)), 2):
         span = taken[j][0] - taken[i][0]
@@ -39,7 +39,6 @@ def test_no_span_has_more_than_the_rate_and_a_burst(rate: int, steps: list[tuple
 
 @given(rate=rates, steps=steps)
 def test_all_that_the_rate_allows_may_be_sent(rate: int, steps: list[tuple[int, int]]) -> None:
-    """What is there is known to the byte."""
     bucket, tokens, most, now = TokenBucket(rate), Fraction(max(rate, LEAST)), max(rate, LEAST), 0.0
     for eighths, wanted in steps:
         now += eighths / 8
@@ -56,20 +55,20 @@ def test_a_datagram_fits_however_low_the_rate() -> None:
     assert [bucket.available(t) for t in (2.0, 2399.0, 2400.0, 1e9)] == [1, 1199, 1200, 1200]
 
 
-def test_what_was_too_much_is_paid_for_later() -> None:
+def test_excess_bytes_delay_later_ones() -> None:
     bucket = TokenBucket(1000.0)
     assert bucket.available(5.0) == 1200
     bucket.take(3200)
     assert [bucket.available(t) for t in (5.0, 6.0, 7.0, 7.5, 9.0)] == [0, 0, 0, 500, 1200]
 
 
-def test_a_clock_that_is_set_back_brings_nothing_for_that_step() -> None:
+def test_a_clock_that_is_set_back_adds_nothing() -> None:
     bucket = TokenBucket(100.0)
     bucket.take(bucket.available(1e9))
     assert [bucket.available(t) for t in (50.0, 51.0, 51.0, 40.0, 42.0)] == [0, 100, 100, 100, 300]
 
 
 @pytest.mark.parametrize("rate", [0.0, -5.0, math.inf, math.nan])
-def test_rates_that_make_no_sense(rate: float) -> None:
+def test_invalid_rates_are_rejected(rate: float) -> None:
     with pytest.raises(InvalidArgumentError, match=r"budget=.*above zero"):
         TokenBucket(rate)

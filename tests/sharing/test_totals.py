@@ -1,4 +1,4 @@
-"""Totals: sums over lives while records come and go, against plain dictionaries."""
+"""Counters: sums over sessions while records are added and dropped, against plain dictionaries."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gmmtorch.sharing.messages.count_messages import counts_of
 from gmmtorch.sharing.messages.record_messages import CountersMessage
-from gmmtorch.sharing.replica.counters import Counters
+from gmmtorch.sharing.replica.component_table import Counters
 from gmmtorch.sharing.replica.record_keys import first_key
 
 entries = st.dictionaries(st.integers(0, 12), st.integers(-41, 160), max_size=8)
@@ -16,7 +16,7 @@ acts = st.lists(st.tuples(st.integers(0, 2), entries, st.booleans()), max_size=2
 
 
 @given(acts=acts, choice=st.randoms(use_true_random=False))
-def test_sums_are_those_of_what_is_here(acts, choice):
+def test_sums_equal_those_of_the_records(acts, choice):
     totals, here = Counters(), {}
     for number, (robot, row, drops) in enumerate(acts):
         names = np.array(list(row), np.int64)

@@ -1,4 +1,4 @@
-"""UDP: real sockets on loopback, and all that can go wrong with them."""
+"""UDP transport: real sockets on loopback, foreign datagrams and failures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def opening() -> Iterator[Opening]:
 
 @pytest.fixture
 def raw() -> Iterator[socket.socket]:
-    """A socket of somebody else."""
+    """A plain socket."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         bound.bind(("127.0.0.1", 0))
         bound.settimeout(10)
@@ -51,7 +51,7 @@ def team(opening: Opening, n: int, **options: object) -> list[UdpTransport]:
 
 
 def until(is_done: Callable[[], bool]) -> None:
-    """Sockets and threads take their time; a test that fails takes ten seconds."""
+    """Waits for a condition; fails after ten seconds."""
     end = time.monotonic() + 10
     while not is_done():
         assert time.monotonic() < end
@@ -65,11 +65,11 @@ def heard(transport: UdpTransport, n: int) -> list[tuple[int, bytes]]:
     return found
 
 
-# -- what is sent, heard, and counted ----------------------------------------------------------------------
+# -- deliveries and statistics --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", [KEY, None])
-def test_all_others_hear_a_datagram_once_and_in_order(opening, key):
+def test_every_peer_receives_each_datagram_once_in_order(opening, key):
     transports: list[Transport] = list(team(opening, 3, key=key))
     sent = [bytes([i]) * (i * 40) for i in range(31)]
     transports[1].send(1, sent, 0.0, "maps")
@@ -80,8 +80,8 @@ def test_all_others_hear_a_datagram_once_and_in_order(opening, key):
 
 
 @pytest.mark.parametrize("key", [KEY, None])
-def test_the_socket_carries_what_the_simulation_counts_and_the_frames(opening, raw, key):
-    """Against a plain socket that measures what really comes, and against `Network` given the same."""
+def test_sent_bytes_equal_the_simulated_network_plus_frames(opening, raw, key):
+    """Against a plain socket that receives the datagrams, and against `Network` with the same input."""
     a, b = team(opening, 2, key=key)
     a.peers = [b.address, raw.getsockname()]
     network, rng, n_measured, n_bytes = Network(2), random.Random(0), 0, 0
@@ -97,14 +97,14 @@ def test_the_socket_carries_what_the_simulation_counts_and_the_frames(opening, r
         for kind in ("maps", "plans", None):
             assert a.traffic(sender, kind) == network.traffic(sender, kind)
     assert a.overhead == (31 if key else 15)
-    assert n_bytes == network.n_bytes + a.overhead * n_measured
+    assert n_bytes == network.traffic().bytes + a.overhead * n_measured
     assert a.sent == Traffic(2 * n_measured, 2 * n_bytes)
     assert a.sent.wire_bytes == 2 * (n_bytes + 28 * n_measured)
     until(lambda: b.received == Traffic(n_measured, n_bytes))
     assert a.failures == {}
 
 
-def test_clocks_that_jump_do_no_harm(opening):
+def test_clock_jumps_do_not_lose_datagrams(opening):
     a, b = team(opening, 2, key=KEY)
     times = [1e9, 0.0, -1e12, math.nan, math.inf, 5.0]
     for now in times:
@@ -116,7 +116,7 @@ def test_clocks_that_jump_do_no_harm(opening):
 
 @pytest.fixture
 def multicast() -> None:
-    """Skips where plain sockets cannot reach a group on loopback."""
+    """Skips if plain sockets cannot reach a group on loopback."""
     options = [
         (socket.IP_ADD_MEMBERSHIP, socket.inet_aton(GROUP) + socket.inet_aton("127.0.0.1")),
         (socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1")),
@@ -135,7 +135,7 @@ def multicast() -> None:
 
 @pytest.mark.usefixtures("multicast")
 @pytest.mark.parametrize("key", [KEY, None])
-def test_a_team_by_multicast_sends_once_and_hears_the_others_alone(key):
+def test_multicast_sends_once_and_delivers_to_the_others_only(key):
     with ExitStack() as stack:
         a = stack.enter_context(UdpTransport.multicast(0, (GROUP, 0), key=key))
         group = a.address
@@ -168,8 +168,8 @@ for number in range(50):
 """
 
 
-def test_another_process_that_knows_the_format_takes_part(opening):
-    """Written from docs/network.md alone: it has none of our code."""
+def test_an_independent_implementation_of_the_format_takes_part(opening):
+    """A process that implements docs/network.md without this package."""
     a = opening(0, key=KEY)
     with subprocess.Popen([sys.executable, "-c", OTHER_PROCESS], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
@@ -180,10 +180,10 @@ def test_another_process_that_knows_the_format_takes_part(opening):
         assert other.wait(10) == 0
 
 
-# -- what else comes in ------------------------------------------------------------------------------------
+# -- foreign datagrams ----------------------------------------------------------------------------
 
 
-def test_whatever_strangers_send_is_counted_and_the_team_goes_on(opening, raw):
+def test_foreign_datagrams_are_counted_and_ignored(opening, raw):
     a, b = team(opening, 2, key=KEY)
     rng, stranger = random.Random(0), Sealer(0, TeamKey.generate())
     a.peers = [*a.peers, raw.getsockname()]
@@ -207,7 +207,7 @@ def test_whatever_strangers_send_is_counted_and_the_team_goes_on(opening, raw):
     assert b.received == Traffic(2 + len(sizes), 2 * 34 + sum(sizes))
 
 
-def test_thousands_of_forged_frames_take_no_memory(opening, raw):
+def test_forged_frames_take_no_memory(opening, raw):
     a, b = team(opening, 2, key=KEY, max_waiting=10)
     rng = random.Random(1)
     for i in range(3000):
@@ -221,7 +221,7 @@ def test_thousands_of_forged_frames_take_no_memory(opening, raw):
     assert sum(b.refused.values()) == 3000
 
 
-def test_of_too_many_that_wait_the_newest_are_kept(opening):
+def test_a_full_queue_keeps_the_newest_datagrams(opening):
     a, b = team(opening, 2, key=KEY, max_waiting=100)
     for i in range(250):
         a.send(0, [i.to_bytes(2, "little")], 0.0, "maps")
@@ -231,8 +231,8 @@ def test_of_too_many_that_wait_the_newest_are_kept(opening):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket has no room for")
-def test_what_the_system_has_no_room_for_is_counted(opening, raw, monkeypatch):
-    """The receiving thread is held up until the socket's own buffer has run over."""
+def test_datagrams_dropped_by_the_system_are_counted(opening, raw, monkeypatch):
+    """The receiving thread is blocked until the buffer of the socket overflows."""
     monkeypatch.setattr("gmmtorch.sharing.transport.udp._BUFFER_BYTES", 1 << 14)
     b = opening(1)
     sealer, n = Sealer(0), 200
@@ -240,7 +240,7 @@ def test_what_the_system_has_no_room_for_is_counted(opening, raw, monkeypatch):
         for _ in range(n):
             raw.sendto(sealer.seal(bytes(1000)), b.address)
     until(lambda: not heard_any(b))
-    raw.sendto(sealer.seal(b"last"), b.address)  # which brings the count with it
+    raw.sendto(sealer.seal(b"last"), b.address)  # this datagram carries the count
     until(lambda: b.deliver(1, 0.0) == [(0, b"last")])
     assert b.n_overflowed > 0
     assert b.received.datagrams + b.n_overflowed == n + 1
@@ -253,7 +253,7 @@ def heard_any(transport: UdpTransport) -> bool:
     return transport.received != before
 
 
-def test_two_robots_with_one_number_are_found_by_all(opening, caplog, monkeypatch):
+def test_duplicate_robot_ids_are_detected_by_all(opening, caplog, monkeypatch):
     monkeypatch.setattr("gmmtorch.sharing.transport.sessions.FRESH_SECONDS", 0.0)
     a, first, second = opening(0, key=KEY), opening(3, key=KEY), opening(3, key=KEY)
     everybody = [each.address for each in (a, first, second)]
@@ -271,21 +271,7 @@ def test_two_robots_with_one_number_are_found_by_all(opening, caplog, monkeypatc
     assert sum("the id 3" in message for message in caplog.messages) == 3  # one of each
 
 
-def test_what_was_recorded_of_a_robot_does_not_end_it_when_it_restarts(opening, raw):
-    with UdpTransport.unicast(1, peers=[raw.getsockname()], key=KEY) as first:
-        first.send(1, [bytes([n]) for n in range(50)], 0.0, "maps")
-        recorded = [raw.recv(2000) for _ in range(50)]
-    a, again = opening(0, key=KEY), opening(1, key=KEY)
-    a.peers = [again.address]
-    for frame in 3 * recorded:
-        raw.sendto(frame, again.address)
-    a.send(0, [b"welcome"], 0.0, "maps")
-    assert heard(again, 1) == [(0, b"welcome")]
-    assert {reason: n for reason, n in again.refused.items() if n} == {"duplicate_id": 150}
-    assert again.duplicates == {}
-
-
-def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
+def test_a_robot_restarted_on_the_same_port_is_received(opening):
     a = opening(0, key=KEY)
     with UdpTransport.unicast(1, peers=[a.address], key=KEY) as first:
         port = first.address
@@ -296,10 +282,10 @@ def test_a_robot_that_restarts_on_the_same_port_is_heard_again(opening):
     assert sum(a.refused.values()) == 0
 
 
-# -- where it may listen, and what goes wrong --------------------------------------------------------------
+# -- addresses and failures -----------------------------------------------------------------------
 
 
-def test_without_a_key_nobody_outside_is_spoken_to_by_accident(opening):
+def test_without_a_key_only_loopback_is_allowed_by_default(opening):
     for open_it in (
         lambda **o: UdpTransport.unicast(0, ("0.0.0.0", 0), **o),
         lambda **o: UdpTransport.multicast(0, (GROUP, 0), "0.0.0.0", **o),
@@ -316,7 +302,7 @@ def test_without_a_key_nobody_outside_is_spoken_to_by_accident(opening):
         opening(0, peers=[("10.0.0.5", 7447)])
 
 
-def test_a_port_in_use_is_named_with_what_to_do(opening):
+def test_a_port_in_use_is_reported_with_its_remedy(opening):
     taken = opening(0).address
     with pytest.raises(
         InvalidArgumentError, match=f"address=.*:{taken[1]} .*another process.*another port, or 0"
@@ -342,7 +328,7 @@ def test_a_port_in_use_is_named_with_what_to_do(opening):
         ({"max_waiting": 0}, "max_waiting=0"),
     ],
 )
-def test_options_that_cannot_be_are_named(options, message):
+def test_invalid_options_are_refused(options, message):
     n_threads = threading.active_count()
     with pytest.raises(InvalidArgumentError, match=message):
         UdpTransport.unicast(**{"robot": 0, **options})
@@ -362,13 +348,13 @@ def test_options_that_cannot_be_are_named(options, message):
         ({"ttl": -1}, "ttl=-1"),
     ],
 )
-def test_groups_that_cannot_be_joined_are_named(options, message):
+def test_groups_that_cannot_be_joined_are_refused(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         UdpTransport.multicast(**{"robot": 0, "group": (GROUP, 0), **options})
 
 
 class Unplugged:
-    """A socket whose network is away."""
+    """A socket whose sends fail."""
 
     def __init__(self, bound: socket.socket, code: int) -> None:
         self._bound, self._code = bound, code
@@ -381,7 +367,7 @@ class Unplugged:
 
 
 @pytest.mark.parametrize("name", ["ENETUNREACH", "EHOSTUNREACH", "EPERM", "ENOBUFS", "EAGAIN", "ENETDOWN"])
-def test_a_network_that_is_away_is_counted_and_the_robot_goes_on(opening, caplog, name):
+def test_an_unreachable_network_is_counted_without_an_error(opening, caplog, name):
     a, b = team(opening, 2, key=KEY)
     plugged = a._socket
     a._socket = Unplugged(plugged, getattr(errno, name))
@@ -396,15 +382,15 @@ def test_a_network_that_is_away_is_counted_and_the_robot_goes_on(opening, caplog
     assert a.sent == Traffic(1, 32)
 
 
-def test_what_the_system_itself_refuses_to_send_is_counted(opening):
-    """Broadcasts need a permission that the socket does not ask for."""
+def test_sends_that_the_system_refuses_are_counted(opening):
+    """Broadcasts need a permission that the socket lacks."""
     a = opening(0, ("0.0.0.0", 0), [("255.255.255.255", 7447)], key=KEY)
     a.send(0, [b"x"], 0.0, "maps")
     assert sum(a.failures.values()) == 1
     assert a.sent == Traffic()
 
 
-def test_only_its_own_robot_sends_and_hears_through_it(opening):
+def test_a_transport_serves_only_its_own_robot(opening):
     a, b = team(opening, 2)
     with pytest.raises(InvalidArgumentError, match="sender=1 must be 0"):
         a.send(1, [b"x"], 0.0, "maps")
@@ -416,7 +402,7 @@ def test_only_its_own_robot_sends_and_hears_through_it(opening):
     assert a.sent == a.traffic() == b.received == Traffic()
 
 
-def test_closing_gives_back_port_and_thread_and_can_be_done_twice():
+def test_close_releases_port_and_thread_and_is_idempotent():
     n_threads = threading.active_count()
     with UdpTransport.unicast(0) as transport:
         assert threading.active_count() == n_threads + 1
@@ -430,7 +416,7 @@ def test_closing_gives_back_port_and_thread_and_can_be_done_twice():
         assert other.address == transport.address
 
 
-def test_keys_are_in_no_message_of_a_transport(opening, caplog):
+def test_keys_never_appear_in_messages_or_representations(opening, caplog):
     a, b = opening(0, key=KEY), opening(1, key=TeamKey.generate())
     b.peers = [a.address]
     b.send(1, [b"x"], 0.0, "maps")

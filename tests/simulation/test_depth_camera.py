@@ -8,12 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch import simulation
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation import DepthCamera
 from gmmtorch.simulation.sensors.range_sensors import depth_camera
+from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
-from gmmtorch.simulation.worlds.solids import box
 
 LOW, HIGH = torch.tensor([0.0, 0, 0]).double(), torch.tensor([9.0, 7, 4]).double()
 ROOM = MeshWorld(box((0, 0, 0), (9, 7, 4)))
@@ -56,11 +55,6 @@ def test_square_pixels_have_the_directions_of_depth_camera():
     angle = 2 * math.atan(math.tan(0.6) * 64 / 80)
     camera = DepthCamera(80, 64, horizontal_fov=1.2, vertical_fov=angle)
     torch.testing.assert_close(camera.directions, depth_camera(80, 64, field_of_view=1.2).directions)
-
-
-def test_simulation_exports_the_function_and_the_class():
-    assert callable(simulation.depth_camera)
-    assert simulation.DepthCamera is DepthCamera
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 2.0, -3.0, 40.0])
@@ -114,14 +108,6 @@ def test_readings_beyond_max_range_become_no_return_beams():
     torch.testing.assert_close(ranges[~frame.is_hit], torch.full_like(ranges[~frame.is_hit], 5.0))
     share = 0.5 * math.erfc(0.1 / (0.01 * 4.9**2) / math.sqrt(2))
     assert abs(float((~frame.is_hit).double().mean()) - share) < 4.5 * math.sqrt(share * (1 - share) / 3600)
-
-
-def test_beams_without_a_surface_end_at_max_range():
-    away = pose(100, 100, 50)
-    frame = DepthCamera(dropout=0.0).sense(ROOM, away, NO_TEAMMATES, 0.3, seeded())
-    assert len(frame.ends) == 160 * 120
-    assert not bool(frame.is_hit.any())
-    assert bool(torch.isfinite(frame.ends).all())
 
 
 def test_noise_never_moves_a_hit_behind_the_camera():
@@ -204,11 +190,6 @@ def test_scan_and_image_contain_the_same_beams():
     c, s = math.cos(0.4), math.sin(0.4)
     rebuilt = where[:3] + torch.stack([z * (c - s * left), z * (s + c * left), z * up], 1)
     torch.testing.assert_close(rebuilt[frame.is_hit], frame.ends[frame.is_hit])
-
-
-def test_the_number_of_threads_does_not_change_distances():
-    origin, directions = torch.tensor([3.0, 2.5, 1.7]).double(), EXACT.directions
-    assert torch.equal(ROOM.distances(origin, directions, threads=1), ROOM.distances(origin, directions))
 
 
 @pytest.mark.parametrize(

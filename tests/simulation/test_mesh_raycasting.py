@@ -12,7 +12,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation.sensors import mesh_raycasting
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments, ray_triangles
 from gmmtorch.simulation.worlds.floor_plan import circle
-from gmmtorch.simulation.worlds.solids import ball, box, prism
+from gmmtorch.simulation.worlds.furniture import ball, box, prism
 
 DTYPE = torch.float64
 

@@ -9,8 +9,8 @@ import torch
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.simulation import ray_triangles
+from gmmtorch.simulation.worlds.furniture import box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld, checked_triangles
-from gmmtorch.simulation.worlds.solids import box
 
 HALL = box((0, 0, 0), (20, 6, 3))
 SMALL = box((40, 0, 0), (44, 4, 3))
@@ -94,16 +94,6 @@ def test_checked_triangles_keeps_thin_small_and_far_triangles(caplog):
     triangles = torch.cat([needle, 1e-6 * CUBE, CUBE + 5e5])
     assert torch.equal(checked_triangles(triangles), triangles)
     assert caplog.text == ""
-
-
-def test_checked_triangles_keeps_holes_and_inverted_triangles():
-    holed = CUBE[:-3].clone()
-    holed[::2] = holed[::2].flip(1)
-    assert torch.equal(checked_triangles(holed), holed)
-
-
-def test_checked_triangles_converts_to_float64():
-    assert checked_triangles(CUBE.float()).dtype == torch.float64
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])

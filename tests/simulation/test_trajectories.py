@@ -36,11 +36,6 @@ def test_path_is_straight_along_collinear_waypoints():
     torch.testing.assert_close(middle[:, 0], torch.full_like(middle[:, 0], 3.0))
 
 
-def test_path_between_two_waypoints_is_a_line():
-    path = smooth_path(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), 0.25)
-    torch.testing.assert_close(path[:, 0], torch.linspace(0, 1, 5, dtype=torch.float64))
-
-
 def test_poses_2d_face_forward_at_even_spacing():
     poses = poses_2d(smooth_path(CORNER), 30)
     assert poses.shape == (30, 3, 3)
@@ -61,10 +56,6 @@ def test_poses_3d_are_rigid_without_roll(pitch, swing):
     assert bool((poses[:, 2, 3] == 1.5).all())
     torch.testing.assert_close(rotation[:, 2, 0], torch.full((20,), -math.sin(pitch), dtype=torch.float64))
     torch.testing.assert_close(rotation[:, 2, 1], torch.zeros(20, dtype=torch.float64))  # no roll
-
-
-def test_a_single_pose_is_at_the_start():
-    assert poses_2d(smooth_path(CORNER), 1)[0, :2, 2].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from gmmtorch.optional_packages import load_open3d
 
 AXES = ("x", "y", "z")
 _HEADER_BYTES = 1 << 16
+_MAX_FIELD, _MAX_FIELDS = 1 << 16, 1 << 10
 _PLY_CODES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -65,7 +66,7 @@ def read_cloud(path: Path) -> Tensor:
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
             cloud = open3d.t.io.read_point_cloud(path)
             points = cloud.point.positions.numpy() if "positions" in cloud.point else np.empty((0, 3))
-    except (RuntimeError, KeyError) as error:
+    except (RuntimeError, KeyError, MemoryError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read as a point cloud: {error}") from error
     if points.shape[0] != header.n_points:
         raise DataError(
@@ -124,11 +125,16 @@ def _pcd_cloud_header(path: Path) -> CloudHeader:
     if not header.get("POINTS", [""])[0].isdecimal():
         raise DataError(f"{path} does not state its number of points (POINTS); it is damaged.")
     n_points, n_bytes = int(header["POINTS"][0]), _header_end(path, b"DATA")
-    if kind == "binary_compressed":  # the data begin with their own length, which Open3D checks
-        return CloudHeader(n_points, False, n_bytes, 0, None)
     is_text = kind == "ascii"
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(fields))]
     sizes = [int(size) for size in header["SIZE"]]
+    if min([*counts, *sizes]) < 1 or max([*counts, *sizes]) > _MAX_FIELD or len(fields) > _MAX_FIELDS:
+        raise DataError(f"{path} announces fields of impossible size; its header is damaged. Write it again.")
+    if kind == "binary_compressed":
+        width = sum(c * s for c, s in zip(counts, sizes, strict=True))
+        return CloudHeader(
+            n_points, False, n_bytes, _compressed_length(path, n_bytes, n_points * width), None
+        )
     codes = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
     widths = counts if is_text else [c * s for c, s in zip(counts, sizes, strict=True)]
     axes = _axes(path, fields, widths, None if is_text else codes)
@@ -136,22 +142,52 @@ def _pcd_cloud_header(path: Path) -> CloudHeader:
     return CloudHeader(n_points, is_text, n_bytes, n_points * layout.width, layout)
 
 
-class _Property(NamedTuple):
-    """A property of a PLY element; `code` is the NumPy type of the value, or of a list's length."""
+def _compressed_length(path: Path, n_bytes: int, n_unpacked: int) -> int:
+    """Number of bytes after the header of a compressed PCD file: two lengths and the compressed data.
+
+    Open3D allocates both lengths unchecked. LZF packs at most 264 bytes into three.
+    """
+    with path.open("rb") as file:
+        file.seek(n_bytes)
+        lengths = file.read(8)
+    packed, unpacked = np.frombuffer(lengths.ljust(8, b"\0"), "<u4").tolist()
+    if unpacked != n_unpacked or unpacked > 88 * packed + 264:
+        raise DataError(
+            f"{path} announces {unpacked} bytes in {packed} compressed ones for points of {n_unpacked} "
+            "bytes; it is damaged. Write it again."
+        )
+    return 8 + packed
+
+
+class PlyProperty(NamedTuple):
+    """A property of a PLY element; `code` is the NumPy type of the value, or of a list's length.
+
+    item: the NumPy type of the entries of a list.
+    """
 
     name: str
     is_list: bool
     code: str
+    item: str
 
 
-def _ply_cloud_header(path: Path) -> CloudHeader:
-    """The layout is None if points contain lists, or follow elements that do."""
+class PlyElements(NamedTuple):
+    """The elements of a PLY file in the order of the file. n_bytes: size of the header."""
+
+    form: str
+    counts: dict[str, int]
+    properties: dict[str, list[PlyProperty]]
+    n_bytes: int
+
+
+def ply_elements(path: Path) -> PlyElements:
+    """The elements that the header of a PLY file announces."""
     lines = [line.decode("ascii", errors="replace").split() for line in _file_head(path).split(b"\n")]
     if lines[0] != ["ply"]:
         raise DataError(f"{path} does not start with 'ply'; it is not a PLY file.")
     form, element = "", ""
     counts: dict[str, int] = {}
-    properties: dict[str, list[_Property]] = {}
+    properties: dict[str, list[PlyProperty]] = {}
     for words in lines[: lines.index(["end_header"])]:
         if words[:1] == ["format"]:
             form = words[1]
@@ -160,13 +196,21 @@ def _ply_cloud_header(path: Path) -> CloudHeader:
             counts[element], properties[element] = int(words[2]), []
         elif words[:1] == ["property"]:
             is_list = words[1] == "list"
-            code = _PLY_CODES[words[2] if is_list else words[1]]
-            properties[element].append(_Property(words[-1], is_list, code))
+            code, item = (words[2], words[3]) if is_list else (words[1], words[1])
+            properties[element].append(PlyProperty(words[-1], is_list, _PLY_CODES[code], _PLY_CODES[item]))
     if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise DataError(f"{path} has format {form!r}; known are ascii, and binary of either byte order.")
+    return PlyElements(form, counts, properties, _header_end(path, b"end_header"))
+
+
+def _ply_cloud_header(path: Path) -> CloudHeader:
+    """The layout is None if points contain lists, or follow elements that do."""
+    form, counts, properties, n_bytes = ply_elements(path)
     if "vertex" not in counts:
         raise DataError(f"{path} does not state its number of points (element vertex); it is damaged.")
-    is_text, n_bytes = form == "ascii", _header_end(path, b"end_header")
+    if any(count < 0 or (count > 0 and not properties[name]) for name, count in counts.items()):
+        raise DataError(f"{path} announces an element without data; its header is damaged. Write it again.")
+    is_text = form == "ascii"
     widths = {
         name: [1 if is_text else np.dtype(p.code).itemsize for p in of] for name, of in properties.items()
     }

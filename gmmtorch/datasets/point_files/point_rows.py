@@ -22,7 +22,11 @@ from gmmtorch.datasets.point_files.cloud_files import (
     read_cloud,
     read_header,
 )
+from gmmtorch.datasets.point_files.las_header import read_las_header
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+
+_LAS_BLOCK_BYTES = 1 << 25
+"""Limit of one read: a point may announce 64 kB of extra bytes."""
 
 
 class Rows(Protocol):
@@ -59,12 +63,14 @@ class NpyRows:
 
     def _map(self) -> np.ndarray:
         try:
-            mapped: np.ndarray = np.load(self._path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
+            mapped = np.load(self._path, mmap_mode="r", allow_pickle=False)
+        except Exception as error:  # a damaged header also raises SyntaxError, TokenError, OverflowError, …
             raise DataError(
                 f"{self._path} cannot be read as a NumPy array ({error}); it is truncated, or not one of "
                 "plain numbers. Write it again with numpy.save."
             ) from error
+        if not isinstance(mapped, np.ndarray):
+            raise DataError(f"{self._path} is a zip archive, not one array; write the array with numpy.save.")
         return mapped
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
@@ -89,13 +95,19 @@ class LasRows:
         self._laspy: Any = laspy
         self._path = path
         self.name = path.stem
-        with _las_errors(path), laspy.open(path) as reader:
-            self.n_rows = int(reader.header.point_count)
+        self.n_rows, self._point_bytes = read_las_header(path)
+        with _las_errors(path), self._open() as reader:
+            if int(reader.header.point_count) != self.n_rows:
+                raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
+
+    def _open(self) -> Any:
+        return self._laspy.open(self._path, read_evlrs=False)
 
     def blocks(self, begin: int, end: int, size: int) -> Iterator[np.ndarray]:
         if begin >= end:  # laspy cannot seek to the end of a file
             return
-        with _las_errors(self._path), self._laspy.open(self._path) as reader:
+        size = min(size, max(1, _LAS_BLOCK_BYTES // self._point_bytes))
+        with _las_errors(self._path), self._open() as reader:
             reader.seek(begin)
             for first in range(begin, end, size):
                 wanted = min(size, end - first)
@@ -142,7 +154,9 @@ class RecordRows:
             n = min(size, end - first)
             offset = self._skip + first * self._record.itemsize
             records = np.memmap(self._path, self._record, "r", offset, (n,))
-            yield np.stack([records[axis].astype(np.float64) for axis in AXES], 1)
+            with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged file
+                block = np.stack([records[axis].astype(np.float64) for axis in AXES], 1)
+            yield block
 
 
 class TextRows:

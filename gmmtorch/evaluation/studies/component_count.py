@@ -29,7 +29,7 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import held_out, split
+from gmmtorch.evaluation import held_out, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.methods import MapFactory
@@ -234,7 +234,7 @@ def map_rows(
     factories = {f"{name} {setting:g}": factory(learning) for name, setting, learning in cases}
     protocol = Protocol(study.test_every, resolution=(study.resolution,), max_beams=study.max_beams)
     outcome = held_out.evaluate(dataset, scans, factories, protocol, seed, on_event)
-    test = torch.cat([scans[i].points for i in split.split_indices(len(scans), study.test_every)[1]])
+    test = torch.cat([scans[i].points for i in queries.split_indices(len(scans), study.test_every)[1]])
     test = test[:: max(1, len(test) // _SCORED_POINTS)]
     return [
         {

@@ -12,6 +12,7 @@ from gmmtorch.evaluation.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
@@ -60,10 +61,10 @@ def fit_timed(data: FitData, n_components: int, options: FitOptions, seed: int) 
     begin = time.perf_counter()
     first = initialize(options.init_params, points, weight, n_components, options.reg_covar, generator)
     between = time.perf_counter()
-    step = em.natural_step(
+    step = loop.natural_step(
         em.quadratic_features(points), weight, options.reg_covar, em.SOFTMAX_DTYPES[options.dtype], points
     )
-    found = em.run_em(step, first, tol=options.tol, max_iter=options.max_iter)
+    found = loop.run_em(step, first, tol=options.tol, max_iter=options.max_iter)
     end = time.perf_counter()
     weights, means, covariances = found.parameters
     mixture = GaussianMixture.from_parameters(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.protocol_options import Protocol
 from gmmtorch.evaluation.queries import FREE, OCCUPIED, Queries
@@ -86,15 +86,15 @@ def evaluate_correction(
     pose_noise_m, pose_noise_rad, n_components, nbytes`, and the AUCs `auc` (map from the perturbed poses),
     `auc_corrected` (the same map after correction) and `auc_clean` (map from the true poses).
     """
-    train_index, test_index = split.split_indices(len(scans), protocol.test_every)
+    train_index, test_index = queries.split_indices(len(scans), protocol.test_every)
     train = [scans[i] for i in train_index]
     origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
     asked = {r: queries.hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
     rows = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
-        shown = split.keep_share(train, kept, protocol.removal, seed)
-        motions = split.pose_perturbations(shown, protocol.pose_noise, seed)
+        shown = queries.keep_share(train, kept, protocol.removal, seed)
+        motions = queries.pose_perturbations(shown, protocol.pose_noise, seed)
         moved = [scan.transformed(motion) for scan, motion in zip(shown, motions, strict=True)]
         true_map, perturbed_map = new_map(), new_map()
         build_by_scan(true_map, shown)

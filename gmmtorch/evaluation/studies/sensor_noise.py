@@ -25,7 +25,7 @@ from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, Row, ignore
 from gmmtorch.evaluation.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -97,7 +97,7 @@ def run(
     """
     study = study or SensorModelStudy()
     sensor = sensor_model(study)
-    train_index, test_index = split.split_indices(len(scans), study.test_every)
+    train_index, test_index = queries.split_indices(len(scans), study.test_every)
     train = [scans[i] for i in train_index]
     cloud = _training_cloud(train, sensor, study, seed)
     origins, ends = queries.test_beams([scans[i] for i in test_index], study.max_beams, seed)

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.evaluation import metrics, queries, split
+from gmmtorch.evaluation import metrics, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.queries import FREE, OCCUPIED
 from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
@@ -48,7 +48,7 @@ def run(
     accuracy on that share; `occupied_recall`, `free_recall`; `thin_recall`, the recall of hits on thin
     structures, which are `thin_share` of all hits.
     """
-    train_index, test_index = split.split_indices(len(scans), study.test_every)
+    train_index, test_index = queries.split_indices(len(scans), study.test_every)
     origins, ends = queries.test_beams([scans[i] for i in test_index], study.max_beams, seed)
     asked = queries.hit_and_free(origins, ends, "uniform", study.resolution, seed)
     thin = on_lines(ends, study.thin_radius)

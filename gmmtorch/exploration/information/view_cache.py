@@ -1,12 +1,15 @@
-"""ViewCache: values of views during one plan. Each view is evaluated once."""
+"""Memory of views: their values during one plan, and lower weights for information they failed to gain."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
+from gmmtorch.exploration.information.view_evaluator import BLOCK, ViewEvaluator
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
+from gmmtorch.exploration.robot.mapper import LocalMap
 
 
 class ViewCache:
@@ -48,3 +51,54 @@ class ViewCache:
         if not self._keys:
             return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
         return self._evaluator.poses(torch.cat(self._keys)), self._gain @ residual
+
+
+_EXTENT = 1 << 20  # blocks along each axis that keys can tell apart
+
+
+class InformationDiscount:
+    """Weights of the blocks of the world; 1 by default.
+
+    The view from the robot's pose, evaluated right after an image was taken there, should gain nothing.
+    What it still promises, the camera cannot resolve: grazing surfaces, and gaps smaller than a cell.
+    Each such image changes the weight w of a block to w (1 − decay · measured), where `measured` is the
+    share of the block's remaining information that the view promises. The robot then does not keep
+    looking at what it cannot see.
+    """
+
+    def __init__(self, decay: float = 0.25) -> None:
+        self._decay = decay
+        self._keys = torch.zeros(0, dtype=torch.int64)  # rising
+        self._weights = torch.zeros(0)
+        self._when = -math.inf
+
+    def note(self, local_map: LocalMap, measured: Tensor, now: float) -> None:
+        """Apply `measured` (G,) of the view that was just taken; repeated calls at one time have no
+        effect.
+        """
+        if now <= self._when:
+            return
+        self._when = now
+        looked = measured > 0
+        fresh = 1 - self._decay * measured[looked].cpu()
+        keys = torch.cat([self._keys, _keys(local_map)[looked.cpu()]])
+        factors = torch.cat([self._weights, fresh])
+        self._keys, row = torch.unique(keys, return_inverse=True)
+        self._weights = torch.ones(len(self._keys)).scatter_reduce_(0, row, factors, "prod")
+
+    def weights(self, local_map: LocalMap) -> Tensor:
+        """Weights (G,) float32 of the local map's blocks."""
+        keys = _keys(local_map)
+        if len(self._keys) == 0:
+            return torch.ones(len(keys))
+        row = torch.searchsorted(self._keys, keys).clamp_max(len(self._keys) - 1)
+        return torch.where(self._keys[row] == keys, self._weights[row], 1.0)
+
+
+def _keys(local_map: LocalMap) -> Tensor:
+    """Return world-fixed keys (G,) of the local map's blocks, in row-major order."""
+    first = local_map.low.cpu() // BLOCK
+    x, y, z = (
+        (torch.arange(-(-n // BLOCK)) + low) % _EXTENT for n, low in zip(local_map.shape, first, strict=True)
+    )
+    return ((x[:, None, None] * _EXTENT + y[:, None]) * _EXTENT + z).reshape(-1)

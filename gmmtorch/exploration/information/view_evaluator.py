@@ -28,7 +28,7 @@ from gmmtorch.exploration.information.mutual_information import (
     shannon,
     sharpened,
 )
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.grid import check_resolution
 
 BLOCK = 4

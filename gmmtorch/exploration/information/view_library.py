@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.sharing.messages.fields import LATEST, TICKS
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, ViewsMessage, encode_views, quantized_poses
 from gmmtorch.sharing.messages.record_messages import check_size
-from gmmtorch.sharing.replica.intervals import Intervals
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
     MOST_RECORDS,
+    Intervals,
     first_key,
     ids_of,
     keys_of,
@@ -71,12 +71,11 @@ class ViewLibrary:
     """Views by id, and the ids of removed views, which are never accepted again.
 
     The library is best-effort: a stale or missing view costs a detour, but never changes the map. Changes
-    made here are sent once, in the next `datagrams`. Against losses, and for robots that join late, views
-    of which no message
-    was heard for a minute are repeated: by their finder, or by another robot if the finder is gone. A robot
-    that hears a view that was removed here is told so. Views are stored as messages carry them: poses to 1
-    cm and 1/256 of a turn, values as float16, stamps in milliseconds. If nothing is lost, all libraries are
-    equal.
+    made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
+    sends it again, or another robot if the finder is gone: for losses, and for robots that join late. If a
+    robot sends a view that was removed here, the removal is sent again. Views are stored as messages carry
+    them: poses to 1 cm and 1/256 of a turn, values as float16, stamps in milliseconds. Without losses all
+    libraries are equal.
 
     Args:
         robot: id of the robot, which is part of the ids of its views.
@@ -337,7 +336,7 @@ class ViewLibrary:
         self._cached = None
 
     def _remove(self, keys: Iterable[int]) -> None:
-        """Remove those of the keys that have views; others are told."""
+        """Remove the keys that have views, and queue the removals for sending."""
         known = [key for key in keys if key in self._views]
         gone = Intervals.of(np.array(known, np.int64))
         self._removed |= gone

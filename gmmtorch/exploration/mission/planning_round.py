@@ -7,8 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 import torch
 
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.planning.coordination import Coordination
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, predicted_path
+from gmmtorch.exploration.planning.coordination import Coordination, PeerTrajectories, predicted_path
 from gmmtorch.exploration.planning.planner_interface import Plan
 from gmmtorch.exploration.robot.agent import Agent
 

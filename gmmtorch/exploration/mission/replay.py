@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any, Protocol
 
 from gmmtorch.errors import DataError, check_whole
-from gmmtorch.exploration.mission.clocks import Stopwatch, check_pace
+from gmmtorch.exploration.mission.driver import Stopwatch, check_pace
 from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan

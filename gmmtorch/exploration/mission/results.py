@@ -1,10 +1,10 @@
-"""Rows of results.json: of a mission, of missions side by side, and of one robot."""
+"""Rows of results.json, of a mission and of missions side by side; and snapshots of a mission."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 
@@ -26,6 +26,7 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
     """Everything measured of a scored mission, except what needs other rows (`with_times`)."""
     world, options, score = mission.world, mission.options, mission.score
     union, network, samples = score.union, mission.network, score.samples
+    traffic = network.traffic()
     cells = world.observable.nonzero() + world.box.low
     occupied = world.occupied[world.observable]
     seen = score.seen_by[world.observable.reshape(-1)]
@@ -60,12 +61,12 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         **samples,
         "observable_bits": union.observable_bits,
         "entropy_reduction_bits": union.observable_bits - union.entropy_bits,
-        "bytes_sent": network.n_bytes,
-        "wire_bytes": network.n_wire_bytes,
+        "bytes_sent": traffic.bytes,
+        "wire_bytes": traffic.wire_bytes,
         "bytes_by_kind": network.bytes_by_kind,
         "bytes_raw_points": samples["raw_points_bytes_over_time"][-1],
         **{f"bytes_{name}": samples[f"{name}_bytes_over_time"][-1] for name in options.codecs},
-        "datagrams": network.n_datagrams,
+        "datagrams": traffic.datagrams,
         "reception": network.reception()._asdict(),
         "n_components": None if components[0] is None else len(components[0]),
         "map_disagreement": disagreement([r.mapper.belief for r in mission.robots], cells),
@@ -190,3 +191,59 @@ def _healed_after(row: Mapping[str, Any], companion: Mapping[str, Any]) -> float
 def _missing(row: Mapping[str, Any]) -> list[tuple[float, float]]:
     """(time, missing share) of each sample."""
     return list(zip(row["times"], row["missing_share"], strict=True))
+
+
+_MOST_SNAPSHOTS = 16
+
+
+class Snapshot(NamedTuple):
+    """tick: number of ticks done. bits: entropy reduction so far. content: what was taken of the mission."""
+
+    tick: int
+    bits: float
+    content: dict[str, Any]
+
+
+class Snapshots:
+    """At most 17 snapshots of a scored mission: the first, the last, and some between at about equal steps of
+    entropy.
+
+    The final entropy is not known in advance. So the class takes a snapshot after each step of entropy; once
+    there are 16, it doubles the step and drops the snapshots between.
+
+    Args:
+        take: returns the content of a snapshot.
+    """
+
+    def __init__(self, take: Callable[[Mission], dict[str, Any]]) -> None:
+        self._take = take
+        self._step = 0.0  # bits
+        self.taken: list[Snapshot] = []
+
+    def update(self, mission: Mission) -> None:
+        """Takes a snapshot if it is due. Called after every tick."""
+        union = mission.score.union
+        bits = union.observable_bits - union.entropy_bits
+        if self.taken and not mission.is_over and bits <= self.taken[-1].bits + self._step:
+            return
+        if len(self.taken) == _MOST_SNAPSHOTS:
+            self._thin()
+        self.taken.append(Snapshot(mission.n_ticks, bits, self._take(mission)))
+
+    def _thin(self) -> None:
+        first, *others = self.taken
+        self._step = 2 * (others[-1].bits - first.bits) / _MOST_SNAPSHOTS
+        self.taken = [first]
+        for snapshot in others:
+            if snapshot.bits >= self.taken[-1].bits + self._step:
+                self.taken.append(snapshot)
+
+    def chosen(self, shares: Sequence[float] = (0.2, 0.5, 0.8)) -> list[Snapshot]:
+        """The last snapshot, and those nearest to these shares of the final reduction; sorted by time, fewer
+        if there are not enough."""
+        *left, end = self.taken
+        chosen = [end]
+        for share in shares[: len(left)]:
+            bits = [abs(snapshot.bits - share * end.bits) for snapshot in left]
+            chosen.append(left.pop(bits.index(min(bits))))
+        return sorted(chosen, key=lambda snapshot: snapshot.tick)

@@ -10,9 +10,8 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.mission.clocks import Stopwatch
-from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.mission_score import MissionScore
+from gmmtorch.exploration.mission.driver import Stopwatch
+from gmmtorch.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.planning.planners import make_planner
 from gmmtorch.exploration.planning.primitives import Primitives

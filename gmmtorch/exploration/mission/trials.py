@@ -20,8 +20,7 @@ from gmmtorch import __version__
 from gmmtorch.errors import DataError, GmmTorchError, check_whole
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.evaluation.processes import end_with_parent
-from gmmtorch.exploration.mission.clocks import SimulatedClock
-from gmmtorch.exploration.mission.driver import drive
+from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
 from gmmtorch.exploration.mission.options import TeamOptions
 from gmmtorch.exploration.mission.results import mission_row

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories, clear_of
-from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.exploration.world.collisions import collides
+from gmmtorch.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.exploration.world.navigable import collides
 from gmmtorch.occupancy.grid import check_resolution
 
 __all__ = [

@@ -16,7 +16,7 @@ from gmmtorch.exploration.planning.global_planner import Journey, looks
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.tree_search import SearchRule, TreeSearch
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 
 _COARSE = 2
 _SAMPLES = 24  # of a line of sight

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.grid import check_resolution
 
 _AROUND = list(itertools.product((-1, 0, 1), repeat=3))

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
 from gmmtorch.exploration.planning.collision_checking import feasible
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 
 LEAST = 0.05
 """Smallest displacement (m) that counts as motion."""

@@ -11,27 +11,13 @@ from typing import Any
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.exploration.information.information_discount import InformationDiscount
-from gmmtorch.exploration.information.view_cache import ViewCache
+from gmmtorch.exploration.information.view_cache import InformationDiscount, ViewCache
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
 from gmmtorch.exploration.planning.frontier import FrontierPlanner
 from gmmtorch.exploration.planning.global_planner import Journey
 from gmmtorch.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.tree_search import Found, SearchRule, TreeSearch
-
-__all__ = [
-    "PLANNERS",
-    "FrontierPlanner",
-    "Plan",
-    "Planner",
-    "PlanningTask",
-    "RandomPlanner",
-    "TreePlanner",
-    "TreeRule",
-    "make_planner",
-]
-
 
 _NOTHING = 1e-3  # share of the largest value below which information counts as zero
 _STUCK = 0.3  # metres of progress that a branch must make
@@ -44,9 +30,9 @@ class TreeRule:
 
     search: tree search while exploring. travel: tree search while travelling. squeeze: tree search by
     distance only, when `travel` makes no progress. little: information a primitive below which a robot
-    looks for a better
-    place. plenty: information a primitive from which on a travelling robot stays. worthwhile: smallest
-    value of a view in the library. metre: value of a metre of progress, compared with information.
+    looks for a better place. plenty: information a primitive from which on a travelling robot stays.
+    worthwhile: smallest value of a view in the library. metre: value of a metre of progress, compared with
+    information.
     n_added, n_revalued: views of the library added and evaluated again in one plan.
     """
 

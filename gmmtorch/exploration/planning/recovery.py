@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.planning.peer_trajectories import clear_of
+from gmmtorch.exploration.planning.coordination import clear_of
 from gmmtorch.exploration.planning.planner_interface import LEAST, Plan, PlanningTask, is_boxed_in
 from gmmtorch.exploration.planning.primitives import Primitives
 

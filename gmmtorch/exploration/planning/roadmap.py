@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.voxels.boxes import Box
 
 _BLOCK = 8  # nodes along each side of a block of storage

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.information.view_cache import ViewCache
-from gmmtorch.exploration.planning.goal import Goal
+from gmmtorch.exploration.planning.global_planner import Goal
 from gmmtorch.exploration.planning.planner_interface import Options, PlanningTask, options
 from gmmtorch.exploration.planning.primitives import Primitives
 

@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_evaluator import ViewEvaluator
-from gmmtorch.exploration.mission.clocks import Stopwatch
+from gmmtorch.exploration.mission.driver import Stopwatch
 from gmmtorch.exploration.mission.options import TeamOptions
-from gmmtorch.exploration.planning.peer_trajectories import PeerTrajectories
+from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.planner_interface import Plan, PlanningTask, Waiting
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.recovery import retreat
-from gmmtorch.exploration.robot.local_map import LocalMap
-from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
+from gmmtorch.exploration.robot.mapper import FrameUpdate, LocalMap, Memo
 from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.sharing.messages.message_registry import (

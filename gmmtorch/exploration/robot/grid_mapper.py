@@ -16,17 +16,17 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.sharing.messages.envelope import within
+from gmmtorch.sharing.broadcast import SendOnce
 from gmmtorch.sharing.messages.message_registry import Message, PointsMessage, decode, encode_points
 from gmmtorch.sharing.messages.point_messages import MOST_PARTS
-from gmmtorch.sharing.replica.intervals import Intervals
+from gmmtorch.sharing.replica.record_keys import Intervals
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
 MOST_INTERVALS = 1 << 14
 """Intervals of received parts kept for a teammate; beyond, the oldest gaps count as received."""
 
 
-class SharedPoints:
+class SharedPoints(SendOnce):
     """The points that a robot sends, and which parts of its teammates' frames have arrived. No losses are
     repaired, so nothing is announced.
 
@@ -41,14 +41,11 @@ class SharedPoints:
             (received before, or so late that this is no longer known).
     """
 
-    version = 0
-    held = missing = Intervals.empty()
-
     def __init__(self, robot: int, size: int) -> None:
+        super().__init__()
         self.refused: Counter[str] = Counter()
         self._robot, self._size = robot, size
         self._n_frames = 0
-        self._due: list[bytes] = []
         self._received: dict[int, Intervals] = {}  # parts of frames, by sender
 
     def add(self, frame: DepthFrame, novel: Tensor) -> list[bytes]:
@@ -74,17 +71,6 @@ class SharedPoints:
             return False
         self._received[message.sender] = _bounded(received | Intervals.span(number, number + 1))
         return True
-
-    def datagrams(self, *, budget: int | None = None) -> list[bytes]:
-        n = within(self._due, budget)
-        sent, self._due = self._due[:n], self._due[n:]
-        return sent
-
-    def announcements(self) -> list[bytes]:
-        return []
-
-    def digest(self) -> bytes:
-        return b""
 
 
 class GridMapper(Mapper):

@@ -12,7 +12,7 @@ from torch import Tensor
 from gmmtorch.exploration.planning.collision_checking import cells_in_sphere, feasible, passable_cells
 from gmmtorch.exploration.planning.planner_interface import LEAST
 from gmmtorch.exploration.planning.primitives import Primitives
-from gmmtorch.exploration.robot.local_map import LocalMap
+from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.robot.initial_free_space import Place, initial_free_space
-from gmmtorch.exploration.world.observable import viewpoints
+from gmmtorch.exploration.world.navigable import viewpoints
 
 _ROOMY = 1.0
 """Preferred distance (m) of a start from the nearest surface."""

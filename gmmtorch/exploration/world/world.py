@@ -15,8 +15,15 @@ from gmmtorch.datasets.mesh_samples import read_triangles
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.exploration.world.navigable import ON_PLANE, above_floor, connected, occupied_and_clear
-from gmmtorch.exploration.world.observable import observable_cells, view_directions, viewpoints
+from gmmtorch.exploration.world.navigable import (
+    ON_PLANE,
+    above_floor,
+    connected,
+    observable_cells,
+    occupied_and_clear,
+    view_directions,
+    viewpoints,
+)
 from gmmtorch.exploration.world.starts import check_start, start_poses
 from gmmtorch.exploration.world.world_cache import cached_cells
 from gmmtorch.occupancy.grid import check_resolution

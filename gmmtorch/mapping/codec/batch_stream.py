@@ -19,13 +19,13 @@ from gmmtorch.mapping.codec import lattice
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints, fewest_bits
 from gmmtorch.mapping.codec.lattice import (
     AXIS_ORDERS,
-    FARTHEST,
     LARGEST_DEVIATION,
     LARGEST_RATIO,
     LEAST_DEVIATION,
     Lattice,
 )
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, LEAST_SHARE, NO_COUNT, ORIGIN_STEP, Quantized
+from gmmtorch.scan import FARTHEST
 
 _ORDER_BITS = {2: 1, 3: 3}
 RASTER_BITS = 60

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.scan import FARTHEST
 
 PER_OCTAVE = 4
 """Steps of deviations, and of counts, in a factor of two."""
@@ -47,8 +48,6 @@ LARGEST_RATIO = 20 * PER_OCTAVE
 represent smaller ones."""
 LARGEST_VARIANCE = 4.0 ** (LARGEST_DEVIATION / PER_OCTAVE)
 """m², along each axis of the world."""
-FARTHEST = 2.0**27
-"""Metres from the world's origin to a mean on each axis, at most."""
 STEEPEST = 2
 """Largest |L_ij|; 1 up to rounding if the covariance is definite."""
 

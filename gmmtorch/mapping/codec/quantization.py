@@ -14,8 +14,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec import lattice
-from gmmtorch.mapping.codec.lattice import FARTHEST, PER_OCTAVE, Lattice
+from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
+from gmmtorch.scan import FARTHEST
 
 ORIGIN_STEP = 2.0**-8
 """Metres. Rounding moves an origin by at most half a step on each axis."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from scipy.stats import chi2
 from torch import Tensor
 
 from gmmtorch.linalg import dense_ranks
@@ -51,14 +50,17 @@ def count_explained(
     rows = (near & (components.max_range == max_range)).nonzero().squeeze(1)
     if n == 0 or len(rows) == 0:
         return Explained(components, found)
-    limit = float(chi2.ppf(0.95, components.dim)) if explained is None else explained
+    if explained is None:
+        from scipy.stats import chi2
+
+        explained = float(chi2.ppf(0.95, components.dim))
     inverse, _ = whitening(components.covariances[rows])
     gained = components.support.new_zeros(len(rows))
     step = max(1, _PAIRS_AT_ONCE // len(rows))
     for begin in range(0, n, step):
         offset = points[begin : begin + step, None].double() - components.means[rows].double()
         squared = torch.einsum("kij,nkj->nki", inverse, offset).square().sum(-1)
-        share = torch.where(squared < limit, squared.clamp_min(_LEAST_DISTANCE).reciprocal(), 0.0)
+        share = torch.where(squared < explained, squared.clamp_min(_LEAST_DISTANCE).reciprocal(), 0.0)
         total = share.sum(1)
         found[begin : begin + step] = total > 0
         gained += (share / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]).sum(0)

@@ -16,6 +16,7 @@ from torch import Tensor
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.viewpoints import AssignViewpoints
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool
 from gmmtorch.scan import Scan
@@ -109,5 +110,5 @@ def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> 
     pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
     first = em.maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
-    step = em.natural_step(features, weight, smallest_variance, fit.dtype)
-    return em.run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters
+    step = loop.natural_step(features, weight, smallest_variance, fit.dtype)
+    return loop.run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 
 import torch
-from torch import Tensor
 
-from gmmtorch.datasets.depth_frames import back_project
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.components import Components
@@ -19,6 +18,7 @@ from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins
 from gmmtorch.mixture.em.partition import FlatnessRule
+from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
 from gmmtorch.scan import Scan
 
 
@@ -54,7 +54,12 @@ def absorb(
 
 
 def depth_scan(
-    depth: Tensor, pose: Tensor, intrinsics: Tensor, pixel_stride: int = 1, max_range: float = torch.inf
+    depth: ArrayLike,
+    pose: ArrayLike,
+    intrinsics: ArrayLike,
+    pixel_stride: int = 1,
+    max_range: float = torch.inf,
+    depth_scale: float | None = None,
 ) -> Scan:
     """The scan of every `pixel_stride`-th pixel of every `pixel_stride`-th row of a depth image.
 
@@ -63,12 +68,14 @@ def depth_scan(
             not finite are left out.
         pose: (4, 4), world ← camera.
         intrinsics: (3, 3).
+        depth_scale: metres per unit of the image; None: metres, in a floating type.
     """
-    rotation, translation = check_rigid(pose, 3)
-    taken = depth[::pixel_stride, ::pixel_stride]
-    valid = torch.isfinite(taken) & (taken < max_range)
-    scaled = intrinsics.double().clone()
+    image = metric_depth(depth, depth_scale).detach()
+    rotation, translation = check_rigid(as_tensor(pose, "pose", torch.float64, image.device).detach(), 3)
+    scaled = check_intrinsics(intrinsics, tuple(image.shape)).to(image.device, copy=True)
     scaled[:2] /= pixel_stride
+    taken = image[::pixel_stride, ::pixel_stride]
+    valid = torch.isfinite(taken) & (taken < max_range)
     points = back_project(torch.where(valid, taken, 0.0).double(), scaled)
     return Scan(points @ rotation.T + translation, translation)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.ray_traversal import traverse
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule
@@ -15,7 +16,6 @@ from gmmtorch.occupancy.evidence import bernoulli_entropy, occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index, intersection, to_lattice
 from gmmtorch.occupancy.voxels.ray_casting import rays_in_box
-from gmmtorch.occupancy.voxels.ray_traversal import traverse
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 
@@ -139,7 +139,7 @@ def beam_novelty(
     if rays.block is not rays.window:
         table = torch.nn.functional.pad(table, (1,) * 6)
     table = table.view(-1)
-    for visit in rays.visits:
+    for visit in rays.visits():
         bits.index_add_(0, visit.ray, table.index_select(0, visit.voxel))
     flat, inside = flat_index(stops.floor().long() - rays.window.low, rays.window.shape)
     ended = (is_hit & inside).nonzero().squeeze(1)

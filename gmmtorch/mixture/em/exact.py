@@ -12,9 +12,7 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -38,19 +36,6 @@ class Parameters(NamedTuple):
     weights: Tensor
     means: Tensor
     covariances: Tensor
-
-
-@dataclass(frozen=True)
-class EMResult:
-    """Parameters, and the lower bound (mean log-likelihood, nats) before the M-step of each iteration."""
-
-    parameters: Parameters
-    lower_bounds: list[float]
-    converged: bool
-
-    @property
-    def n_iter(self) -> int:
-        return len(self.lower_bounds)
 
 
 def quadratic_features(points: Tensor) -> Tensor:
@@ -173,7 +158,7 @@ def is_ill_conditioned(parameters: Parameters) -> bool:
     return bool((size * parameters.weights.sign()).max() * torch.finfo(whiten.dtype).eps > 1e-6)
 
 
-def _has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
+def has_cancelled(statistics: Tensor, parameters: Parameters) -> bool:
     """Whether Σγxxᵀ/N − μμᵀ lost digits that the smallest variance, or the next step, needs.
 
     Accepts covariances that are not positive definite: nothing is factorised.
@@ -254,80 +239,3 @@ def direct_step(
         sums, lambda means: direct_scatter(points, sample_weight, parameters, means), reg_covar, parameters
     )
     return new, total
-
-
-# -- the loop -------------------------------------------------------------------------------------
-
-Step = Callable[[Parameters], tuple[Parameters, float]]
-"""One EM step: from parameters to improved ones, and the mean lower bound (nats) of the given ones."""
-
-
-def natural_step(
-    features: Tensor,
-    sample_weight: Tensor,
-    reg_covar: float,
-    softmax_dtype: torch.dtype = torch.float32,
-    points: Tensor | None = None,
-) -> Step:
-    """EM steps on features (N, F), float64, of points or cells.
-
-    If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
-    digits to cancellation uses the direct form instead.
-    """
-
-    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
-        return expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
-
-    direct = None
-    if points is not None:
-        direct = functools.partial(direct_step, points, sample_weight, reg_covar=reg_covar)
-    return guarded_step(gather, direct, reg_covar, float(sample_weight.sum()))
-
-
-def guarded_step(
-    gather: Callable[[Parameters], tuple[Tensor, Tensor]],
-    direct: Callable[[Parameters], tuple[Parameters, Tensor]] | None,
-    reg_covar: float,
-    total: float,
-) -> Step:
-    """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
-
-    If the natural parameters or S lose digits to cancellation, `direct` takes the step, if it is given.
-    """
-
-    def step(parameters: Parameters) -> tuple[Parameters, float]:
-        if direct is None or not is_ill_conditioned(parameters):
-            statistics, value = gather(parameters)
-            new = maximization(statistics, reg_covar, parameters)
-            if direct is None or not _has_cancelled(statistics, new):
-                return new, float(value) / total
-        new, value = direct(parameters)
-        return new, float(value) / total
-
-    return step
-
-
-def run_em(
-    step: Step,
-    parameters: Parameters,
-    *,
-    tol: float = 1e-3,
-    max_iter: int = 100,
-    on_iteration: Callable[[int, float], None] | None = None,
-    lower_bounds: Sequence[float] = (),
-) -> EMResult:
-    """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations.
-
-    To continue a run, pass as `lower_bounds` those of the iterations that led to `parameters`.
-    """
-    bounds = list(lower_bounds)
-    while not (converged := _has_converged(bounds, tol)) and len(bounds) < max_iter:
-        parameters, bound = step(parameters)
-        bounds.append(bound)
-        if on_iteration is not None:
-            on_iteration(len(bounds), bound)
-    return EMResult(parameters, bounds, converged)
-
-
-def _has_converged(bounds: list[float], tol: float) -> bool:
-    return len(bounds) > 1 and abs(bounds[-1] - bounds[-2]) < tol

@@ -70,10 +70,49 @@ def from_random_points(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
 ) -> Parameters:
     """Means at distinct random points, drawn by weight; isotropic covariance, uniform weights."""
-    # The K smallest of E/w, E exponential, are a weighted draw without replacement.
+    return _isotropic(points[_draw(weight, n_components, generator)], points, weight, reg_covar)
+
+
+def _draw(weight: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """Indices (n,) of a draw without replacement, by weight: the n smallest of E/w, E exponential."""
     race = torch.empty(weight.shape, dtype=torch.float64).exponential_(generator=generator)
-    chosen = (race.to(weight.device) / weight).argsort()[:n_components]
-    return _isotropic(points[chosen], points, weight, reg_covar)
+    return (race.to(weight.device) / weight).argsort()[:n]
+
+
+def from_single_points(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+) -> Parameters:
+    """Components of one random point each, with variance `reg_covar`: scikit-learn's "random_from_data"."""
+    return _single_points(points[_draw(weight, n_components, generator)], reg_covar)
+
+
+def from_kmeans_plus_plus(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+) -> Parameters:
+    """Components of one point each, chosen far apart as k-means++ does, with variance `reg_covar`."""
+    from sklearn.cluster import kmeans_plusplus
+
+    seed = int(torch.randint(2**31 - 1, (), generator=generator))
+    means, _ = kmeans_plusplus(
+        points.cpu().numpy(), n_components, sample_weight=weight.cpu().numpy(), random_state=seed
+    )
+    return _single_points(torch.from_numpy(means).to(points.device), reg_covar)
+
+
+def _single_points(means: Tensor, reg_covar: float) -> Parameters:
+    k, dim = means.shape
+    covariances = (torch.eye(dim, dtype=means.dtype, device=means.device) * reg_covar).repeat(k, 1, 1)
+    return Parameters(means.new_full((k,), 1 / k), means, covariances)
+
+
+def from_random_responsibilities(
+    points: Tensor, weight: Tensor, n_components: int, reg_covar: float, generator: torch.Generator
+) -> Parameters:
+    """The moments of uniformly random responsibilities: scikit-learn's "random"."""
+    shape = (points.shape[0], n_components)
+    share = torch.rand(shape, generator=generator, dtype=torch.float64).to(points.device)
+    share = share * (weight / share.sum(1))[:, None]
+    return maximization(share.T @ quadratic_features(points), reg_covar)
 
 
 def from_bounding_box(
@@ -191,6 +230,9 @@ def moments_of(
 INITIALIZATIONS: dict[str, Initialization] = {
     "kmeans": from_kmeans,
     "kmeans_restarts": from_kmeans_restarts,
+    "k-means++": from_kmeans_plus_plus,
+    "random": from_random_responsibilities,
+    "random_from_data": from_single_points,
     "random_points": from_random_points,
     "bounding_box": from_bounding_box,
     "flat_pieces": from_flat_pieces,

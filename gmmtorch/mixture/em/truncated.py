@@ -8,6 +8,7 @@ of components. Each group is computed relative to its owner's mean, so that floa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mixture.em.cells import pool_into_cells
-from gmmtorch.mixture.em.exact import EMResult, Parameters, maximization, shift_features
+from gmmtorch.mixture.em.exact import Parameters, maximization, shift_features
 from gmmtorch.mixture.em.grouping import (
     Expectation,
     Groups,
@@ -26,6 +27,7 @@ from gmmtorch.mixture.em.grouping import (
     rounding,
     truncated_expectation,
 )
+from gmmtorch.mixture.em.loop import EMResult, has_converged
 from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
 
 _FIRST_SETS = (2, 3, 3, 4, 4)  # iterations with the same candidates; afterwards _LATER_SETS
@@ -46,7 +48,7 @@ class Settings:
     on_iteration: called with the iteration, from 1, and the bound. processes: processes that share the
     fit, each with its own rows. compiled: run the E-step through torch.compile. The result is the same
     to rounding and about 1.5 times as fast, after about five seconds for the first use in a process.
-    Needs a C++ compiler.
+    Needs a C++ compiler. previous_bound: bound of the fit that this one continues.
     """
 
     reg_covar: float = 1e-6
@@ -57,6 +59,7 @@ class Settings:
     on_iteration: Callable[[int, float], None] | None = None
     processes: Processes = SINGLE_PROCESS
     compiled: bool = False
+    previous_bound: float = -math.inf
 
 
 # -- momentum -------------------------------------------------------------------------------------
@@ -123,7 +126,7 @@ def _moved(parameters: Parameters, means: Tensor) -> Parameters:
 
 def run_truncated(
     rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings, candidates: Tensor | None = None
-) -> tuple[EMResult, Tensor, Tensor]:
+) -> tuple[EMResult[Parameters], Tensor, Tensor]:
     """Accelerated truncated EM from `parameters` and an initial owner (N,) of each row.
 
     It starts with the owners' `candidates` (K, m), or chooses them. Returns the result of EM, and the
@@ -159,7 +162,7 @@ def run_truncated(
             settings.on_iteration(len(bounds), bound)
         was_extrapolated = momentum.is_extrapolated
         parameters = momentum.step(statistics, parameters)
-        if len(bounds) > 1 and bounds[-1] - bounds[-2] < settings.tol:
+        if has_converged(bounds, settings.tol, settings.previous_bound):
             if not was_extrapolated:
                 converged = True
                 break
@@ -203,7 +206,9 @@ def _with_enough_digits(rows: Rows, groups: Groups, parameters: Parameters) -> G
     return group_rows(rows, owners_of(groups), parameters.means, torch.float64)
 
 
-def fit_truncated(rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings) -> EMResult:
+def fit_truncated(
+    rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings
+) -> EMResult[Parameters]:
     """`run_truncated`, first on a random sample if there are many points, or on cells if very many.
 
     With the same owners and candidates, the bound on cells is below the bound on their points, so the
@@ -218,7 +223,7 @@ def fit_truncated(rows: Rows, owner: Tensor, parameters: Parameters, settings: S
         if n_all >= 2 * n_sampled and settings.max_iter > 1:
             drawn = _sample(rows, n * n_sampled // n_all)
             part = Rows(rows.values[drawn], rows.weight[drawn], rows.are_points)
-            silent = replace(settings, on_iteration=None)
+            silent = replace(settings, on_iteration=None, previous_bound=-math.inf)
             parameters = run_truncated(part, owner[drawn], parameters, silent)[0].parameters
         return run_truncated(rows, owner, parameters, settings)[0]
     share = max(1, n_cells // settings.processes.size)
@@ -229,14 +234,19 @@ def fit_truncated(rows: Rows, owner: Tensor, parameters: Parameters, settings: S
         Rows(cells.features, cells.weight, are_points=False),
         first,
         parameters,
-        replace(settings, max_iter=settings.max_iter // 2),
+        replace(settings, max_iter=settings.max_iter // 2, previous_bound=-math.inf),
     )
 
     def on_fine_iteration(iteration: int, bound: float) -> None:
         if settings.on_iteration is not None:
             settings.on_iteration(coarse.n_iter + iteration, bound)
 
-    left = replace(settings, max_iter=settings.max_iter - coarse.n_iter, on_iteration=on_fine_iteration)
+    left = replace(
+        settings,
+        max_iter=settings.max_iter - coarse.n_iter,
+        on_iteration=on_fine_iteration,
+        previous_bound=-math.inf,
+    )
     fine, *_ = run_truncated(rows, owner[cells.member], coarse.parameters, left, candidates)
     return EMResult(fine.parameters, coarse.lower_bounds + fine.lower_bounds, fine.converged)
 

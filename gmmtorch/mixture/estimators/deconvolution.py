@@ -139,7 +139,7 @@ def bound_variances(covariances: Tensor, min_variance: float = 0.0, thickness: f
 def deconvolution_step(
     blocks: list[Block], min_variance: float = 0.0, thickness: float | None = None
 ) -> Callable[[Parameters], tuple[Parameters, float]]:
-    """EM steps for `exact.run_em`: improved parameters, and the mean log-likelihood of the given ones."""
+    """EM steps for `loop.run_em`: improved parameters, and the mean log-likelihood of the given ones."""
     total = float(sum(block.weight.sum() for block in blocks))
 
     def step(parameters: Parameters) -> tuple[Parameters, float]:

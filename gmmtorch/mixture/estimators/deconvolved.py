@@ -7,13 +7,14 @@ import numbers
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.initialization import initialize
 from gmmtorch.mixture.estimator import MixtureEstimator
 from gmmtorch.mixture.estimators import deconvolution
@@ -37,7 +38,7 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         thickness: upper limit of a component's smallest standard deviation (m); None: no limit. With
             reg_covar = thickness² every component has exactly this thickness.
         max_iter: largest number of EM iterations.
-        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        init_params: as in `GaussianMixture`, without "auto".
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
 
     Fitted attributes: those of every `MixtureEstimator`. `lower_bound_` is the mean log-likelihood of
@@ -55,7 +56,6 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         init_params: str = "kmeans",
         random_state: RandomState = None,
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
         self.tol = tol
         self.reg_covar = reg_covar
@@ -93,10 +93,10 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
         )
         blocks = deconvolution.group_by_noise(points, weight, noise)
         step = deconvolution.deconvolution_step(blocks, least, self.thickness)
-        found = em.run_em(step, first, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
+        found = loop.run_em(step, first, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
         safe_cholesky(found.parameters.covariances)  # raises if a component collapsed in the last step
         self._store_fit(found.parameters, center, found.lower_bounds, found.converged)
-        self._warn_unless_converged("EM")
+        self._warn_unless_converged()
         return self
 
     def score_samples(self, X: Array, noise_covariances: Array | None = None) -> Array:
@@ -135,9 +135,7 @@ def checked_noise(noise: Array | None, n: int, points: Tensor) -> Tensor:
     dim = points.shape[1]
     if noise is None:
         return points.new_zeros(dim, dim)
-    if not isinstance(noise, Tensor):
-        noise = torch.from_numpy(np.array(noise, dtype=np.float64))
-    noise = noise.detach().to(points.device, torch.float64)
+    noise = as_tensor(noise, "noise_covariances", torch.float64, points.device).detach()
     if noise.shape not in ((n, dim, dim), (dim, dim)):
         raise InvalidArgumentError(
             f"noise_covariances has shape {tuple(noise.shape)}; expected ({n}, {dim}, {dim}), one per point, "

@@ -6,7 +6,7 @@
 
 Given the moments of each component's points, the posterior has the same form (`update`). Its expected
 log-density is that of Gaussians with modified weights (`expected_log_density`), so variational Bayes
-uses the E-step of EM (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
+uses the E-step of EM, see `variational_step` (Bishop, 2006, section 10.2; Blei & Jordan, 2006).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em.covariance_types import constrain
 from gmmtorch.mixture.em.exact import Parameters
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -63,11 +64,12 @@ def unbiased_covariance(points: Tensor, weight: Tensor, thickness: float) -> Ten
     return (directions * variances.clamp_min(thickness)) @ directions.T
 
 
-def update(prior: Prior, moments: Parameters, process: bool) -> Posterior:
+def update(prior: Prior, moments: Parameters, process: bool, covariance_type: str = "full") -> Posterior:
     """The posterior given the points N_k (K,) of each component, their means and their covariances.
 
     `moments` has N_k in place of weights. process: whether the weights have a Dirichlet process prior.
-    Bishop (10.58)–(10.63); Blei & Jordan (18)–(19).
+    Bishop (10.58)–(10.63); Blei & Jordan (18)–(19). For other types than full covariances, the Wishart
+    factors are the best ones whose scale matrix is of the type: tied ones are equal.
     """
     count, mean, covariance = moments
     mean_precision = prior.mean_precision + count
@@ -76,6 +78,9 @@ def update(prior: Prior, moments: Parameters, process: bool) -> Posterior:
     pull = count * prior.mean_precision / mean_precision
     scatter = prior.covariance + count[:, None, None] * covariance
     scatter = scatter + pull[:, None, None] * offset[:, :, None] * offset[:, None, :]
+    scatter = constrain(scatter, covariance_type)
+    if covariance_type == "tied":
+        degrees_of_freedom = degrees_of_freedom.mean().expand_as(degrees_of_freedom).clone()
     return Posterior(
         _sticks(prior.concentration, count) if process else (prior.concentration + count)[None],
         mean_precision,
@@ -194,70 +199,3 @@ def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
 
     rows = max(1, em.CHUNK_ELEMENTS // k)
     return torch.cat([torch.logsumexp(joint(part), 1) for part in points.split(rows)])
-
-
-# -- variational Bayes --------------------------------------------------------------------------------
-
-
-def variational_step(
-    points: Tensor,
-    sample_weight: Tensor,
-    prior: Prior,
-    process: bool,
-    reg_covar: float,
-    softmax_dtype: torch.dtype,
-) -> em.Step:
-    """One iteration for `exact.run_em`: from moments to the moments of the next responsibilities.
-
-    Moments are `Parameters` with N_k, in points, in place of weights; their covariances include
-    `reg_covar` (m²). The bound (nats a point) is that of the returned moments.
-    """
-    features = em.quadratic_features(points)
-    total = float(sample_weight.sum())
-
-    def step(moments: Parameters) -> tuple[Parameters, float]:
-        log_weight, gaussians = expected_log_density(update(prior, moments, process))
-        found, value = _expected_moments(
-            features, points, sample_weight, log_weight, gaussians, reg_covar, softmax_dtype
-        )
-        posterior = update(prior, found, process)
-        entropy = value - assigned_log_density(_unregularized(found, reg_covar), log_weight, gaussians)
-        return found, float(entropy + log_evidence(prior, posterior, total)) / total
-
-    return step
-
-
-def _expected_moments(
-    features: Tensor,
-    points: Tensor,
-    sample_weight: Tensor,
-    log_weight: Tensor,
-    gaussians: Parameters,
-    reg_covar: float,
-    softmax_dtype: torch.dtype,
-) -> tuple[Parameters, Tensor]:
-    """Moments of γ_nk ∝ exp(ω_k) N(x_n | m_k, Σ_k), and Σ_n p_n times the log of their normaliser.
-
-    Computed as two products with `features`, or directly from `points` if the products would cancel.
-    """
-    weights = torch.exp(log_weight - log_weight.max())
-    unnormalised = gaussians._replace(weights=weights)
-    if not em.is_ill_conditioned(unnormalised):
-        natural = em.natural_parameters(gaussians)
-        natural[:, 0] += log_weight
-        sums, value = em.expectation(features, sample_weight, natural, softmax_dtype)
-        found = em.maximization(sums, reg_covar)
-        found = found._replace(weights=sums[:, 0])
-        least = torch.linalg.eigvalsh(found.covariances)[:, 0]
-        second = sums[:, 1:].abs().amax(1) / sums[:, 0].clamp_min(1e-300)
-        has_cancelled = torch.finfo(least.dtype).eps * second > 1e-6 * least
-        if not bool((has_cancelled & (sums[:, 0] > 1e-9)).any()):
-            return found, value
-    found, value = em.direct_step(points, sample_weight, unnormalised, reg_covar)
-    total = sample_weight.sum()
-    return found._replace(weights=found.weights * total), value + log_weight.max() * total
-
-
-def _unregularized(moments: Parameters, reg_covar: float) -> Parameters:
-    eye = torch.eye(moments.means.shape[1], dtype=moments.means.dtype, device=moments.means.device)
-    return moments._replace(covariances=moments.covariances - reg_covar * eye)

@@ -23,19 +23,20 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
+from sklearn.utils._param_validation import StrOptions
 from torch import Tensor, nn
 
-from gmmtorch.errors import NumericalError, check_choice, check_whole
+from gmmtorch.errors import NumericalError
 from gmmtorch.linalg import inverse_factor, pack_symmetric, safe_cholesky, triangle_indices, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.em.loop import EMResult, OnIteration
+from gmmtorch.mixture.estimator import COUNT, MixtureEstimator
 from gmmtorch.mixture.estimators.ascent import SOLVERS, ascend
 from gmmtorch.mixture.validation import Array, RandomState, as_generator
 
@@ -60,7 +61,7 @@ class RiemannianGaussianMixture(MixtureEstimator):
             each variance.
         max_iter: largest number of iterations of each start.
         n_init: number of starts; the one with the best likelihood is kept.
-        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        init_params: as in `GaussianMixture`, without "auto".
         solver: "lbfgs", or "cg" for conjugate gradients.
         memory: number of steps that L-BFGS stores.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
@@ -68,6 +69,12 @@ class RiemannianGaussianMixture(MixtureEstimator):
 
     `lower_bounds_` contains the mean log-likelihood of the blurred points after each iteration.
     """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **MixtureEstimator._parameter_constraints,
+        "solver": [StrOptions(set(SOLVERS))],
+        "memory": [COUNT],
+    }
 
     def __init__(
         self,
@@ -83,7 +90,6 @@ class RiemannianGaussianMixture(MixtureEstimator):
         random_state: RandomState = None,
         dtype: str = "float64",
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
         self.tol = tol
         self.reg_covar = reg_covar
@@ -100,39 +106,30 @@ class RiemannianGaussianMixture(MixtureEstimator):
         X: Array,
         y: Any = None,
         sample_weight: Array | None = None,
-        on_iteration: Callable[[int, float], None] | None = None,
+        on_iteration: OnIteration | None = None,
     ) -> RiemannianGaussianMixture:
         """Fit the mixture to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
         blur, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         likelihood = Likelihood(points, weight, blur, dtype)
         generator = as_generator(self.random_state)
-        best: tuple[Iterate, list[float], bool] | None = None
-        for _ in range(self.n_init):
+
+        def run(report: OnIteration | None) -> EMResult[Iterate]:
             first = initialize(self.init_params, points, weight, self.n_components, blur, generator)
-            found = ascend(
-                likelihood.at(first),
-                SOLVERS[self.solver](self.memory),
-                tol=float(self.tol),
-                max_iter=self.max_iter,
-                on_iteration=on_iteration,
+            solver = SOLVERS[self.solver](self.memory)
+            start = likelihood.at(first)
+            return EMResult(
+                *ascend(start, solver, tol=float(self.tol), max_iter=self.max_iter, on_iteration=report)
             )
-            if best is None or found[0].value > best[0].value:
-                best = found
-        assert best is not None
-        peak, values, converged = best
-        mixture = peak.parameters()
+
+        best = self._best_start(run, on_iteration)
+        mixture = best.parameters.parameters()
         safe_cholesky(mixture.covariances)
         if blur == 0:
             check_thickness(mixture, points)
-        self._store_fit(mixture, center, values, converged)
-        self._warn_unless_converged("The ascent")
+        self._store_fit(mixture, center, best.lower_bounds, best.converged)
+        self._warn_unless_converged()
         return self
-
-    def check_parameters(self, n_points: int | None = None) -> None:
-        super().check_parameters(n_points)
-        check_whole("memory", self.memory, 1)
-        check_choice("solver", self.solver, SOLVERS)
 
 
 # -- the objective and its manifold ---------------------------------------------------------------

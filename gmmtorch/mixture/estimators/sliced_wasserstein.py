@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
 
-from gmmtorch.errors import check_number, check_whole
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, MixtureEstimator
 from gmmtorch.mixture.estimators.optimal_transport import Slices, random_directions, slice_cloud, transport
 from gmmtorch.mixture.validation import Array, RandomState, as_generator
 
@@ -45,13 +44,19 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
             after seven such passes.
         reg_covar: added to each variance, in the squared unit of the points (m²).
         max_iter: largest number of passes over the directions.
-        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        init_params: as in `GaussianMixture`, without "auto".
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         dtype: of Φ and φ.
 
     `lower_bounds_` contains −SW² (m²) of each pass, as the mean over its steps. It is not a likelihood,
     and this fit may decrease the likelihood.
     """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **MixtureEstimator._parameter_constraints,
+        "n_projections": [COUNT],
+        "learning_rate": [ABOVE_ZERO],
+    }
 
     def __init__(
         self,
@@ -66,7 +71,6 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         random_state: RandomState = None,
         dtype: str = "float64",
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
         self.n_projections = n_projections
         self.learning_rate = learning_rate
@@ -121,13 +125,8 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         safe_cholesky(covariances)
         found = Parameters(weights, means * unit, covariances)
         self._store_fit(found, center, [-cost * unit**2 for cost in costs], converged)
-        self._warn_unless_converged("The descent")
+        self._warn_unless_converged()
         return self
-
-    def check_parameters(self, n_points: int | None = None) -> None:
-        super().check_parameters(n_points)
-        check_whole("n_projections", self.n_projections, 1)
-        check_number("learning_rate", self.learning_rate, above=True)
 
 
 # -- the descent -----------------------------------------------------------------------------------

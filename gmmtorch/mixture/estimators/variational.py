@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
+from numbers import Integral
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from sklearn.utils._param_validation import Interval, StrOptions
+from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_choice, check_number
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import EMResult, Parameters
+from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, compact, constrain, expand, type_shape
+from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimator import Cloud, MixtureEstimator
+from gmmtorch.mixture.em.loop import EMResult, OnIteration, run_em
+from gmmtorch.mixture.estimator import ABOVE_ZERO, COUNT, Cloud, MixtureEstimator
 from gmmtorch.mixture.estimators.gaussian_wishart import (
     Posterior,
     Prior,
@@ -22,8 +27,8 @@ from gmmtorch.mixture.estimators.gaussian_wishart import (
     log_predictive,
     unbiased_covariance,
     update,
-    variational_step,
 )
+from gmmtorch.mixture.estimators.variational_step import variational_step
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
 
 WEIGHT_PRIORS = ("dirichlet_process", "dirichlet_distribution")
@@ -41,9 +46,11 @@ def _posterior_attribute(buffer: str, doc: str) -> Any:
 
 
 class VariationalGaussianMixture(MixtureEstimator):
-    """Variational Bayes of a mixture with full covariances (thesis 2.1.5; Bishop, 2006, section 10.2).
+    """Variational Bayes of a mixture (thesis 2.1.5; Bishop, 2006, section 10.2).
 
-    The fit is a posterior over mixtures, computed as in scikit-learn's `BayesianGaussianMixture`.
+    The fit is a posterior over mixtures, computed as in scikit-learn's `BayesianGaussianMixture`: with
+    `dtype="float64"`, equal initial responsibilities and the same number of iterations, the parameters are
+    equal to 1e-6. Equal seeds do not give equal starts.
     Components that explain too few points end with almost no weight. `n_components_used_` counts the
     others, and `gmmtorch.mixture.prune` returns the mixture (without posterior) of the others.
 
@@ -55,11 +62,13 @@ class VariationalGaussianMixture(MixtureEstimator):
 
     Args:
         n_components: K, the largest number of components, at most the number of points.
+        covariance_type: "full", "tied", "diag" or "spherical". The posterior of each precision matrix is a
+            Wishart distribution whose scale matrix has this form.
         tol: stops when the lower bound changes by less (nats a point).
         reg_covar: added to each variance, in the squared unit of the points (m²).
-        max_iter: largest number of iterations of each start.
+        max_iter: largest number of iterations of each start. 0: the posterior of the start.
         n_init: number of starts; the one with the best lower bound is kept.
-        init_params: "kmeans" (scikit-learn's), "random_points" or "bounding_box".
+        init_params: as in `GaussianMixture`, without "auto".
         weight_concentration_prior_type: "dirichlet_process" (stick-breaking, truncated at K) or
             "dirichlet_distribution".
         weight_concentration_prior: γ₀; smaller values use fewer components. None: 1/K.
@@ -67,16 +76,19 @@ class VariationalGaussianMixture(MixtureEstimator):
         mean_prior: m₀ (D,). None: the mean of the points.
         degrees_of_freedom_prior: ν₀ > D − 1, the number of points that the prior covariance counts as.
             None: D.
-        covariance_prior: W₀⁻¹ (D, D), ν₀ times a typical covariance. None: the covariance of the points.
+        covariance_prior: W₀⁻¹, ν₀ times a typical covariance: (D, D), "diag" (D,), "spherical" a number.
+            None: the covariance of the points.
         random_state: a seed, a `RandomState`, a `torch.Generator`, or None for a random seed.
         dtype: of the exponentials of the E-step, as in `GaussianMixture`.
+        warm_start: `fit` continues from the posterior and the lower bound of the last fit.
+        verbose, verbose_interval: as in `GaussianMixture`.
 
     Fitted attributes: those of every `MixtureEstimator`; of the posterior `weight_concentration_` ((K,),
     or for a process a pair of Beta parameters, (K,) each), `mean_precision_` (K,) and
-    `degrees_of_freedom_` (K,); and of the prior `weight_concentration_prior_`, `mean_precision_prior_`,
-    `mean_prior_`, `degrees_of_freedom_prior_`, `covariance_prior_`. `lower_bounds_` are lower bounds of
-    log p(X) with all constants, nats a point, after each iteration. Scikit-learn's bound omits some
-    constants and is not divided by the number of points.
+    `degrees_of_freedom_` ((K,), "tied" a number); and of the prior `weight_concentration_prior_`,
+    `mean_precision_prior_`, `mean_prior_`, `degrees_of_freedom_prior_`, `covariance_prior_`.
+    `lower_bounds_` are lower bounds of log p(X) with all constants, nats a point, after each iteration.
+    Scikit-learn's bound omits some constants and is not divided by the number of points.
     """
 
     _extra_names: ClassVar[tuple[str, ...]] = (
@@ -86,15 +98,31 @@ class VariationalGaussianMixture(MixtureEstimator):
         *(f"prior_{name}" for name in Prior._fields),
     )
     _accepts_any_total_weight = True
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **MixtureEstimator._parameter_constraints,
+        "covariance_type": [StrOptions(set(COVARIANCE_TYPES))],
+        "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "weight_concentration_prior_type": [StrOptions(set(WEIGHT_PRIORS))],
+        "weight_concentration_prior": [ABOVE_ZERO, None],
+        "mean_precision_prior": [ABOVE_ZERO, None],
+        "mean_prior": ["array-like", None],
+        "degrees_of_freedom_prior": [ABOVE_ZERO, None],
+        "covariance_prior": ["array-like", ABOVE_ZERO, None],
+        "warm_start": ["boolean"],
+        "verbose": ["verbose"],
+        "verbose_interval": [COUNT],
+    }
     concentration: Tensor
     mean_precision: Tensor
     degrees_of_freedom: Tensor
+    prior_covariance: Tensor
     prior_mean_precision: Tensor
 
     def __init__(
         self,
         n_components: int = 1,
         *,
+        covariance_type: str = "full",
         tol: float = 1e-3,
         reg_covar: float = 1e-6,
         max_iter: int = 100,
@@ -108,9 +136,12 @@ class VariationalGaussianMixture(MixtureEstimator):
         covariance_prior: Array | None = None,
         random_state: RandomState = None,
         dtype: str = "float32",
+        warm_start: bool = False,
+        verbose: int = 0,
+        verbose_interval: int = 10,
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
+        self.covariance_type = covariance_type
         self.tol = tol
         self.reg_covar = reg_covar
         self.max_iter = max_iter
@@ -124,6 +155,9 @@ class VariationalGaussianMixture(MixtureEstimator):
         self.covariance_prior = covariance_prior
         self.random_state = random_state
         self.dtype = dtype
+        self.warm_start = warm_start
+        self.verbose = verbose
+        self.verbose_interval = verbose_interval
 
     # -- learning ---------------------------------------------------------------------------------
 
@@ -132,30 +166,34 @@ class VariationalGaussianMixture(MixtureEstimator):
         X: Array,
         y: Any = None,
         sample_weight: Array | None = None,
-        on_iteration: Callable[[int, float], None] | None = None,
+        on_iteration: OnIteration | None = None,
     ) -> VariationalGaussianMixture:
         """Compute the posterior given points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         cloud = self._prepare(X, sample_weight)
         prior = self._prior(cloud)
-        process = self.weight_concentration_prior_type == "dirichlet_process"
-        reg_covar, total = float(self.reg_covar), cloud.weight.sum()
-        dtype = em.SOFTMAX_DTYPES[self.dtype]
-        step = variational_step(cloud.points, cloud.weight, prior, process, reg_covar, dtype)
         generator = as_generator(self.random_state)
-        best: EMResult | None = None
-        for _ in range(self.n_init):
-            first = initialize(
-                self.init_params, cloud.points, cloud.weight, self.n_components, reg_covar, generator
+        step = variational_step(
+            cloud.points,
+            cloud.weight,
+            prior,
+            self.weight_concentration_prior_type == "dirichlet_process",
+            float(self.reg_covar),
+            em.SOFTMAX_DTYPES[self.dtype],
+            self.covariance_type,
+        )
+
+        def run(report: OnIteration | None) -> EMResult[Posterior]:
+            return run_em(
+                step,
+                self._first_posterior(cloud, prior, generator),
+                tol=self.tol,
+                max_iter=self.max_iter,
+                on_iteration=report,
+                previous_bound=self.lower_bound_ if self._continues() else -math.inf,
             )
-            # Stick-breaking depends on the order of components. With the largest component first the
-            # bound is best and does not depend on the frame.
-            order = first.weights.argsort(descending=True, stable=True)
-            moments = Parameters(first.weights[order] * total, first.means[order], first.covariances[order])
-            found = em.run_em(step, moments, tol=self.tol, max_iter=self.max_iter, on_iteration=on_iteration)
-            if best is None or found.lower_bounds[-1] > best.lower_bounds[-1]:
-                best = found
-        assert best is not None
-        posterior = update(prior, best.parameters, process)
+
+        best = self._best_start(run, on_iteration)
+        posterior = best.parameters
         mixture = Parameters(
             expected_weights(posterior.concentration), posterior.means, posterior.covariances
         )
@@ -163,8 +201,34 @@ class VariationalGaussianMixture(MixtureEstimator):
         extra |= {f"prior_{name}": value for name, value in prior._asdict().items()}
         extra["prior_mean"] = prior.mean + cloud.center
         self._store_fit(mixture, cloud.center, best.lower_bounds, best.converged, extra)
-        self._warn_unless_converged("The fit")
+        self._warn_unless_converged()
         return self
+
+    def _continues(self) -> bool:
+        return super()._continues() and "concentration" in self._buffers
+
+    def _first_posterior(self, cloud: Cloud, prior: Prior, generator: torch.Generator) -> Posterior:
+        """Posterior of the initial moments, or of the last fit, relative to the cloud's centre."""
+        if self._continues():
+            last = Posterior(*(value.to(cloud.points.device) for value in self._posterior()))
+            self._check_continues(cloud.points)
+            covariances = constrain(last.covariances, self.covariance_type)
+            return last._replace(means=last.means - cloud.center, covariances=covariances)
+        first = initialize(
+            self.init_params,
+            cloud.points,
+            cloud.weight,
+            self.n_components,
+            float(self.reg_covar),
+            generator,
+        )
+        # Stick-breaking depends on the order of components. With the largest component first the bound is
+        # best and does not depend on the frame.
+        order = first.weights.argsort(descending=True, stable=True)
+        count = first.weights[order] * cloud.weight.sum()
+        moments = Parameters(count, first.means[order], first.covariances[order])
+        process = self.weight_concentration_prior_type == "dirichlet_process"
+        return update(prior, moments, process, self.covariance_type)
 
     def _prior(self, cloud: Cloud) -> Prior:
         """The prior relative to the cloud's centre; values not given come from the cloud."""
@@ -173,15 +237,22 @@ class VariationalGaussianMixture(MixtureEstimator):
         dof = self.degrees_of_freedom_prior
         if dof is not None and dof <= dim - 1:
             raise InvalidArgumentError(
-                f"degrees_of_freedom_prior={dof!r} must be above D − 1 = {dim - 1}, D the dimension of X."
+                f"The parameter 'degrees_of_freedom_prior' should be greater than {dim - 1}, but got "
+                f"{dof:.3f}."
             )
-        mean, covariance = torch.zeros_like(center), self.covariance_prior
+        mean = torch.zeros_like(center)
         if self.mean_prior is not None:
             mean = checked_parameter(self.mean_prior, (dim,), "mean_prior", points.device) - center
-        if covariance is None:
+        kind = self.covariance_type
+        if self.covariance_prior is None:
             spread = unbiased_covariance(points, weight, thickness=float(self.reg_covar))
+            spread = constrain(spread[None], kind)[0]
         else:
-            spread = checked_parameter(covariance, (dim, dim), "covariance_prior", points.device)
+            shape = (dim, dim) if kind == "full" else type_shape(kind, 1, dim)
+            given = torch.as_tensor(self.covariance_prior)
+            given = given[None] if kind in ("diag", "spherical") else given
+            given = checked_parameter(given, shape, "covariance_prior", points.device)
+            spread = expand(given, kind, 1, dim).reshape(dim, dim)
             safe_cholesky(check_symmetric(spread[None], "covariance_prior"), "covariance_prior")
         gamma, beta = self.weight_concentration_prior, self.mean_precision_prior
         return Prior(
@@ -229,13 +300,25 @@ class VariationalGaussianMixture(MixtureEstimator):
         rows = [self._as_fit_kind(row) for row in self._posterior().concentration]
         return (rows[0], rows[1]) if len(rows) == 2 else rows[0]
 
+    @property
+    def degrees_of_freedom_(self) -> Array | float:
+        """ν (K,); of tied covariances one number."""
+        value = self._posterior().degrees_of_freedom
+        return float(value[0]) if self._fitted_type == "tied" else self._as_fit_kind(value)
+
+    @property
+    def covariance_prior_(self) -> Array | float:
+        """W₀⁻¹: (D, D), of diagonal covariances (D,), of spherical ones a number."""
+        self._posterior()
+        value = compact(self.prior_covariance[None], self._fitted_type)
+        value = value if self._fitted_type == "tied" else value[0]
+        return self._as_fit_kind(value) if value.ndim else float(value)
+
     mean_precision_ = _posterior_attribute("mean_precision", "β (K,).")
-    degrees_of_freedom_ = _posterior_attribute("degrees_of_freedom", "ν (K,).")
     weight_concentration_prior_ = _posterior_attribute("prior_concentration", "γ₀.")
     mean_precision_prior_ = _posterior_attribute("prior_mean_precision", "β₀.")
     mean_prior_ = _posterior_attribute("prior_mean", "m₀ (D,).")
     degrees_of_freedom_prior_ = _posterior_attribute("prior_degrees_of_freedom", "ν₀.")
-    covariance_prior_ = _posterior_attribute("prior_covariance", "W₀⁻¹ (D, D).")
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
         k, dim = self.means.shape
@@ -266,12 +349,3 @@ class VariationalGaussianMixture(MixtureEstimator):
             extra["prior_mean"] = rotation @ extra["prior_mean"] + translation
             extra["prior_covariance"] = rotation @ extra["prior_covariance"] @ rotation.T
         return extra
-
-    # -- arguments --------------------------------------------------------------------------------
-
-    def check_parameters(self, n_points: int | None = None) -> None:
-        super().check_parameters(n_points)
-        for name in ("weight_concentration_prior", "mean_precision_prior", "degrees_of_freedom_prior"):
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), above=True)
-        check_choice("weight_concentration_prior_type", self.weight_concentration_prior_type, WEIGHT_PRIORS)

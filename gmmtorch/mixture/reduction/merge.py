@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.linalg import check_symmetric, pack_symmetric
 from gmmtorch.mixture.em.exact import Parameters
@@ -45,7 +45,7 @@ class Reduction(NamedTuple):
 
 
 def simplify(
-    parameters: Parameters,
+    parameters: Parameters | MixtureEstimator,
     n_components: int | None = None,
     max_cost: float | None = None,
     cost: str = "kullback_leibler",
@@ -59,8 +59,8 @@ def simplify(
     the order of the given components has no effect.
 
     Args:
-        parameters: weights (K,), not negative, which need not add up to one (supports in points are
-            allowed); means (K, D); covariances (K, D, D). K may be 0.
+        parameters: a fitted mixture; or weights (K,), not negative, which need not add up to one (supports
+            in points are allowed); means (K, D); covariances (K, D, D). K may be 0.
         n_components: stop at this number of components.
         max_cost: stop if every merge costs more; see `cost` for the unit.
         cost: "kullback_leibler" (`kullback_leibler_bound`: nats times the unit of the weights) or
@@ -157,6 +157,8 @@ def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     If more means coincide than the neighbour search returns, it finds only some of them. Each row is
     therefore also paired with the next row, because rows at the same place are adjacent.
     """
+    from scipy.spatial import cKDTree
+
     k, device = means.shape[0], means.device
     positions = means.cpu().numpy()
     found = cKDTree(positions).query(positions, k=min(neighbors + 1, k))[1]
@@ -189,16 +191,35 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
 # -- arguments and order --------------------------------------------------------------------------
 
 
-def _checked(parameters: Parameters) -> Parameters:
+def parameters_of(mixture: Parameters | MixtureEstimator, name: str) -> Parameters:
+    """Parameters of a mixture or of a fitted estimator, as tensors without gradients.
+
+    Raises `InvalidArgumentError` for anything else, `NotFittedError` for an estimator without parameters.
+    """
+    check_fitted = getattr(mixture, "_fitted", None)
+    if check_fitted is not None:
+        check_fitted()
+        return Parameters(mixture.weights, mixture.means, mixture.covariances)
+    if not isinstance(mixture, tuple) or len(mixture) != len(Parameters._fields):
+        raise InvalidArgumentError(
+            f"{name} is a {type(mixture).__name__}; give a fitted mixture, or Parameters(weights (K,), "
+            "means (K, D), covariances (K, D, D))."
+        )
+    named = zip(Parameters._fields, mixture, strict=True)
+    return Parameters(*(as_tensor(value, field, torch.float64).detach() for field, value in named))
+
+
+def _checked(parameters: Parameters | MixtureEstimator) -> Parameters:
     """The parameters in float64. Raises unless they are a mixture; the weights need not add up to one."""
-    means = torch.as_tensor(parameters.means).detach()
+    parameters = parameters_of(parameters, "parameters")
+    means = parameters.means
     if means.ndim != 2 or means.shape[1] == 0:
         raise InvalidArgumentError(f"means has shape {tuple(means.shape)}; expected (K, D).")
     k, dim = means.shape
     shapes = {"weights": (k,), "means": (k, dim), "covariances": (k, dim, dim)}
     checked = Parameters(
         *(
-            checked_parameter(torch.as_tensor(value).detach(), shape, name, means.device)
+            checked_parameter(value, shape, name, means.device)
             for value, (name, shape) in zip(parameters, shapes.items(), strict=True)
         )
     )
@@ -262,6 +283,12 @@ def merge(
     """
     from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 
+    for name, mixture in (("a", a), ("b", b)):
+        if not hasattr(mixture, "_fitted"):
+            raise InvalidArgumentError(
+                f"{name} is a {type(mixture).__name__}; give a fitted mixture, or use "
+                "GaussianMixture.from_parameters(weights, means, covariances)."
+            )
     dims = a._fitted().shape[1], b._fitted().shape[1]
     if dims[0] != dims[1]:
         raise InvalidArgumentError(

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimators.sensor_model import SensorModel, cos_incidence
+from gmmtorch.mixture.reduction.merge import parameters_of
 
 if TYPE_CHECKING:
     from gmmtorch.mixture.estimator import MixtureEstimator
@@ -73,8 +75,8 @@ def prune(
     min_support: float = 0.0,
     min_density_share: float = 0.0,
     sensor: SensorModel | None = None,
-    origins: Tensor | None = None,
-    counts: Tensor | None = None,
+    origins: ArrayLike | None = None,
+    counts: ArrayLike | None = None,
 ) -> tuple[Mixture, Tensor]:
     """Remove components with too little support, or with too low a density for a surface.
 
@@ -94,7 +96,7 @@ def prune(
 
     Raises `InvalidArgumentError` for invalid arguments, and if no component would remain.
     """
-    parameters = _parameters(mixture)
+    parameters = parameters_of(mixture, "mixture")
     weights, means, covariances = parameters
     check_number("min_support", min_support)
     check_number("min_density_share", min_density_share)
@@ -103,7 +105,7 @@ def prune(
     kept = support >= min_support
     largest = f"the largest support is {float(support.max()):.4g} points"
     if min_density_share > 0:
-        counts = None if counts is None else torch.as_tensor(counts)
+        counts = None if counts is None else as_tensor(counts, "counts").to(means)
         sensor, origins = _checked(means, sensor, origins, counts)
         share = support_density(support, covariances) / expected_density(
             means, covariances, sensor, origins, counts
@@ -117,13 +119,6 @@ def prune(
         )
     remaining = Parameters(weights[kept] / weights[kept].sum(), means[kept], covariances[kept])
     return _as_given_type(mixture, remaining), kept
-
-
-def _parameters(mixture: Mixture) -> Parameters:
-    if isinstance(mixture, Parameters):
-        return mixture
-    mixture._fitted()
-    return Parameters(mixture.weights, mixture.means, mixture.covariances)
 
 
 def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
@@ -141,14 +136,14 @@ def _as_given_type(mixture: Mixture, remaining: Parameters) -> Mixture:
 
 
 def _checked(
-    means: Tensor, sensor: SensorModel | None, origins: Tensor | None, counts: Tensor | None
+    means: Tensor, sensor: SensorModel | None, origins: ArrayLike | None, counts: Tensor | None
 ) -> tuple[SensorModel, Tensor]:
     k, dim = means.shape
     if dim not in (2, 3):
         raise InvalidArgumentError(f"min_density_share needs a mixture in 2D or 3D; this one has D = {dim}.")
     if sensor is None or origins is None:
         raise InvalidArgumentError("min_density_share needs sensor and origins; pass both.")
-    origins = torch.as_tensor(origins)
+    origins = as_tensor(origins, "origins").to(means)
     if origins.ndim not in (1, 2) or origins.shape[-1] != dim or origins.numel() == 0:
         raise InvalidArgumentError(
             f"origins has shape {tuple(origins.shape)}; expected ({dim},) or (S, {dim})."

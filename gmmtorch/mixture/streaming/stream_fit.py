@@ -7,20 +7,20 @@ that of `GaussianMixture.fit` on the whole cloud, to rounding.
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import PointChunks
 from gmmtorch.datasets.point_files.point_survey import Survey
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.grouping import Rows, nearest
 from gmmtorch.mixture.em.truncated import Settings, fit_truncated
@@ -78,7 +78,7 @@ def fit_stream(
 
     One pass over the source counts, centres and samples the points. Each EM iteration is one further
     pass, or two if the parameters are too ill-conditioned for natural parameters (see
-    `exact.guarded_step`).
+    `loop.guarded_step`).
 
     With `algorithm="truncated"`, which stores the owner of each point, every process keeps its points in
     memory (about 130 bytes a point in total), and the result depends slightly on how the points are
@@ -127,12 +127,13 @@ def fit_stream(
         run = run_facts(mixture, survey, repr(e_step))
         first = first_state(mixture, survey, run, generator, checkpoint, processes)
         done += first.lower_bounds
+        previous_bound = mixture.lower_bound_ if mixture._continues() else -math.inf
         center = first.center.to(device)
         start = Parameters(*(value.to(device) for value in first.parameters))
         writer = None
         if checkpoint is not None and processes.rank == 0:
             writer = CheckpointWriter(checkpoint, run, first.center)
-        step = _stream_step(source, center, e_step, float(mixture.reg_covar), survey.n_points, processes)
+        step = _stream_step(source, center, e_step, mixture, survey.n_points, processes)
 
         def checkpointed_step(parameters: Parameters) -> tuple[Parameters, float]:
             new, bound = step(parameters)
@@ -142,27 +143,24 @@ def fit_stream(
             return new, bound
 
         if mixture.algorithm == "truncated":
-            result = _truncated(mixture, source, center, start, processes, on_iteration)
+            result = _truncated(mixture, source, center, start, processes, on_iteration, previous_bound)
         else:
-            result = em.run_em(
+            result = loop.run_em(
                 checkpointed_step,
                 start,
                 tol=mixture.tol,
                 max_iter=mixture.max_iter,
                 on_iteration=on_iteration,
                 lower_bounds=first.lower_bounds,
+                previous_bound=previous_bound,
             )
     if writer is not None:
         writer.write_if_due(result.parameters, result.lower_bounds, final=True)
     mixture._tensors, mixture.n_features_in_ = True, source.dim
     seen = {"n_samples_seen": center.new_tensor(survey.n_points)}
     mixture._store_fit(result.parameters, center, result.lower_bounds, result.converged, seen)
-    if not mixture.converged_ and mixture.tol > 0 and processes.rank == 0:
-        warnings.warn(
-            f"EM did not converge within max_iter={mixture.max_iter}; raise it, or raise tol.",
-            ConvergenceWarning,
-            stacklevel=2,
-        )
+    if processes.rank == 0:
+        mixture._warn_unless_converged()
     return mixture
 
 
@@ -195,7 +193,8 @@ def _truncated(
     first: Parameters,
     processes: Processes,
     on_iteration: Callable[[int, float], None] | None,
-) -> em.EMResult:
+    previous_bound: float,
+) -> loop.EMResult[Parameters]:
     """Truncated EM on the points of all processes. Each process keeps its own points."""
     held = [chunk.points.to(center.device) - center for chunk in source]
     points = torch.cat(held) if held else center.new_empty(0, source.dim)
@@ -210,6 +209,7 @@ def _truncated(
         on_iteration=on_iteration,
         processes=processes,
         compiled=bool(mixture.compiled),
+        previous_bound=previous_bound,
     )
     return fit_truncated(Rows(points, points.new_ones(points.shape[0])), owner, first, settings)
 
@@ -221,11 +221,12 @@ def _stream_step(
     source: PointChunks,
     center: Tensor,
     e_step: EStep,
-    reg_covar: float,
+    mixture: GaussianMixture,
     n_points: int,
     processes: Processes,
-) -> em.Step:
+) -> loop.Step[Parameters]:
     """EM steps on the points of all processes. Each process sums over its chunks, then all sum once."""
+    reg_covar = float(mixture.reg_covar)
 
     def centered() -> Iterator[tuple[Tensor, Tensor]]:
         yield (
@@ -259,4 +260,4 @@ def _stream_step(
 
         return em.direct_maximization(sums, scatter, reg_covar, parameters), total
 
-    return em.guarded_step(gather, direct, reg_covar, float(n_points))
+    return loop.guarded_step(gather, direct, reg_covar, float(n_points), mixture.covariance_type)

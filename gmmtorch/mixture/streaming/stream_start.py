@@ -11,6 +11,7 @@ from gmmtorch.datasets.point_files.point_chunks import PointChunks
 from gmmtorch.datasets.point_files.point_survey import Survey, merge_surveys
 from gmmtorch.datasets.point_files.point_survey import survey as survey_source
 from gmmtorch.errors import check_whole
+from gmmtorch.mixture.em.grouping import Rows
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint, RunFacts, State
 from gmmtorch.mixture.streaming.distributed import SINGLE_PROCESS, Processes
@@ -60,7 +61,8 @@ def first_state(
         if state is None:
             center = survey.center
             points = survey.points - center
-            parameters = mixture._start(points, points.new_ones(points.shape[0]), center, generator)
+            rows = Rows(points, points.new_ones(points.shape[0]))
+            parameters, _ = mixture._start(rows, center, generator)
             state = State(parameters, center, [])
         packed = state.pack()
     return State.unpack(processes.broadcast(packed), mixture.n_components, survey.low.shape[0])
@@ -77,6 +79,7 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
         given = (mixture.weights, mixture.means, mixture.covariances)
     return {
         "n_components": int(mixture.n_components),
+        "covariance_type": mixture.covariance_type,
         "reg_covar": float(mixture.reg_covar),
         "init_params": mixture.init_params,
         "random_state": None if seed is None or not hasattr(seed, "__index__") else int(seed),

@@ -53,7 +53,8 @@ def sample_rays(
         raise InvalidArgumentError(f"sampling={sampling!r} is not one of {', '.join(SAMPLINGS)}.")
     if n_samples < 1:
         raise InvalidArgumentError(f"n_samples={n_samples} must be at least 1.")
-    device, dim = cones.means.device, cones.means.shape[1]
+    cones = cones.checked()
+    device, dim = cones.means.device, cones.dim
     generator = generator or torch.Generator().manual_seed(0)
     if not bool((cones.counts > 0).any()):
         cone, weights = torch.empty(0, dtype=torch.int64, device=device), cones.counts.double()[:0]

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.point_evidence import PointTable, compiled_pair_evidence, listed_evidence, pair_evidence
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.index.cone_index import ConeIndex
-from gmmtorch.occupancy.index.hulls import sum_of
 from gmmtorch.occupancy.index.point_blocks import PointBlocks
 from gmmtorch.occupancy.protocol import check_queries
 
@@ -24,7 +24,6 @@ CHUNK_PAIRS = 1 << 16
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
 _FEW = 1 << 11  # for at most this many points an index does not pay
-_SQRT_HALF_PI = math.sqrt(math.pi / 2)
 
 
 class PointEvidence(NamedTuple):
@@ -36,7 +35,7 @@ class PointEvidence(NamedTuple):
 
 def point_evidence(
     cones: Cones,
-    points: Tensor,
+    points: ArrayLike,
     resolution: float,
     cutoff: float = CUTOFF,
     *,
@@ -47,7 +46,7 @@ def point_evidence(
 
     For several calls with the same cones use a `PointForm`.
     """
-    form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=points.shape[0] > _FEW)
+    form = PointForm(cones, resolution, cutoff, compiled=compiled, indexed=len(points) > _FEW)
     return form(points, hit_length)
 
 
@@ -89,15 +88,17 @@ class PointForm:
         indexed: bool = True,
     ) -> None:
         self.resolution = check_resolution(resolution)
+        cones = cones.checked()
         if not 0 < cutoff < math.inf:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
-        self._table = _ConeTable.of(cones, self.resolution)
+        self._table = _table_of(cones, self.resolution)
+        self._rows = self._table.rows(self.resolution)
         entries = None if indexed else 0
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
 
     def __call__(
-        self, points: Tensor, hit_length: float | None = None, chunk_pairs: int = CHUNK_PAIRS
+        self, points: ArrayLike, hit_length: float | None = None, chunk_pairs: int = CHUNK_PAIRS
     ) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points.
 
@@ -105,17 +106,20 @@ class PointForm:
         Raises `InvalidArgumentError` for another shape, NaN, or a length that is not above zero.
         """
         query = check_queries(points, self.dim)
-        scale = 1.0 if hit_length is None else _check_length(hit_length) / self.resolution
-        hits, misses = [], []
-        for part in query.split(_CHUNK_POINTS):
-            found = self._evaluate(part, chunk_pairs)
-            hits.append(found.hits * scale)
-            misses.append(found.misses)
-        return PointEvidence(torch.cat(hits), torch.cat(misses))
+        parts = [self._evaluate(part, chunk_pairs) for part in query.split(_CHUNK_POINTS)]
+        hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
+        if hit_length is not None:
+            hits = hits * (_check_length(hit_length) / self.resolution)
+        return PointEvidence(hits, misses)
 
     def _evaluate(self, points: Tensor, chunk_pairs: int) -> PointEvidence:
-        zeros = torch.zeros_like(points[:, 0])
         bucket = self.index.buckets(points)
+        if is_fused(points, self._rows):
+            lists = self.index.starts, self.index.entries
+            order = self.index.in_space_order(points, bucket)
+            found = listed_evidence(points, order, bucket, lists, self._rows, self.resolution, self.cutoff)
+            return PointEvidence(*found)
+        zeros = torch.zeros_like(points[:, 0])
         if not bool((bucket >= 0).any()):
             return PointEvidence(zeros, zeros.clone())
         blocks = PointBlocks.of(points, bucket, self.index)
@@ -139,11 +143,11 @@ class PointForm:
         points = blocks.points[..., part]
         hits = points.new_zeros(points.shape[2], points.shape[1])
         misses = hits.clone()
-        pair_evidence = _compiled_pair_evidence() if self.compiled else _pair_evidence
+        evaluate = compiled_pair_evidence() if self.compiled else pair_evidence
         settings = (self.resolution, self.cutoff, self._table.oblique)
         n_rows = max(1, chunk_pairs // points.shape[1])
         for rows, cones in zip(block.split(n_rows), cone.split(n_rows), strict=True):
-            hit, miss = pair_evidence(points, rows, self._table.columns, cones, *settings)
+            hit, miss = evaluate(points, rows, self._table.columns, cones, *settings)
             hits, misses = hits.index_add(0, rows, hit.T), misses.index_add(0, rows, miss.T)
         return torch.stack([hits, misses])
 
@@ -167,120 +171,30 @@ def _check_length(length: float) -> float:
     return float(length)
 
 
-class _ConeTable(NamedTuple):
-    """The quantities that `_pair_evidence` needs, one column for each cone, in the axes V of its component.
-
-    oblique: whether the columns end with the off-diagonal entries of VᵀΣV. These are zero, but gradients with
-    respect to the covariance pass through them.
-    """
-
-    columns: Tensor
-    oblique: bool
-
-    @staticmethod
-    def of(cones: Cones, resolution: float) -> _ConeTable:
-        dim = cones.dim
-        covariances = cones.covariances.double()
-        safe_cholesky(covariances.detach())  # raises if one is not positive definite
-        # V has no gradient where variances are equal. It is held constant, which is exact to first order in
-        # Σ.
-        axes = torch.linalg.eigh(covariances.detach())[1]
-        turned = axes.transpose(1, 2) @ covariances @ axes
-        variances = turned.diagonal(dim1=1, dim2=2)
-        variances = variances.clamp_min(1e-12 * float(resolution) ** 2)
-        means, origins, counts = cones.means.double(), cones.origins.double(), cones.counts.double()
-        toward = means - origins
-        seen = (axes.transpose(1, 2) @ toward[:, :, None]).squeeze(2)
-        spread = resolution**2 / 12
-        log_scale = -0.5 * (2 * math.pi * (variances + spread)).log().sum(1) + dim * math.log(resolution)
-        columns = [axes.flatten(1), means, origins, seen, variances]
-        columns += [
-            spread * (toward * toward).sum(1, keepdim=True),
-            log_scale[:, None],
-            counts[:, None],
-            (counts * ~cones.max_range)[:, None],
-        ]
-        oblique = covariances.requires_grad
-        if oblique:
-            above = torch.triu_indices(dim, dim, 1, device=covariances.device)
-            columns.append(turned[:, above[0], above[1]])
-        return _ConeTable(torch.cat(columns, 1).T.contiguous(), oblique)
-
-
-def _pair_evidence(
-    points: Tensor,
-    block: Tensor,
-    table: Tensor,
-    cone: Tensor,
-    resolution: float,
-    cutoff: float,
-    oblique: bool,
-) -> tuple[Tensor, Tensor]:
-    """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of the table."""
-    dim = points.shape[0]
-    h = resolution
-    columns = [column[cone] for column in table]
-    axes = [columns[i * dim : (i + 1) * dim] for i in range(dim)]  # axes[i][j]: entry i of axis j
-    mean, origin, seen, variances = (columns[dim * dim + i * dim :][:dim] for i in range(4))
-    widening, log_scale, counts, surface = columns[dim * dim + 4 * dim :][:4]
-    tilts = columns[dim * dim + 4 * dim + 4 :] if oblique else []
-
-    x = [axis[:, block] for axis in points]
-    offset = [a - m for a, m in zip(x, mean, strict=True)]
-    ray = [a - s for a, s in zip(x, origin, strict=True)]
-    size = [r.abs() for r in ray]
-    at_sensor = functools.reduce(torch.maximum, size) <= 0.5 * h  # the cube contains the sensor origin
-    y = [sum_of(axes[i][j] * offset[i] for i in range(dim)) for j in range(dim)]
-    # There all rays pass. The closed form is not used; it is kept finite for the sake of gradients.
-    z = [torch.where(at_sensor, 1.0, a + b) for a, b in zip(y, seen, strict=True)]
-    squared_distance = torch.where(at_sensor, 1.0, sum_of(r * r for r in ray))
-    breadth = torch.where(at_sensor, 1.0, sum_of(size))
-
-    sharp = [1 / (v + h * h / 12) for v in variances]
-    squared = _product(y, y, sharp, tilts)
-    hit = (torch.exp(log_scale - 0.5 * squared) * (cutoff**2 - squared).clamp(0, 1)).clamp_max(1)
-
-    kappa = widening / squared_distance
-    sharp = [1 / (v + kappa) for v in variances]
-    aa, bb = _product(z, z, sharp, tilts), _product(y, z, sharp, tilts)
-    across = [a - bb / aa * b for a, b in zip(y, z, strict=True)]
-    squared = _product(across, across, sharp, tilts)
-    length = aa.sqrt()
-    along = bb / length
-    leaving = along + 0.5 * h * length / breadth
-    determinant = functools.reduce(torch.mul, sharp)
-    peak = torch.exp(-0.5 * squared) * (determinant / (2 * math.pi * aa) ** dim).sqrt()
-    flux = peak * tail_moment(leaving, length - along, dim) * breadth * h ** (dim - 1)
-    inside = (cutoff**2 - squared - leaving.clamp_min(0) ** 2).clamp(0, 1)
-    miss = torch.minimum(torch.where(at_sensor, 1.0, flux * inside), 1 - hit)
-    return hit * surface, miss * counts
-
-
-def _product(v: list[Tensor], w: list[Tensor], sharp: list[Tensor], tilts: list[Tensor]) -> Tensor:
-    """vᵀ(VᵀΣV + κI)⁻¹w, to first order in the off-diagonal entries `tilts`, which are zero."""
-    dim = len(v)
-    product = sum_of(g * a * b for g, a, b in zip(sharp, v, w, strict=True))
-    pairs = [(i, j) for i in range(dim) for j in range(i + 1, dim)] if tilts else []
-    for (i, j), tilt in zip(pairs, tilts, strict=True):
-        product = product - tilt * sharp[i] * sharp[j] * (v[i] * w[j] + v[j] * w[i])
-    return product
-
-
-@functools.cache
-def _compiled_pair_evidence() -> Callable[..., tuple[Tensor, Tensor]]:
-    compiled: Callable[..., tuple[Tensor, Tensor]] = torch.compile(_pair_evidence, dynamic=True)
-    return compiled
-
-
-def tail_moment(along: Tensor, depth: Tensor, dim: int) -> Tensor:
-    """∫_a^∞ (w + b)^{D−1} e^{−w²/2} dw, the radial integral of the rays that end beyond a point; any shape.
-
-    All lengths are in the deviations of one ray, measured from its point nearest to the mean: a (`along`)
-    is the position of the query, and −b (`depth`) that of the sensor origin. With Q = √(π/2) erfc(a/√2) and
-    g = e^{−a²/2} the integral is b Q + g in 2D and (b² + 1) Q + (2b + a) g in 3D.
-    """
-    tail = _SQRT_HALF_PI * torch.special.erfc(along * math.sqrt(0.5))
-    edge = torch.exp(-0.5 * along * along)
-    if dim == 2:
-        return depth * tail + edge
-    return (depth * depth + 1) * tail + (2 * depth + along) * edge
+def _table_of(cones: Cones, resolution: float) -> PointTable:
+    dim = cones.dim
+    covariances = cones.covariances.double()
+    safe_cholesky(covariances.detach())  # raises if one is not positive definite
+    # V has no gradient where variances are equal. It is held constant, which is exact to first order in
+    # Σ.
+    axes = torch.linalg.eigh(covariances.detach())[1]
+    turned = axes.transpose(1, 2) @ covariances @ axes
+    variances = turned.diagonal(dim1=1, dim2=2)
+    variances = variances.clamp_min(1e-12 * float(resolution) ** 2)
+    means, origins, counts = cones.means.double(), cones.origins.double(), cones.counts.double()
+    toward = means - origins
+    seen = (axes.transpose(1, 2) @ toward[:, :, None]).squeeze(2)
+    spread = resolution**2 / 12
+    log_scale = -0.5 * (2 * math.pi * (variances + spread)).log().sum(1) + dim * math.log(resolution)
+    columns = [axes.flatten(1), means, origins, seen, variances]
+    columns += [
+        spread * (toward * toward).sum(1, keepdim=True),
+        log_scale[:, None],
+        counts[:, None],
+        (counts * ~cones.max_range)[:, None],
+    ]
+    oblique = covariances.requires_grad
+    if oblique:
+        above = torch.triu_indices(dim, dim, 1, device=covariances.device)
+        columns.append(turned[:, above[0], above[1]])
+    return PointTable(torch.cat(columns, 1).T.contiguous(), dim, oblique)

@@ -24,6 +24,7 @@ _ENTRIES_PER_CONE = {2: 64, 3: 512}  # limits memory and build time to a multipl
 _SPAN = 4  # the search for a cone's buckets starts with at most this many along an axis
 _KEY_BITS = {2: 31, 3: 21}  # bits of one bucket coordinate in a packed key
 _TESTS_AT_ONCE = 1 << 13
+_SUBCELLS = 4  # points are sorted into this many parts of a bucket along each axis
 
 
 class ConeIndex:
@@ -52,6 +53,7 @@ class ConeIndex:
         entries_per_cone: int | None = None,
     ) -> None:
         self.extent = check_resolution(extent)
+        cones = cones.checked()
         self.dim = cones.dim
         hulls = self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
         low, high = hulls.bounds()
@@ -95,6 +97,17 @@ class ConeIndex:
         key = self._pack(torch.where(inside[:, None], cell, 0.0).long())
         place = torch.searchsorted(self.keys, key).clamp_max_(self.n_buckets - 1)
         return torch.where(inside & (self.keys[place] == key), place, -1)
+
+    def in_space_order(self, points: Tensor, bucket: Tensor) -> Tensor:
+        """An order (M,) of points (M, D), finite where they have a bucket (M,), in which neighbours follow.
+
+        Points are sorted by bucket, and by the parts of their bucket.
+        """
+        part = ((points.detach() - self.origin) / self.side % 1 * _SUBCELLS).long()
+        fine = bucket
+        for axis in range(self.dim):
+            fine = fine * _SUBCELLS + part[:, axis]
+        return argsort(fine)
 
     def list_lengths(self) -> Tensor:
         """Number of cones (n_buckets,) in each list."""

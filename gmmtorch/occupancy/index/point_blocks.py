@@ -8,12 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.linalg import argsort
 from gmmtorch.occupancy.index.cone_index import ConeIndex
-
-_SUBCELLS = (
-    4  # points are sorted into this many parts of a bucket along each axis, so that blocks are compact
-)
 
 
 class PointBlocks(NamedTuple):
@@ -35,11 +30,7 @@ class PointBlocks(NamedTuple):
     def of(cls, points: Tensor, bucket: Tensor, index: ConeIndex) -> PointBlocks:
         """Blocks of the points (M, D) that have a bucket (M,); points with bucket −1 are left out."""
         point = (bucket >= 0).nonzero().squeeze(1)
-        within = (points.detach()[point] - index.origin) / index.side % 1
-        fine = bucket[point]
-        for axis in range(index.dim):
-            fine = fine * _SUBCELLS + (within[:, axis] * _SUBCELLS).long()
-        point = point[argsort(fine)]
+        point = point[index.in_space_order(points[point], bucket[point])]
         touched, count = torch.unique_consecutive(bucket[point], return_counts=True)
         n_points, n_touched = point.shape[0], touched.shape[0]
         size = 16 if n_points > 24 * n_touched else 4 if n_points > 4 * n_touched else 1

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import MemoryLimitError
+from gmmtorch.kernels.ray_counting import count_in_grid
+from gmmtorch.kernels.ray_traversal import Visits, traverse
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.ray_traversal import Visits, traverse
 
 _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
 
@@ -63,10 +64,7 @@ def cast_evidence(
             f"{n_bytes:,} bytes, above the limit of {MEMORY_LIMIT:,}; use coarser cells or a smaller box."
         )
     weight = torch.ones_like(stops[:, 0]) if weights is None else weights.double()
-    misses = torch.zeros(math.prod(block.shape), dtype=torch.float64, device=ends.device)
-    for visit in rays.visits:
-        misses.scatter_add_(0, visit.voxel, weight.index_select(0, visit.ray))
-    misses = misses.view(block.shape)
+    misses = rays.count_rays(weight).view(block.shape)
     if block is not window:
         misses = misses[1:-1, 1:-1, 1:-1]
     if places is None or hit_places is None:
@@ -79,15 +77,40 @@ def cast_evidence(
 
 
 class RaysInBox(NamedTuple):
-    """The cells of a box that rays leave.
+    """Rays through a box of cells.
 
-    window: the part of the box that the rays span. block: the cells that `visits` numbers, row-major: the
-    window, or the window with a margin of one cell.
+    window: the part of the box that the rays span. block: the cells that the visits number, row-major: the
+    window, or the window with a margin of one cell. starts, stops: (r, 3) in cells, cut near the window. low:
+    (3,) lowest cell of the block, None if the coordinates are relative to it. ray: (r,) indices of the rays
+    given, None if these are all.
     """
 
     window: Box
     block: Box
-    visits: Iterator[Visits]
+    starts: Tensor
+    stops: Tensor
+    low: Tensor | None
+    ray: Tensor | None
+
+    def visits(self) -> Iterator[Visits]:
+        """The cells of the block that the rays leave."""
+        for visit in traverse(self.starts, self.stops, self.block.shape, _CHUNK_VISITS, low=self.low):
+            yield visit if self.ray is None else Visits(visit.voxel, self.ray[visit.ray])
+
+    def count_rays(self, weights: Tensor) -> Tensor:
+        """The sum (cells,) float64 of the weights (R,) of the rays that leave each cell of the block."""
+        counts = torch.zeros(math.prod(self.block.shape), dtype=torch.float64, device=weights.device)
+        weights = weights if self.ray is None else weights.index_select(0, self.ray)
+        count_in_grid(
+            counts,
+            self.starts,
+            self.stops,
+            self.block.shape,
+            weights,
+            low=self.low,
+            chunk_visits=_CHUNK_VISITS,
+        )
+        return counts
 
 
 def rays_in_box(
@@ -112,8 +135,7 @@ def rays_in_box(
         return None
     stops = stops if until is None else until
     if torch.equal(window.low, lowest) and torch.equal(window.high, highest):
-        visits = traverse(starts, stops, window.shape, _CHUNK_VISITS, low=window.low)
-        return RaysInBox(window, window, visits)
+        return RaysInBox(window, window, starts, stops, window.low, None)
     block = Box(window.low - 1, window.high + 1)
     first, last = near_interval(starts, stops, stops, window)
     near = (first <= last).nonzero().squeeze(1)
@@ -121,8 +143,7 @@ def rays_in_box(
     way, first, last = stop - start, first[near, None], last[near, None]
     cut_start = torch.where(first > 0, start + first * way, start)
     cut_stop = torch.where(last < 1, start + last * way, stop)
-    cut = traverse(cut_start, cut_stop, block.shape, _CHUNK_VISITS)
-    return RaysInBox(window, block, (Visits(visit.voxel, near[visit.ray]) for visit in cut))
+    return RaysInBox(window, block, cut_start, cut_stop, None, near)
 
 
 def _relative(units: Tensor, low: Tensor) -> Tensor:

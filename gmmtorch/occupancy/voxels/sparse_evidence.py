@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
+from gmmtorch.occupancy.voxels.block_table import count_misses
 from gmmtorch.occupancy.voxels.boxes import Box, contains, intersection
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
-from gmmtorch.occupancy.voxels.ray_counting import count_misses
-from gmmtorch.occupancy.voxels.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.voxels.sparse_lattice import SparseLattice
 
 _AXIS_BITS = {2: 31, 3: 21}

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.kernels.ray_traversal import row_major_strides
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
-from gmmtorch.occupancy.voxels.ray_traversal import row_major_strides
 
 _NUDGE = 1e-6
 """Cells by which the mesh is moved up along all axes. A face in a lattice plane then counts only for the

@@ -25,8 +25,8 @@ from gmmtorch.report.exploration.trial_groups import (
     seeds_note,
     short_name,
 )
-from gmmtorch.report.quantities import byte_text
 from gmmtorch.report.style import Rows
+from gmmtorch.report.table import byte_text
 
 
 class _Measure(NamedTuple):
@@ -46,7 +46,7 @@ _MEASURES = (
 )
 
 
-def summary_bars(rows: Rows, title: str | None = None) -> Figure:
+def summary_bars(rows: Rows) -> Figure:
     """Draws bytes sent, t90, AUC and coverage per metre of each framework, and below them the differences.
 
     Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
@@ -56,7 +56,6 @@ def summary_bars(rows: Rows, title: str | None = None) -> Figure:
 
     Args:
         rows: explore rows of `results.json`.
-        title: title of the figure; by default world, robots, frameworks and number of seeds.
 
     Raises:
         InvalidArgumentError: no row.
@@ -80,7 +79,7 @@ def summary_bars(rows: Rows, title: str | None = None) -> Figure:
     for axes in grid.flat:
         style.draw_grid(axes, "y")
     names = ", ".join(framework_name(name) for name in groups)
-    style.figure_title(figure, title or f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
+    style.figure_title(figure, f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
     return figure
 
 
@@ -100,7 +99,6 @@ def stage_means(rows: Rows) -> tuple[dict[str, dict[str, float]], dict[str, floa
 def profile_figure(
     stages: Mapping[str, Mapping[str, float]],
     simulated_seconds: Mapping[str, float] | float,
-    title: str | None = "Computing time per simulated second",
 ) -> Figure:
     """Draws the milliseconds of computing per simulated second by stage, one bar per framework.
 
@@ -109,7 +107,6 @@ def profile_figure(
     Args:
         stages: by framework: wall seconds of each stage of a mission, for all robots together.
         simulated_seconds: duration of the missions, by framework or one for all.
-        title: title of the figure.
 
     Raises:
         InvalidArgumentError: no framework, negative times, or a duration that is not positive.
@@ -135,7 +132,7 @@ def profile_figure(
     axes.set_yticks(range(len(costs)), [framework_name(f) for f in costs], fontsize=style.LABEL_SIZE)
     axes.set_xlim(0, 1.3 * longest)
     style.legend_below(figure, max_columns=7)
-    style.figure_title(figure, title)
+    style.figure_title(figure, "Computing time per simulated second")
     return figure
 
 

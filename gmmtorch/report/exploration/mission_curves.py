@@ -32,8 +32,8 @@ from gmmtorch.report.exploration.trial_groups import (
     seeds_note,
 )
 from gmmtorch.report.labels import LineEnd, label_ends
-from gmmtorch.report.quantities import byte_text, ratio_text
 from gmmtorch.report.style import Rows
+from gmmtorch.report.table import byte_text, ratio_text
 
 _MILESTONES = (("t50", 0.5, "o"), ("t90", 0.9, "s"))
 _SIZE = (9.6, 5.4)  # inches
@@ -46,7 +46,7 @@ _BYTE_LINES = (
 )
 
 
-def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
+def entropy_figure(rows: Rows) -> Figure:
     """Draws the share of the observable entropy that remains in the team's union of maps (Fig 4.4).
 
     There is a line for each framework: the mean over seeds in its 95 % band. Marks show the mean t50 and
@@ -55,7 +55,6 @@ def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
 
     Args:
         rows: explore rows of `results.json`.
-        title: title of the figure; by default world, robots and number of seeds.
 
     Raises:
         InvalidArgumentError: no row, or one without observable entropy.
@@ -73,11 +72,11 @@ def entropy_figure(rows: Rows, title: str | None = None) -> Figure:
                 axes.plot(trials[0]["times"], percent_left(trials[0], bits), **look)
     if any(len(trials) == 1 for trials in groups.values()):
         handles.append(Line2D([], [], color=style.EDGE, linewidth=0.8, label="map of one robot"))
-    title = title or f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}"
+    title = f"Entropy of the team's map: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
+def planner_comparison_figure(rows: Rows) -> Figure:
     """Draws the share of the observable entropy that remains, one line per variant of the planner.
 
     Variants differ in any option; a label lists those in which they do. Lines are means over seeds in 95 %
@@ -95,11 +94,11 @@ def planner_comparison_figure(rows: Rows, title: str | None = None) -> Figure:
     for index, (name, trials) in enumerate(variants.items()):
         look = {"color": style.colour(index), "linestyle": style.line_style(index)}
         ends.append(_draw_trials(axes, name, [_timed(row, reference) for row in trials], look))
-    title = title or f"Planners: {about(rows)}\n{seeds_note(rows)}"
+    title = f"Planners: {about(rows)}\n{seeds_note(rows)}"
     return _finished(figure, axes, ends, rows, handles, title)
 
 
-def bandwidth_figure(rows: Rows, title: str | None = None, draco_error: float = 0.03) -> Figure:
+def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
     """Draws the cumulative bytes that the team shared over time, on a logarithmic axis (Fig 4.5).
 
     Lines are what E0 and E1 sent, and the novel points of the frames that E0 learned from in other codecs:
@@ -107,7 +106,6 @@ def bandwidth_figure(rows: Rows, title: str | None = None, draco_error: float = 
 
     Args:
         rows: explore rows; E2 sends nothing and has no line. Series that are null are left out.
-        title: title of the figure; by default world, robots and number of seeds.
         draco_error: RMS error (m) of Draco's points: `map.noise` of the missions.
 
     Raises:
@@ -141,9 +139,8 @@ def bandwidth_figure(rows: Rows, title: str | None = None, draco_error: float = 
         ends.append(LineEnd(total, f"{text}\n{note}", hue))
     style.label_axes(axes, "", TIME, "cumulative bytes")
     _byte_axis(axes, list(found.values()))
-    return _finished(
-        figure, axes, ends, rows, [], title or f"Data shared by the team: {about(rows)}\n{seeds_note(rows)}"
-    )
+    title = f"Data shared by the team: {about(rows)}\n{seeds_note(rows)}"
+    return _finished(figure, axes, ends, rows, [], title)
 
 
 def _entropy_axes(reference: float | None, whose: str) -> tuple[Figure, Axes, list[Line2D]]:

@@ -23,9 +23,9 @@ from gmmtorch.exploration.world.scoring import BeliefRule
 from gmmtorch.occupancy.evidence import CellClass
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_images import MapImage
-from gmmtorch.report.quantities import count_text
 from gmmtorch.report.scenes.ellipsoids import checked_components, ellipse_outlines
 from gmmtorch.report.scenes.paths import draw_paths, path_handles
+from gmmtorch.report.table import count_text
 from gmmtorch.scan import ArrayLike
 
 MAX_ELLIPSES = 20_000
@@ -56,7 +56,6 @@ def trajectories_figure(
     world: MapImage,
     trajectories: Sequence[ArrayLike],
     coverage: ArrayLike | None = None,
-    title: str | None = "Robot paths",
 ) -> Figure:
     """Draws the paths of the robots over the world from above, and how many robots saw each place (Fig 1.1).
 
@@ -66,7 +65,6 @@ def trajectories_figure(
             have a white core.
         coverage: (nx, ny), number of robots that saw each cell of the world image; shaded, with the shares of
             the seen cells in the legend.
-        title: title of the figure; the heights shown are added.
 
     Raises:
         InvalidArgumentError: coverage has another shape than the image.
@@ -91,13 +89,11 @@ def trajectories_figure(
     style.legend_below(figure, [*handles, *path_handles(trajectories, world.band, ends=True)])
     heights = _heights(world)
     shown = "surfaces" if coverage is None else "surfaces and coverage"
-    style.figure_title(figure, f"{title}\n{shown}{heights}" if title and heights else title)
+    style.figure_title(figure, f"Robot paths\n{shown}{heights}" if heights else "Robot paths")
     return figure
 
 
-def team_map_figure(
-    snapshots: Sequence[TeamSnapshot], title: str | None = "Team map", belief: BeliefRule | None = None
-) -> Figure:
+def team_map_figure(snapshots: Sequence[TeamSnapshot], belief: BeliefRule | None = None) -> Figure:
     """Draws the team's map at several times: free, occupied and unknown space, paths, and components.
 
     Components within the heights shown have 2σ outlines in the colour of the robot that learned them, at most
@@ -105,7 +101,6 @@ def team_map_figure(
 
     Args:
         snapshots: one or more, one per panel.
-        title: title of the figure; the heights shown are added.
         belief: thresholds of free and occupied; the defaults of `BeliefRule` if None.
 
     Raises:
@@ -136,7 +131,7 @@ def team_map_figure(
         handles.append(ring)
     paths = max((s.trajectories for s in snapshots), key=lambda paths: (len(paths), sum(map(len, paths))))
     style.legend_below(figure, [*handles, *path_handles(paths, snapshots[0].view.band, ends=False)])
-    style.figure_title(figure, None if title is None else f"{title}{_heights(snapshots[0].view)}")
+    style.figure_title(figure, f"Team map{_heights(snapshots[0].view)}")
     return figure
 
 

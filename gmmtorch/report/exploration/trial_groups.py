@@ -12,8 +12,8 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Band, Interval, mean_band, on_common_times, paired_interval
 from gmmtorch.exploration.mission.results import NETWORK, differing, variant_of
 from gmmtorch.report import style
-from gmmtorch.report.quantities import byte_text, count_text
 from gmmtorch.report.style import Rows
+from gmmtorch.report.table import byte_text, count_text
 from gmmtorch.scan import ArrayLike
 
 FRAMEWORKS = {

@@ -79,7 +79,7 @@ def reliability_figure(
     return figure
 
 
-def auc_against_kept_figure(rows: Iterable[Mapping[str, Any]], title: str | None = None) -> Figure:
+def auc_against_kept_figure(rows: Iterable[Mapping[str, Any]]) -> Figure:
     """Draws the AUC against the share of the training data kept: one panel per resolution, one line per
     method.
 
@@ -89,7 +89,6 @@ def auc_against_kept_figure(rows: Iterable[Mapping[str, Any]], title: str | None
     Args:
         rows: occupancy rows of `results.json`: dataset, method, resolution (m), removal, kept, auc, and for
             error bars auc_low and auc_high. Rows without a finite auc are left out.
-        title: title of the figure.
     """
     valid = [
         row for row in rows if _is_number(row.get("auc")) and _is_number(row.get("kept")) and row["kept"] > 0
@@ -112,7 +111,6 @@ def auc_against_kept_figure(rows: Iterable[Mapping[str, Any]], title: str | None
         if position % n_columns == 0:
             axes.set_ylabel("area under the ROC curve", fontsize=style.LABEL_SIZE)
     style.legend_below(figure, max_columns=4)
-    style.figure_title(figure, title)
     return figure
 
 

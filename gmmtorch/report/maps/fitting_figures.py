@@ -12,9 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from gmmtorch.report import style
 
 
-def convergence_figure(
-    lower_bounds_by_name: Mapping[str, Sequence[float]], title: str = "Convergence of the fit"
-) -> Figure:
+def convergence_figure(lower_bounds_by_name: Mapping[str, Sequence[float]]) -> Figure:
     """Draws the mean log-likelihood per point (nats) after each iteration, one line per fit."""
     figure = style.new_figure(7.0, 4.8)
     axes = figure.subplots()
@@ -29,11 +27,11 @@ def convergence_figure(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.draw_grid(axes)
     style.legend_below(figure, max_columns=2)
-    style.figure_title(figure, title)
+    style.figure_title(figure, "Convergence of the fit")
     return figure
 
 
-def comparison_figure(rows: style.Rows, title: str | None = None) -> Figure:
+def comparison_figure(rows: style.Rows) -> Figure:
     """Draws log-likelihood and PSNR2 against seconds on a logarithmic axis: one mark per method.
 
     Uses held-out points if there are any, else the training points. The legend gives the number of components
@@ -41,7 +39,6 @@ def comparison_figure(rows: style.Rows, title: str | None = None) -> Figure:
 
     Args:
         rows: fit rows of `results.json`; values that are None have no mark.
-        title: title of the figure; by default data set and number of points.
     """
     figure = style.new_figure(11.0, 5.6)
     left, right = figure.subplots(1, 2)
@@ -50,10 +47,9 @@ def comparison_figure(rows: style.Rows, title: str | None = None) -> Figure:
     _draw(left, rows, f"{prefix}log_likelihood", f"log-likelihood{where}", "nats per point")
     _draw(right, rows, f"{prefix}psnr2_db", f"PSNR2{where}", "dB")
     style.legend_below(figure, max_columns=3)
-    if title is None and rows:
+    if rows:
         points = f"{style.label_of(str(rows[0]['dataset']))}, {rows[0]['n_points']:,} points"
-        title = f"Methods of fitting a mixture: {points}"
-    style.figure_title(figure, title)
+        style.figure_title(figure, f"Methods of fitting a mixture: {points}")
     return figure
 
 

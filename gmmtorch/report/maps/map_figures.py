@@ -41,7 +41,6 @@ def map_figure(
     trajectory: ArrayLike | None = None,
     *,
     title: str | None = None,
-    slice_height: float | None = None,
     ceiling: float | None = None,
     occupied_above: float = 0.5,
     max_pixels: int = MAX_PIXELS,
@@ -49,14 +48,13 @@ def map_figure(
 ) -> Figure:
     """Draws one panel per map: occupied dark, free light, unknown (θ within 0.02 of ½) blue-grey.
 
-    In 3D, draws a horizontal slice of each map, and below it the height of the highest occupied cells.
+    In 3D, draws a horizontal slice of each map, and below it the height of the highest occupied cells. The
+    slice is at the median height of the trajectory, or without one in the middle of the region.
 
     Args:
         panels: one or more maps, all 2D or all 3D.
         trajectory: sensor positions (S, D) in order, world metres; if None, no path is drawn.
         title: title of the figure.
-        slice_height: height of the slice (m); if None, the median height of the trajectory, or without
-            trajectory the middle of the region.
         ceiling: height (m) above which cells are left out of the view from above; if None, half a metre above
             the trajectory if most of it lies under a roof, else no limit.
         occupied_above: probability above which a cell counts as occupied in the view from above.
@@ -82,16 +80,16 @@ def map_figure(
     figure, grid, shown_pixels = _sheet(panels, n_columns, n_bands * n_views)
     bands = [grid[i * n_views : (i + 1) * n_views] for i in range(n_bands)]
     slices = np.concatenate([band[0] for band in bands])
-    height = _slice_height(panels[0], path, slice_height)
+    height = _slice_height(panels[0], path)
     for axes, panel in zip(slices, panels, strict=False):
         cells = f"cells of {style.metres(panel.resolution)}"
         image = slice_image(panel, height, max_pixels, shown_pixels)
         # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
-        image.draw(axes, _greys()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
+        image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
         _draw_path(axes, panel, path)
         caption = f"slice at z = {style.metres(height)}, {cells}" if dim == 3 else cells
         style.label_axes(axes, f"{panel.title}\n{caption}")
-    greys = ScalarMappable(Normalize(0, 1), _greys())
+    greys = ScalarMappable(Normalize(0, 1), occupancy_colours())
     for band in bands:
         style.colour_bar(figure, greys, band[0].tolist(), "occupancy probability θ")
     if dim == 3:
@@ -132,15 +130,13 @@ def _sheet(panels: Sequence[MapPanel], n_columns: int, n_rows: int) -> tuple[Fig
     return figure, axes, int(width * max(shape, 1.0) * style.SAVED_DPI)
 
 
-def _slice_height(panel: MapPanel, path: np.ndarray | None, given: float | None) -> float:
+def _slice_height(panel: MapPanel, path: np.ndarray | None) -> float:
     if panel.dim == 2:
         return 0.0
-    if given is not None:
-        return float(given)
     return (panel.low[2] + panel.high[2]) / 2 if path is None else float(np.median(path[:, 2]))
 
 
-def _greys() -> Colormap:
+def occupancy_colours() -> Colormap:
     """Returns the colours of θ: white for free, black for occupied, blue-grey for NaN."""
     greys = LinearSegmentedColormap.from_list("occupancy", _GREYS)
     return greys.with_extremes(bad=style.UNKNOWN)

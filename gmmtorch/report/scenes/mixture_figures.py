@@ -17,11 +17,10 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import robust_bounds
-from gmmtorch.report.quantities import count_text
-from gmmtorch.report.scenes.cutaway import cut_away
 from gmmtorch.report.scenes.ellipsoids import (
     checked_components,
     checked_rows,
+    cut_away,
     ellipse_outlines,
     height_colours,
 )
@@ -34,6 +33,7 @@ from gmmtorch.report.scenes.scene import (
     height_bar,
 )
 from gmmtorch.report.scenes.scene_renderer import Canvas
+from gmmtorch.report.table import count_text
 from gmmtorch.scan import ArrayLike
 
 MAX_POINTS = 20_000
@@ -103,7 +103,8 @@ def mixture_figure(
     count = count_text(len(weight), "component")
     if len(shown) < len(weight):
         count = f"{len(shown):,} largest of {count}"
-    style.figure_title(figure, f"{title}: {count}, {count_text(len(cloud), 'point')}")
+    points_drawn = f", {count_text(len(cloud), 'point')}" if len(cloud) else ""
+    style.figure_title(figure, f"{title}: {count}{points_drawn}")
     return figure
 
 
@@ -118,7 +119,7 @@ def _flat_figure(
     colours = np.tile(to_rgb(_ELLIPSE), (len(mean), 1))
     _draw_from_above(axes, points, ellipse_outlines(mean, covariance), colours, marks, box)
     style.label_axes(axes, "", "x [m]", "y [m]")
-    _mixture_legend(figure, "2σ ellipses", len(marks) > 0)
+    _mixture_legend(figure, "2σ ellipses", len(points) > 0, len(marks) > 0)
     return figure
 
 
@@ -144,7 +145,7 @@ def _solid_figure(
     _draw_from_above(plan, points, outlines, height_colours(mean[:, 2], scale).numpy(), marks, box)
     style.label_axes(plan, "from above", "x [m]", "y [m]")
     height_bar(figure, plan, scale)
-    _mixture_legend(figure, "2σ ellipsoids", len(marks) > 0)
+    _mixture_legend(figure, "2σ ellipsoids", len(points) > 0, len(marks) > 0)
     return figure
 
 
@@ -220,12 +221,12 @@ def _opacity(outlines: np.ndarray) -> np.ndarray:
     return np.clip(0.5 * np.sqrt(typical / np.maximum(area, 1e-300)), 0.04, 0.5)
 
 
-def _mixture_legend(figure: Figure, shapes: str, with_origins: bool) -> None:
+def _mixture_legend(figure: Figure, shapes: str, with_points: bool, with_origins: bool) -> None:
     """Draws the legend with marks large enough to see."""
-    entries: list[tuple[str, str, Literal["full", "none"], int, str]] = [
-        (_POINT, "o", "full", 5, "points"),
-        (_ELLIPSE, "o", "none", 10, shapes),
-    ]
+    entries: list[tuple[str, str, Literal["full", "none"], int, str]] = []
+    if with_points:
+        entries.append((_POINT, "o", "full", 5, "points"))
+    entries.append((_ELLIPSE, "o", "none", 10, shapes))
     if with_origins:
         entries.append((_ORIGIN, "^", "full", 8, "sensor positions"))
     handles = [

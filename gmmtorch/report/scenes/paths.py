@@ -97,7 +97,13 @@ def draw_paths(
 def path_handles(trajectories: Sequence[ArrayLike], band: tuple[float, float], ends: bool) -> list[Line2D]:
     """Returns legend entries for `draw_paths`: robots, first and last poses, and heights outside the band."""
     handles = [
-        Line2D([], [], color=style.colour(i), linewidth=2.4, label=f"robot {i}")
+        Line2D(
+            [],
+            [],
+            color=style.colour(i),
+            linewidth=2.4,
+            label=f"robot {i}" if len(trajectories) > 1 else "path",
+        )
         for i in range(min(len(trajectories), _MAX_NAMED))
     ]
     marks = (("o", "start"), ("^", "end")) if ends else (("^", "robot"),)

@@ -18,17 +18,17 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import robust_bounds
-from gmmtorch.report.quantities import count_text
-from gmmtorch.report.scenes.cutaway import cut_away
 from gmmtorch.report.scenes.ellipsoids import (
     N_SIGMA,
     checked_components,
     checked_rows,
+    cut_away,
     height_colour_map,
     height_colours,
 )
 from gmmtorch.report.scenes.paths import path_handles, smooth_path
 from gmmtorch.report.scenes.scene_renderer import Camera, Canvas, render
+from gmmtorch.report.table import count_text
 from gmmtorch.scan import ArrayLike
 
 SOUTH_WEST = Camera(-120.0, 45.0)

@@ -1,1 +1,1 @@
-"""Figures of the studies, one module per study."""
+"""Figures of the studies."""

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report import style
-from gmmtorch.report.quantities import byte_text
+from gmmtorch.report.table import byte_text
 
 QUALITIES = {"psnr2_db": "PSNR2", "psnr_lesser_db": "lesser term of PSNR2", "auc": "AUC"}
 OURS = "ours"

@@ -8,8 +8,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.sharing.messages.envelope import MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import read_intervals, read_number, write_intervals, write_number
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, LARGEST_INCARNATION, LARGEST_ROBOT
+from gmmtorch.sharing.replica.record_keys import END, LARGEST_INCARNATION, LARGEST_ROBOT, Intervals
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
 from gmmtorch.sharing.messages.envelope import FARTHEST
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, authors
+from gmmtorch.sharing.replica.record_keys import END, MOST_RECORDS, NUMBER_BITS, Intervals, authors
 
 LARGEST_NUMBER = (1 << 60) - 1
 """Largest robot id, and largest number of anything that a robot counts."""
@@ -73,7 +72,8 @@ def read_ids(reader: BitReader) -> Ints:
         if not (last < robot <= LARGEST_NUMBER and n >= 1 and first >= 0):
             raise DataError(f"Robot {robot} after {last} with {n} ids from {first} on: it is damaged.")
         gaps = reader.rice_column(n - 1) if n > 1 else np.zeros(0, np.int64)
-        if first + n + float(gaps.astype(np.float64).sum()) > LARGEST_NUMBER:
+        about = first + n + float(gaps.astype(np.float64).sum())  # the exact sum could overflow
+        if about > 2 * LARGEST_NUMBER or first + n - 1 + int(gaps.sum()) > LARGEST_NUMBER:
             raise DataError("Ids are out of range: it is damaged.")
         numbers = first + np.cumsum(np.concatenate([np.zeros(1, np.int64), gaps + 1]))
         parts.append(np.stack([np.full(n, robot), numbers], 1))

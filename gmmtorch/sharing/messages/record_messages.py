@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
@@ -24,8 +23,7 @@ from gmmtorch.sharing.messages.fields import (
     write_keys,
     write_number,
 )
-from gmmtorch.sharing.replica.intervals import Intervals, Ints
-from gmmtorch.sharing.replica.record_keys import END, first_key, keys_of_robot, robot_of
+from gmmtorch.sharing.replica.record_keys import END, Intervals, Ints, first_key, keys_of_robot, robot_of
 
 RECORD_BYTES = 1000
 """Longest record. A datagram of 1200 bytes has room for it and for encryption."""
@@ -94,6 +92,8 @@ class CorrectionMessage:
             cos, sin = self.pose[2:].tolist()
             turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
         else:
+            from scipy.spatial.transform import Rotation
+
             turn = torch.from_numpy(Rotation.from_quat(self.pose[3:].numpy()).as_matrix())
         matrix[:-1, :-1] = turn
         return matrix
@@ -228,5 +228,7 @@ def pose_of(transform: Tensor) -> Tensor:
     if len(rotation) == 2:
         turn = rotation[:, 0] / rotation[:, 0].norm()
     else:
+        from scipy.spatial.transform import Rotation
+
         turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
     return torch.cat([translation, turn]) + 0.0  # no −0

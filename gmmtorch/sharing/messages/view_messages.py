@@ -27,8 +27,7 @@ from gmmtorch.sharing.messages.fields import (
     write_path,
     write_poses,
 )
-from gmmtorch.sharing.replica.intervals import Intervals
-from gmmtorch.sharing.replica.record_keys import END, ids_of, keys_of
+from gmmtorch.sharing.replica.record_keys import END, Intervals, ids_of, keys_of
 
 MOST_POSES = 1000
 """Poses of a path, and of the views of a plan. The poses of a robot at rest take no bits, so data do not

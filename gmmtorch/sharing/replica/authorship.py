@@ -29,9 +29,10 @@ from gmmtorch.sharing.messages.record_messages import (
 )
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
-from gmmtorch.sharing.replica.intervals import Intervals, Ints
 from gmmtorch.sharing.replica.record_keys import (
     MOST_RECORDS,
+    Intervals,
+    Ints,
     author_of,
     first_key,
     ids_of,
@@ -214,9 +215,8 @@ class Author:
     def _supersede(self, old: Intervals, new: Intervals) -> Intervals:
         """Write supersessions of `old` by `new`; returns their keys.
 
-        A supersession whose successors are all dead by now is superseded with them, and its old records
-        become
-        old records of the new supersession: so no robot needs the first one any more. See docs/replica.md.
+        A supersession whose successors are all superseded is superseded with them, and its old records become
+        old records of the new supersession. So no robot needs the first one any more. See docs/replica.md.
         """
         if not old:
             return Intervals.empty()

@@ -1,4 +1,4 @@
-"""Keys of records: the robot, its incarnation, and a number.
+"""Keys of records (the robot, its incarnation, and a number), and sets of keys stored as intervals.
 
 A record's id is (robot, sequence), as a component's in a map; sequence = incarnation · 2²⁸ + number. A
 robot draws a new incarnation whenever it starts, and numbers its records from 0. So a robot that lost its
@@ -12,16 +12,173 @@ the number robot · 2²⁴ + incarnation.
 from __future__ import annotations
 
 import secrets
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from gmmtorch.errors import DataError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader
 from gmmtorch.mapping.codec.lattice import AXIS_ORDERS
 from gmmtorch.sharing.messages.envelope import Kind, parse_datagram
-from gmmtorch.sharing.replica.intervals import Intervals, Ints
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """A set of 64-bit whole numbers. Memory is proportional to the number of intervals, not to their length.
+
+    edges (2n,): strictly rising; the set has the numbers from edges[0] to edges[1] − 1, from edges[2] to
+    edges[3] − 1, …. Intervals are sorted and do not touch, so equal sets have equal edges.
+    """
+
+    edges: Ints
+
+    def __post_init__(self) -> None:
+        edges = self.edges
+        if edges.ndim != 1 or len(edges) % 2 or edges.dtype != np.int64 or (edges[1:] <= edges[:-1]).any():
+            raise InvalidArgumentError(
+                f"edges of shape {edges.shape} and {edges.dtype} must be pairs of int64 that rise strictly."
+            )
+
+    @classmethod
+    def empty(cls) -> Intervals:
+        return cls(np.zeros(0, np.int64))
+
+    @classmethod
+    def span(cls, begin: int, end: int) -> Intervals:
+        """The numbers from `begin` to `end` − 1; the empty set unless `begin < end`."""
+        return cls(np.array([begin, end] if begin < end else [], np.int64))
+
+    @classmethod
+    def of(cls, numbers: Ints) -> Intervals:
+        """The set of these numbers (N,), in any order."""
+        if not len(numbers):
+            return cls.empty()
+        rising = np.unique(numbers)
+        breaks = np.flatnonzero(np.diff(rising) > 1)
+        begins, lasts = rising[np.append(0, breaks + 1)], rising[np.append(breaks, len(rising) - 1)]
+        return cls(np.stack([begins, lasts + 1], 1).reshape(-1).astype(np.int64))
+
+    @classmethod
+    def union(cls, sets: Iterable[Intervals]) -> Intervals:
+        """The union of any number of sets, faster than repeated `|`."""
+        parts = [one for one in sets if one]
+        if len(parts) < 2:
+            return parts[0] if parts else cls.empty()
+        edges = np.concatenate([one.edges for one in parts]).reshape(-1, 2)
+        begins, ends = edges[np.argsort(edges[:, 0])].T
+        ends = np.maximum.accumulate(ends)
+        is_first = np.ones(len(begins), np.bool_)
+        is_first[1:] = begins[1:] > ends[:-1]
+        is_last = np.append(is_first[1:], True)
+        return cls(np.stack([begins[is_first], ends[is_last]], 1).reshape(-1))
+
+    def __len__(self) -> int:
+        """The number of intervals."""
+        return len(self.edges) // 2
+
+    @property
+    def size(self) -> int:
+        """The number of numbers."""
+        return sum((self.edges[1::2] - self.edges[::2]).tolist())  # Python's integers do not overflow
+
+    def up_to(self, most: int) -> Intervals:
+        """The set; the empty set if it has more than `most` intervals."""
+        return self if len(self) <= most else Intervals.empty()
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Begin and end (exclusive) of each interval."""
+        return list(zip(self.edges[::2].tolist(), self.edges[1::2].tolist(), strict=True))
+
+    def contains(self, numbers: Ints) -> NDArray[np.bool_]:
+        """Which of the numbers (N,) are in the set: those with an odd number of edges at or below them."""
+        return np.searchsorted(self.edges, numbers, side="right") % 2 == 1
+
+    def covers(self, other: Intervals) -> bool:
+        """Whether the other set is a subset of this one."""
+        return not (other - self)
+
+    def __contains__(self, number: int) -> bool:
+        return bool(self.contains(np.array([number], np.int64))[0])
+
+    def numbers(self) -> Ints:
+        """All numbers (N,), rising."""
+        begins, lengths = self.edges[::2], self.edges[1::2] - self.edges[::2]
+        return np.arange(lengths.sum()) + np.repeat(begins + lengths - np.cumsum(lengths), lengths)
+
+    # Often one set is large and the other small: only the part of the large one near the small one is
+    # compared.
+
+    def __or__(self, other: Intervals) -> Intervals:
+        large, small = (self, other) if len(self) >= len(other) else (other, self)
+        if not small:
+            return large
+        begin, end = large._range_near(small)
+        places, in_large, in_small = large._part(begin, end)._membership(small)
+        joined = _where(places, in_large | in_small).edges
+        return Intervals(np.concatenate([large.edges[:begin], joined, large.edges[end:]]))
+
+    def __and__(self, other: Intervals) -> Intervals:
+        if not (self and other):
+            return Intervals.empty()
+        places, in_self, in_other = self._near(other)._membership(other._near(self))
+        return _where(places, in_self & in_other)
+
+    def __sub__(self, other: Intervals) -> Intervals:
+        if not (self and other):
+            return self
+        begin, end = self._range_near(other)
+        places, in_self, in_other = self._part(begin, end)._membership(other._near(self))
+        left = _where(places, in_self & ~in_other).edges
+        return Intervals(np.concatenate([self.edges[:begin], left, self.edges[end:]]))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Intervals) and np.array_equal(self.edges, other.edges)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return "Intervals(" + ", ".join(f"{begin}…{end - 1}" for begin, end in self.pairs()) + ")"
+
+    def _range_near(self, other: Intervals) -> tuple[int, int]:
+        """The range of edges of the intervals that may meet or touch the other set, which is not empty."""
+        begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
+        end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
+        return begin - begin % 2, end + end % 2
+
+    def _part(self, begin: int, end: int) -> Intervals:
+        return Intervals(self.edges[begin:end])
+
+    def _near(self, other: Intervals) -> Intervals:
+        """The intervals that may meet the other set."""
+        return self._part(*self._range_near(other))
+
+    def _membership(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+        """All edges of both sets, and whether the numbers from each edge to the next are in each set."""
+        places = np.unique(np.concatenate([self.edges, other.edges]))
+        return places, self.contains(places), other.contains(places)
+
+
+def evict(sets: Mapping[int, Intervals], most: int) -> list[int]:
+    """The names of the largest sets to remove, so that the others have at most `most` intervals together."""
+    removed: list[int] = []
+    n_left = sum(map(len, sets.values()))
+    by_size = sorted(sets, key=lambda name: len(sets[name])) if n_left > most else []
+    while n_left > most:
+        removed.append(by_size.pop())
+        n_left -= len(sets[removed[-1]])
+    return removed
+
+
+def _where(places: Ints, inside: NDArray[np.bool_]) -> Intervals:
+    """The set of the numbers from each place to the next where `inside`; none after the last place."""
+    return Intervals(places[np.diff(inside, prepend=False)])
+
 
 NUMBER_BITS, INCARNATION_BITS, ROBOT_BITS = 28, 24, 10
 SEQUENCE_BITS = INCARNATION_BITS + NUMBER_BITS

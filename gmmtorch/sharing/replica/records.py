@@ -20,12 +20,9 @@ from gmmtorch.sharing.messages.record_messages import (
     SupersessionMessage,
     encode_record,
 )
-from gmmtorch.sharing.replica.changes import ChangeLog, Changes
-from gmmtorch.sharing.replica.component_table import ComponentTable, fingerprints, most_viewpoints
-from gmmtorch.sharing.replica.counters import Counters
-from gmmtorch.sharing.replica.intervals import Intervals, Ints
-from gmmtorch.sharing.replica.materialized_view import corrected, with_gains
-from gmmtorch.sharing.replica.record_keys import keys_of, robot_of
+from gmmtorch.sharing.replica.component_table import ComponentTable, Counters, fingerprints, most_viewpoints
+from gmmtorch.sharing.replica.materialized_view import ChangeLog, Changes, corrected, with_gains
+from gmmtorch.sharing.replica.record_keys import Intervals, Ints, keys_of, robot_of
 
 MOST_VIEWPOINTS = 48
 """Viewpoints of a component. One component then fits into `RECORD_BYTES`, so that every robot can send it."""

@@ -24,20 +24,20 @@ from gmmtorch.sharing.messages.record_messages import (
     SupersessionMessage,
     check_size,
 )
-from gmmtorch.sharing.replica.anti_entropy import Backlog
+from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
-from gmmtorch.sharing.replica.changes import Changes
-from gmmtorch.sharing.replica.intervals import Intervals, Ints
+from gmmtorch.sharing.replica.materialized_view import Changes
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
+    Intervals,
+    Ints,
     drawn_incarnation,
     ids_of,
     keys_of,
     robot_of,
 )
 from gmmtorch.sharing.replica.records import MOST_COMPONENTS, Records, RefusedError
-from gmmtorch.sharing.replica.send_queue import packets
 
 
 class Replica:

@@ -159,18 +159,9 @@ class Network:
         return Reception(*(sum(counts[field] for counts in chosen) for field in Reception._fields))
 
     @property
-    def n_datagrams(self) -> int:
-        return self.traffic().datagrams
-
-    @property
     def n_bytes(self) -> int:
         """Bytes of all datagrams, without headers."""
         return self.traffic().bytes
-
-    @property
-    def n_wire_bytes(self) -> int:
-        """Bytes of all datagrams, with the headers of UDP and IPv4."""
-        return self.traffic().wire_bytes
 
     @property
     def bytes_by_kind(self) -> dict[str, int]:

@@ -3,17 +3,169 @@
 from __future__ import annotations
 
 import atexit
+import ipaddress
+import json
 import re
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.sharing.transport.frames import MAX_WAITING, FramedTransport
 from gmmtorch.sharing.transport.security import TeamKey
 from gmmtorch.sharing.transport.simulated_network import Traffic
-from gmmtorch.sharing.transport.zenoh_session import load_zenoh, open_session
+
+if TYPE_CHECKING:
+    import zenoh
+
+
+_IP_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
+_ADDRESS = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^\s:\[\]]+)):([0-9]{1,5})")
+_LARGEST_MESSAGE = 1 << 16
+"""Bytes that Zenoh assembles from parts. Its default would accept a gigabyte from any stranger."""
+_KEY_REMEDY = "give one, or say insecure=True to let anybody read and write."
+_REMEDIES = {
+    "in use": "another process has that port. Stop it (`ss -tulpn` shows it), or give another port.",
+    "assign requested": "this machine has no such address, or not yet. `ip address` lists those it has; "
+    "0.0.0.0 is all of them, later ones included.",
+    "denied": "ports below 1024 are for the system. Give one above.",
+}
+
+
+def load_zenoh() -> Any:
+    """The package zenoh; raises `GmmTorchError` if it is not installed."""
+    try:
+        import zenoh
+    except ImportError as error:
+        raise GmmTorchError(
+            f"transport=zenoh needs the package eclipse-zenoh, which does not load ({error}); "
+            "pip install 'gmmtorch[zenoh]'."
+        ) from error
+    return zenoh
+
+
+def open_session(
+    listen: Sequence[str],
+    connect: Sequence[str],
+    scouting: bool | None,
+    config: str | Path | None,
+    is_local: bool,
+) -> zenoh.Session:
+    """A session of Zenoh. While it is open, it keeps trying to connect to endpoints that are not reached.
+
+    Args:
+        listen: endpoints, such as 'tcp/10.0.0.3:7447'; empty: those of `config`.
+        connect: endpoints of other robots, or of routers; empty: those of `config`.
+        scouting: whether to look for others by multicast; None: as `config` says, else not.
+        config: a file of Zenoh's own settings (JSON5), or None.
+        is_local: use only the given endpoints, which must be on loopback.
+
+    Raises `InvalidArgumentError` for endpoints that are invalid or cannot be listened on, `MissingDataError`
+    if `config` does not exist, and `DataError` if it is no configuration.
+    """
+    if is_local and (scouting or config is not None):
+        given = "scouting=True" if scouting else f"config={str(config)!r}"
+        raise InvalidArgumentError(
+            f"{given} may reach other machines, and there is no key (key=None): {_KEY_REMEDY}"
+        )
+    if not (listen or connect or scouting or config is not None):
+        raise InvalidArgumentError(
+            "No robot is reached with listen=[], connect=[], scouting=None, config=None: give one of them."
+        )
+    settings = _settings(
+        _checked("listen", listen, 0, is_local), _checked("connect", connect, 1, is_local), scouting, config
+    )
+    if is_local:
+        settings["scouting/gossip/enabled"] = False  # neighbours may know robots on other machines
+    zenoh = load_zenoh()
+    whole = zenoh.Config() if config is None else _read(zenoh, Path(config))
+    try:
+        for name, value in settings.items():
+            whole.insert_json5(name, json.dumps(value))
+        return zenoh.open(whole)
+    except zenoh.ZError as error:
+        cause = _cause(error)
+        remedies = (remedy for sign, remedy in _REMEDIES.items() if sign in cause)
+        raise InvalidArgumentError(
+            f"listen={list(listen)}, connect={list(connect)}, config={str(config)!r} cannot be used by Zenoh "
+            f"({cause}): {next(remedies, 'see the documentation of Zenoh.')}"
+        ) from error
+
+
+def _settings(
+    listen: list[str], connect: list[str], scouting: bool | None, config: str | Path | None
+) -> dict[str, Any]:
+    """Settings of Zenoh, by name, that override those of the file."""
+    settings: dict[str, Any] = {
+        "connect/exit_on_failure": False,
+        "transport/link/rx/max_message_size": _LARGEST_MESSAGE,
+        "transport/shared_memory/enabled": False,  # saves little with datagrams, and opens one more way in
+    }
+    if listen or (config is None and not scouting):  # else Zenoh listens everywhere
+        settings["listen/endpoints"] = listen
+    if connect:
+        settings["connect/endpoints"] = connect
+    if config is None or scouting is not None:
+        settings["scouting/multicast/enabled"] = bool(scouting)
+    return settings
+
+
+def _read(zenoh: Any, path: Path) -> zenoh.Config:
+    if not path.is_file():
+        raise MissingDataError(f"config={str(path)!r} is no file; give a configuration of Zenoh, or None.")
+    try:
+        config = zenoh.Config.from_file(path)
+        mode = json.loads(config.get_json("mode"))
+    except (zenoh.ZError, ValueError) as error:
+        raise DataError(f"config={str(path)!r} is no configuration of Zenoh: {_cause(error)}.") from error
+    if mode == "client":
+        raise DataError(
+            f"config={str(path)!r} has mode 'client', which gives up if the router is absent at the start. "
+            "Use mode: 'router', which waits for it, and relays other robots' datagrams."
+        )
+    return config
+
+
+def _checked(name: str, endpoints: Sequence[str], least_port: int, is_local: bool) -> list[str]:
+    """The endpoints, checked: Zenoh itself would try for ever to connect to an invalid one."""
+    if isinstance(endpoints, str):
+        raise InvalidArgumentError(f"{name}={endpoints!r} must be a list of endpoints: [{endpoints!r}].")
+    for endpoint in endpoints:
+        host = _host(name, endpoint, least_port)
+        if is_local and not _is_loopback(host):
+            raise InvalidArgumentError(
+                f"{name}={endpoint!r} reaches other machines, and there is no key (key=None): "
+                f"take 127.0.0.1, {_KEY_REMEDY}"
+            )
+    return list(endpoints)
+
+
+def _host(name: str, endpoint: str, least_port: int) -> str:
+    """The host of an endpoint 'protocol/host:port?metadata#config'; '' if the protocol is not one of IP."""
+    protocol, _, rest = endpoint.partition("/") if isinstance(endpoint, str) else ("", "", "")
+    if protocol and rest and protocol not in _IP_PROTOCOLS:
+        return ""
+    found = _ADDRESS.fullmatch(re.split("[?#]", rest, maxsplit=1)[0])
+    if found is None or not least_port <= int(found[3]) <= 65535:
+        raise InvalidArgumentError(
+            f"{name}={endpoint!r} must be an endpoint: a protocol ({', '.join(_IP_PROTOCOLS)}), a host, and "
+            f"a port {least_port} … 65535, such as 'tcp/10.0.0.3:7447'."
+        )
+    return found[1] or found[2]
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _cause(error: Exception) -> str:
+    """Zenoh's message in one line, without places in its source code."""
+    return " ".join(re.sub(r" at /\S+", "", str(error)).split()).rstrip(" .")[:300]
+
 
 SOON_REPEATED = frozenset({"announcements", "plans"})
 """Kinds of datagrams that the next one replaces. A lost one need not be repeated."""

@@ -23,6 +23,7 @@ from gmmtorch.simulation.worlds.floor_plan import DrawPiece, Room, furnish
 from gmmtorch.simulation.worlds.furniture import (
     CEILING,
     barrel,
+    box,
     boxes,
     chair,
     globe,
@@ -30,7 +31,6 @@ from gmmtorch.simulation.worlds.furniture import (
     shelf,
     table,
 )
-from gmmtorch.simulation.worlds.solids import box
 
 _THICKNESS = 0.2
 _CORRIDOR_CEILING = 2.6

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.simulation.worlds.floor_plan import Room, circle, uniform
-from gmmtorch.simulation.worlds.furniture import RACK_DEPTH, Bays, racks
-from gmmtorch.simulation.worlds.solids import UNIT_CUBE, box, copies, prism
+from gmmtorch.simulation.worlds.furniture import RACK_DEPTH, UNIT_CUBE, Bays, box, copies, prism, racks
 
 _SHELL = 0.13
 """Thickness of floor, outer walls and ceiling (m). Only their inner faces are drawn. The faces do not lie on

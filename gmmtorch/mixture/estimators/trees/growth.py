@@ -6,13 +6,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.mixture.em.exact import Parameters, log_joint
+from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, log_joint
 from gmmtorch.mixture.estimators.trees.nested import (
     Assignment,
     Children,
@@ -28,30 +27,12 @@ from gmmtorch.mixture.estimators.trees.nested import (
     run_em,
 )
 
+if TYPE_CHECKING:
+    from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture as Rule
+
 _WORST_ROUNDING = 0.02  # nats a point of float32 error above which float64 is used
 _SHORTLIST = 3  # nodes that are fully fitted, per node that the limit of leaves allows to split
 _TRIAL_ITERATIONS = 2
-
-
-@dataclass(frozen=True)
-class GrowthRule:
-    """When a node is split, into how many children, and how the children are fitted.
-
-    The fields are the parameters of `HierarchicalGaussianMixture`; dtype is a torch dtype.
-    """
-
-    n_components: int | None = None
-    branching: int = 8
-    max_levels: int = 4
-    tol: float = 1e-3
-    max_iter: int = 100
-    reg_covar: float = 1e-6
-    soft_threshold: float = 0.1
-    planarity_threshold: float = 0.0
-    thickness: float = 0.0
-    min_support: float = 4.0
-    min_gain: float = 1.0
-    dtype: torch.dtype = torch.float32
 
 
 class Tree(NamedTuple):
@@ -122,7 +103,7 @@ class Growth(NamedTuple):
 def grow(
     points: Tensor,
     weight: Tensor,
-    rule: GrowthRule,
+    rule: Rule,
     on_iteration: Callable[[int, float], None] | None = None,
     on_level: Callable[[Nodes, Members], None] | None = None,
 ) -> Growth:
@@ -130,7 +111,7 @@ def grow(
 
     Args:
         points, weight: the cloud.
-        rule: when nodes are split.
+        rule: an estimator; its parameters say when a node is split, and how children are fitted.
         on_iteration: called with the EM iteration, from 1, and the lower bound, nats a point.
         on_level: called with the nodes of each level, starting with the root (level 0), and their members.
     """
@@ -190,7 +171,7 @@ def _root(points: Tensor, weight: Tensor, reg_covar: float) -> tuple[Nodes, Memb
     return Nodes(index.new_tensor([-1]), root, own, own), Members(index, torch.zeros_like(index), weight)
 
 
-def _splittable(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
+def _splittable(nodes: Nodes, mass: Tensor, rule: Rule) -> Tensor:
     """The nodes with enough points for two children that are not flat (2.9)."""
     variance = torch.linalg.eigvalsh(nodes.parameters.covariances)
     is_flat = variance[:, 0] < rule.planarity_threshold * variance.sum(1)
@@ -199,17 +180,24 @@ def _splittable(nodes: Nodes, mass: Tensor, rule: GrowthRule) -> Tensor:
 
 
 def _shortlist(
-    points: Tensor, members: Members, nodes: Nodes, chosen: Tensor, m: int, free: float, rule: GrowthRule
+    points: Tensor,
+    members: Members,
+    nodes: Nodes,
+    chosen: Tensor,
+    m: int,
+    free: float,
+    rule: Rule,
 ) -> Tensor:
     """Of the nodes `chosen` for splitting, those that gain most in a few trial iterations."""
     n_kept = _SHORTLIST * math.ceil(free / (m - 1))
     if nodes.n <= n_kept:
         return chosen
-    packed = pack(points, members, nodes.parameters.means, rule.dtype)
+    dtype = SOFTMAX_DTYPES[rule.dtype]
+    packed = pack(points, members, nodes.parameters.means, dtype)
     children = principal_axes_start(packed, nodes.n, m, rule.reg_covar)
     for _ in range(_TRIAL_ITERATIONS):
         statistics, value = expectation(packed, children)
-        children, _ = maximization(statistics, rule.reg_covar, rule.dtype, children)
+        children, _ = maximization(statistics, rule.reg_covar, dtype, children)
     best = (value - nodes.own).argsort(descending=True, stable=True)[:n_kept]
     return chosen[best.sort().values]
 
@@ -227,7 +215,7 @@ def _split(
     members: Members,
     nodes: Nodes,
     m: int,
-    rule: GrowthRule,
+    rule: Rule,
     report_bound: Callable[[Tensor], None],
     rest: Tensor,
 ) -> _Split:
@@ -247,14 +235,14 @@ def _split(
             on_values=lambda value: report_bound(rest + value.sum()),
         )
 
-    packed, found = learn(rule.dtype, None, rule.max_iter)
+    packed, found = learn(SOFTMAX_DTYPES[rule.dtype], None, rule.max_iter)
     if found.is_coarse:
         packed, found = learn(torch.float64, found.children, max(1, rule.max_iter - found.n_iter))
     children = drop_weak_children(found.children, mass, rule.min_support)
     return _Split(children, assign_members(packed, children, members, rule.soft_threshold), found.converged)
 
 
-def _accepted_splits(split: _Split, nodes: Nodes, mass: Tensor, free: float, rule: GrowthRule) -> Tensor:
+def _accepted_splits(split: _Split, nodes: Nodes, mass: Tensor, free: float, rule: Rule) -> Tensor:
     """Mask (G,) of nodes whose split gains enough; if these exceed the limit of leaves, the best of them."""
     gain = split.assignment.value - nodes.own
     added = (split.children.weights > 0).sum(1) - 1

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from sklearn.utils._param_validation import Interval
+from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.mixture.em import exact as em
+from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimator import MixtureEstimator
-from gmmtorch.mixture.estimators.trees.growth import GrowthRule, Tree, grow
+from gmmtorch.mixture.estimator import AT_LEAST_ZERO, COUNT, MixtureEstimator
+from gmmtorch.mixture.estimators.trees.growth import Tree, grow
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.validation import Array, RandomState
 
@@ -62,8 +63,18 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         "node_means",
         "node_covariances",
     )
-    _optional_n_components = True
     _finds_n_components = True
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **MixtureEstimator._parameter_constraints,
+        "n_components": [COUNT, None],
+        "branching": [Interval(Integral, 2, None, closed="left")],
+        "max_levels": [COUNT],
+        "soft_threshold": [Interval(Real, 0, 1, closed="both")],
+        "planarity_threshold": [AT_LEAST_ZERO],
+        "thickness": [AT_LEAST_ZERO],
+        "min_support": [AT_LEAST_ZERO],
+        "min_gain": [AT_LEAST_ZERO],
+    }
     node_parents: Tensor
     node_weights: Tensor
     node_means: Tensor
@@ -86,7 +97,6 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         random_state: RandomState = None,
         dtype: str = "float32",
     ) -> None:
-        nn.Module.__init__(self)
         self.n_components = n_components
         self.branching = branching
         self.max_levels = max_levels
@@ -112,18 +122,14 @@ class HierarchicalGaussianMixture(MixtureEstimator):
     ) -> HierarchicalGaussianMixture:
         """Fit the tree to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
         points, weight, center = self._prepare(X, sample_weight)
-        found = grow(points, weight, self._rule(), on_iteration)
+        found = grow(points, weight, self, on_iteration)
         tree = found.tree._replace(means=found.tree.means + center)
         leaves = tree.leaves()
         mixture = Parameters(*(value[leaves] for value in found.tree[1:]))
         extra = dict(zip(self._extra_names, tree, strict=True))
         self._store_fit(mixture, center, found.lower_bounds, found.converged, extra)
-        self._warn_unless_converged("EM", " in every node")
+        self._warn_unless_converged()
         return self
-
-    def _rule(self) -> GrowthRule:
-        given = {name: getattr(self, name) for name in GrowthRule.__dataclass_fields__}
-        return GrowthRule(**{**given, "dtype": em.SOFTMAX_DTYPES[self.dtype]})
 
     # -- the tree ---------------------------------------------------------------------------------
 
@@ -203,16 +209,6 @@ class HierarchicalGaussianMixture(MixtureEstimator):
             extra["node_means"] = extra["node_means"] @ rotation.T + translation
             extra["node_covariances"] = rotation @ extra["node_covariances"] @ rotation.T
         return extra
-
-    # -- arguments --------------------------------------------------------------------------------
-
-    def check_parameters(self, n_points: int | None = None) -> None:
-        super().check_parameters(n_points)
-        check_whole("branching", self.branching, 2)
-        check_whole("max_levels", self.max_levels, 1)
-        for name in ("planarity_threshold", "thickness", "min_support", "min_gain"):
-            check_number(name, getattr(self, name))
-        check_number("soft_threshold", self.soft_threshold, largest=1.0)
 
 
 def check_tree(tree: Tree, leaf_weights: Tensor) -> None:

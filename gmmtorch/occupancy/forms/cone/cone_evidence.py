@@ -8,10 +8,11 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
 from gmmtorch.occupancy.forms.cone.projection import Planes, share_beyond_3d
 from gmmtorch.occupancy.forms.cone.silhouette import facing, image, meets_disc, outline
-from gmmtorch.occupancy.forms.flux.box_flux import check_boxes
+from gmmtorch.occupancy.forms.flux.box_flux import checked_boxes
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.index.culling import Pairs, candidate_pairs, in_chunks
 
@@ -23,8 +24,8 @@ _QUARTER = 0.5 * math.pi
 
 def cone_evidence(
     cones: Cones,
-    low: Tensor,
-    high: Tensor,
+    low: ArrayLike,
+    high: ArrayLike,
     pairs: Iterable[Pairs] | None = None,
     exact: bool = False,
     cutoff: float = CUTOFF,
@@ -48,8 +49,8 @@ def cone_evidence(
     Raises:
         InvalidArgumentError: corners of another shape, not finite, or not low < high.
     """
-    check_boxes(low, high, cones.dim)
-    low, high = low.double(), high.double()
+    cones = cones.checked()
+    low, high = checked_boxes(low, high, cones)
     white, counts = WhitenedCones.of(cones), cones.counts.double()
     planes = Planes.of(cones) if cones.dim == 3 else None
     hits, misses = (low.new_zeros(len(low)) for _ in range(2))

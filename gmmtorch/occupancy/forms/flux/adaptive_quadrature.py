@@ -117,13 +117,18 @@ def check_tolerance(tolerance: float) -> float:
     return float(tolerance)
 
 
+def variation_limits(tolerance: float) -> tuple[float, ...]:
+    """Largest variation of a panel, in deviations, for rules of 1, 2, 3 and 4 nodes."""
+    return tuple((tolerance / error) ** (0.5 / n) for n, error in zip(_ORDERS, _ERROR, strict=True))
+
+
 def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> Tensor:
     """Integral over each patch (P,); `like` (D, P) gives the dimension, dtype and device.
 
     Differentiable: cuts and orders depend on detached values only. Panels to cut further are kept on a stack;
     a pass works on about `CHUNK_PANELS` of them.
     """
-    limits = tuple((tolerance / error) ** (0.5 / n) for n, error in zip(_ORDERS, _ERROR, strict=True))
+    limits = variation_limits(tolerance)
     total = like.new_zeros(len(patches))
     index = torch.arange(len(patches), device=like.device)
     whole = like.new_zeros(like.shape[0] - 1, len(patches))

@@ -13,7 +13,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.face_flux import add_row_flux, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
@@ -25,10 +28,12 @@ from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
     linear_on,
     product_on,
     square_on,
+    variation_limits,
 )
 from gmmtorch.occupancy.forms.flux.box_mass import box_mass
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.index.culling import (
+    FaceRows,
     Pairs,
     ball_rows,
     candidate_pairs,
@@ -154,33 +159,57 @@ def flux_evidence(
         InvalidArgumentError: a grid of another dimension, or a tolerance outside (0, 1).
     """
     check_tolerance(tolerance)
+    cones = cones.checked()
     if cones.dim != grid.dim:
         raise InvalidArgumentError(
             f"grid is {grid.dim}-dimensional, but the cones are {cones.dim}-dimensional."
         )
     white = WhitenedCones.of(cones)
     misses = white.log_norm.new_zeros(grid.n_cells)
+    counts = cones.counts.double()
+    fused = dtype == torch.float64 and is_fused(*white, counts)
     for axis in range(grid.dim):
         rows = face_rows(cones, grid, axis, cutoff)
-        for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
-            cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
-            patches = _grid_faces(white, grid, axis, cone, plane, forward, cells, cutoff, dtype)
-            flux = integrate(patches, patches.ray, tolerance).double()
-            indices = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
-            misses = misses.index_add(0, _flat(grid, indices), flux * cones.counts.double()[cone])
+        if fused:
+            table = whitened_rows(white.matrix, white.origin, white.toward, white.log_norm)
+            place = grid.origin, grid.resolution, grid.shape
+            add_row_flux(misses, table, counts, rows, axis, place, cutoff, variation_limits(tolerance))
+        else:
+            misses = _add_faces(misses, white, counts, grid, axis, rows, cutoff, tolerance, dtype)
     hits = torch.zeros_like(misses)
     balls = ball_rows(cones, grid, cutoff)
     for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
         cone, low = balls.cone[row], _corner(grid, cell)
         mass = box_mass(white.take(cone), low, low + grid.resolution, cutoff, tolerance, dtype)
-        hits = hits.index_add(0, _flat(grid, [*cell]), mass * cones.counts.double()[cone])
+        hits = hits.index_add(0, _flat(grid, [*cell]), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
+
+
+def _add_faces(
+    misses: Tensor,
+    white: WhitenedCones,
+    counts: Tensor,
+    grid: VoxelGrid,
+    axis: int,
+    rows: FaceRows,
+    cutoff: float,
+    tolerance: float,
+    dtype: torch.dtype,
+) -> Tensor:
+    """misses (cells,) and the flux through rows of faces; the twin of `kernels.face_flux`."""
+    for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
+        cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
+        patches = _grid_faces(white, grid, axis, cone, plane, forward, cells, cutoff, dtype)
+        flux = integrate(patches, patches.ray, tolerance).double()
+        indices = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
+        misses = misses.index_add(0, _flat(grid, indices), flux * counts[cone])
+    return misses
 
 
 def box_flux(
     cones: Cones,
-    low: Tensor,
-    high: Tensor,
+    low: ArrayLike,
+    high: ArrayLike,
     pairs: Iterable[Pairs] | None = None,
     cutoff: float = CUTOFF,
     *,
@@ -198,8 +227,8 @@ def box_flux(
         InvalidArgumentError: corners of another shape, not finite, or not low < high.
     """
     check_tolerance(tolerance)
-    check_boxes(low, high, cones.dim)
-    low, high = low.double(), high.double()
+    cones = cones.checked()
+    low, high = checked_boxes(low, high, cones)
     white = WhitenedCones.of(cones)
     counts = cones.counts.double()
     hits, misses = (low.new_zeros(len(low)) for _ in range(2))
@@ -218,11 +247,16 @@ def box_flux(
     return hits, misses
 
 
-def check_boxes(low: Tensor, high: Tensor, dim: int) -> None:
-    """Raise `InvalidArgumentError` unless low and high are corners (M, D) of boxes."""
-    if low.shape != high.shape or low.ndim != 2 or low.shape[1] != dim:
+def checked_boxes(low: ArrayLike, high: ArrayLike, cones: Cones) -> tuple[Tensor, Tensor]:
+    """Corners (M, D) of boxes, float64, on the device of the cones.
+
+    Raises `InvalidArgumentError` unless they are finite, and low is below high along each axis.
+    """
+    device = cones.means.device
+    low, high = (as_tensor(v, n, torch.float64, device) for n, v in (("low", low), ("high", high)))
+    if low.shape != high.shape or low.ndim != 2 or low.shape[1] != cones.dim:
         raise InvalidArgumentError(
-            f"low has shape {tuple(low.shape)}, high {tuple(high.shape)}; expected (M, {dim}) both."
+            f"low has shape {tuple(low.shape)}, high {tuple(high.shape)}; expected (M, {cones.dim}) both."
         )
     bad = ~((low < high) & torch.isfinite(low) & torch.isfinite(high)).all(1)
     if bool(bad.any()):
@@ -231,6 +265,7 @@ def check_boxes(low: Tensor, high: Tensor, dim: int) -> None:
             f"low[{row}]={low[row].tolist()}, high[{row}]={high[row].tolist()} is no box: corners must be "
             "finite, and low below high along each axis."
         )
+    return low, high
 
 
 def _grid_faces(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
@@ -35,13 +36,13 @@ class Boundary(NamedTuple):
     edges: Tensor
 
     @classmethod
-    def of_polygon(cls, vertices: Tensor) -> Boundary:
+    def of_polygon(cls, vertices: ArrayLike) -> Boundary:
         """Boundary of a simple polygon with vertices (V, 2) in order, clockwise or counter-clockwise.
 
         Raises `InvalidArgumentError` for fewer than three vertices or vertices that are not finite, and
         `DataError` for a polygon that crosses or touches itself, or has no area.
         """
-        vertices = vertices.double()
+        vertices = as_tensor(vertices, "vertices", torch.float64)
         _check_vertices(vertices, 2)
         edges = vertices.roll(-1, 0) - vertices
         if bool((edges == 0).all(1).any()):
@@ -56,14 +57,14 @@ class Boundary(NamedTuple):
         return cls(vertices, edges[:, None])
 
     @classmethod
-    def of_mesh(cls, vertices: Tensor, triangles: Tensor) -> Boundary:
+    def of_mesh(cls, vertices: ArrayLike, triangles: Tensor) -> Boundary:
         """Boundary of a closed mesh with vertices (V, 3) and triangles (F, 3) of vertex indices.
 
         The corners of a triangle run counter-clockwise as seen from outside. Raises `InvalidArgumentError`
         for other shapes, vertices that are not finite and indices out of range, and `DataError` for a mesh
         that is open, inconsistently oriented or inside out.
         """
-        vertices = vertices.double()
+        vertices = as_tensor(vertices, "vertices", torch.float64)
         _check_vertices(vertices, 3)
         if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.is_floating_point():
             raise InvalidArgumentError(
@@ -100,6 +101,7 @@ def region_flux(
     Arguments as in `flux_evidence`. Differentiable in the boundary and the cones.
     """
     check_tolerance(tolerance)
+    cones = cones.checked()
     if boundary.starts.shape[1] != cones.dim:
         raise InvalidArgumentError(
             f"boundary is {boundary.starts.shape[1]}-dimensional, but the cones are {cones.dim}-dimensional."

@@ -1,0 +1,96 @@
+"""Arrays as arguments: tensors, NumPy arrays and nested lists of real numbers become tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError
+
+ArrayLike = Tensor | np.ndarray | list | tuple
+
+_REAL_KINDS = "biuf"  # NumPy's kinds of bool, int, unsigned and float
+_SHARED_DTYPES = [np.dtype(code) for code in "?Bbhilqefd"]  # bool to float64, without uint16 and wider
+_KEPT_DTYPES = (torch.float32, torch.float64)
+
+
+def as_tensor(
+    value: Any, name: str, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+) -> Tensor:
+    """`value` as a tensor of real numbers, of any shape. Gradients flow through tensors.
+
+    Arrays can have any strides and byte order. Large arrays share memory with the result if they can.
+
+    Args:
+        value: a tensor, an array, whatever NumPy turns into an array of numbers, or a list of these.
+        name: name of the argument, for errors.
+        dtype: type of the result. None: float32 and float64 stay, all other types become float64.
+        device: device of the result. None: that of a tensor, otherwise the CPU.
+
+    Raises `InvalidArgumentError` for masked arrays, whose mask would be lost, for complex numbers, objects,
+    strings, sparse tensors, and lists whose rows have different lengths.
+    """
+    tensor = _tensor(value, name)
+    if dtype is None:
+        dtype = tensor.dtype if tensor.dtype in _KEPT_DTYPES else torch.float64
+    return tensor.to(device or tensor.device, dtype)
+
+
+def _tensor(value: Any, name: str) -> Tensor:
+    if isinstance(value, Tensor):
+        if value.layout != torch.strided or value.is_quantized or value.is_nested:
+            raise InvalidArgumentError(f"{name} is a {value.layout} tensor; give {name}.to_dense().")
+        if value.is_complex():
+            raise _complex(name, value.dtype)
+        return value
+    if isinstance(value, list | tuple) and any(isinstance(x, Tensor | np.ma.MaskedArray) for x in value):
+        parts = [_tensor(part, f"{name}[{i}]") for i, part in enumerate(value)]
+        if len({part.shape for part in parts}) > 1:
+            raise InvalidArgumentError(
+                f"{name} has parts of shapes {', '.join(str(tuple(part.shape)) for part in parts[:4])}; give "
+                "parts of one shape."
+            )
+        return torch.stack([part.double() for part in parts])
+    return torch.from_numpy(_array(value, name))
+
+
+def _array(value: Any, name: str) -> np.ndarray:
+    """An array of real numbers that torch can share."""
+    check_unmasked(value, name)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidArgumentError(
+            f"{name} is a {type(value).__name__} that is not an array of numbers ({error}); give an array "
+            "whose rows have the same length."
+        ) from error
+    if array.dtype.kind == "c":
+        raise _complex(name, array.dtype)
+    if array.dtype.kind not in _REAL_KINDS:
+        raise InvalidArgumentError(
+            f"{name} is a {type(value).__name__} of dtype {array.dtype}, not an array of numbers; convert it "
+            f"first: np.asarray({name}, dtype=float)."
+        )
+    # torch takes neither negative strides nor another byte order, and warns of read-only memory.
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
+    if array.dtype not in _SHARED_DTYPES:
+        return array.astype(np.int64 if array.dtype in (np.uint16, np.uint32) else np.float64)
+    fits = array.flags.writeable and all(step >= 0 for step in array.strides)
+    return array if fits else array.copy(order="C")
+
+
+def check_unmasked(value: Any, name: str) -> None:
+    """Raise `InvalidArgumentError` for a masked array, whose mask would be lost."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise InvalidArgumentError(
+            f"{name} is a masked array, and its mask would be lost; remove the masked rows first, "
+            f"{name}.data[~np.ma.getmaskarray({name}).reshape(len({name}), -1).any(1)], or fill them with "
+            f"{name}.filled(value)."
+        )
+
+
+def _complex(name: str, dtype: object) -> InvalidArgumentError:
+    return InvalidArgumentError(f"{name} is complex ({dtype}); give real numbers, such as {name}.real.")

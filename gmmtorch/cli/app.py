@@ -1,0 +1,159 @@
+"""Starts a command. `main` of each command is `app.start(NAME, run)`.
+
+It installs what all commands share: Ctrl-C always ends a command, an error is one line, and a job of a
+sweep that fails does not end the sweep.
+"""
+
+from __future__ import annotations
+
+import _thread
+import math
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from omegaconf import DictConfig
+
+from gmmtorch.cli import command_options, common, schema
+from gmmtorch.cli.sweep_table import ERROR_FILE
+from gmmtorch.errors import GmmTorchError
+
+_FULL_ERROR = "HYDRA_FULL_ERROR"
+"""Environment variable with which Hydra raises its errors."""
+
+
+def start(name: str, run: Callable[[DictConfig], Any]) -> None:
+    """Run the command gmmtorch-`name` with the arguments of this process.
+
+    Args:
+        name: name of the command and of its file in conf/.
+        run: does the work for a configuration. Its result is what a sweep can optimize. A `GmmTorchError`
+            becomes a one-line message and exit status 1.
+    """
+    schema.register()
+    try:
+        with interruptible():
+            _hydra_main(name, run)
+    except KeyboardInterrupt:
+        print("gmmtorch: interrupted; all files that were written are complete.", file=sys.stderr)
+        sys.exit(130)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """SIGINT raises `KeyboardInterrupt` here, whatever the process was started with.
+
+    A shell starts background processes with SIGINT ignored. Python drops an exception that is raised
+    in `__del__` or in a callback of a library; such an interrupt is sent again.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    hook = sys.unraisablehook
+
+    def send_again(dropped: sys.UnraisableHookArgs) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            # From another thread, because an interrupt in this function would be dropped, too.
+            # Thread.start would take locks, which the interrupted code may hold.
+            _thread.start_new_thread(_interrupt, ())
+        else:
+            hook(dropped)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.unraisablehook = send_again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
+
+
+def _interrupt() -> None:
+    time.sleep(0.01)  # until `__del__` has returned; if it has not, the interrupt is dropped and sent again
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
+    """Run a command by Hydra, with our own help, completion and errors of options."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    if "--version" in sys.argv[1:]:
+        import gmmtorch
+
+        print(f"gmmtorch {gmmtorch.__version__}")
+        return
+    flags = get_args_parser().parse_args()
+    is_running: list[bool] = []
+
+    def task(config: DictConfig) -> Any:
+        is_running.append(True)
+        return _guarded(run, config)
+
+    try:
+        if flags.help:
+            print(command_options.help_text(name, flags.overrides))
+        elif flags.shell_completion and {"query=bash", "query=fish"} & {*flags.overrides}:
+            found = command_options.completions(name, os.environ["COMP_LINE"])
+            print(*found, sep=" " if "query=bash" in flags.overrides else "\n")
+        else:
+            command_options.check_choices(name, flags.overrides)
+            with _raising():
+                hydra.main(version_base="1.3", config_path=common.conf_dir(), config_name=name)(task)()
+    except GmmTorchError as error:
+        sys.exit(f"gmmtorch: error: {error}")
+    except (HydraException, OmegaConfBaseException) as error:
+        if is_running:
+            raise
+        sys.exit(f"gmmtorch: error: {command_options.explained(name, flags.overrides, error)}")
+    except OSError as error:
+        if is_running:
+            raise
+        place = f" of {error.filename}" if error.filename else ""
+        sys.exit(
+            f"gmmtorch: error: hydra.run.dir cannot be written because{place}: {error.strerror or error}; "
+            "give another folder, as in hydra.run.dir=/tmp/run."
+        )
+
+
+@contextmanager
+def _raising() -> Iterator[None]:
+    """Hydra raises its errors instead of printing them."""
+    before = os.environ.get(_FULL_ERROR)
+    os.environ[_FULL_ERROR] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[_FULL_ERROR]
+        if before is not None:
+            os.environ[_FULL_ERROR] = before
+
+
+def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
+    """The result of a command; an error ends the command, or only its job of a sweep."""
+    from gmmtorch.evaluation.processes import end_with_parent
+
+    end_with_parent()  # a job of a sweep in its own process ends if the sweep's process ends
+    if not common.is_job_of_sweep():
+        try:
+            return run(config)
+        except GmmTorchError as error:
+            sys.exit(f"gmmtorch: error: {error}")
+    note = common.run_dir() / ERROR_FILE
+    note.unlink(missing_ok=True)  # of an earlier sweep in this folder
+    try:
+        return run(config)
+    except GmmTorchError as error:
+        text = str(error)
+    except Exception as error:
+        text = f"{traceback.format_exc()}{type(error).__name__}: {error}"
+    note.write_text(text, encoding="utf-8")
+    return math.nan  # for optimizers

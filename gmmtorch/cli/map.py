@@ -1,0 +1,173 @@
+"""gmmtorch-map: builds a map from a recording, and draws and exports it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import app, common, map_outputs, maps
+from gmmtorch.cli.view import serve
+
+if TYPE_CHECKING:
+    from gmmtorch.evaluation.events import Row
+    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.report.progress import ProgressBars
+
+_STAGE = "mapping"
+_CHECKPOINT = "checkpoint.safetensors"
+TABLE = (
+    "dataset n_scans n_skipped n_points metres n_components nbytes bytes_per_metre seconds scans_per_second"
+)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app.start("map", run)
+
+
+def run(config: DictConfig) -> None:
+    """Run the command. A run directory that contains a checkpoint of the same run is continued."""
+    from gmmtorch.errors import GmmTorchError
+    from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.occupancy.grid import check_resolution
+    from gmmtorch.report.progress import ProgressBars
+
+    device, folder = common.set_up(config), common.run_dir()
+    check_resolution(config.resolution)
+    map_outputs.check_exports(config)
+    dataset = common.open_dataset(config.dataset)
+    target = maps.map_factory(config, resolution=config.resolution)()
+    builder = MapBuilder(dataset, target, device)
+    with ProgressBars(enabled=config.report.progress) as bars:
+        viewer = _viewer(config)
+        _build(config, builder, folder / _CHECKPOINT, bars, viewer)
+        target.save(folder / "map.safetensors")
+        trajectory = map_outputs.write_trajectory(builder, folder)
+        row = _row(dataset.name, builder, config)
+        exported, errors = map_outputs.write_exports(config, target, folder, bars)
+        common.write_results("map", config, [row], folder)
+        map_outputs.draw(config, builder, trajectory, row, folder)
+    (folder / _CHECKPOINT).unlink(missing_ok=True)
+    common.print_table([row], TABLE.split(), f"{dataset.name}: {row['n_scans']} scans")
+    for reason, count in builder.skipped.items():
+        print(f"skipped   {count} scans: {reason}")
+    print(f"\nmap       {folder / 'map.safetensors'}")
+    print(*exported, sep="\n", end="\n" if exported else "")
+    common.print_files(folder, folder / "results.json")
+    if viewer is not None:
+        serve(viewer)
+    if errors:
+        raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
+
+
+def _viewer(config: DictConfig) -> MapViewer | None:
+    """The viewer of the growing map, if the options ask for it."""
+    if not config.view:
+        return None
+    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
+    viewer = MapViewer(GaussianMap())
+    print(f"The map is at {viewer.url}", flush=True)
+    return viewer
+
+
+def _build(
+    config: DictConfig,
+    builder: MapBuilder,
+    checkpoint: Path,
+    bars: ProgressBars,
+    viewer: MapViewer | None,
+) -> None:
+    """Inserts all scans. If the user stops the run, writes the checkpoint and ends the command."""
+    import gmmtorch
+    from gmmtorch.errors import check_number
+
+    check_number("checkpoint_seconds", config.checkpoint_seconds)
+    run_facts = {
+        "version": gmmtorch.__version__,
+        "dataset": common.as_options(config.dataset),
+        "map": common.as_options(config.map),
+        "seed": config.seed,
+        "dtype": config.runtime.dtype,
+    }
+    if checkpoint.exists():
+        builder.load(checkpoint, run_facts)
+        print(f"continues after scan {builder.record.n_read} of {checkpoint}")
+    saved = builder.record.seconds
+    with _stop_requests() as is_stopped:
+        for now in builder.insert_all():
+            bars(_STAGE, now.n_read, now.n_total)
+            bars.note(_STAGE, f"{now.n_components:,} components, {now.metres:,.0f} m")
+            if viewer is not None and builder.map.n_pending == 0:
+                viewer.update(*map_outputs.snapshot(builder))
+            is_over = now.n_read == now.n_total
+            if is_stopped() or is_over or now.seconds - saved >= config.checkpoint_seconds:
+                builder.save(checkpoint, run_facts)
+                saved = now.seconds
+            if is_stopped() and not is_over:
+                bars.close()
+                print(
+                    f"gmmtorch: stopped after scan {now.n_read} of {now.n_total}; the same options with "
+                    f"hydra.run.dir={checkpoint.parent} continue.",
+                    file=sys.stderr,
+                )
+                sys.exit(130)
+    builder.finish()
+    if viewer is not None:
+        viewer.update(*map_outputs.snapshot(builder))
+
+
+@contextlib.contextmanager
+def _stop_requests() -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C was pressed, or the process was asked to end. A second Ctrl-C interrupts at
+    once."""
+    requests: list[int] = []
+
+    def request(number: int, frame: Any) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    before = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(requests)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
+    """The row of results.json."""
+    now, record, built = builder.progress(), builder.record, builder.map
+    nbytes, seconds = built.nbytes, max(now.seconds, 1e-9)
+    return {
+        "dataset": name,
+        "n_scans": len(record.indices),
+        "n_skipped": now.n_skipped,
+        "skipped": [{"reason": reason, "n_scans": n} for reason, n in builder.skipped.items()],
+        "n_points": now.n_points,
+        "metres": now.metres,
+        "n_components": built.n_components,
+        "nbytes": nbytes,
+        "bytes_per_metre": nbytes / now.metres if now.metres else None,
+        "resolution": config.resolution,
+        "seconds": now.seconds,
+        "scans_per_second": now.n_read / seconds,
+        "metres_per_second": now.metres / seconds,
+        "memory_bytes": max(row["memory_bytes"] for row in record.history),
+        "history": record.history,
+    }
+
+
+if __name__ == "__main__":
+    main()

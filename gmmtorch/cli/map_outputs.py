@@ -1,0 +1,154 @@
+"""The files of gmmtorch-map: trajectory, exports, pictures and TensorBoard."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch.cli import common, export, schema
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gmmtorch.evaluation.events import Event, Row
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mapping.map_builder import MapBuilder
+
+EXPORTS = {
+    "map_server": ("map_server", "navigation.yaml"),
+    "octomap": ("octomap", "map.ot"),
+    "cloud": ("ply", "cloud.ply"),
+    "mesh": ("mesh", "mesh.ply"),
+    "distance_field": ("distance_field", "distance_field.npz"),
+}
+"""The format of gmmtorch-export and the file of each export."""
+
+_MESH_CELLS = 0.5  # sides of a mesh's cells, relative to the resolution of the map
+_MOST_CELLS = 1600  # along a side of a picture
+
+
+def check_exports(config: DictConfig) -> None:
+    """Raises `InvalidArgumentError` for an unknown export."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    for name in config.export:
+        if name not in EXPORTS:
+            raise InvalidArgumentError(
+                f"export={list(config.export)}: {name!r} is not one of {', '.join(EXPORTS)}."
+            )
+
+
+def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
+    """Write trajectory.tum; returns the sensor positions (S, D)."""
+    from gmmtorch.export.trajectory_files import write_tum
+
+    write_tum(folder / "trajectory.tum", builder.times, builder.poses)
+    return builder.poses[:, :-1, -1]
+
+
+def snapshot(builder: MapBuilder) -> tuple[GaussianMap, Tensor]:
+    """A copy of the map for the viewer, and the sensor positions (S, D)."""
+    from dataclasses import asdict
+
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    options = {**asdict(builder.map.query_options), "resolution": builder.map.resolution}
+    return GaussianMap.of(builder.map.components(), **options), builder.poses[:, :-1, -1]
+
+
+def write_exports(
+    config: DictConfig, source: GaussianMap, folder: Path, on_event: Event
+) -> tuple[list[str], list[str]]:
+    """Write the exports that the options name; returns messages, and the errors of those that failed."""
+    from gmmtorch.errors import GmmTorchError
+
+    messages, errors = [], []
+    for name in config.export:
+        form, file = EXPORTS[name]
+        options = {
+            "format": form,
+            "path": str(folder / "map.safetensors"),
+            "output": str(folder / file),
+            "resolution": config.resolution * (_MESH_CELLS if name == "mesh" else 1),
+            "runtime": {key: config.runtime[key] for key in ("device", "threads", "memory_limit")},
+            **({"z_min": config.z_min, "z_max": config.z_max} if name == "map_server" else {}),
+        }
+        merged: Any = OmegaConf.merge(OmegaConf.structured(schema.Export), options)
+        try:
+            written = export.write_space(merged, source, on_event)
+        except GmmTorchError as error:
+            errors.append(f"{name}: {error}")
+            continue
+        messages.append("export    " + written.replace("\n", "\n          "))
+    return messages, errors
+
+
+def draw(config: DictConfig, builder: MapBuilder, trajectory: Tensor, row: Row, folder: Path) -> None:
+    """Write the figures as PNG, and figures and numbers to TensorBoard."""
+    if not (config.report.figures or config.report.tensorboard):
+        return
+    figures = _figures(builder.map, trajectory, row)
+    common.save_figures(config, figures, folder)
+    if not config.report.tensorboard:
+        return
+    from gmmtorch.report.tensorboard_writer import Board
+
+    components = builder.map.components()
+    with Board(folder / "tensorboard") as board:
+        for entry in builder.record.history:
+            board.scalars(entry, "map", step=entry["n_read"])
+        for name, figure in figures.items():
+            board.figure(name, figure)
+        surface = ~components.max_range
+        board.ellipsoids("components", components.means[surface], components.covariances[surface])
+        board.paths("trajectory", [trajectory])
+        board.hparams(
+            common.chosen_options(config), {f"{key}": row[key] for key in ("n_components", "nbytes")}
+        )
+
+
+def _figures(built: GaussianMap, trajectory: Tensor, row: Row) -> dict[str, Any]:
+    """The map from above, and its components: in 3D in space."""
+    from gmmtorch.report.maps.map_figures import map_figure
+    from gmmtorch.report.maps.map_images import MapPanel
+    from gmmtorch.report.maps.map_regions import robust_bounds
+    from gmmtorch.report.scenes.ellipsoids import first_viewpoints
+    from gmmtorch.report.scenes.mixture_figures import mixture_figure
+    from gmmtorch.report.scenes.scene import mixture_scene_figure
+    from gmmtorch.report.table import byte_text
+
+    components = built.components()
+    surfaces = components.selected((~components.max_range).nonzero().squeeze(1))
+    surfaces = surfaces if len(surfaces) else components
+    low, high = robust_bounds(surfaces.means.cpu(), trajectory)
+    side = max(b - a for a, b in zip(low[:2], high[:2], strict=True))
+    resolution = built.resolution * max(1, math.ceil(side / (_MOST_CELLS * built.resolution)))
+
+    def answer(points: Tensor) -> Tensor:
+        return built.occupancy(points, resolution)  # type: ignore[return-value]
+
+    title = (
+        f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}, "
+        f"{row['metres']:,.0f} m travelled"
+    )
+    panel = MapPanel("occupancy", answer, resolution, low, high)
+    # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
+    figures = {"above": map_figure([panel], trajectory, title=title, occupied_above=0.4)}
+    shown = surfaces.means.cpu(), surfaces.covariances.cpu()
+    if surfaces.dim == 3:
+        seen_from = first_viewpoints(surfaces).cpu()
+        figures["components"] = mixture_scene_figure(
+            *shown, seen_from=seen_from, trajectories=[trajectory], title=title
+        )
+    else:
+        figures["components"] = mixture_figure(
+            surfaces.means[:0].cpu(),
+            *shown,
+            surfaces.support.cpu(),
+            title=str(row["dataset"]),
+            max_components=max(len(surfaces), 1),
+        )
+    return figures

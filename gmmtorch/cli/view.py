@@ -1,0 +1,115 @@
+"""gmmtorch-view: shows a map in the browser, or writes it as one HTML file."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import app, common
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gmmtorch.live.map_viewer import MapViewer
+
+# Flags of Hydra whose values are words of their own.
+_FLAGS_WITH_A_VALUE = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp"}
+_FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
+_MAP, _TRAJECTORY = "map.safetensors", "trajectory.tum"
+
+
+def main() -> None:
+    """Entry point of the command."""
+    sys.argv[1:] = overrides(sys.argv[1:])
+    app.start("view", run)
+
+
+def overrides(words: Sequence[str]) -> list[str]:
+    """The arguments as Hydra's overrides: a FILE or folder becomes path=, and --html FILE becomes html=."""
+    found: list[str] = []
+    before = ""
+    for word in words:
+        if before == "--html":
+            found.append(_assigned("html", word))
+        elif word.startswith("--html="):
+            found.append(_assigned("html", word.removeprefix("--html=")))
+        elif before in _FLAGS_WITH_A_VALUE or word.startswith("-") or "=" in word:
+            found += [] if word == "--html" else [word]
+        else:
+            found.append(_assigned("path", word))
+        before = word
+    return found
+
+
+def _assigned(name: str, value: str) -> str:
+    quoted = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{name}='{quoted}'"
+
+
+def run(config: DictConfig) -> None:
+    """Run the command. Without `html` it serves the page until it is interrupted."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    if not config.path:
+        raise InvalidArgumentError("path is not set; give a map file or the run directory of gmmtorch-map.")
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
+    common.use_runtime(config.runtime)
+    path = Path(config.path).expanduser()
+    path = path / _MAP if path.is_dir() else path
+    shown = GaussianMap.load(path).to(config.runtime.device)
+    viewer = MapViewer(
+        shown,
+        _trajectory(config, path, shown.dim),
+        shape=config.shape,
+        colour=config.colour,
+        host=config.host,
+        port=config.port,
+    )
+    try:
+        if config.html:
+            written = viewer.save_html(config.html)
+            print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
+        else:
+            serve(viewer)
+    finally:
+        viewer.stop()
+
+
+def serve(viewer: MapViewer) -> None:
+    """Prints the address and waits until the user interrupts."""
+    print(f"The map is at {viewer.url}. Ctrl-C ends.", flush=True)
+    threading.Event().wait()
+
+
+def _trajectory(config: DictConfig, path: Path, dim: int | None) -> Tensor | None:
+    """The sensor positions (S, D) of `trajectory`, or of the file beside the map if there is one."""
+    import numpy as np
+    import torch
+
+    from gmmtorch.errors import DataError, MissingDataError
+
+    given = config.trajectory is not None
+    file = Path(config.trajectory).expanduser() if given else path.parent / _TRAJECTORY
+    if not file.is_file():
+        if given:
+            raise MissingDataError(f"trajectory={file} does not exist; give a TUM file, or null.")
+        return None
+    try:
+        rows = np.loadtxt(file, ndmin=2)
+        if rows.shape[1] != 8 or not np.isfinite(rows).all():
+            raise ValueError("its rows are not eight finite numbers")
+    except ValueError as error:
+        raise DataError(f"trajectory={file} is not a TUM file: {error}.") from error
+    return torch.from_numpy(rows[:, 1 : 1 + (dim or 3)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Headers of LAS and LAZ files, checked against the size of the file before anything is allocated.
+
+Offsets are those of the LAS specification 1.4 (ASPRS) and of the LASzip specification of its chunk table.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from gmmtorch.errors import DataError
+
+_HEADER = struct.Struct("<4s20x2B68xHIIBHI")  # to the number of points, 111 bytes
+_HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
+_RECORD_HEADER = struct.Struct("<2x16sHH32x")
+_COMPRESSED = 0x80
+_LASZIP = (b"laszip encoded", 22204)
+_LASZIP_ITEMS = 34
+
+
+class LasHeader(NamedTuple):
+    """n_points: number of points. point_bytes: size of an uncompressed point."""
+
+    n_points: int
+    point_bytes: int
+
+
+def read_las_header(path: Path) -> LasHeader:
+    """The header of a LAS or LAZ file.
+
+    Raises `DataError` if the file is shorter than its header, its variable-length records, its chunk table
+    or its uncompressed points.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES[5])
+        if len(head) < _HEADER_BYTES[0] or head[:4] != b"LASF":
+            raise _damaged(path, "it does not begin with a LAS header")
+        _, major, minor, header_size, data_start, n_records, form, point_bytes, n_points = (
+            _HEADER.unpack_from(head)
+        )
+        if major != 1 or minor not in _HEADER_BYTES or len(head) < _HEADER_BYTES[minor]:
+            raise _damaged(path, f"its version {major}.{minor} is not one of 1.0 to 1.5")
+        if minor >= 4:
+            (n_points,) = struct.unpack_from("<Q", head, 247)
+        if not _HEADER_BYTES[minor] <= header_size <= data_start <= size:
+            raise _damaged(
+                path,
+                f"its header of {header_size} bytes and points from byte {data_start} need more than {size}",
+            )
+        if n_records * _RECORD_HEADER.size > data_start - header_size:
+            raise _damaged(path, f"{n_records} variable-length records do not fit before its points")
+        if point_bytes < 20:
+            raise _damaged(path, f"a point has {point_bytes} bytes; at least 20 are needed")
+        if form & _COMPRESSED:
+            file.seek(header_size)
+            _check_laszip(path, file.read(data_start - header_size), n_records, point_bytes)
+            _check_chunks(path, file, data_start, size, n_points)
+        elif n_points * point_bytes > size - data_start:
+            raise _damaged(
+                path,
+                f"it announces {n_points} points of {point_bytes} bytes, but has {size - data_start} bytes",
+            )
+    return LasHeader(n_points, point_bytes)
+
+
+def _check_laszip(path: Path, records: bytes, n_records: int, point_bytes: int) -> None:
+    """Checks that the compressor's record describes points of `point_bytes`."""
+    start = 0
+    for _ in range(n_records):
+        if start + _RECORD_HEADER.size > len(records):
+            break
+        user, number, length = _RECORD_HEADER.unpack_from(records, start)
+        start += _RECORD_HEADER.size
+        content = records[start : start + length]
+        start += length
+        if (user.split(b"\0")[0], number) != _LASZIP:
+            continue
+        count = (
+            struct.unpack_from("<H", content, _LASZIP_ITEMS - 2)[0] if len(content) >= _LASZIP_ITEMS else 0
+        )
+        items = content[_LASZIP_ITEMS : _LASZIP_ITEMS + 6 * count]
+        widths = (
+            [width for _, width, _ in struct.iter_unpack("<HHH", items)] if len(items) == 6 * count else []
+        )
+        if sum(widths) != point_bytes:
+            raise _damaged(path, "its LASzip record does not describe its points")
+        return
+    raise _damaged(path, "its points are compressed, but the LASzip record is missing")
+
+
+def _check_chunks(path: Path, file: BinaryIO, data_start: int, size: int, n_points: int) -> None:
+    """Checks the position and the length of the table of compressed chunks.
+
+    A chunk has at least one byte; the decompressor allocates the whole table.
+    """
+    file.seek(data_start)
+    start = file.read(8)
+    table = struct.unpack("<q", start)[0] if len(start) == 8 else -1
+    if table == -1 and len(start) == 8:  # written to a stream: the position is at the end of the file
+        file.seek(max(data_start, size - 8))
+        table = struct.unpack("<q", file.read(8).rjust(8, b"\0"))[0]
+    if n_points == 0:
+        return
+    if not data_start + 8 <= table <= size - 8:
+        raise _damaged(path, f"its table of chunks at byte {table} is outside of its {size} bytes")
+    file.seek(table + 4)
+    (n_chunks,) = struct.unpack("<I", file.read(4))
+    if n_chunks > table - data_start - 8:
+        raise _damaged(path, f"{n_chunks} chunks do not fit into {table - data_start - 8} bytes")
+
+
+def _damaged(path: Path, reason: str) -> DataError:
+    return DataError(
+        f"{path} cannot be read as LAS or LAZ: {reason}; it is truncated or damaged. Write or fetch it again."
+    )

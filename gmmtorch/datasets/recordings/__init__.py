@@ -1,0 +1,1 @@
+"""Recordings of robots: ROS bags, KITTI and TUM sequences, and the trajectories and transforms in them."""

@@ -1,0 +1,181 @@
+"""The poses of a bag's scans: one pass over the bag collects the headers of the sensor and all transforms."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from gmmtorch.datasets.recordings.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.bag_topics import POSE_TYPES, TF_TYPES, listed
+from gmmtorch.datasets.recordings.pose_sources import (
+    BodyPoses,
+    PosesByIndex,
+    PoseSource,
+    Standing,
+    TfPoses,
+    mount_matrix,
+    pose_sample,
+)
+from gmmtorch.datasets.recordings.trajectory import Trajectory, read_rows, read_trajectory
+from gmmtorch.datasets.recordings.transform_tree import TransformTree
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+_HEAD_BYTES = 1024
+_KITTI_COLUMNS = 12
+
+
+class Stamped(Protocol):
+    """A message of the sensor: its number in the topic, its stamp (ns) and its frame."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def stamp(self) -> int: ...
+    @property
+    def frame(self) -> str: ...
+
+
+class PoseOptions(NamedTuple):
+    """Options of `open_rosbag`."""
+
+    poses: str | None
+    frame: str | None
+    extrinsic: list[float] | None
+    max_gap: float
+
+
+class BagSurvey:
+    """What one pass over a bag finds.
+
+    Attributes:
+        heads: (time of recording in ns, first bytes) of each message of the sensor.
+        tree: the transforms of TF.
+
+    Raises `DataError` or `InvalidArgumentError` if the bag cannot have the poses that the options choose.
+    """
+
+    def __init__(self, reader: BagReader, topic: str, options: PoseOptions) -> None:
+        self._reader, self._topic, self._options = reader, topic, options
+        names = {t.name for t in reader.topics}
+        poses = options.poses
+        self._pose_topic = poses if poses in names else None
+        self._file = None
+        transforms = [t.name for t in reader.topics if t.type in TF_TYPES and t.n_messages]
+        if poses in (None, "tf"):
+            if not transforms:
+                raise DataError(
+                    f"{reader.path} has no TF, so the sensor's poses are unknown. {self._remedy()}"
+                )
+        elif self._pose_topic is not None:
+            self._check_pose_topic()
+        elif poses != "standing":
+            self._file = Path(str(poses)).expanduser()
+            if not self._file.is_file():
+                raise InvalidArgumentError(
+                    f"dataset.poses={poses} is neither tf, standing, a topic of the bag, nor a file. "
+                    f"{self._remedy()}"
+                )
+        self.heads: list[tuple[int, bytes]] = []
+        self.tree = TransformTree()
+        self._samples: list[tuple[int, np.ndarray]] = []
+        self._bodies: Counter[str] = Counter()
+        for message in reader.messages(
+            {topic, *transforms, *([self._pose_topic] if self._pose_topic else [])}
+        ):
+            self._note(message)
+
+    def _note(self, message: RawMessage) -> None:
+        if message.topic == self._topic:
+            self.heads.append((message.time, message.data[:_HEAD_BYTES]))
+            return
+        try:
+            content = self._reader.decode(message)
+            if message.type in TF_TYPES:
+                self.tree.add(content, static=message.topic.endswith("tf_static"))
+                return
+            time, matrix, body = pose_sample(content, message.type)
+        except (DataError, ValueError):
+            return  # a transform that is missed leaves a gap, which `max_gap` notices
+        self._samples.append((time, matrix))
+        self._bodies[body] += 1
+
+    def _check_pose_topic(self) -> None:
+        types = [t.type for t in self._reader.topics if t.name == self._pose_topic]
+        if not set(types) <= set(POSE_TYPES):
+            raise InvalidArgumentError(
+                f"dataset.poses={self._pose_topic} has messages of type {', '.join(types)}, "
+                "which are not poses. "
+                f"{self._remedy()}"
+            )
+
+    def _remedy(self) -> str:
+        topics = [t for t in self._reader.topics if t.type in POSE_TYPES and t.n_messages]
+        return (
+            "Choose dataset.poses=standing for a sensor that does not move, "
+            "dataset.poses=FILE for a TUM or KITTI "
+            f"trajectory, or dataset.poses=TOPIC; topics of poses: {listed(topics)}."
+        )
+
+    def source(self, records: Sequence[Stamped], where: str) -> PoseSource:
+        """The poses of the sensor. Raises `DataError` if the sensor's frames are not connected to them."""
+        frames = Counter(record.frame for record in records)
+        options, mount = self._options, mount_matrix(self._options.extrinsic)
+        if options.poses in (None, "tf"):
+            return self._from_tf(frames, where)
+        if self._pose_topic is not None:
+            times, matrices = [list(column) for column in zip(*self._samples, strict=True)] or ([], [])
+            trajectory, _ = Trajectory.from_samples(
+                np.array(times, np.int64), np.array(matrices).reshape(-1, 4, 4)
+            )
+            mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in frames}
+            return BodyPoses(trajectory, mounts, options.max_gap, f"topic {self._pose_topic}")
+        if len(frames) > 1:
+            counts = ", ".join(f"{frame or '(unnamed)'} ({n} scans)" for frame, n in frames.most_common())
+            raise InvalidArgumentError(
+                f"{where}: several sensors share the topic, with frames {counts}; choose one: "
+                f"dataset.sensor_frame={frames.most_common(1)[0][0]}."
+            )
+        if self._file is None:
+            return Standing()
+        fixed = np.eye(4) if mount is None else mount
+        if read_rows(self._file).shape[1] == _KITTI_COLUMNS:
+            matrices_of = read_trajectory(self._file, len(self.heads)).matrices
+            return PosesByIndex({r.stamp: matrices_of[r.number] for r in records}, fixed)
+        mounts = dict.fromkeys(frames, fixed)
+        return BodyPoses(read_trajectory(self._file), mounts, options.max_gap, str(self._file))
+
+    def _from_tf(self, frames: Counter[str], where: str) -> PoseSource:
+        source = TfPoses(self.tree, self._options.frame, self._options.max_gap, where)
+        chains = [source.chain(frame) for frame in frames]
+        chosen = self._options.poses is not None or self._options.frame is not None
+        if not chosen and not any(self.tree.is_moving(chain) for chain in chains):
+            raise DataError(
+                f"{where}: TF has only static transforms from frame {chains[0][0]} up to "
+                f"{chains[0][-1]}, so the "
+                f"sensor's motion is unknown. {self._remedy()}"
+            )
+        return source
+
+    def _mount(self, frame: str, where: str) -> np.ndarray:
+        """body ← sensor from the static transforms."""
+        body = self._bodies.most_common(1)[0][0] if self._bodies else ""
+        if body in ("", frame):
+            return np.eye(4)
+        try:
+            chain = self.tree.chain(frame, body) if frame in self.tree.frames else []
+        except DataError:
+            chain = []
+        if not chain or self.tree.is_moving(chain):
+            raise DataError(
+                f"{where}: dataset.poses={self._pose_topic} states poses of frame {body}, but "
+                "TF has no static "
+                f"transform from there to the sensor's frame {frame or '(unnamed)'}. State "
+                "the sensor's pose on the "
+                "body: dataset.extrinsic=[x,y,z,qx,qy,qz,qw], which is [0,0,0,0,0,0,1] if they are the same."
+            )
+        matrix: np.ndarray = self.tree.lookup(chain, np.zeros(1, np.int64), np.inf).matrices[0]
+        return matrix

@@ -1,0 +1,138 @@
+"""Which topics of a bag are sensors, and the choice between them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from gmmtorch.datasets.recordings.bag_reader import BagReader, Topic
+from gmmtorch.datasets.recordings.message_decoder import BASE, NAME, SEQUENCE
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+_IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+
+CLOUD, LIST, LASER, DEPTH, COMPRESSED = (
+    "cloud",
+    "list of points",
+    "laser",
+    "depth image",
+    "compressed depth image",
+)
+_PREFERENCE = (CLOUD, LIST, LASER, DEPTH, COMPRESSED)
+
+
+class Sensor(NamedTuple):
+    """A topic of a sensor. kind: one of the constants above. field: of the list, for `LIST`."""
+
+    topic: Topic
+    kind: str
+    field: str = ""
+
+
+def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
+    """The topic `wanted`, or else the only one of the most preferred kind that the bag has.
+
+    Kinds in order: clouds, lists of points, lasers, depth images. Raises `DataError` or
+    `InvalidArgumentError`, which list the topics, if there is none, or a choice.
+    """
+    named = [topic for topic in reader.topics if topic.name == wanted]
+    if wanted is not None and not named:
+        raise InvalidArgumentError(
+            f"dataset.topic={wanted} is not in {reader.path}, whose topics are {listed(reader.topics)}."
+        )
+    if len(named) > 1:
+        raise DataError(
+            f"{reader.path}: topic {wanted} has messages of {len(named)} types: "
+            f"{listed(named)}. Choose another "
+            "dataset.topic, or write each type to a topic of its own."
+        )
+    found = [
+        sensor for topic in named or reader.topics if topic.n_messages and (sensor := _sensor(reader, topic))
+    ]
+    if not found:
+        what = f"dataset.topic={wanted} is not" if wanted else "has no topic of"
+        raise DataError(
+            f"{reader.path} {what} a range sensor with messages (PointCloud2, LaserScan, "
+            "depth Image, or a list "
+            f"of points). Its topics are {listed(reader.topics)}. Record such a topic, or "
+            "choose dataset.topic."
+        )
+    kind = min((sensor.kind for sensor in found), key=_PREFERENCE.index)
+    found = [sensor for sensor in found if sensor.kind == kind]
+    if len(found) > 1:
+        raise InvalidArgumentError(
+            f"{reader.path} has {len(found)} topics of a range sensor: "
+            f"{listed([sensor.topic for sensor in found])}. Choose one: dataset.topic={found[0].topic.name}."
+        )
+    return found[0]
+
+
+def listed(topics: list[Topic]) -> str:
+    """Topics with types and counts, for messages."""
+    return "; ".join(f"{t.name} ({t.type}, {t.n_messages} messages)" for t in topics) or "none"
+
+
+def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
+    if topic.type == "sensor_msgs/msg/PointCloud2":
+        return Sensor(topic, CLOUD)
+    if topic.type == "sensor_msgs/msg/LaserScan":
+        return Sensor(topic, LASER)
+    if topic.type in (_IMAGE, _COMPRESSED_IMAGE):
+        return _camera(reader, topic)
+    if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):
+        fields = reader.fields(topic.type)
+        if fields and fields[0][1] == (NAME, "std_msgs/msg/Header"):
+            for name, desc in fields:
+                if _is_list_of_points(reader, desc):
+                    return Sensor(topic, LIST, name)
+    return None
+
+
+def _is_list_of_points(reader: BagReader, desc: Any) -> bool:
+    if desc[0] != SEQUENCE or desc[1][0][0] != NAME:
+        return False
+    fields = dict(reader.fields(desc[1][0][1]))
+    numbers = all(inner[0] == BASE and inner[1][0] != "string" for inner in fields.values())
+    return numbers and {"x", "y", "z"} <= fields.keys()
+
+
+def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
+    """A camera whose first image is a depth."""
+    first = next(reader.messages([topic.name]), None)
+    if first is None:
+        return None
+    try:
+        message = reader.decode(first)
+    except DataError:
+        return None
+    if topic.type == _IMAGE:
+        return Sensor(topic, DEPTH) if message["encoding"] in _DEPTH_ENCODINGS else None
+    return Sensor(topic, COMPRESSED) if "compressedDepth" in message["format"] else None
+
+
+def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str:
+    """The topic of the camera parameters: `wanted`, or the one that shares most of the image topic's name."""
+    infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
+    if wanted is not None and wanted in infos:
+        return wanted
+
+    def shared(name: str) -> int:
+        pairs = zip(name.split("/"), image.split("/"), strict=False)
+        return next((i for i, (a, b) in enumerate(pairs) if a != b), 0)
+
+    best = [name for name in infos if shared(name) == max(map(shared, infos))]
+    if wanted is not None or len(best) != 1:
+        raise InvalidArgumentError(
+            f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of "
+            f"{image}; topics of type "
+            f"CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
+        )
+    return best[0]

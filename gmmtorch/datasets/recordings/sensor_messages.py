@@ -1,0 +1,178 @@
+"""Points of sensor messages: PointCloud2, LaserScan, depth images, and messages with a list of points.
+
+Input are messages as `MessageDecoder` returns them. Every size in them is checked against their data.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.depth_frames import MAX_PIXELS, read_png
+from gmmtorch.errors import DataError
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeoffset", "time_offset")
+_UNITS = (1_000_000_000, 1_000_000, 1_000, 1)  # nanoseconds in s, ms, µs, ns
+_SWEEP = (2_000_000, 600_000_000)
+"""Shortest and longest plausible sweep of a sensor in ns; at most one unit of time falls into it."""
+_NEAR = 10_000_000_000
+_EMPTY_DEPTH = (0, 65535)
+_COMPRESSED_DEPTH_BYTES = 12
+_PNG = b"\x89PNG"
+
+
+class Reading(NamedTuple):
+    """The points of one message.
+
+    points: (N, 3) float64, sensor frame, metres; finite and not at the sensor. no_return: (N,) whether the
+    beam met nothing. offsets: (N,) int64, ns after the stamp of the message; None without times of points.
+    """
+
+    points: np.ndarray
+    no_return: np.ndarray
+    offsets: np.ndarray | None
+
+
+def reading(points: np.ndarray, no_return: np.ndarray | None, offsets: np.ndarray | None) -> Reading:
+    """The valid ones of some points: finite, and not at the sensor."""
+    valid = np.isfinite(points).all(1) & (points != 0).any(1)
+    empty = np.zeros(len(points), bool) if no_return is None else no_return
+    return Reading(points[valid], empty[valid], None if offsets is None else offsets[valid])
+
+
+def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
+    """The points of a PointCloud2 with any layout of fields and either byte order."""
+    width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
+    data = message["data"]
+    row = int(message["row_step"]) if height > 1 else width * step
+    if width * height == 0:
+        return reading(np.empty((0, 3)), None, None)
+    order = ">" if message["is_bigendian"] else "<"
+    fields = {f["name"]: f for f in message["fields"]}
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        raise DataError(f"the cloud has no field {missing[0]}, only {', '.join(fields) or 'none'}")
+    time = next((name for name in fields if name.lower() in _TIME_FIELDS), None)
+    names = [*"xyz", *([time] if time else [])]
+    layout: dict[str, Any] = {"names": names, "formats": [], "offsets": [], "itemsize": step}
+    for name in names:
+        offset, kind = int(fields[name]["offset"]), _TYPES.get(int(fields[name]["datatype"]))
+        if kind is None or offset + np.dtype(kind).itemsize > step:
+            raise DataError(f"field {name} does not fit into a point of {step} bytes")
+        layout["formats"].append(order + kind)
+        layout["offsets"].append(offset)
+    if row < width * step or (height - 1) * row + width * step > len(data):
+        raise DataError(
+            f"{height} × {width} points of {step} bytes are announced, but the cloud has {len(data)} bytes"
+        )
+    table = np.ndarray((height, width), np.dtype(cast(Any, layout)), bytes(data), 0, (row, step)).ravel()
+    points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+    return reading(points, None, point_offsets(table[time], stamp) if time else None)
+
+
+def listed_points(message: dict[str, Any], field: str, stamp: int) -> Reading:
+    """The points of a message with a list of points in `field`, such as Livox's CustomMsg."""
+    table = message[field]
+    if len(table) == 0:
+        return reading(np.empty((0, 3)), None, None)
+    points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+    time = next((name for name in table.dtype.names if name.lower() in _TIME_FIELDS), None)
+    return reading(points, None, point_offsets(table[time], stamp) if time else None)
+
+
+def point_offsets(values: np.ndarray, stamp: int) -> np.ndarray | None:
+    """Times of points as ns after the stamp; None if they do not vary, or if their unit is not clear.
+
+    The unit is the one that gives a plausible length of the sweep. Times near the stamp are absolute; times
+    far from it count from the stamp if they begin near zero, and otherwise from the first point.
+    """
+    finite = np.isfinite(values)
+    if not finite.any():
+        return None
+    whole = np.where(finite, values, values[finite].min())
+    low, high = whole.min(), whole.max()
+    span = float(high) - float(low)
+    unit = next((unit for unit in _UNITS if _SWEEP[0] <= span * unit <= _SWEEP[1]), None)
+    if unit is None:
+        return None
+    offsets = np.round((whole - low).astype(np.float64) * unit).astype(np.int64)
+    first = round(float(low) * unit) if values.dtype.kind == "f" else int(low) * unit
+    if abs(first) < _NEAR:
+        return offsets + first
+    return offsets + (first - stamp if abs(first - stamp) < _NEAR else 0)
+
+
+def laser_points(message: dict[str, Any]) -> Reading:
+    """The beam ends of a LaserScan. Infinite ranges and too long ones have no return."""
+    ranges = message["ranges"].astype(np.float64)
+    farthest = float(message["range_max"])
+    limit = farthest if 0 < farthest < np.inf else np.inf
+    angles = float(message["angle_min"]) + np.arange(len(ranges)) * float(message["angle_increment"])
+    if not np.isfinite(angles).all():
+        raise DataError("the angles of the laser are not finite")
+    with np.errstate(invalid="ignore"):
+        no_return = (ranges > limit) | (ranges == np.inf)
+        valid = (ranges > 0) & (ranges >= float(message["range_min"])) & (no_return | (ranges <= limit))
+    length = np.where(valid & ~no_return, ranges, np.where(valid, limit if limit < np.inf else 1.0, 0.0))
+    points = np.stack([length * np.cos(angles), length * np.sin(angles), np.zeros_like(length)], 1)
+    step = float(message["time_increment"])
+    sweep = step * len(ranges) * 1e9
+    offsets = np.round(np.arange(len(ranges)) * step * 1e9).astype(np.int64) if 0 < sweep < 2e9 else None
+    return reading(points, no_return, offsets)
+
+
+def depth_image(message: dict[str, Any]) -> Tensor:
+    """Depth (H, W) in metres, float64, 0 where it is unknown, of an Image with 16UC1, mono16 or 32FC1."""
+    width, height, step = int(message["width"]), int(message["height"]), int(message["step"])
+    kind = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}.get(message["encoding"])
+    if kind is None:
+        raise DataError(f"encoding {message['encoding']} is not a depth: expected 16UC1, mono16 or 32FC1")
+    dtype = np.dtype((">" if message["is_bigendian"] else "<") + kind)
+    data = message["data"]
+    if not 0 < width * height <= MAX_PIXELS or step < width * dtype.itemsize:
+        raise DataError(f"{width} × {height} pixels in rows of {step} bytes are not an image")
+    if (height - 1) * step + width * dtype.itemsize > len(data):
+        raise DataError(f"{width} × {height} pixels are announced, but the image has {len(data)} bytes")
+    raw = np.ndarray((height, width), dtype, bytes(data), 0, (step, dtype.itemsize))
+    return _metres(raw) if kind == "u2" else _finite(raw.astype(np.float64))
+
+
+def compressed_depth_image(message: dict[str, Any]) -> Tensor:
+    """Depth (H, W) in metres of a CompressedImage of compressed_depth_image_transport, in PNG.
+
+    For 32FC1 the image stores q = a / d + b with the two parameters in the header of the data.
+    """
+    form, data = str(message["format"]), bytes(message["data"])
+    start = 0 if data.startswith(_PNG) else _COMPRESSED_DEPTH_BYTES
+    if not data[start:].startswith(_PNG):
+        raise DataError(
+            f"the image has format {form!r}, which is not a depth in PNG; record raw depth images"
+        )
+    raw = read_png(io.BytesIO(data[start:]), "the compressed image")
+    if "32FC1" not in form or start == 0:
+        return _metres(raw)
+    a, b = np.frombuffer(data, "<f4", 2, 4).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _finite(np.where(raw > 0, a / (raw.astype(np.float64) - b), 0))
+
+
+def _metres(raw: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.where(np.isin(raw, _EMPTY_DEPTH), 0, raw) / 1000.0)
+
+
+def _finite(depth: np.ndarray) -> Tensor:
+    with np.errstate(invalid="ignore"):
+        return torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0.0))
+
+
+def camera_matrix(message: dict[str, Any]) -> Tensor:
+    """The pinhole matrix (3, 3) in pixels of a CameraInfo. Raises `DataError` if it is not one."""
+    matrix = torch.tensor(np.asarray(message["k"] if "k" in message else message["K"]), dtype=torch.float64)
+    if matrix.shape != (9,) or not bool(torch.isfinite(matrix).all()) or min(matrix[0], matrix[4]) <= 0:
+        raise DataError(f"the camera matrix {matrix.tolist()} has no focal lengths above zero")
+    return matrix.reshape(3, 3)

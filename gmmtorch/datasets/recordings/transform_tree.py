@@ -1,0 +1,142 @@
+"""TransformTree: the frames of a robot and the transforms between them over time (TF)."""
+
+from __future__ import annotations
+
+import itertools
+from array import array
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from gmmtorch.datasets.recordings.trajectory import MIN_NORM, NANOSECONDS, Poses, Trajectory, pose_matrix
+from gmmtorch.errors import DataError
+
+
+class TransformTree:
+    """Transforms parent ← child, each static or over time. Frames are named without a leading slash."""
+
+    def __init__(self) -> None:
+        self._samples: dict[str, tuple[array[int], array[float]]] = {}
+        self._static: dict[str, np.ndarray] = {}
+        self._parents: dict[str, Counter[str]] = {}
+        self._edges: dict[str, Trajectory] = {}
+
+    def add(self, message: dict[str, Any], static: bool) -> None:
+        """The transforms of a decoded TFMessage. Those that are not rigid are left out."""
+        for entry in message["transforms"]:
+            child, parent = frame_name(entry["child_frame_id"]), frame_name(entry["header"]["frame_id"])
+            translation, rotation = entry["transform"]["translation"], entry["transform"]["rotation"]
+            if static:
+                try:
+                    self._static[child] = transform_matrix(translation, rotation)
+                except ValueError:
+                    continue
+            else:
+                times, numbers = self._samples.setdefault(child, (array("q"), array("d")))
+                times.append(stamp_of(entry["header"]))
+                numbers.extend([*(translation[a] for a in "xyz"), *(rotation[a] for a in "xyzw")])
+            self._parents.setdefault(child, Counter())[parent] += 1
+
+    def __len__(self) -> int:
+        return len(self._parents)
+
+    @property
+    def frames(self) -> list[str]:
+        return sorted({*self._parents, *(p for parents in self._parents.values() for p in parents)})
+
+    def is_moving(self, chain: list[str]) -> bool:
+        """Whether a transform of the chain is not static."""
+        return any(child in self._samples for child in chain[:-1])
+
+    def chain(self, frame: str, top: str | None = None) -> list[str]:
+        """Frames from `frame` up to `top`, or to the root of its tree.
+
+        Raises `DataError` if the tree loops, if a frame has two parents, or if `top` is not above `frame`.
+        """
+        found = [frame]
+        while found[-1] in self._parents and found[-1] != top:
+            parents = self._parents[found[-1]]
+            if len(parents) > 1:
+                counts = ", ".join(f"{parent} ({n} times)" for parent, n in parents.most_common())
+                raise DataError(
+                    f"TF states several parents of frame {found[-1]}: {counts}; record only one of them, or "
+                    "choose other poses: dataset.poses=TOPIC, FILE or standing."
+                )
+            parent = next(iter(parents))
+            if parent in found:
+                raise DataError(
+                    f"TF loops: {' → '.join([*found, parent])}; record only one of these "
+                    "transforms, or choose "
+                    "other poses: dataset.poses=TOPIC, FILE or standing."
+                )
+            found.append(parent)
+        if top is not None and found[-1] != top:
+            raise DataError(
+                f"TF has no transform between frame {top} and frame {frame}, whose tree is "
+                f"{' → '.join(found)}; all frames: {self.describe()}. Choose dataset.frame, "
+                "dataset.sensor_frame "
+                "or dataset.poses."
+            )
+        return found
+
+    def describe(self) -> str:
+        """The frames of each tree of TF, for messages."""
+        trees: dict[str, list[str]] = {}
+        for frame in self.frames:
+            at, seen = frame, {frame}
+            while at in self._parents and (up := next(iter(self._parents[at]))) not in seen:
+                at = up
+                seen.add(at)
+            trees.setdefault(at, []).append(frame)
+        return "; ".join(", ".join(frames) for frames in trees.values()) or "none"
+
+    def lookup(self, chain: list[str], times: np.ndarray, max_gap: float) -> Poses:
+        """Poses of the first frame of a chain in its last one, at times (M,) in ns."""
+        matrices = np.tile(np.eye(4), (len(times), 1, 1))
+        known = np.ones(len(times), bool)
+        for child in chain[:-1]:
+            step = self._step(child, times, max_gap)
+            matrices, known = step.matrices @ matrices, known & step.known
+        return Poses(matrices, known)
+
+    def unknown_step(self, chain: list[str], time: int, max_gap: float) -> str:
+        """The transform of a chain that is not known at a time, with the times at which it is."""
+        for child, parent in itertools.pairwise(chain):
+            if not self._step(child, np.array([time]), max_gap).known[0]:
+                times = self._edge(child).times / NANOSECONDS
+                if len(times) == 0:
+                    return f"{parent} ← {child} is never a rigid transform"
+                return f"{parent} ← {child} is known from {times[0]:.3f} to {times[-1]:.3f} s"
+        return "all transforms are known"
+
+    def _step(self, child: str, times: np.ndarray, max_gap: float) -> Poses:
+        if child not in self._samples:
+            return Poses(np.tile(self._static[child], (len(times), 1, 1)), np.ones(len(times), bool))
+        return self._edge(child).at(times, max_gap)
+
+    def _edge(self, child: str) -> Trajectory:
+        if child not in self._edges:
+            times, numbers = (np.array(column) for column in self._samples[child])
+            numbers = numbers.reshape(-1, 7)
+            valid = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > MIN_NORM)
+            poses = pose_matrix(numbers[valid, :3], numbers[valid, 3:])
+            self._edges[child], _ = Trajectory.from_samples(times[valid], poses)
+        return self._edges[child]
+
+
+def frame_name(name: str) -> str:
+    """The name of a frame as ROS 2 writes it, without a leading slash."""
+    return name.lstrip("/")
+
+
+def stamp_of(header: dict[str, Any]) -> int:
+    """The stamp of a message header in ns."""
+    return int(header["stamp"]["sec"]) * NANOSECONDS + int(header["stamp"]["nanosec"])
+
+
+def transform_matrix(translation: dict[str, float], rotation: dict[str, float]) -> np.ndarray:
+    """The pose (4, 4) of a Transform or Pose message. Raises `ValueError` if it is not one."""
+    return pose_matrix(
+        np.array([translation[axis] for axis in "xyz"]), np.array([rotation[axis] for axis in "xyzw"])
+    )

@@ -1,0 +1,140 @@
+"""Sequences of the TUM RGB-D benchmark: depth images with times, and a trajectory of the camera.
+
+`depth.txt`: rows `time file`. `groundtruth.txt`: rows `time x y z qx qy qz qw`. Depth images are PNG with 16
+bits, in 1/5000 m; 0 is invalid.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges, require_path
+from gmmtorch.datasets.depth_frames import back_project, read_png
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, increasing, read_trajectory, to_nanoseconds
+from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
+from gmmtorch.scan import Scan
+
+_INTRINSICS = (525.0, 525.0, 319.5, 239.5)
+"""The values that the benchmark recommends: its depth images are registered with these."""
+
+
+class TumRgbd(Dataset):
+    """Depth images as scans, in the order of depth.txt, with poses interpolated at their times.
+
+    Images without a pose are left out and counted. `intrinsics` is the pinhole matrix (3, 3) in pixels;
+    `image` returns the full depth image of a scan.
+
+    Args:
+        path: the folder of the sequence.
+        ranges, stride: see `Dataset`.
+        poses: another trajectory file with times; None: groundtruth.txt.
+        intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5.
+        depth_scale: metres per unit of the images.
+        max_gap: longest time (s) between two poses that are interpolated.
+        pixel_stride: every n-th pixel of every n-th row is used.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        ranges: Ranges,
+        stride: int = 1,
+        poses: str | None = None,
+        intrinsics: list[float] | None = None,
+        depth_scale: float = 0.0002,
+        max_gap: float = 0.5,
+        pixel_stride: int = 1,
+    ) -> None:
+        path = require_path(
+            path,
+            "folder",
+            "depth.txt, groundtruth.txt and depth/*.png",
+            "The TUM RGB-D benchmark publishes sequences in this layout.",
+        )
+        super().__init__(path.resolve().name, ranges, stride)
+        self.pixel_stride = check_whole("dataset.pixel_stride", pixel_stride, 1)
+        if not 0 < depth_scale < np.inf:
+            raise InvalidArgumentError(
+                f"dataset.depth_scale={depth_scale} must be above zero metres per unit."
+            )
+        self._scale = depth_scale
+        self.intrinsics = _pinhole(_INTRINSICS if intrinsics is None else intrinsics)
+        times, files = _listed(path / "depth.txt")
+        kept = increasing(times)
+        for index in sorted({*range(len(times))} - {*kept.tolist()}):
+            self._skip("stamp out of order (the clock jumped)", index)
+        trajectory = read_trajectory(poses or path / "groundtruth.txt")
+        if len(trajectory) and trajectory.times[-1] < len(trajectory):
+            raise DataError(
+                f"{poses or path / 'groundtruth.txt'} has poses without times; give a TUM trajectory."
+            )
+        found = trajectory.at(times[kept], max_gap)
+        for index in kept[~found.known].tolist():
+            self._skip("no pose at the time of the scan", index)
+        if not found.known.any():
+            raise DataError(
+                f"{path}: no depth image has a pose. Images are from {times[0] / NANOSECONDS:.3f} to "
+                f"{times[-1] / NANOSECONDS:.3f} s, poses from {trajectory.times[0] / NANOSECONDS:.3f} to "
+                f"{trajectory.times[-1] / NANOSECONDS:.3f} s."
+            )
+        kept = kept[found.known]
+        self._files = [files[index] for index in kept]
+        self._poses = torch.from_numpy(found.matrices[found.known])
+        self._times = torch.from_numpy(times[kept] / NANOSECONDS)
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _known_pose(self, index: int) -> Tensor:
+        return self._poses[index]
+
+    def _known_times(self) -> Tensor:
+        return self._times
+
+    def _read(self, index: int) -> Scan:
+        pose = self._poses[index]
+        points = back_project(self._depth(index), self.intrinsics, self.pixel_stride)
+        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+    def image(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
+        position = self._position(index)
+        return self._depth(position), self._poses[position]
+
+    def _depth(self, index: int) -> Tensor:
+        path = self._files[index]
+        return torch.from_numpy(read_png(path, str(path)) * self._scale)
+
+
+def _pinhole(values: tuple[float, ...] | list[float]) -> Tensor:
+    numbers = [float(value) for value in values]
+    if len(numbers) != 4 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:
+        raise InvalidArgumentError(f"dataset.intrinsics={list(values)} must be fx, fy, cx, cy in pixels.")
+    fx, fy, cx, cy = numbers
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
+    """Times (ns) and files of a list of images. Files must be inside the folder of the list."""
+    if not path.is_file():
+        raise DataError(f"{path} is missing; it lists a time and a file for each depth image.")
+    times, files = [], []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            seconds, name = float(words[0]), PurePosixPath(words[1])
+            if not abs(seconds) < 9e9 or name.is_absolute() or ".." in name.parts:
+                raise ValueError(f"{line!r} is not a time and a file of this folder")
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{path}, line {number}: expected a time and a file ({error}).") from error
+        times.append(seconds)
+        files.append(path.parent / name)
+    if not files:
+        raise DataError(f"{path} lists no image.")
+    return to_nanoseconds(np.array(times)), files

@@ -1,0 +1,237 @@
+"""FusedKernel: a loop in C++ that Warp compiles for the CPU (with its own LLVM) or for CUDA.
+
+All kernels are one Warp module, so that a machine compiles once. The result is cached in a folder; without a
+folder that can be written, in a temporary one, for this process.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import itertools
+import logging
+import os
+import pkgutil
+import re
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import GmmTorchError
+
+logger = logging.getLogger(__name__)
+
+_MODULE = "gmmtorch_kernels"
+_TYPES = {"int64": "int64", "double": "float64", "float": "float32", "bool": "bool"}
+_POINTERS = {"int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
+_LEAST_ITEMS = 1 << 10  # of a thread
+_lock = threading.RLock()
+_sources: dict[str, FusedKernel] = {}
+
+_PRELUDE = """
+#if defined(__CUDA_ARCH__)
+#define GMM_ADD(place, value) atomicAdd(place, value)
+#else
+#define GMM_ADD(place, value) (*(place) += (value))
+#endif
+#define GMM_MIN(a, b) ((a) < (b) ? (a) : (b))
+#define GMM_MAX(a, b) ((a) > (b) ? (a) : (b))
+"""
+
+
+class FusedKernel:
+    """A C++ loop body, which runs once for each `item` (int64) from 0 up to the size of a launch.
+
+    Args:
+        name: a C++ identifier, unique among the kernels.
+        parameters: C++ parameters of the types int64, double, float, bool, and pointers to these and to
+            int32 and uint8, separated by commas. A pointer is a tensor, or None for a null pointer.
+        body: C++ statements. GMM_ADD(pointer, value) adds so that items can meet in one place on CUDA.
+        shares: whether items write to the same places. Such a launch uses one thread of a CPU.
+    """
+
+    def __init__(self, name: str, parameters: str, body: str, shares: bool = False) -> None:
+        self.name, self.shares = name, shares
+        casts, names, types = [], [], []
+        for parameter in parameters.split(","):
+            match = re.fullmatch(r"\s*(const\s+)?(\w+)\s*(\*?)\s*(\w+)\s*", parameter)
+            if match is None:
+                raise ValueError(f"parameter {parameter!r} of kernel {name} is not `type name`.")
+            const, kind, star, label = match.groups()
+            names.append(label + "_" if star else label)
+            types.append("uint64" if star else _TYPES[kind])
+            if star:
+                cpp = f"{const or ''}{_POINTERS.get(kind, kind)}*"
+                casts.append(f"{cpp} {label} = ({cpp}){label}_;")
+        signature = ", ".join(f"{n}: wp.{t}" for n, t in zip(names, types, strict=True))
+        self._body = _PRELUDE + "\n".join(casts) + body
+        self._stub = f"def {name}_body(item: wp.int64, {signature}): ...\n"
+        self._entry = (
+            f"def {name}(begin: wp.int64, {signature}):\n"
+            f"    {name}_body(begin + wp.int64(wp.tid()), {', '.join(names)})\n"
+        )
+        self._kernel: Any = None
+        _sources[name] = self
+
+    def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
+        """Run the body for the items 0 … n_items − 1.
+
+        Tensors must be contiguous, on `device`, and of the type of their pointers; they are not checked. On
+        a CPU the items are split over `torch.get_num_threads()` threads, unless the kernel `shares`.
+        """
+        if n_items == 0:
+            return
+        _load(device)
+        values = [a.data_ptr() if isinstance(a, Tensor) else 0 if a is None else a for a in arguments]
+        wp = _warp()
+        if device.type == "cuda":
+            stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+            wp.launch(self._kernel, dim=n_items, inputs=[0, *values], device=str(device), stream=stream)
+            return
+        n_threads = 1 if self.shares else min(torch.get_num_threads(), 1 + n_items // _LEAST_ITEMS)
+        if n_threads == 1:
+            wp.launch(self._kernel, dim=n_items, inputs=[0, *values], device="cpu")
+            return
+        bounds = [n_items * part // n_threads for part in range(n_threads + 1)]
+        jobs = [
+            _threads(n_threads).submit(
+                wp.launch, self._kernel, dim=stop - begin, inputs=[begin, *values], device="cpu"
+            )
+            for begin, stop in itertools.pairwise(bounds)
+        ]
+        for job in jobs:
+            job.result()  # Warp releases the interpreter's lock during a launch
+
+    def define(self, wp: Any) -> None:
+        """Register the body and its entry with Warp."""
+        import linecache
+
+        for part in (self._stub, self._entry):
+            path = f"<gmmtorch kernel {self.name} {'stub' if part is self._stub else 'entry'}>"
+            linecache.cache[path] = (len(part), None, part.splitlines(True), path)
+        scope: dict[str, Any] = {"wp": wp, "__name__": _MODULE}
+        exec(compile(self._stub, f"<gmmtorch kernel {self.name} stub>", "exec"), scope)
+        body = f"{self.name}_body"
+        scope[body] = wp.func_native(self._body)(scope[body])
+        exec(compile(self._entry, f"<gmmtorch kernel {self.name} entry>", "exec"), scope)
+        self._kernel = wp.kernel(
+            scope[self.name], enable_backward=False, module=wp.get_module(_MODULE), grid_stride=False
+        )
+
+
+@functools.cache
+def _threads(n: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(n, thread_name_prefix="gmmtorch-kernels")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_threads.cache_clear)  # a child process has no threads
+
+
+@functools.cache
+def compiler_failure() -> str | None:
+    """Why the kernel compiler does not work, or None. The first call compiles the kernels for the CPU."""
+    try:
+        with _lock:
+            _load(torch.device("cpu"))
+    except GmmTorchError as error:
+        return str(error)
+    return None
+
+
+@functools.cache
+def _warp() -> Any:
+    """The module warp, set up. Raises `GmmTorchError` if it does not load."""
+    try:
+        import warp as wp
+    except Exception as error:  # a broken installation fails in many ways
+        raise GmmTorchError(f"the package warp-lang does not load ({error})") from error
+    from_user = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)
+    wp.config.kernel_cache_dir = str(_cache_folder(Path(from_user) if from_user else None))
+    with _without_driver_warning():
+        wp.init()
+    return wp
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Without a GPU, discards what Warp's library writes to stderr: that it found no driver."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _cache_folder(preferred: Path | None) -> Path:
+    """The folder of compiled kernels: `preferred`, the user's cache, or a temporary folder."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    for folder in (preferred, (Path(home) if home else Path.home() / ".cache") / "gmmtorch" / "kernels"):
+        if folder is None:
+            continue
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    logger.info("Compiled kernels are not kept, because no cache folder can be written.")
+    return _temporary_folder()
+
+
+@functools.cache
+def _temporary_folder() -> Path:
+    folder = tempfile.TemporaryDirectory(prefix="gmmtorch-kernels-")
+    _kept.append(folder)
+    return Path(folder.name)
+
+
+_kept: list[object] = []  # removed when the process ends
+
+
+def _load(device: torch.device) -> None:
+    if str(device) not in _loaded:
+        with _lock:
+            if str(device) not in _loaded:
+                _compile(device)
+                _loaded.add(str(device))
+
+
+_loaded: set[str] = set()
+
+
+def _compile(device: torch.device) -> None:
+    """Compile all kernels for a device, or load them from the cache."""
+    wp = _warp()
+    package = importlib.import_module("gmmtorch.kernels")
+    for found in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"gmmtorch.kernels.{found.name}")
+    for kernel in _sources.values():
+        if kernel._kernel is None:
+            kernel.define(wp)
+    module, begin = wp.get_module(_MODULE), time.perf_counter()
+    logger.info("Loading the fused kernels for %s; the first time they are compiled (seconds).", device)
+    try:
+        loaded = module.load(wp.get_device(str(device)), 1 if device.type == "cpu" else None)
+    except Exception as error:
+        raise GmmTorchError(f"the kernels do not compile for {device} ({error})") from error
+    if not loaded:
+        raise GmmTorchError(f"the kernels do not compile for {device}")
+    logger.info("The fused kernels are ready after %.1f s.", time.perf_counter() - begin)

@@ -1,0 +1,149 @@
+"""The test whether the hull of a cone can give evidence near a point, see `occupancy.index.hulls`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.point_evidence import sum_of
+
+_BODY = """
+    const double* row = rows + cone[item] * WIDTH;
+    const double *mean = row + DIM * DIM, *origin = mean + DIM, *squares = origin + DIM;
+    const double whole = squares[DIM], *center = centers + item * DIM;
+    double y[DIM], z[DIM], distance = 0.0;
+    for (int j = 0; j < DIM; ++j) {
+        y[j] = z[j] = 0.0;
+        for (int i = 0; i < DIM; ++i) {
+            y[j] += row[i * DIM + j] * (center[i] - mean[i]);
+            z[j] += row[i * DIM + j] * (center[i] - origin[i]);
+        }
+        distance += (center[j] - origin[j]) * (center[j] - origin[j]);
+    }
+    distance = sqrt(distance);
+    const double ball = radii ? radii[item] : radius;
+    const double reach = spread > 0.0 ? ball : ball + cube_reach;
+    const double clear = GMM_MAX(distance - reach, 1e-12);
+    double widened = spread * GMM_MAX(whole / clear, 1.0);
+    const double far = squares[DIM + 1] + widened;
+    widened *= widened;
+    const double beta = far * reach / clear;
+    bool close = distance <= far + reach;
+    for (int axis = DIM - 1; close && axis >= DIM - 2; --axis) {
+        double ratio = beta / GMM_MAX(sqrt(squares[axis] + widened), 1e-12);
+        ratio = GMM_MIN(GMM_MAX(ratio, 1e-6), 1e6);
+        const double added = (1.0 + ratio) * widened + (1.0 + 1.0 / ratio) * beta * beta;
+        double aa = 0.0, bb = 0.0, cc = 0.0;
+        for (int j = 0; j < DIM; ++j) {
+            const double weight = 1.0 / ((1.0 + ratio) * squares[j] + added);
+            aa += weight * z[j] * z[j];
+            bb += weight * y[j] * z[j];
+            cc += weight * y[j] * y[j];
+        }
+        bb = GMM_MIN(bb, 0.0);
+        close = cc - bb * bb / GMM_MAX(aa, 1e-300) < 1.0 + 1e-6;
+    }
+    near[item] = close || distance <= (reach + cube_reach) * (1.0 + 1e-9);
+"""
+_KERNELS = {
+    dim: FusedKernel(
+        f"hull_test_{dim}d",
+        "const double* rows, const int64* cone, const double* centers, const double* radii, double radius,"
+        " double cube_reach, double spread, bool* near",
+        _BODY.replace("WIDTH", str(dim * dim + 3 * dim + 2)).replace("DIM", str(dim)),
+    )
+    for dim in (2, 3)
+}
+
+
+def near_hulls(
+    table: Tensor,
+    cone: Tensor,
+    centers: Tensor,
+    radius: Tensor | float,
+    cube_reach: float,
+    spread: float,
+    compiled: bool = False,
+) -> Tensor:
+    """Whether (T,) cone (T,) can give evidence to a cube centred in the ball around `centers` (T, D).
+
+    Args:
+        table: (C, n) float64, a row for each cone: its axes (D²), mean, sensor origin and squared half axes
+            at the cutoff (D each), the distance between mean and origin, and that to the farthest point.
+        radius: of the balls, one for all or (T,).
+        cube_reach: from the centre of a cube to its corners; spread: see `Hulls`; metres.
+        compiled: torch.compile for the twin.
+    """
+    radii = radius if isinstance(radius, Tensor) else None
+    if is_fused(table, cone, centers, radii):
+        near = torch.empty(len(cone), dtype=torch.bool, device=cone.device)
+        radii = None if radii is None else radii.double().contiguous()
+        fixed = 0.0 if isinstance(radius, Tensor) else radius
+        _KERNELS[centers.shape[1]](
+            len(cone),
+            table,
+            cone.contiguous(),
+            centers.double().contiguous(),
+            radii,
+            fixed,
+            cube_reach,
+            spread,
+            near,
+            device=cone.device,
+        )
+        return near
+    test = _compiled_near() if compiled else _near_cone
+    return test(table.T, cone, centers, radius, cube_reach, spread)
+
+
+def _near_cone(
+    table: Tensor, cone: Tensor, centers: Tensor, radius: Tensor | float, cube_reach: float, spread: float
+) -> Tensor:
+    """The twin; the cones are columns of the table.
+
+    Let y, within R of the centre x, lie on the segment from the sensor origin s to a point p of the
+    ellipsoid E. Then the ray from s through x passes, beyond x, within R |p − s|/|y − s| ≤ β of p, with β =
+    R·far/(|x − s| − R). So from x on this ray meets the sum of E and a ball of radius β. The ellipsoid (1 +
+    ε)E + (1 + 1/ε)β²I contains that sum for every ε > 0. The test uses two values of ε, which are tight
+    along the two longest axes. In the smoothed case E is widened first.
+    """
+    dim = centers.shape[1]
+    columns = [column[cone] for column in table]
+    mean, origin, squares = (columns[dim * dim + i * dim :][:dim] for i in range(3))
+    whole, far = columns[-2:]
+    axes = [columns[i * dim : (i + 1) * dim] for i in range(dim)]  # axes[i][j]: entry i of axis j
+    x = centers.unbind(1)
+    ray = [a - s for a, s in zip(x, origin, strict=True)]
+    offset = [a - m for a, m in zip(x, mean, strict=True)]
+    y = [sum_of(axes[i][j] * offset[i] for i in range(dim)) for j in range(dim)]
+    z = [sum_of(axes[i][j] * ray[i] for i in range(dim)) for j in range(dim)]
+    distance = sum_of(r * r for r in ray).sqrt()
+    reach = radius if spread > 0 else radius + cube_reach
+    clear = (distance - reach).clamp_min(1e-12)
+    widened = (spread * (whole / clear).clamp_min(1)) ** 2  # added variance, of the rays and of the component
+    far = far + widened.sqrt()
+    beta = far * reach / clear
+    near = distance <= far + reach
+    for axis in (-1, -2):
+        ratio = (beta / (squares[axis] + widened).sqrt().clamp_min(1e-12)).clamp(1e-6, 1e6)
+        added = (1 + ratio) * widened + (1 + 1 / ratio) * beta**2
+        weight = [1 / ((1 + ratio) * square + added) for square in squares]
+        cc = sum_of(w * a * a for w, a in zip(weight, y, strict=True))
+        bb = sum_of(w * a * b for w, a, b in zip(weight, y, z, strict=True))
+        aa = sum_of(w * b * b for w, b in zip(weight, z, strict=True))
+        # Squared Mahalanobis distance to the inflated ellipsoid, at x or at the nearest point of the ray
+        # beyond x.
+        near = near & (cc - bb.clamp_max(0) ** 2 / aa.clamp_min(1e-300) < 1 + 1e-6)
+    # The bound does not hold where the cube contains the sensor origin: these cones count as near.
+    return near | (distance <= (reach + cube_reach) * (1 + 1e-9))
+
+
+@functools.cache
+def _compiled_near() -> Callable[..., Tensor]:
+    compiled: Callable[..., Tensor] = torch.compile(_near_cone, dynamic=True)
+    return compiled

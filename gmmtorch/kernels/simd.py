@@ -1,0 +1,82 @@
+"""C++ of a vector of eight numbers on a CPU, and of one on CUDA: `vec`, `mask`, exp, Mills' ratio."""
+
+from __future__ import annotations
+
+CPU_LANES = 8
+"""Lanes of a vector on a CPU; CUDA has one lane in each thread."""
+
+MILLS = (
+    1.1995549603570066,
+    -0.24492908847573483,
+    0.0019722954680675953,
+    0.09537120623471908,
+    -0.07584057196494208,
+    0.026019720645055353,
+    0.000658739314212789,
+    -0.0035720573940499914,
+    0.0003697001811368178,
+    0.0005347378018567725,
+    -6.178536177826783e-05,
+    -9.796267488692001e-05,
+    1.7148664092742522e-06,
+    1.9463951187330875e-05,
+    3.1954198511379135e-06,
+    -3.523740392012662e-06,
+    -1.5724856549774496e-06,
+    4.5897502967394406e-07,
+    4.802961679927754e-07,
+    -2.0994793053819336e-08,
+    -9.765595887420525e-08,
+    -2.9857433243157565e-09,
+    1.0223231681768988e-08,
+)
+"""Coefficients in t = (x − 3.5)/(x + 3.5) of (1 + x) R(x), interpolated at Chebyshev nodes in t. The
+substitution is that of Shepherd & Laframboise 1981. The relative error is below 2·10⁻¹⁴."""
+
+SIMD = """
+#if defined(__CUDA_ARCH__)
+    typedef double vec;
+    typedef bool mask;
+    constexpr int LANES = 1;
+    auto any = [](mask m) { return m; };
+    auto root = [](vec x) { return sqrt(x); };
+    auto expo = [](vec x) { return exp(x); };
+    auto get = [](vec v, int) { return v; };
+    auto set = [](vec& v, int, double x) { v = x; };
+#else
+    typedef double vec __attribute__((ext_vector_type(8)));
+    typedef decltype(vec() < vec()) mask;
+    constexpr int LANES = 8;
+    auto any = [](mask m) { return __builtin_reduce_or(m) != 0; };
+    auto root = [](vec x) { return __builtin_elementwise_sqrt(x); };
+    auto get = [](vec v, int i) { return v[i]; };
+    auto set = [](vec& v, int i, double x) { v[i] = x; };
+    auto expo = [](vec x) {  // relative error below 4e-16 between -700 and 700, where it is clamped
+        x = x < -700.0 ? (vec)(-700.0) : x;
+        x = x > 700.0 ? (vec)(700.0) : x;
+        const vec shifted = x * 1.4426950408889634 + 6755399441055744.0;  // n in its lowest bits
+        const vec n = shifted - 6755399441055744.0;
+        const vec r = x - n * 0.693147180369123816490 - n * 1.90821492927058770002e-10;
+        const double inverse[12] = {
+            1.0 / 39916800.0, 1.0 / 3628800.0, 1.0 / 362880.0, 1.0 / 40320.0, 1.0 / 5040.0, 1.0 / 720.0,
+            1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0};
+        vec p = (vec)(1.0 / 479001600.0);
+        for (int i = 0; i < 12; ++i) p = p * r + inverse[i];
+        const mask power = __builtin_bit_cast(mask, shifted) << 52;
+        return __builtin_bit_cast(vec, __builtin_bit_cast(mask, p) + power);
+    };
+#endif
+    auto mills = [](vec x) {  // R(x) = e^(x*x/2) integral of e^(-w*w/2) from x, x >= 0; relative error 2e-14
+        const double c[23] = {MILLS};
+        const vec scale = 1.0 / ((x + 3.5) * (1.0 + x));
+        const vec t = 1.0 - 7.0 * (1.0 + x) * scale, tt = t * t;
+        vec even = (vec)(c[22]), odd = (vec)(c[21]);
+        for (int i = 20; i >= 2; i -= 2) {
+            even = even * tt + c[i];
+            odd = odd * tt + c[i - 1];
+        }
+        even = even * tt + c[0];
+        return (even + odd * t) * (x + 3.5) * scale;
+    };
+""".replace("MILLS", ", ".join(map(repr, MILLS)))
+"""Statements at the start of a kernel's body."""

@@ -1,0 +1,1 @@
+"""Maps shown live: the browser viewer."""

@@ -1,0 +1,239 @@
+"""MapBuilder: builds a map from a data set, scan by scan, and continues after a stop."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.files import joined_tensors, pack_tensors, read_tensors, split_tensors, write_bytes
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.scan import Scan
+
+_KIND, _VERSION = "gmmtorch.map_builder", 1
+_N_ROWS = 20  # rows of the history of a complete run, at most; each encodes the whole map
+
+
+@dataclass(frozen=True)
+class BuildProgress:
+    """The state of a map while it is built.
+
+    n_read, n_total: scans that were read, of all. n_skipped: scans of these that could not be used.
+    n_points: returns in the map. n_components: final components. metres: length of the sensor's path.
+    seconds: computing time of all runs so far.
+    """
+
+    n_read: int
+    n_total: int
+    n_skipped: int
+    n_points: int
+    n_components: int
+    metres: float
+    seconds: float
+
+
+@dataclass
+class BuildRecord:
+    """What a builder knows besides its map.
+
+    n_read: scans that were read. indices: of the scans in the map. n_points: their returns. metres: length of
+    the path through their origins. skipped: number of scans left out while reading, by the reason. history:
+    rows of (n_read, n_components, nbytes, metres, seconds, memory_bytes) at the ends of windows. seconds:
+    computing time of all runs.
+    """
+
+    n_read: int = 0
+    indices: list[int] = field(default_factory=list)
+    n_points: int = 0
+    metres: float = 0.0
+    skipped: dict[str, int] = field(default_factory=dict)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+class MapBuilder:
+    """Inserts the scans of a data set into a map.
+
+        builder = MapBuilder(dataset, GaussianMap())
+        for progress in builder.insert_all():
+            print(progress.n_read, progress.n_components)
+
+    A scan that cannot be read (`DataError`) or has no beam is skipped and counted. The map is a
+    function of the scans alone: stops, checkpoints and progress do not change it.
+
+    Attributes:
+        map: the map.
+        poses: (S, D+1, D+1) sensor poses of the scans in the map, world ← sensor, metres. The rotation is the
+            identity if the data set states none.
+        times: (S,) their times in seconds, float64; their indices if the data set states none.
+        skipped: number of scans left out, by the reason.
+        record: counts and the history of the run.
+    """
+
+    def __init__(self, dataset: Dataset, target: GaussianMap, device: str | torch.device = "cpu") -> None:
+        self.map = target
+        self.record = BuildRecord()
+        self._dataset = dataset
+        self._device = device
+        self._poses: list[Tensor] = []
+        self._left_out = dataset.skipped  # when the data set was opened
+
+    @property
+    def poses(self) -> Tensor:
+        size = 1 + (self.map.dim or 3)
+        return torch.stack(self._poses) if self._poses else torch.zeros(0, size, size, dtype=torch.float64)
+
+    @property
+    def times(self) -> Tensor:
+        indices, known = self.record.indices, self._dataset.times
+        return torch.tensor(indices).double() if known is None else known[indices]
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        reasons = dict.fromkeys([*self._left_out, *self.record.skipped])
+        return {why: self._left_out.get(why, 0) + self.record.skipped.get(why, 0) for why in reasons}
+
+    def insert_all(self) -> Iterator[BuildProgress]:
+        """Inserts the remaining scans, and yields the progress after each scan.
+
+        Raises `DataError` if no scan of the data set can be used.
+        """
+        n_total, record = len(self._dataset), self.record
+        before = record.seconds
+        begin = time.monotonic()
+        for index in range(record.n_read, n_total):
+            self._insert(index)
+            record.n_read = index + 1
+            record.seconds = before + time.monotonic() - begin
+            if self.map.n_pending == 0 and record.n_read * _N_ROWS >= n_total * (len(record.history) + 1):
+                self._add_row()
+            yield self.progress()
+            begin, before = time.monotonic(), record.seconds  # the caller's work does not count
+        if not record.indices:
+            reason = next(iter(self.skipped), "it contains none")
+            raise DataError(f"{self._dataset.name}: no scan of {n_total} can be used: {reason}")
+
+    def finish(self) -> None:
+        """Learns from the scans of the unfinished window, and completes the history."""
+        begin = time.monotonic()
+        self.map.finish()
+        self.record.seconds += time.monotonic() - begin
+        self._add_row()
+
+    def progress(self) -> BuildProgress:
+        """The present state."""
+        record = self.record
+        return BuildProgress(
+            record.n_read,
+            len(self._dataset),
+            sum(self.skipped.values()),
+            record.n_points,
+            0 if self.map.dim is None else self.map.means.shape[0],
+            record.metres,
+            record.seconds,
+        )
+
+    def _insert(self, index: int) -> None:
+        record, before = self.record, self._dataset.skipped
+        scan, reason = None, "a scan has neither returns nor free beams"
+        try:
+            scan = self._dataset[index].to(self._device)
+        except DataError as error:
+            reason = str(error)
+        if scan is not None and scan.n_beams > 0:
+            self.map.insert(scan)
+            self._note(index, scan)
+        found = {why: n - before.get(why, 0) for why, n in self._dataset.skipped.items()}
+        found = {why: n for why, n in found.items() if n}
+        if scan is None or (scan.n_beams == 0 and not found):
+            found = {reason: 1}
+        for why, n in found.items():
+            record.skipped[why] = record.skipped.get(why, 0) + n
+
+    def _note(self, index: int, scan: Scan) -> None:
+        """Records the pose of a scan that the map has learned from."""
+        record, known = self.record, self._dataset.pose(index)
+        pose = torch.eye(scan.dim + 1, dtype=torch.float64) if known is None else known.double().cpu()
+        pose = pose.clone()
+        pose[:-1, -1] = scan.origin.double().cpu()
+        if self._poses:
+            record.metres += float((pose[:-1, -1] - self._poses[-1][:-1, -1]).norm())
+        self._poses.append(pose)
+        record.indices.append(index)
+        record.n_points += scan.points.shape[0]
+
+    def _add_row(self) -> None:
+        now = self.progress()
+        row = {
+            "n_read": now.n_read,
+            "n_components": self.map.n_components,
+            "nbytes": self.map.nbytes,
+            "metres": now.metres,
+            "seconds": now.seconds,
+            "memory_bytes": resident_bytes(),
+        }
+        history = self.record.history
+        if history and history[-1]["n_read"] == now.n_read:
+            history.pop()
+        history.append(row)
+
+    # -- checkpoints ----------------------------------------------------------------------------------
+
+    def save(self, path: str | Path, run: Mapping[str, Any]) -> None:
+        """Writes everything that building continues from, atomically.
+
+        Args:
+            path: the file.
+            run: the settings of the run, in JSON types; `load` compares them.
+        """
+        state = {"map": dict(self.map.state_dict()), "poses": self.poses, "record": vars(self.record)}
+        tree, tensors = split_tensors(state)
+        write_bytes(path, pack_tensors(tensors, _KIND, _VERSION, tree=tree, run=dict(run)))
+
+    def load(self, path: str | Path, run: Mapping[str, Any]) -> None:
+        """Continues from a file that `save` wrote.
+
+        Raises `InvalidArgumentError` if the file is of another run, and `DataError` if it is damaged.
+        """
+        tensors, facts = read_tensors(path, _KIND, _VERSION)
+        stored = facts.get("run")
+        if not isinstance(stored, dict):
+            raise DataError(f"{path} lacks the description of its run; the file is damaged.")
+        for name in dict.fromkeys([*run, *stored]):
+            if stored.get(name) != run.get(name):
+                raise InvalidArgumentError(
+                    f"{path} is of another run: it has {name}={stored.get(name)!r}, this run has "
+                    f"{name}={run.get(name)!r}. Use the same value, or another folder, or delete the file."
+                )
+        try:
+            state = joined_tensors(facts["tree"], tensors)
+            record, poses = BuildRecord(**state["record"]), state["poses"]
+            if not (0 <= record.n_read <= len(self._dataset) and len(record.indices) == len(poses)):
+                raise ValueError("its counts disagree")
+            self.map.load_state_dict(state["map"])
+            self.map.to(self._device)
+        except GmmTorchError:
+            raise
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise DataError(f"{path} is damaged: {error!r}; delete it to start again.") from error
+        self.record, self._poses = record, list(poses.double())
+
+
+def resident_bytes() -> int:
+    """Memory of this process now; the largest so far on systems without /proc."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return largest if sys.platform == "darwin" else 1024 * largest

@@ -1,0 +1,125 @@
+"""The loop of EM, and its exact steps."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from gmmtorch.mixture.em import exact
+from gmmtorch.mixture.em.covariance_types import constrain
+from gmmtorch.mixture.em.exact import Parameters
+
+State = TypeVar("State")  # what an iteration improves: `Parameters`, or a posterior
+
+Step = Callable[[State], tuple[State, float]]
+"""One EM step: from a state to an improved one, and a mean lower bound (nats)."""
+
+OnIteration = Callable[[int, float], None]
+"""Called with the iteration, from 1, and its lower bound."""
+
+
+@dataclass(frozen=True)
+class EMResult(Generic[State]):
+    """The last state, and the lower bound (mean log-likelihood, nats) that each iteration gave."""
+
+    parameters: State
+    lower_bounds: list[float]
+    converged: bool
+
+    @property
+    def n_iter(self) -> int:
+        return len(self.lower_bounds)
+
+    @property
+    def lower_bound(self) -> float:
+        """The last bound; −∞ without an iteration."""
+        return self.lower_bounds[-1] if self.lower_bounds else -math.inf
+
+
+def run_em(
+    step: Step[State],
+    parameters: State,
+    *,
+    tol: float = 1e-3,
+    max_iter: int = 100,
+    on_iteration: OnIteration | None = None,
+    lower_bounds: Sequence[float] = (),
+    previous_bound: float = -math.inf,
+) -> EMResult[State]:
+    """EM until the mean log-likelihood changes by less than `tol` nats, or for `max_iter` iterations.
+
+    To continue a run, pass as `lower_bounds` those of the iterations that led to `parameters`. To start a
+    new count of iterations from an earlier result, pass its last bound as `previous_bound`.
+    """
+    bounds = list(lower_bounds)
+    while not (converged := has_converged(bounds, tol, previous_bound)) and len(bounds) < max_iter:
+        parameters, bound = step(parameters)
+        bounds.append(bound)
+        if on_iteration is not None:
+            on_iteration(len(bounds), bound)
+    return EMResult(parameters, bounds, converged)
+
+
+def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -math.inf) -> bool:
+    """Whether the last iteration changed the bound by less than `tol`."""
+    return len(bounds) > 0 and abs(bounds[-1] - [previous_bound, *bounds][-2]) < tol
+
+
+def natural_step(
+    features: Tensor,
+    sample_weight: Tensor,
+    reg_covar: float,
+    softmax_dtype: torch.dtype = torch.float32,
+    points: Tensor | None = None,
+    covariance_type: str = "full",
+) -> Step[Parameters]:
+    """EM steps on features (N, F), float64, of points or cells.
+
+    If `points` (N, D), the points of the features, are given, a step whose natural parameters would lose
+    digits to cancellation uses the direct form instead.
+    """
+
+    def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
+        natural = exact.natural_parameters(parameters)
+        return exact.expectation(features, sample_weight, natural, softmax_dtype)
+
+    direct = None
+    if points is not None:
+        direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
+    return guarded_step(gather, direct, reg_covar, float(sample_weight.sum()), covariance_type)
+
+
+def guarded_step(
+    gather: Callable[[Parameters], tuple[Tensor, Tensor]],
+    direct: Callable[[Parameters], tuple[Parameters, Tensor]] | None,
+    reg_covar: float,
+    total: float,
+    covariance_type: str = "full",
+) -> Step[Parameters]:
+    """EM steps with an E-step `gather`: parameters → S (K, F) and Σ_n p_n log p(x_n). `total` is Σ_n p_n.
+
+    If the natural parameters or S lose digits to cancellation, `direct` takes the step, if it is given.
+    """
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        if direct is None or not exact.is_ill_conditioned(parameters):
+            statistics, value = gather(parameters)
+            new = of_type(exact.maximization(statistics, reg_covar, parameters), covariance_type)
+            if direct is None or not exact.has_cancelled(statistics, new):
+                return new, float(value) / total
+        new, value = direct(parameters)
+        return of_type(new, covariance_type), float(value) / total
+
+    return step
+
+
+def of_type(parameters: Parameters, covariance_type: str) -> Parameters:
+    """The parameters with covariances of the type (see `covariance_types`)."""
+    covariances = constrain(parameters.covariances, covariance_type, parameters.weights)
+    return parameters._replace(covariances=covariances)

@@ -1,0 +1,187 @@
+"""MixtureState: parameters, history and further tensors of a fitted mixture; motions, states and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, cast
+
+import numpy as np
+import torch
+from sklearn.base import BaseEstimator
+from torch import Tensor
+
+from gmmtorch.arrays import as_tensor
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
+from gmmtorch.mixture import mixture_file
+from gmmtorch.mixture.density import MixtureDensity
+from gmmtorch.mixture.em.covariance_types import check_type, expand, type_shape
+from gmmtorch.mixture.validation import Array, checked_parameter
+
+Self = TypeVar("Self", bound="MixtureState")
+
+
+class MixtureState(MixtureDensity):
+    """What a fit leaves behind: made from given parameters, copied, moved, stored and loaded.
+
+    Further tensors of a subclass (a posterior, a tree) are buffers that `_extra_names` lists.
+    """
+
+    n_components: Any  # a whole number; None if a subclass determines it
+    _extra_names: ClassVar[tuple[str, ...]] = ()  # buffers besides weights, means and covariances
+    _finds_n_components: ClassVar[bool] = False  # whether n_components is only an upper limit
+
+    @classmethod
+    def from_parameters(
+        cls: type[Self],
+        weights: Array,
+        means: Array,
+        covariances: Array,
+        *,
+        lower_bounds: Sequence[float] = (),
+        converged: bool = True,
+        **options: Any,
+    ) -> Self:
+        """A fitted mixture with given weights (K,), means (K, D) and covariances.
+
+        The covariances are (K, D, D), or have the shape of the covariance type. `lower_bounds` and
+        `converged` describe the fit, if known; `options` are those of the constructor. Raises
+        `InvalidArgumentError` or `NumericalError` for invalid parameters.
+        """
+        mean = as_tensor(means, "means", torch.float64)
+        if mean.ndim != 2 or 0 in mean.shape:
+            raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, D).")
+        k, dim = mean.shape
+        mixture = cls(**{"n_components": k, **options})
+        kind = mixture.covariance_type
+        shape: tuple[int, ...] = (k, dim, dim)
+        if len(np.shape(covariances)) < 3:
+            shape = type_shape(kind, k, dim)
+        checked = (
+            checked_parameter(value, shape, name, mean.device)
+            for value, shape, name in (
+                (weights, (k,), "weights"),
+                (means, (k, dim), "means"),
+                (covariances, shape, "covariances"),
+            )
+        )
+        weight, mean, covariance = checked
+        covariance = covariance if len(shape) == 3 else expand(covariance, kind, k, dim)
+        if bool((weight < 0).any()) or abs(float(weight.sum()) - 1) > 1e-6:
+            raise InvalidArgumentError(f"weights={weight.tolist()} must be at least zero and add up to one.")
+        safe_cholesky(check_type(check_symmetric(covariance, "covariances"), kind))
+        mixture._tensors = isinstance(means, Tensor)
+        mixture.n_features_in_ = dim
+        mixture._set_history(lower_bounds, converged)
+        mixture._set_buffers(weight, mean, covariance)
+        mixture._set_extra({})
+        return mixture
+
+    def _set_history(self, lower_bounds: Sequence[float], converged: bool) -> None:
+        self.lower_bounds_ = [float(x) for x in lower_bounds]
+        self.lower_bound_ = self.lower_bounds_[-1] if self.lower_bounds_ else -math.inf
+        self.n_iter_ = len(self.lower_bounds_)
+        self.converged_ = bool(converged)
+
+    # -- extra tensors of a subclass --------------------------------------------------------------
+
+    def _extra_tensors(self) -> dict[str, Tensor]:
+        """The existing tensors of `_extra_names`: float64, int64 or bool."""
+        return {name: getattr(self, name) for name in self._extra_names if name in self._buffers}
+
+    def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
+        """Replace the extra tensors. Called after the weights, means and covariances are set.
+
+        The tensors may come from a file or a state dict, so a subclass checks them first and raises
+        `InvalidArgumentError`. An empty mapping is valid: a mixture of given parameters has none.
+        """
+        for name in self._extra_names:
+            self._buffers.pop(name, None)
+            if name in tensors:
+                self.register_buffer(name, tensors[name])
+
+    def _transformed_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
+        """The extra tensors after a rigid motion x ↦ R x + t. A subclass transforms those that need it."""
+        return self._extra_tensors()
+
+    # -- states, motions and files ----------------------------------------------------------------
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Load the state of a fitted mixture with any K and D, whether this one is fitted or not."""
+        given = [state_dict.get(prefix + name) for name in ("weights", "means", "covariances")]
+        if all(isinstance(value, Tensor) for value in given):
+            weights, means, covariances = (cast(Tensor, value).double().clone() for value in given)
+            check_type(covariances, self.covariance_type)
+            self._set_buffers(weights, means, covariances)
+            self.n_features_in_ = means.shape[1]
+            if self.n_components is not None:  # None means: determined by the fit
+                self.n_components = means.shape[0]
+            extra = ((name, state_dict.get(prefix + name)) for name in self._extra_names)
+            self._set_extra({name: value.clone() for name, value in extra if isinstance(value, Tensor)})
+            if not hasattr(self, "lower_bounds_"):
+                self._tensors = True
+                self._set_history((), True)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _scalar_options(self) -> dict[str, Any]:
+        """Constructor options that JSON can represent."""
+        options = BaseEstimator.get_params(self, deep=False)
+        return {key: value for key, value in options.items() if isinstance(value, int | float | str | None)}
+
+    def moved(self: Self, transform: Array) -> Self:
+        """A copy moved by a rigid motion (D+1, D+1): means R μ + t, covariances R Σ Rᵀ.
+
+        A rotated diagonal covariance is not diagonal: the copy of a "diag" mixture has
+        `covariance_type="full"`.
+        """
+        means = self._fitted()
+        matrix = as_tensor(transform, "transform", torch.float64, means.device)
+        rotation, translation = check_rigid(matrix, means.shape[1])
+        moved = type(self)(**BaseEstimator.get_params(self, deep=False))
+        if self._fitted_type == "diag":
+            moved.covariance_type = "full"
+        for name in ("_tensors", "n_features_in_", "lower_bounds_", "lower_bound_", "n_iter_", "converged_"):
+            setattr(moved, name, getattr(self, name))
+        moved._set_buffers(
+            self.weights.clone(), means @ rotation.T + translation, rotation @ self.covariances @ rotation.T
+        )
+        moved._set_extra({k: v.clone() for k, v in self._transformed_extra(rotation, translation).items()})
+        return moved
+
+    def save(self, path: str | Path) -> None:
+        """Write the fitted mixture to a safetensors file, atomically."""
+        self._fitted()
+        stored = mixture_file.StoredMixture(
+            self.weights,
+            self.means,
+            self.covariances,
+            self.lower_bounds_,
+            self.converged_,
+            arrays=not self._tensors,
+            parameters=self._scalar_options(),
+            extra=self._extra_tensors(),
+        )
+        mixture_file.write(path, stored)
+
+    @classmethod
+    def load(cls: type[Self], path: str | Path) -> Self:
+        """Read a mixture that `save` wrote. Raises `DataError` if the file is not a valid mixture."""
+        stored = mixture_file.read(path)
+        known = set(cls._get_param_names())
+        stored_n = stored.parameters.get("n_components", 0)
+        if stored_n is not None and not (cls._finds_n_components and isinstance(stored_n, int)):
+            known.remove("n_components")  # then it is the number of stored components
+        with mixture_file.errors_naming(path):
+            mixture = cls.from_parameters(
+                stored.weights,
+                stored.means,
+                stored.covariances,
+                lower_bounds=stored.lower_bounds,
+                converged=stored.converged,
+                **{key: value for key, value in stored.parameters.items() if key in known},
+            )
+            mixture._set_extra(stored.extra)
+        mixture._tensors = not stored.arrays
+        return mixture

@@ -1,0 +1,176 @@
+"""Figures of studies of maps: AUC against bytes (thesis Table 3.1), pose correction, thresholds (Fig 3.8)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
+from torch import Tensor
+
+from gmmtorch.occupancy.evidence import CellClass, classify
+from gmmtorch.report import style
+from gmmtorch.report.labels import Label, place_labels
+from gmmtorch.report.maps.map_regions import Corners, busiest_regions
+from gmmtorch.report.scenes.ellipsoids import height_colour_map, height_colours
+from gmmtorch.report.scenes.scene import balls, canvas_around, draw_scene
+from gmmtorch.report.scenes.scene_renderer import Camera
+from gmmtorch.report.table import byte_text
+
+
+def auc_memory_figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws `auc_memory`: one panel per resolution, one line per method, one point per size of its map.
+
+    Args:
+        rows: dataset, method, size, resolution (m), auc, auc_low, auc_high, nbytes.
+    """
+    resolutions = list(dict.fromkeys(float(row["resolution"]) for row in rows))
+    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
+    figure = style.new_figure(1.2 + 6.2 * len(resolutions), 5.2)
+    grid = figure.subplots(1, len(resolutions), squeeze=False, sharey=True)
+    labels: list[Label] = []
+    for axes, resolution in zip(grid[0], resolutions, strict=True):
+        for index, method in enumerate(methods):
+            own = [r for r in rows if r["method"] == method and float(r["resolution"]) == resolution]
+            own.sort(key=lambda row: row["nbytes"])
+            sizes = [row["nbytes"] for row in own]
+            areas = [row["auc"] for row in own]
+            axes.plot(sizes, areas, label=style.label_of(method), **style.line_look(index))
+            style.draw_intervals(axes, sizes, own, style.colour(index))
+            look = {"fontsize": style.TICK_SIZE - 1, "color": style.colour(index)}
+            labels += [
+                Label(axes, f"{row['size']:,}", row["nbytes"], row["auc"], look)
+                for row in own
+                if row["size"] is not None
+            ]
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: byte_text(value, digits=1)))
+        style.label_axes(axes, f"cells of {style.metres(resolution)}", "map size", "")
+        style.draw_grid(axes)
+    grid[0][0].set_ylabel("area under the ROC curve", fontsize=style.LABEL_SIZE)
+    style.legend_below(figure, max_columns=4)
+    style.figure_title(figure, f"AUC against map size: {rows[0]['dataset']}")
+    place_labels(figure, labels)
+    return {"auc_memory": figure}
+
+
+_BARS = (("auc", "noisy poses"), ("auc_corrected", "noisy poses, corrected"), ("auc_clean", "true poses"))
+
+
+def pose_correction_figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws `pose_correction`, three bars per row: AUC with noisy poses, after correction, and with true
+    poses.
+
+    Args:
+        rows: dataset, method, kept, resolution (m), pose_noise_m, pose_noise_rad, auc, auc_corrected,
+            auc_clean.
+    """
+    figure = style.new_figure(2.4 + 2.4 * len(rows), 4.6)
+    axes = figure.subplots()
+    for number, (field, label) in enumerate(_BARS):
+        places = [i + 0.27 * (number - 1) for i in range(len(rows))]
+        bars = axes.bar(places, [row[field] for row in rows], 0.25, label=label, color=style.colour(number))
+        axes.bar_label(bars, fmt="%.4f", padding=3, fontsize=style.TICK_SIZE - 1)
+    names = [f"{style.label_of(row['method'])}, {style.metres(row['resolution'])}" for row in rows]
+    kept = [f"{row['kept']:.0%} of the data" for row in rows]
+    axes.set_xticks(range(len(rows)), [f"{a}\n{b}" for a, b in zip(names, kept, strict=True)])
+    style.label_axes(axes, "", "", "area under the ROC curve")
+    lowest = min(row[field] for row in rows for field, _ in _BARS)
+    axes.set_ylim(max(0.0, lowest - 0.5 * (1 - lowest)), 1.0)
+    style.legend_below(figure)
+    noise = f"{style.metres(rows[0]['pose_noise_m'])}, {rows[0]['pose_noise_rad']:g} rad"
+    style.figure_title(figure, f"Maps with pose noise of {noise}: {rows[0]['dataset']}")
+    return {"pose_correction": figure}
+
+
+_PANELS = {
+    "occupied_recall": "occupied points found",
+    "thin_recall": "occupied points found,\nthin structures",
+    "free_recall": "free points found",
+    "share_decided": "points not left unknown",
+}
+_MAX_CELLS = 400_000
+_SIDE = 3.4  # inches of a panel in space
+_POINT_PIXELS = 2.5  # radius of a measured point
+_CAMERA = Camera(-60.0, 24.0)
+
+
+def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws `variance_threshold`: the decisions at each threshold, one line per number of components."""
+    figure = style.new_figure(13.5, 4.6)
+    grid = figure.subplots(1, len(_PANELS), sharey=True)
+    sizes = list(dict.fromkeys(int(row["n_components"]) for row in rows))
+    for axes, (field, title) in zip(grid, _PANELS.items(), strict=True):
+        for index, size in enumerate(sizes):
+            own = [r for r in rows if r["n_components"] == size and r[field] is not None]
+            thresholds = [row["variance_threshold"] for row in own]
+            label = f"{size:,} components"
+            axes.plot(thresholds, [row[field] for row in own], label=label, **style.line_look(index))
+        style.label_axes(axes, title, "variance threshold v", "")
+        axes.set_ylim(0, 1.02)
+        style.draw_grid(axes)
+    grid[0].set_ylabel("share of the points", fontsize=style.LABEL_SIZE)
+    style.legend_below(figure)
+    subject = f"{rows[0]['dataset']}, {style.label_of(rows[0]['method'])}"
+    style.figure_title(figure, f"Decisions against the variance threshold: {subject}")
+    return {"variance_threshold": figure}
+
+
+def closest_look(thin: Tensor, hits: Tensor, side: float = 4.0) -> Corners:
+    """Returns the corners of a box around the most thin points: `side` × `side` metres, as high as its
+    hits."""
+    (low, high), *_ = busiest_regions(thin[:, :2], 1, side)
+    inside = ((hits[:, :2] >= torch.tensor(low)) & (hits[:, :2] <= torch.tensor(high))).all(1)
+    heights = np.quantile(hits[inside, 2].numpy(), [0.005, 0.995])
+    return (*low, float(heights[0]) - 0.2), (*high, float(heights[1]) + 0.2)
+
+
+def cells_figure(
+    maps: Mapping[int, Callable[[Tensor], Tensor]],
+    thresholds: Sequence[float],
+    hits: Tensor,
+    low: Sequence[float],
+    high: Sequence[float],
+    resolution: float,
+) -> Figure:
+    """Draws the cells classified occupied in the box [low, high] (m): one row per map, one column per
+    threshold.
+
+    The first column shows the held-out points. All panels have the same colours of height.
+
+    Args:
+        maps: by number of components: occupancy (M,) of points (M, 3).
+        thresholds: variance thresholds.
+        hits: (H, 3) measured points, world metres.
+        low, high: (3,) corners of the box, world metres.
+        resolution: side (m) of the cells; larger if the box has more than 400,000 of them.
+    """
+    corners = torch.tensor([low, high], dtype=torch.float64)
+    inside = hits[((hits >= corners[0]) & (hits <= corners[1])).all(1)]
+    size = resolution * max(1.0, (math.prod((corners[1] - corners[0]) / resolution) / _MAX_CELLS) ** (1 / 3))
+    steps = [torch.arange(a, b, size, dtype=torch.float64) + size / 2 for a, b in zip(low, high, strict=True)]
+    centres = torch.cartesian_prod(*steps)
+    scale = Normalize(low[2], high[2], clip=True)
+    figure = style.new_figure(_SIDE * (1 + len(thresholds)) + 1.0, _SIDE * len(maps) + 0.6)
+    grid = figure.subplots(len(maps), 1 + len(thresholds), squeeze=False)
+    canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
+    for row, (n_components, occupancy) in zip(grid, maps.items(), strict=True):
+        theta = occupancy(centres)
+        shown = [(inside, _POINT_PIXELS / canvas.scale, f"{n_components:,} components:\nheld-out points")]
+        for threshold in thresholds:
+            occupied = centres[classify(theta, threshold) == CellClass.OCCUPIED]
+            shown.append((occupied, size / 2, f"v = {threshold:g}:\n{len(occupied):,} cells"))
+        for axes, (places, radius, title) in zip(row, shown, strict=True):
+            part = balls(places, radius, height_colours(places[:, 2], scale))
+            draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
+            axes.set_title(title, fontsize=style.TITLE_SIZE)
+    colours = ScalarMappable(scale, height_colour_map())
+    style.colour_bar(figure, colours, grid.ravel().tolist(), "height z [m]", shrink=0.6)
+    style.figure_title(figure, f"Cells of {style.metres(size)} classified occupied, by variance threshold v")
+    return figure

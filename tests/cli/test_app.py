@@ -1,0 +1,191 @@
+"""What all commands share: interrupts, mistyped options, version, help, completion, sweeps."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from command_runs import COMMANDS as MODULES
+from command_runs import QUIET, Finished, refused, run_here, succeeded
+from omegaconf import DictConfig
+
+import gmmtorch
+from gmmtorch.cli import command_options, common, explore, map, occupancy, robot, team
+from gmmtorch.errors import InvalidArgumentError
+
+COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map"]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Finished]:
+    for name, module in {"explore": explore, "robot": robot, "team": team, "map": map}.items():
+        monkeypatch.setitem(MODULES, name, module)
+
+    def run_command(command: str, *options: str) -> Finished:
+        return run_here(monkeypatch, command, tmp_path / "run", *options)
+
+    return run_command
+
+
+def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
+    class Interrupted:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    ended: list[int] = []
+
+    def work(*_: object) -> None:
+        Interrupted()
+        for step in range(500):  # the interrupt arrives in the first of them
+            time.sleep(0.02)
+            ended.append(step)
+
+    monkeypatch.setattr(occupancy, "_compare", work)
+    hook = sys.unraisablehook
+    done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET)
+    assert done.status == 130
+    assert done.stderr == "gmmtorch: interrupted; all files that were written are complete.\n"
+    assert len(ended) < 500
+    assert sys.unraisablehook is hook
+
+
+# -- mistyped options -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "words"),
+    [
+        ("occupancy", "dataset.pth=x", "dataset.pth;did you mean dataset.path?"),
+        ("occupancy", "dataset.path=x", "dataset.path;another choice of dataset= has it"),
+        ("occupancy", "resolution=0.1", "did you mean evaluation.resolution?"),
+        ("occupancy", "datset=carmen", "did you mean dataset?"),
+        ("occupancy", "map=windwed", "map=windwed;did you mean map=windowed?;per_scan"),
+        ("occupancy", "-m map=windowed,windwed", "did you mean map=windowed?"),
+        ("occupancy", "experiment=fig4_4_entropy", "experiment=fig4_4_entropy does not exist"),
+        ("occupancy", "hydra.run.dri=x", "did you mean hydra.run.dir?"),
+        ("occupancy", "method=[em", "method=[em;quote"),
+        ("fit", "-m mixture.n_componets=3,4", "did you mean mixture.n_components?"),
+        ("robot", "dataset@log.dataset=carmn", "did you mean dataset@log.dataset=carmen?"),
+        ("explore", "network.los=0.1", "did you mean network.loss?"),
+    ],
+)
+def test_a_typo_names_the_nearest_option_or_choice(command, options, words, run):
+    line = refused(run(command, *options.split()))
+    assert all(word in line for word in words.split(";")), line
+    assert "+" not in line
+
+
+def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
+    (tmp_path / "file").touch()
+    line = refused(run("occupancy", f"hydra.run.dir={tmp_path / 'file' / 'run'}"))
+    assert "hydra.run.dir" in line
+    assert str(tmp_path / "file") in line
+
+
+# -- version, help, completion --------------------------------------------------------------------
+
+
+def test_the_version_is_that_of_the_package(run):
+    assert succeeded(run("fit", "--version")).stdout == f"gmmtorch {gmmtorch.__version__}\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_describes_every_option_in_a_line(command, run):
+    shown = succeeded(run(command, "--help")).stdout
+    lines = shown.split("== Options, with their values ==\n")[1].split("\nFlags:")[0].splitlines()
+    assert len(lines) >= 10
+    for line in lines:
+        value, _, about = line.partition("  ")
+        assert re.fullmatch(r"[\w.]+=\S.*", value), line
+        assert len(about.strip()) > 3, line
+    assert "evaluation.every" not in shown or "seconds between" in shown
+
+
+def test_the_help_shows_the_options_of_the_chosen_data_set(run):
+    shown = succeeded(run("occupancy", "--help", "dataset=depth_frames")).stdout
+    assert re.search(r"^dataset\.pixel_stride=1 +every n-th pixel of every n-th row$", shown, re.MULTILINE)
+    # From the docstring of the library's class, whose module loads torch.
+    shown = succeeded(run("explore", "--help")).stdout
+    assert re.search(r"^sensor\.dropout=0\.01 +share of the pixels without a reading$", shown, re.MULTILINE)
+
+
+def test_descriptions_are_read_from_docstrings():
+    doc = """Rule.
+
+    first: one. Second sentence. third,
+        fourth (m): two; see first: not here. fifth: five.
+    """
+    found = command_options.descriptions(doc, ["first", "third", "fourth", "sixth"])
+    assert found["first"] == "one. Second sentence"
+    assert found["third"] == found["fourth"]
+
+
+@pytest.mark.parametrize(
+    ("command", "line", "expected"),
+    [
+        (
+            "occupancy",
+            "dataset=s",
+            "dataset=scan_folder dataset=synthetic_building dataset=synthetic_building_2d",
+        ),
+        ("occupancy", "dataset=depth_frames dataset.pix", "dataset.pixel_stride="),
+        ("occupancy", "report.figures=", "report.figures=false report.figures=true"),
+        ("occupancy", "map=windowed map.min", "map.min_points="),
+        ("fit", "experiment=s", "experiment=sensor_model experiment=strategies"),
+        (
+            "explore",
+            "experiment=",
+            "experiment=fig4_4_entropy experiment=fig4_5_bandwidth experiment=planners",
+        ),
+        ("explore", "check", ""),
+        ("export", "bounds", "bounds="),
+        ("robot", "dataset@log.dataset=ca", "dataset@log.dataset=carmen"),
+        ("team", "network.b", "network.budget="),
+    ],
+)
+def test_completion_offers_what_the_command_can_run(command, line, expected, run, monkeypatch):
+    monkeypatch.setenv("COMP_LINE", f"gmmtorch-{command} {line}")
+    assert succeeded(run(command, "-sc", "query=bash")).stdout.split() == expected.split()
+
+
+# -- sweeps ---------------------------------------------------------------------------------------
+
+
+def test_a_sweep_prints_one_table_with_its_failed_jobs(monkeypatch, tmp_path):
+    chosen = []
+
+    def work(config: DictConfig, _: str, folder: Path, __: object) -> list[dict[str, float]]:
+        chosen.append(common.chosen_options(config))
+        if config.seed == 2:
+            raise InvalidArgumentError("seed=2 fails.")
+        if config.seed == 3:
+            raise ZeroDivisionError("a mistake")
+        rows = [{"method": "point", "resolution": 0.1, "kept": 1.0, "auc": 0.5 + config.seed / 10}]
+        common.write_results("occupancy", config, rows, folder)
+        common.print_table(rows, ["method"], "its own table")
+        return rows
+
+    monkeypatch.setattr(occupancy, "_compare", work)
+    folder = tmp_path / "sweep"
+    options = ["-m", "seed=1,2,3", "map.noise=0.01", f"hydra.sweep.dir={folder}"]
+    done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, *options)
+    assert done.status == 1
+    assert done.stderr == "gmmtorch: error: 2 of 3 jobs failed: 1, 2.\n"
+    assert "its own table" not in done.stdout
+    swept = [{name: options[name] for name in ("seed", "map.noise")} for options in chosen]  # for HParams
+    assert swept == [{"seed": seed, "map.noise": 0.01} for seed in (1, 2, 3)]
+    assert all(
+        options.keys() <= {"seed", "map.noise", *(q.split("=")[0] for q in QUIET)} for options in chosen
+    )
+    table = done.stdout.split(f"3 jobs in {folder}\n")[1].splitlines()
+    assert table[0].split() == ["job", "seed", "method", "resolution", "kept", "auc", "error"]
+    assert table[2].split() == ["0", "1", "point", "0.1", "1", "0.6000", "-"]
+    assert table[3].endswith("seed=2 fails.")
+    assert table[4].endswith("ZeroDivisionError: a mistake")
+    assert "Traceback" in (folder / "2" / "error.txt").read_text()

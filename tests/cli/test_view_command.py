@@ -1,0 +1,61 @@
+"""gmmtorch-view: its arguments, the HTML file, and errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from command_runs import refused, run_here, succeeded
+
+from gmmtorch.cli import map as map_command
+from gmmtorch.cli.view import overrides
+from gmmtorch.datasets import load
+from gmmtorch.mapping.gaussian_map import GaussianMap
+
+pytest.importorskip("viser")
+
+
+def test_files_become_options():
+    assert overrides(["a b.safetensors", "--html", "it's.html", "port=9"]) == [
+        "path='a b.safetensors'",
+        "html='it\\'s.html'",
+        "port=9",
+    ]
+    assert overrides(["--html=c.html", "--cfg", "job", "x"]) == ["html='c.html'", "--cfg", "job", "path='x'"]
+
+
+def test_html_of_a_run_directory_and_errors(monkeypatch, tmp_path):
+    built = GaussianMap()
+    for scan in load("synthetic_building_2d", n_scans=2):
+        built.insert(scan)
+    built.save(tmp_path / "map.safetensors")
+    (tmp_path / "trajectory.tum").write_text("0 1 2 0 0 0 0 1\n1 2 2 0 0 0 0 1\n")
+    html = f"html={tmp_path / 'map.html'}"
+    done = succeeded(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html))
+    assert (tmp_path / "map.html").stat().st_size > 100_000
+    assert "open it in a browser" in done.stdout
+    assert "path is not set" in refused(run_here(monkeypatch, "view", tmp_path))
+    (tmp_path / "trajectory.tum").write_text("no numbers\n")
+    assert "is not a TUM file" in refused(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html))
+
+
+def test_a_map_is_shown_while_it_is_built(monkeypatch, tmp_path):
+    from gmmtorch.live.map_viewer import MapViewer
+
+    shown: list[int] = []
+    update = MapViewer.update
+
+    def count(self: MapViewer, built: GaussianMap, trajectory: torch.Tensor | None = None) -> None:
+        update(self, built, trajectory)
+        shown.append(built.n_components)
+
+    monkeypatch.setattr(MapViewer, "update", count)
+    monkeypatch.setattr(map_command, "serve", lambda viewer: viewer.stop())
+    options = ["dataset=synthetic_building_2d", "dataset.n_scans=5", "map.window=2", "view=true"]
+    quiet = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
+    succeeded(run_here(monkeypatch, "map", tmp_path, *options, *quiet))
+    n_components = GaussianMap.load(Path(tmp_path) / "map.safetensors").n_components
+    assert shown[0] == 0
+    assert shown[-1] == n_components > shown[1] > 0
+    assert len(shown) == 4  # empty, after two windows, and with the last scan

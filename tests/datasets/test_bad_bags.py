@@ -1,0 +1,278 @@
+"""Bad bags give errors that name topic, frame, time and remedy, or scans that are left out and counted."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_rosbag import POINTS, clouds, drive, moved
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+
+pytest.importorskip("rosbags")
+
+from gmmtorch.export.bag import BagWriter
+
+FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
+
+
+@FORMATS
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_truncated_bags_are_refused_with_a_repair(tmp_path, suffix, share):
+    path = clouds(tmp_path / f"a.{suffix}")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DataError, match=r"a\.(mcap|db3|bag) cannot be read.*(recover|reindex)"):
+        load("rosbag", path)
+
+
+@FORMATS
+def test_empty_bags_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match="is empty"):
+        load("rosbag", path)
+    path.unlink()
+    with BagWriter(path):
+        pass
+    with pytest.raises(DataError, match="topics are none"):
+        load("rosbag", path)
+
+
+def test_paths_without_a_bag_are_refused(tmp_path):
+    with pytest.raises(MissingDataError, match="does not exist"):
+        load("rosbag", tmp_path / "none.mcap")
+    with pytest.raises(DataError, match=r"no metadata\.yaml and 0 bag files"):
+        load("rosbag", tmp_path)
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(DataError, match="is not a ROS bag"):
+        load("rosbag", tmp_path / "a.txt")
+    (tmp_path / "a.mcap").write_bytes(b"hello" * 100)
+    with pytest.raises(DataError, match="cannot be read as a ROS bag"):
+        load("rosbag", tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("mcap", b"zstd"), ("bag", b"bz2")])
+def test_an_unknown_compression_is_named(tmp_path, suffix, codec):
+    from rosbags.rosbag1 import Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    path = tmp_path / f"a.{suffix}"
+    bag = BagWriter(path)
+    if suffix == "bag":
+        bag.writer.set_compression(Writer.CompressionFormat.BZ2)
+    else:
+        bag.writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag:
+        drive(bag)
+        bag.cloud("/points", 0.0, "lidar", POINTS)
+    assert len(load("rosbag", path)) == 1
+    name = b"w" * len(codec)
+    path.write_bytes(path.read_bytes().replace(codec, name))
+    with pytest.raises(DataError, match=f"{name.decode()}.*unknown compression"):
+        load("rosbag", path)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "bag"])
+def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypatch):
+    from rosbags.rosbag1 import Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    from gmmtorch.datasets.recordings import rosbags_access
+
+    path = tmp_path / f"a.{suffix}"
+    bag = BagWriter(path)
+    if suffix == "bag":
+        bag.writer.set_compression(Writer.CompressionFormat.LZ4)
+    else:
+        bag.writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag:
+        drive(bag)
+        bag.cloud("/points", 0.0, "lidar", np.ones((100_000, 3)))
+    assert path.stat().st_size < 20_000
+    monkeypatch.setattr(rosbags_access, "MAX_CHUNK_BYTES", 1 << 20)
+    with pytest.raises(DataError, match="unpacks to more than"):
+        load("rosbag", path)
+
+
+def test_two_sensors_on_one_topic_are_told_apart_by_their_frame(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.transforms(0.0, {("base", "rear"): moved(-9)}, static=True)
+        for i, frame in enumerate(["lidar", "rear", "lidar"]):
+            bag.cloud("/points", i / 2, frame, POINTS)
+    by_tf = load("rosbag", tmp_path / "a.mcap")
+    assert [float(by_tf.pose(i)[0, 3]) for i in range(3)] == [0.0, -8.5, 1.0]
+    with pytest.raises(
+        InvalidArgumentError, match=r"/points.*lidar \(2 scans\), rear \(1 scans\).*sensor_frame"
+    ):
+        load("rosbag", tmp_path / "a.mcap", poses="standing")
+    one = load("rosbag", tmp_path / "a.mcap", poses="standing", sensor_frame="lidar")
+    assert (len(one), one.skipped) == (2, {"message of another frame": 1})
+    with pytest.raises(InvalidArgumentError, match=r"sensor_frame=front is not.*lidar \(2 times\)"):
+        load("rosbag", tmp_path / "a.mcap", sensor_frame="front")
+
+
+def test_two_types_on_one_topic_are_refused(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.cloud("/scan", 0.0, "lidar", POINTS)
+        bag.laser("/scan", 0.0, "lidar", [1.0], 0.0, 0.1, 8.0)
+    with pytest.raises(DataError, match=r"topic /scan has messages of 2 types.*LaserScan.*PointCloud2"):
+        load("rosbag", tmp_path / "a.mcap", topic="/scan")
+
+
+def test_clocks_that_jump_are_left_out_and_counted(tmp_path):
+    stamps = [0.0, 0.25, 99.0, 0.5, 0.75, 0.1, 1.0]  # one far ahead, one back
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        for i, stamp in enumerate(stamps):
+            content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+            bag.message("/scan", "sensor_msgs/msg/LaserScan", stamp, content, received=float(i))
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    assert dataset.times.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert dataset.skipped == {"stamp out of order (the clock jumped)": 2}
+
+
+def test_transforms_whose_clock_runs_backwards_keep_the_longest_run(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for received, stamp, x in [(0, 0, 0), (1, 5, 50), (2, 1, 10), (3, 2, 20)]:
+            matrix = {"translation": {"x": float(x)}, "rotation": {"w": 1.0}}
+            entry = {"header": {"frame_id": "odom"}, "child_frame_id": "lidar", "transform": matrix}
+            entry["header"]["stamp"] = {"sec": stamp, "nanosec": 0}
+            bag.message("/tf", "tf2_msgs/msg/TFMessage", float(received), {"transforms": [entry]})
+        bag.cloud("/points", 1.5, "lidar", POINTS)
+    assert float(load("rosbag", tmp_path / "a.mcap").pose(0)[0, 3]) == 15
+
+
+def test_a_sensor_with_a_clock_of_its_own_needs_the_times_of_recording(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        content = {"header": {"frame_id": "lidar"}, "ranges": np.ones(3, np.float32), "range_max": 9.0}
+        bag.message("/scan", "sensor_msgs/msg/LaserScan", 5000.0, content, received=1.0)
+    with pytest.raises(
+        DataError,
+        match=r"/scan: no scan.*Frame lidar, stamps from 5000\.000.*0\.000 to 2\.000 s.*clock=received",
+    ):
+        load("rosbag", tmp_path / "a.mcap")
+    dataset = load("rosbag", tmp_path / "a.mcap", clock="received")
+    assert dataset.times.tolist() == [1.0]
+
+
+def test_poses_that_end_before_the_scans_leave_scans_out(tmp_path):
+    path = clouds(tmp_path / "a.mcap", (0.5, 1.5, 2.5, 3.5))
+    dataset = load("rosbag", path)
+    assert (dataset.times.tolist(), dataset.skipped) == ([0.5, 1.5], {"no pose at the time of the scan": 2})
+    (tmp_path / "t.txt").write_text("10 0 0 0 0 0 0 1\n20 0 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"stamps from 0\.500 to 3\.500 s; .*t\.txt has poses from 10\.000"):
+        load("rosbag", path, poses=str(tmp_path / "t.txt"))
+
+
+def test_a_gap_in_the_poses_is_not_bridged(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for time in (0.0, 1.0, 31.0, 32.0):
+            bag.transforms(time, {("odom", "lidar"): moved(time)})
+        for time in (0.5, 16.0, 31.5):
+            bag.cloud("/points", time, "lidar", POINTS)
+    assert load("rosbag", tmp_path / "a.mcap").times.tolist() == [0.5, 31.5]
+    assert len(load("rosbag", tmp_path / "a.mcap", max_gap=60)) == 3
+
+
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        (
+            [("odom", "base"), ("mast", "lidar")],
+            r"frame odom and frame lidar, whose tree is lidar → mast; all",
+        ),
+        ([("odom", "base")], r"/points: TF has no frame lidar.*frames are base, odom"),
+        ([("base", "lidar"), ("lidar", "base")], "TF loops: lidar → base → lidar"),
+        ([("base", "lidar"), ("mast", "lidar")], r"several parents of frame lidar: base \(2 times\), mast"),
+    ],
+    ids=["split", "missing", "loop", "two parents"],
+)
+def test_broken_trees_of_transforms_are_described(tmp_path, edges, message):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for time in (0.0, 1.0):
+            for edge in edges:
+                bag.transforms(time, {edge: moved(time)})
+        bag.cloud("/points", 0.5, "lidar", POINTS)
+    with pytest.raises(DataError, match=message):
+        load("rosbag", tmp_path / "a.mcap", frame="odom")
+
+
+def test_transforms_that_are_not_rigid_are_left_out(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        entry = {"header": {"frame_id": "odom"}, "child_frame_id": "base"}  # a quaternion of zeros
+        bag.message("/tf", "tf2_msgs/msg/TFMessage", 0.5, {"transforms": [entry]})
+        bag.cloud("/points", 0.5, "lidar", POINTS)
+    assert float(load("rosbag", tmp_path / "a.mcap").pose(0)[0, 3]) == 0.5
+
+
+def test_clouds_without_points_are_counted(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        for time, points in ((0.0, POINTS), (1.0, np.empty((0, 3))), (2.0, np.full((5, 3), np.nan))):
+            bag.cloud("/points", time, "lidar", points)
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    for _ in range(2):  # a second reading counts nothing twice
+        assert [len(scan.points) for scan in dataset] == [2, 0, 0]
+        assert dataset.skipped == {"message without a valid point": 2}
+
+
+def test_a_damaged_message_gives_an_empty_scan_and_is_counted(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.cloud("/points", 0.0, "lidar", POINTS)
+        header = {"header": {"frame_id": "lidar"}}
+        fields = [{"name": axis, "offset": 4 * i, "datatype": 7} for i, axis in enumerate("xyz")]
+        size = {"height": 2**31, "width": 2**31, "point_step": 12, "row_step": 2**32 - 1, "fields": fields}
+        bag.message("/points", "sensor_msgs/msg/PointCloud2", 1.0, {**header, **size})
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    assert [len(scan.points) for scan in dataset] == [2, 0]
+    assert dataset.skipped == {"message that cannot be decoded": 1}
+
+
+def test_an_unusable_layout_is_refused_at_once(tmp_path):
+    table = np.zeros(4, np.dtype([("x", "<f4"), ("intensity", "<f4")]))
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.cloud_table("/points", 1.0, "lidar", table)
+    with pytest.raises(
+        DataError, match=r"/points, frame lidar, stamp 1\.000 s.*no field y, only x, intensity"
+    ):
+        load("rosbag", tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_announced_lengths_are_checked_before_anything_is_allocated(packed):
+    from gmmtorch.datasets.recordings.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+
+    numbers, items = (BASE, ("float64", 0)), (NAME, "Item")
+    definitions = {
+        "Numbers": ([], [("values", (SEQUENCE, (numbers, 0)))]),
+        "Items": ([], [("values", (SEQUENCE, (items, 0)))]),
+        "Item": ([], [("a", (BASE, ("uint8", 0))), ("b", (BASE, ("string", 0)))]),
+        "Loop": ([], [("again", (NAME, "Loop"))]),
+        "Nest0": ([], []),
+        **{f"Nest{i}": ([], [(f"f{j}", (NAME, f"Nest{i - 1}")) for j in range(10)]) for i in range(1, 12)},
+    }
+    decoder = MessageDecoder(definitions, packed)
+    head = b"" if packed else b"\0\1\0\0"
+    for name in ("Numbers", "Items"):
+        with pytest.raises(DataError, match="4294967295 entries"):
+            decoder.decode(head + struct.pack("<I", 2**32 - 1) + bytes(16), name)
+    for name in ("Loop", "Nest11"):
+        with pytest.raises(DataError, match=f"type {name}"):
+            decoder.decode(head + bytes(16), name)
+
+
+def test_options_are_checked(tmp_path):
+    path: Path = clouds(tmp_path / "a.mcap")
+    for option, value in (("clock", "local"), ("max_gap", 0.0), ("stride", 0)):
+        with pytest.raises(InvalidArgumentError, match=option):
+            load("rosbag", path, **{option: value})

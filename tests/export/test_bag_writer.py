@@ -1,0 +1,61 @@
+"""Bags that gmmtorch writes: read by rosbags itself, and refused input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gmmtorch.errors import InvalidArgumentError, OutputError
+from gmmtorch.scan import Scan
+
+pytest.importorskip("rosbags")
+
+from gmmtorch.export.bag import BagWriter, write_bag
+
+SCAN = Scan(torch.tensor([[3.0, 5.0, 1.0], [2.0, 7.0, 1.5]], dtype=torch.float64), [2.0, 5.0, 1.0])
+POSE = np.array([[0.0, -1, 0, 2], [1, 0, 0, 5], [0, 0, 1, 1], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
+def test_rosbags_reads_what_is_written(tmp_path, suffix):
+    from rosbags.highlevel import AnyReader
+
+    path = write_bag(tmp_path / f"a.{suffix}", [SCAN], [POSE], [2.5])
+    assert [file.name for file in tmp_path.iterdir()] == [f"a.{suffix}"]
+    with AnyReader([path]) as reader:
+        messages = {
+            connection.topic: (time, reader.deserialize(data, connection.msgtype))
+            for connection, time, data in reader.messages()
+        }
+    time, cloud = messages["/points"]
+    assert (time, cloud.header.stamp.sec, cloud.header.stamp.nanosec) == (2_500_000_000, 2, 500_000_000)
+    assert (cloud.header.frame_id, cloud.width, cloud.height) == ("lidar", 2, 1)
+    points = cloud.data.view(np.float32).reshape(2, 3)
+    np.testing.assert_allclose(points, [[0, -1, 0], [2, 0, 0.5]], atol=1e-6)
+    (transform,) = messages["/tf"][1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("map", "lidar")
+    turn, place = transform.transform.rotation, transform.transform.translation
+    assert (place.x, place.y, place.z) == (2, 5, 1)
+    assert abs(turn.z) == pytest.approx(0.5**0.5)
+    assert turn.z == pytest.approx(turn.w)
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = write_bag(tmp_path / "a.mcap", [SCAN], [POSE])
+    before = path.read_bytes()
+    flat = Scan(torch.zeros(1, 2, dtype=torch.float64), [0.0, 0.0])
+    with pytest.raises(InvalidArgumentError, match="scans are 2D"):
+        write_bag(path, [flat], [np.eye(3)])
+    with pytest.raises(InvalidArgumentError, match="1 scans, 2 poses and 1 times"):
+        write_bag(path, [SCAN], [POSE, POSE])
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unusable_paths_are_refused(tmp_path):
+    with pytest.raises(InvalidArgumentError, match=r"must end in \.mcap"):
+        BagWriter(tmp_path / "a.txt")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        BagWriter(tmp_path / "file" / "a.mcap")

@@ -1,0 +1,114 @@
+"""The main paths on a pretended GPU: they mix no devices, and give the results of the CPU."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kernels.cones_for_kernels import cones_of
+from pretended_gpu import GPUTensor, pretended_gpu
+
+import gmmtorch as gt
+from gmmtorch.kernels import kernels
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+
+
+def cloud(n: int = 4000) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(n, 3, generator=generator) * torch.tensor([4.0, 4.0, 2.0])
+    points[torch.arange(n), torch.arange(n) % 3] = 0.01 * torch.randn(n, generator=generator)
+    return points
+
+
+def rays() -> tuple[torch.Tensor, torch.Tensor]:
+    ends = cloud(500)
+    return torch.tensor([[2.0, 2.0, 1.0]]).expand_as(ends).contiguous(), ends
+
+
+def add_rays(device):
+    origins, ends = (part.to(device) for part in rays())
+    evidence = Evidence.empty(VoxelGrid((0.0, 0.0, 0.0), 0.2, (20, 20, 10)), device)
+    evidence.add_rays(origins, ends)
+    return evidence.hits, evidence.misses
+
+
+def add_sparse_rays(device):
+    origins, ends = (part.to(device) for part in rays())
+    store = SparseEvidence(0.2, 3, device)
+    store.add_rays(origins, ends)
+    return store.in_key_order()
+
+
+def cast_rays(device):
+    origins, ends = (part.to(device) for part in rays())
+    box = Box(torch.tensor([1, 1, 1], device=device), torch.tensor([15, 15, 8], device=device))
+    is_hit = torch.ones(len(ends), dtype=torch.bool, device=device)
+    return tuple(cast_evidence(origins, ends, is_hit, 0.2, box))
+
+
+def ask_points(device):
+    cones = Cones(*(part.to(device) for part in cones_of(3, "any")))
+    return tuple(point_evidence(cones, 3 * cloud(1000).double().to(device) - 2, 0.1))
+
+
+def grid_flux(device):
+    cones = Cones(*(part.to(device) for part in cones_of(3, "any", 6)))
+    found = flux_evidence(cones, VoxelGrid((-2.0,) * 3, 1.0, (4, 4, 4)), 3.0, tolerance=1e-2)
+    return found.hits, found.misses
+
+
+def fit_mixture(device):
+    fitted = gt.GaussianMixture(10, random_state=0, max_iter=3, tol=1e9).fit(cloud(1000).to(device))
+    return fitted.weights_, fitted.means_, fitted.covariances_
+
+
+def build_and_ask_a_map(device):
+    built = gt.GaussianMap(n_samples=300)
+    for shift in (0.0, 0.1):
+        points = cloud(300).to(device) + shift
+        built.insert(gt.Scan(points, torch.tensor([2.0, 2.0, 1.0], device=device)))
+    built.finish()
+    asked = cloud(60).to(device)
+    return built.means, built.occupancy(asked, 0.1), built.occupancy(asked, 0.2, method="monte_carlo")
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        add_rays,
+        add_sparse_rays,
+        cast_rays,
+        ask_points,
+        grid_flux,
+        fit_mixture,
+        pytest.param(build_and_ask_a_map, marks=pytest.mark.slow),
+    ],
+)
+def test_results_of_the_pretended_gpu_are_those_of_the_cpu(work):
+    with kernels("torch"):
+        expected = work("cpu")
+    with pretended_gpu():
+        found = work("cuda")
+        assert all(isinstance(part, GPUTensor) for part in found)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.held, other, rtol=1e-5, atol=1e-5, check_dtype=False)
+
+
+def test_the_pretended_gpu_refuses_what_a_gpu_refuses():
+    with pretended_gpu() as gpu:
+        x = torch.arange(3.0, device="cuda")
+        assert (x.device.type, (2 * x).tolist()) == ("cuda", [0.0, 2.0, 4.0])
+        with pytest.raises(RuntimeError, match="same device"):
+            x + torch.ones(3)
+        with pytest.raises(TypeError, match="cpu"):
+            x.numpy()
+        assert gpu.waits.total() == 0
+        assert float(x.sum()) == 3.0
+        assert x.cpu().numpy().sum() == 3.0
+        assert gpu.waits.total() >= 1

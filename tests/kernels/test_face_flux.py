@@ -1,0 +1,36 @@
+"""The fused flux through the faces of a grid against its twin, which test_flux compares with quadrature."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kernels.cones_for_kernels import cones_of
+
+from gmmtorch.kernels import kernels
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
+from gmmtorch.occupancy.grid import VoxelGrid
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "flat", "around"])
+def test_fused_flux_equals_the_twin(dim, kind):
+    # Some sensor origins lie in the grid, some outside, and some on a corner of its cells.
+    cones = cones_of(dim, kind, 12, thin=0.03)
+    cones.origins[:2] = torch.tensor([0.5, 1.0, -1.5][:dim])
+    cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
+    grid, found = VoxelGrid((-3.0,) * dim, 0.5, (12, 13, 14)[:dim]), []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(flux_evidence(cones, grid, 7.0, tolerance=1e-6))  # no jump at the cutoff
+    assert found[0].misses.count_nonzero() > 50
+    torch.testing.assert_close(found[1].misses, found[0].misses, rtol=1e-5, atol=1e-5)
+
+
+def test_a_looser_tolerance_stays_within_itself():
+    cones = cones_of(3, "any", 12)
+    cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
+    grid = VoxelGrid((-3.0,) * 3, 0.5, (12, 12, 12))
+    with kernels("fused"):
+        loose, exact = (flux_evidence(cones, grid, 4.0, tolerance=t).misses for t in (1e-3, 1e-6))
+    assert 0 < float((loose - exact).abs().max()) < 1e-3

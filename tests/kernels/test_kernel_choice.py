@@ -1,0 +1,111 @@
+"""`runtime.kernels`: which kernels run, and what happens without a compiler or a cache folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.kernels import choice, compiler, kernels, use_kernels
+
+ONE = torch.ones(1)
+
+
+@pytest.fixture
+def no_compiler(monkeypatch):
+    monkeypatch.setattr(compiler, "compiler_failure", lambda: "the package warp-lang does not load (test)")
+    monkeypatch.setattr(choice, "_reported", set())
+
+
+def test_fused_kernels_compute_plain_tensors_without_gradients():
+    with kernels("fused"):
+        assert choice.is_fused(ONE, None)
+        assert not choice.is_fused(ONE, torch.ones(1, requires_grad=True))
+        with torch.no_grad():
+            assert choice.is_fused(torch.ones(1, requires_grad=True))
+        assert not choice.is_fused(torch.ones(1, device="meta"))
+    with kernels("torch"):
+        assert not choice.is_fused(ONE)
+
+
+def test_the_choice_ends_with_its_block():
+    with kernels("torch"):
+        with pytest.raises(RuntimeError, match="inside"), kernels("auto"):
+            raise RuntimeError("inside")
+        assert choice.chosen_kernels() == "torch"
+
+
+def test_an_unknown_choice_lists_the_choices():
+    with pytest.raises(InvalidArgumentError, match="kernels='numba' is not one of auto, fused, torch"):
+        use_kernels("numba")
+
+
+def test_the_environment_gives_the_default(monkeypatch):
+    monkeypatch.setattr(choice, "_chosen", [])
+    monkeypatch.setenv("GMMTORCH_KERNELS", "torch")
+    assert choice.chosen_kernels() == "torch"
+    monkeypatch.setattr(choice, "_chosen", [])
+    monkeypatch.setenv("GMMTORCH_KERNELS", "cuda")
+    with pytest.raises(InvalidArgumentError, match="GMMTORCH_KERNELS='cuda'"):
+        choice.chosen_kernels()
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_fused_without_a_compiler_names_the_extra():
+    with pytest.raises(GmmTorchError, match=r"warp-lang does not load .*gmmtorch\[fast\].*kernels=torch"):
+        use_kernels("fused")
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_auto_without_a_compiler_logs_one_line(caplog):
+    with caplog.at_level(logging.INFO, "gmmtorch"), kernels("auto"):
+        assert not choice.is_fused(ONE)
+        assert not choice.is_fused(ONE)
+    assert [r.message for r in caplog.records] == [
+        "Tensor operations replace fused kernels, because the package warp-lang does not load (test)."
+    ]
+
+
+def test_kernels_are_cached_in_the_first_folder_that_can_be_written(tmp_path, monkeypatch):
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # no folder can be made in a file
+    temporary = compiler._cache_folder(None)
+    assert temporary.is_dir()
+    assert temporary.name.startswith("gmmtorch-kernels-")
+    assert compiler._cache_folder(tmp_path / "own") == tmp_path / "own"
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_items_split_over_threads_are_each_run_once(n_threads):
+    from gmmtorch.kernels.ray_traversal import traverse
+
+    starts = torch.rand(5000, 3, dtype=torch.float64) * 20
+    with kernels("torch"):
+        expected = torch.cat([v.ray * 8000 + v.voxel for v in traverse(starts, starts.flip(0), (20, 20, 20))])
+    torch.set_num_threads(n_threads)
+    with kernels("fused"):
+        found = torch.cat([v.ray * 8000 + v.voxel for v in traverse(starts, starts.flip(0), (20, 20, 20))])
+    assert torch.equal(found.sort().values, expected.sort().values)
+
+
+@pytest.mark.slow
+def test_two_processes_compile_at_once(tmp_path):
+    code = "from gmmtorch.kernels import use_kernels; use_kernels('fused')"
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    jobs = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(2)]
+    assert [job.wait() for job in jobs] == [0, 0]
+    assert list(tmp_path.rglob("*.o"))
+
+
+def test_a_forked_process_makes_its_own_threads():
+    assert compiler._threads(2).submit(lambda: 1).result() == 1
+    child = os.fork()
+    if child == 0:
+        os._exit(compiler._threads.cache_info().currsize)
+    assert os.waitpid(child, 0)[1] == 0

@@ -1,0 +1,84 @@
+"""The fused point evidence against its twin, which test_point compares with quadrature."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kernels.cones_for_kernels import cones_of
+from scipy.special import erfcx
+
+from gmmtorch.kernels import kernels
+from gmmtorch.kernels.simd import MILLS
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.forms.point import PointForm
+from gmmtorch.occupancy.index.hulls import Hulls
+
+
+def points_of(cones: Cones) -> torch.Tensor:
+    """Points near and between, on the means, on the sensor origins, very far, and at infinity."""
+    generator = torch.Generator().manual_seed(0)
+    along = torch.rand(40, len(cones.means), 1, generator=generator, dtype=torch.float64) * 1.3
+    between = (cones.origins + along * (cones.means - cones.origins)).flatten(0, 1)
+    between = between + 0.2 * torch.randn(between.shape, generator=generator, dtype=torch.float64)
+    far = cones.means[:3] + 1e6
+    infinite = torch.full_like(far, torch.inf)
+    return torch.cat([between, cones.means, cones.origins, cones.origins + 1e-9, far, infinite])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "flat", "around"])
+@pytest.mark.parametrize(("resolution", "cutoff"), [(0.05, 3.0), (0.5, 5.0)])
+def test_fused_evidence_equals_the_twin(dim, kind, resolution, cutoff):
+    cones = cones_of(dim, kind)
+    points = points_of(cones)
+    form, found = PointForm(cones, resolution, cutoff), []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(form(points))
+    assert found[0].misses.count_nonzero() > 1000
+    bound = 1e-11 * cones.counts.sum()
+    for one, other in zip(*found, strict=True):
+        assert torch.isfinite(other).all()
+        torch.testing.assert_close(other, one, rtol=1e-10, atol=float(bound))
+
+
+def test_fused_evidence_does_not_depend_on_the_other_points():
+    cones = cones_of(3, "any")
+    points = points_of(cones)
+    form = PointForm(cones, 0.1)
+    with kernels("fused"):
+        together, alone = form(points), [form(points[i : i + 1]) for i in range(0, 200, 7)]
+    assert torch.equal(together.misses[:200:7], torch.cat([part.misses for part in alone]))
+
+
+def test_evidence_of_points_with_gradients_comes_from_the_twin():
+    cones = cones_of(3, "any")
+    points = points_of(cones)[:50].requires_grad_()
+    with kernels("fused"):
+        found = PointForm(cones, 0.1)(points)
+    assert torch.autograd.grad(found.misses.sum(), points)[0].abs().sum() > 0
+
+
+def test_the_mills_ratio_of_the_kernels_equals_the_error_function():
+    x = torch.cat([torch.linspace(0, 12, 2001), torch.logspace(1, 5, 200)]).double()
+    t = (x - 3.5) / (x + 3.5)
+    found = sum(c * t**i for i, c in enumerate(MILLS)) / (1 + x)
+    exact = torch.from_numpy((torch.pi / 2) ** 0.5 * erfcx((x / 2**0.5).numpy()))
+    assert float((found / exact - 1).abs().max()) < 2e-14
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "flat", "around"])
+@pytest.mark.parametrize("smoothed", [False, True])
+def test_fused_hull_tests_equal_the_twin(dim, kind, smoothed):
+    cones = cones_of(dim, kind)
+    points = points_of(cones)
+    points = points[torch.isfinite(points).all(1)]
+    hulls, cone = Hulls(cones, 0.1, 3.0, smoothed), torch.arange(len(points)) % len(cones.means)
+    radius, found = torch.rand(len(points), generator=torch.Generator().manual_seed(0)).double(), []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append((hulls.near(cone, points, radius), hulls.near(cone, points, 0.2)))
+    for one, other in zip(*found, strict=True):
+        assert 0 < one.sum() < len(one)
+        assert torch.equal(one, other)

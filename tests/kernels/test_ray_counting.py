@@ -1,0 +1,73 @@
+"""Fused ray counting against its twin, which test_sparse_evidence compares with exact walks."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels import kernels
+from gmmtorch.occupancy.evidence import Evidence
+from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy.voxels.boxes import Box
+from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+
+
+def rays(dim: int, kind: str, n: int = 3000) -> tuple[Tensor, Tensor]:
+    """Origins and ends (n, dim) in a box of 10 m, on cell planes or along axes for some kinds."""
+    generator = torch.Generator().manual_seed(1)
+    origins, ends = 12 * torch.rand(2, n, dim, generator=generator, dtype=torch.float64) - 1
+    if kind == "planes":  # ties of crossings at edges and corners
+        return (origins * 4).round() / 4, (ends * 4).round() / 4
+    if kind == "flat":
+        ends[:, 0] = origins[:, 0]
+        ends[::2] = origins[::2]  # zero length
+    if kind == "far":
+        return origins, origins + (ends - origins) * torch.tensor([1e-14, 1.0, 1e5])[
+            torch.arange(n) % 3, None
+        ]
+    return origins, ends
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "planes", "flat", "far"])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_fused_counts_in_a_grid_equal_the_twin(dim, kind, weighted):
+    origins, ends = rays(dim, kind)
+    weights = (torch.arange(len(ends)) % 7).double() if weighted else None  # whole, so that sums are exact
+    grid, found = VoxelGrid((0.0,) * dim, 0.25, (40,) * dim), []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(Evidence.empty(grid))
+            found[-1].add_rays(origins, ends, weights)
+    assert found[0].misses.sum() > 1000
+    torch.testing.assert_close(found[1].misses, found[0].misses, rtol=0, atol=0)
+    torch.testing.assert_close(found[1].hits, found[0].hits, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", ["any", "planes", "flat"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_fused_counts_in_blocks_equal_the_twin(dim, kind, dtype):
+    origins, ends = rays(dim, kind)
+    found = []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            store = SparseEvidence(0.25, dim, dtype=dtype)
+            for part in range(0, 3000, 1000):  # later rays meet blocks of earlier ones
+                store.add_rays(origins[part : part + 1000], ends[part : part + 1000])
+            found.append((store.keys, *store.in_key_order()))
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_fused_evidence_of_rays_cut_at_a_box_equals_the_twin():
+    origins, ends = rays(3, "planes")
+    box = Box(torch.tensor([8, 4, 0]), torch.tensor([30, 36, 22]))
+    found = []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(cast_evidence(origins, ends, torch.arange(3000) % 2 == 0, 0.25, box))
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)

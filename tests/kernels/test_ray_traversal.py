@@ -1,0 +1,277 @@
+"""Ray traversal against a plain DDA in exact rational arithmetic."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from occupancy.exact_dda import voxels_crossed, voxels_left
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from gmmtorch.kernels import kernels
+from gmmtorch.kernels.ray_traversal import row_major_strides, traverse
+
+
+@pytest.fixture(autouse=True, params=["fused", "torch"])
+def _kernels(request):
+    with kernels(request.param):
+        yield
+
+
+SHAPES = {2: (7, 9), 3: (6, 5, 7)}
+
+Visited = list[tuple[int, tuple[int, ...]]]  # (ray, voxel), sorted
+
+
+def visited(starts: Tensor, ends: Tensor, shape: tuple[int, ...], **options) -> Visited:
+    strides = options.get("strides") or row_major_strides(shape)
+    found = []
+    for chunk in traverse(starts, ends, shape, **options):
+        assert chunk.voxel.dtype == chunk.ray.dtype == torch.int64
+        for voxel, ray in zip(chunk.voxel.tolist(), chunk.ray.tolist(), strict=True):
+            index = []
+            for axis in sorted(range(len(shape)), key=lambda a: -strides[a]):
+                index.append((axis, voxel // strides[axis]))
+                voxel %= strides[axis]
+            found.append((ray, tuple(i for _, i in sorted(index))))
+    return sorted(found)
+
+
+def expected(starts: Tensor, ends: Tensor, shape: tuple[int, ...]) -> Visited:
+    rays = zip(starts.tolist(), ends.tolist(), strict=True)
+    return sorted((r, v) for r, (a, b) in enumerate(rays) for v in voxels_left(a, b, shape))
+
+
+def check(starts: Tensor, ends: Tensor, shape: tuple[int, ...]) -> None:
+    assert visited(starts, ends, shape) == expected(starts, ends, shape)
+
+
+def random_rays(
+    n: int, shape: tuple[int, ...], margin: float, step: float, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Ends within the box grown by `margin` of its size, on multiples of `step`."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor(shape, dtype=torch.float64)
+
+    def draw() -> Tensor:
+        unit = torch.rand(n, len(shape), generator=generator, dtype=torch.float64) * (1 + 2 * margin) - margin
+        return torch.round(unit * size / step) * step
+
+    return draw(), draw()
+
+
+def one(start: list[float], end: list[float], shape: tuple[int, ...]) -> list[tuple[int, ...]]:
+    found = visited(torch.tensor([start]).double(), torch.tensor([end]).double(), shape)
+    return [voxel for _, voxel in found]
+
+
+# -- the oracle itself, by hand -----------------------------------------------------------------------
+
+
+def test_the_reference_walk_equals_a_hand_computed_ray():
+    assert voxels_left([0.5, 0.5], [2.5, 1.25]) == [(0, 0), (1, 0), (1, 1)]
+    assert voxels_left([2.5, 1.25], [0.5, 0.5]) == [(2, 1), (1, 1), (1, 0)]
+    assert voxels_left([0.5, 0.5], [2.5, 2.5]) == [(0, 0), (1, 0), (1, 1), (2, 1)]  # ties: lower axis first
+    assert voxels_left([0.5, 0.5], [0.75, 0.75]) == []
+
+
+# -- random and aligned -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("margin", [-0.02, 1.0])
+def test_random_rays_equal_the_reference_walk(dim, margin):
+    check(*random_rays(1500, SHAPES[dim], margin, 2.0**-16), SHAPES[dim])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("step", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("margin", [0.0, 0.6])
+def test_rays_on_lattice_points_equal_the_reference_walk(dim, step, margin):
+    check(*random_rays(1500, SHAPES[dim], margin, step), SHAPES[dim])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_unmasked_path_equals_the_masked_one(dim):
+    starts, ends = random_rays(500, SHAPES[dim], -0.1, 0.25, seed=1)
+    outside = torch.full((1, dim), -50.0, dtype=torch.float64)
+    with_outlier = visited(torch.cat([starts, outside]), torch.cat([ends, outside - 1]), SHAPES[dim])
+    assert visited(starts, ends, SHAPES[dim]) == with_outlier == expected(starts, ends, SHAPES[dim])
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, 1), (-1, 1, -1), (-1, -1, -1)])
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
+def test_diagonals_through_the_corners(signs, offset):
+    start = [offset if s > 0 else 5.0 - offset for s in signs]
+    end = [x + 4.75 * s for x, s in zip(start, signs, strict=True)]
+    rays = torch.tensor([start]).double(), torch.tensor([end]).double()
+    assert len(visited(*rays, (5, 5, 5))) >= 10
+    check(*rays, (5, 5, 5))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("other", [0.0, 0.5, 2.0, 4.0, 5.0, -0.25])
+@pytest.mark.parametrize("span", [(0.0, 4.0), (4.0, 0.0), (-3.5, 8.5), (8.0, -3.0), (1.25, 1.75), (3.0, 3.0)])
+def test_rays_along_an_axis(axis, other, span):
+    start, end = [other] * 3, [other] * 3
+    start[axis], end[axis] = span
+    check(torch.tensor([start]).double(), torch.tensor([end]).double(), (5, 5, 5))
+
+
+def test_the_end_voxel_is_not_visited():
+    assert one([0.5, 0.5], [3.5, 0.5], (5, 5)) == [(0, 0), (1, 0), (2, 0)]
+    assert one([3.5, 0.5], [0.5, 0.5], (5, 5)) == [(1, 0), (2, 0), (3, 0)]
+
+
+def test_a_ray_that_ends_on_a_plane_has_crossed_it_only_upwards():
+    assert one([0.5, 0.5], [2.0, 0.5], (5, 5)) == [(0, 0), (1, 0)]  # 2.0 belongs to voxel 2
+    assert one([3.5, 0.5], [2.0, 0.5], (5, 5)) == [(3, 0)]
+
+
+@pytest.mark.parametrize("point", [[0.5, 0.5], [2.0, 3.0], [-1.0, 2.0]])
+def test_a_ray_of_no_length_leaves_nothing(point):
+    assert one(point, point, (5, 5)) == []
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ([-2.0, -1.0], [-1.0, 7.0]),
+        ([6.0, 0.5], [9.0, 4.5]),
+        ([-1.0, 4.5], [4.5, 10.0]),
+        ([-3.0, 5.0], [9.0, 5.0]),
+    ],
+)
+def test_rays_outside_the_grid_visit_nothing(start, end):
+    assert one(start, end, (5, 5)) == []
+
+
+def test_no_rays_visit_nothing():
+    empty = torch.empty(0, 3, dtype=torch.float64)
+    assert list(traverse(empty, empty, (4, 4, 4))) == []
+
+
+coordinate = st.integers(-(2**11), 2**12).map(lambda i: i / 256)  # −8 … 16, so that ties are exact
+nice = st.sampled_from([-2.0, 0.0, 0.5, 1.0, 2.0, 2.25, 3.0, 4.0, 5.0, 8.0]) | coordinate
+
+
+@settings(max_examples=150)
+@given(
+    st.sampled_from([2, 3]).flatmap(
+        lambda d: st.lists(st.lists(nice, min_size=2 * d, max_size=2 * d), min_size=1, max_size=6)
+    )
+)
+def test_arbitrary_rays_equal_the_reference_walk(rows):
+    rays = torch.tensor(rows, dtype=torch.float64)
+    dim = rays.shape[1] // 2
+    check(rays[:, :dim], rays[:, dim:], SHAPES[dim])
+
+
+def test_float32_rays_are_converted_exactly():
+    starts, ends = random_rays(200, (7, 9), 0.5, 2.0**-10)
+    assert visited(starts.float(), ends.float(), (7, 9)) == expected(starts, ends, (7, 9))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("slope", [1.0, 2.0, 0.5, -1.0])
+@pytest.mark.parametrize("resolution", [0.1, 0.3, 0.05])
+def test_voxels_occur_once_and_none_is_missed_at_rounded_ties(dim, slope, resolution):
+    # Rays through edges and corners all the way, in coordinates that are no binary fractions.
+    starts = 0.01 * torch.arange(1, 60, 5, dtype=torch.float64)[:, None].repeat(1, dim) / resolution
+    direction = torch.tensor([1.0, slope, 1.0][:dim], dtype=torch.float64)
+    ends = (
+        starts + (3.0 + 0.1 * torch.arange(1, 60, 5, dtype=torch.float64)[:, None]) / resolution * direction
+    )
+    shift = torch.tensor([0.0, 250.0 if slope < 0 else 0.0, 0.0][:dim], dtype=torch.float64)
+    starts, ends = starts + shift, ends + shift
+    found = visited(starts, ends, (500,) * dim)
+    assert len(found) == len(set(found))
+    rays = zip(starts.tolist(), ends.tolist(), strict=True)
+    needed = {(r, voxel) for r, (a, b) in enumerate(rays) for voxel in voxels_crossed(a, b, 1e-6)}
+    assert needed <= set(found)
+
+
+# -- chunks, strides, work ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 100, 10**9])
+@pytest.mark.parametrize("margin", [0.0, 1.0])
+def test_visits_do_not_depend_on_the_chunk_size(chunk, margin):
+    rays = random_rays(120, SHAPES[3], margin, 0.25)
+    assert visited(*rays, SHAPES[3], chunk_visits=chunk) == visited(*rays, SHAPES[3])
+
+
+def test_chunks_have_about_the_requested_size():
+    starts, ends = random_rays(5000, (50, 50), 0.0, 2.0**-10)
+    sizes = [chunk.voxel.numel() for chunk in traverse(starts, ends, (50, 50), chunk_visits=1000)]
+    assert len(sizes) > 50
+    assert max(sizes) <= 1000 + 100  # one ray more, at most
+
+
+@pytest.mark.parametrize("strides", [[1, 8], [64, 1], [16, 1]])
+def test_flat_indices_use_the_given_strides(strides):
+    rays = random_rays(300, (8, 8), 0.3, 0.25)
+    assert visited(*rays, (8, 8), strides=strides) == expected(*rays, (8, 8))
+
+
+def test_row_major_strides_are_those_of_a_tensor():
+    for shape in ((4, 5), (3, 4, 5)):
+        assert row_major_strides(shape) == list(torch.empty(shape).stride())
+
+
+class LargestTensor(TorchDispatchMode):
+    """Notes the most elements that any tensor had."""
+
+    largest = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self.largest = max(self.largest, leaf.numel())
+        return result
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-0.3, 0.9, 0.01), (1e-7, 1.0, 0.0)])
+def test_a_ray_of_500_km_costs_no_more_than_the_grid(direction):
+    shape = (40, 30, 20)
+    length = 5e6 / math.hypot(*direction)  # cells of 10 cm
+    middle = torch.tensor([[20.25, 15.25, 10.25]]).double()
+    offset = torch.tensor([direction]).double() * length
+    starts, ends = middle - offset, middle + offset
+    with LargestTensor() as work:
+        n = sum(chunk.voxel.numel() for chunk in traverse(starts, ends, shape))
+    assert 0 < n <= sum(shape)
+    assert work.largest < 4 * sum(shape)
+
+
+def test_a_ray_of_500_km_visits_what_exact_arithmetic_says():
+    starts = torch.tensor([[-(2.0**22) + 0.25, 1.5], [2.0**22, 2.0**21]], dtype=torch.float64)
+    ends = torch.tensor([[2.0**22, 2.75], [-(2.0**22) + 8, -(2.0**21) + 8]], dtype=torch.float64)
+    found = visited(starts, ends, (9, 9))
+    # Only the middle of the oracle's walk is affordable: cut the rays at exact points around the grid.
+    for ray, (a, b) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        slope = (b[1] - a[1]) / (b[0] - a[0])
+        inside = [v for r, v in found if r == ray]
+        assert inside
+        for i, j in inside:
+            low, high = sorted(a[1] + slope * (x - a[0]) for x in (i, i + 1))
+            assert low - 1e-6 < j + 1
+            assert high + 1e-6 > j
+        columns = {i for i, _ in inside}
+        assert columns == set(range(min(columns), max(columns) + 1))
+
+
+@pytest.mark.parametrize("bad", [math.inf, -math.inf, math.nan, -1e300])
+def test_the_fused_walk_ends_for_rays_that_are_not_finite(bad):
+    inside = torch.full((3, 3), 2.5, dtype=torch.float64)
+    outside = inside.clone()
+    outside[torch.arange(3), torch.arange(3)] = bad
+    with kernels("fused"):
+        assert visited(outside, inside, (5, 5, 5)) == []
+        visited(inside, outside, (5, 5, 5))

@@ -1,0 +1,181 @@
+"""The browser viewer: what it shows, compared with the map; a browser is not needed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.live import viewer_scene
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.report.scenes.ellipsoids import unit_sphere
+
+pytest.importorskip("viser")
+
+
+@pytest.fixture(scope="module")
+def maps() -> dict[int, tuple[GaussianMap, torch.Tensor]]:
+    """A map and its sensor path by dimension."""
+    torch.set_num_threads(1)
+    found = {}
+    for dim, name in ((2, "synthetic_building_2d"), (3, "synthetic_building")):
+        scans = load(name, n_scans=3)
+        built = GaussianMap()
+        for scan in scans:
+            built.insert(scan.select(torch.arange(scan.n_beams) % (1 if dim == 2 else 8) == 0))
+        found[dim] = built, torch.stack([scan.origin for scan in scans])
+    return found
+
+
+@pytest.fixture
+def viewer(maps) -> Iterator:
+    from gmmtorch.live.map_viewer import MapViewer
+
+    made = MapViewer(*maps[3], port=8391)
+    yield made
+    made.stop()
+
+
+# -- what is shown --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_instances_are_the_two_sigma_ellipsoids(dim, maps):
+    from scipy.spatial.transform import Rotation
+
+    components = maps[dim][0].components()
+    solid = viewer_scene.surfaces(components)
+    balls = viewer_scene.instances(solid)
+    sphere = unit_sphere(20)[0].numpy()
+    for k in range(0, len(solid.means), 50):
+        turn = Rotation.from_quat(balls.wxyz[k, [1, 2, 3, 0]]).as_matrix()
+        offset = (sphere * balls.scales[k]) @ turn.T
+        covariance = components.covariances[solid.rows[k]].numpy()
+        # Points at two deviations have a squared Mahalanobis distance of 4; in 2D those of the equator.
+        level = np.abs(offset[:, 2]) if dim == 2 else np.zeros(len(offset))
+        flat = offset[:, :dim]
+        distance = np.einsum("pi,ij,pj->p", flat, np.linalg.inv(covariance), flat)
+        if dim == 3:
+            np.testing.assert_allclose(distance, 4, rtol=1e-6)
+        else:
+            assert distance.max() <= 4 + 1e-6
+            assert level.max() <= 0.011
+    np.testing.assert_allclose(balls.positions[:, :dim], components.means[solid.rows].numpy())
+
+
+def test_surfaces_leave_out_free_ends_and_what_is_above(maps):
+    components = maps[3][0].components()
+    below = viewer_scene.surfaces(components, 1.0)
+    wanted = (~components.max_range & (components.means[:, 2] <= 1.0)).nonzero()[:, 0]
+    assert torch.equal(below.rows, wanted)
+
+
+@pytest.mark.parametrize("by", viewer_scene.COLOURS)
+def test_colours_follow_the_order_of_their_quantity(by, maps):
+    components = maps[3][0].components()
+    solid = viewer_scene.surfaces(components)
+    colours = viewer_scene.colours(components, solid, by).astype(int)
+    quantity = {"height": solid.means[:, 2], "support": components.support, "age": components.ids[:, 1]}[by]
+    quantity = quantity if by == "height" else quantity[solid.rows]
+    low, high = int(quantity.argmin()), int(quantity.argmax())
+    assert colours[high, 1] > colours[low, 1] + 100  # viridis: from violet to yellow, with rising green
+    with pytest.raises(InvalidArgumentError, match="colour"):
+        viewer_scene.colours(components, solid, "taste")
+
+
+def test_slice_has_the_occupancy_of_the_map_with_the_highest_y_first(maps):
+    built, _ = maps[3]
+    low, high = (0.0, 0.0, 0.0), (8.0, 4.0, 3.0)
+    found = viewer_scene.occupancy_slice(built, 0.5, 1.2, low, high)
+    assert found.pixels.shape == (8, 16, 4)
+    assert (found.middle, found.size) == ((4.0, 2.0), (8.0, 4.0))
+    for row, column in ((0, 3), (5, 0), (7, 15), (2, 9)):
+        x, y = 0.25 + 0.5 * column, 3.75 - 0.5 * row
+        theta = float(built.occupancy(np.array([[x, y, 1.2]]), 0.5)[0])
+        alpha = int(found.pixels[row, column, 3])
+        assert (alpha == 0) == (abs(theta - 0.5) < 0.02)
+        if alpha:
+            assert (alpha > 200) == (theta >= 0.5)
+
+
+def test_first_hit_is_where_a_dense_walk_along_the_ray_enters_an_ellipsoid(maps):
+    solid = viewer_scene.surfaces(maps[3][0].components())
+    precision = torch.linalg.inv(solid.covariances)
+    origin = torch.tensor([4.0, 4.0, 1.2], dtype=torch.float64)
+    step = torch.arange(0, 12, 0.01, dtype=torch.float64)
+    n_hits = 0
+    for angle in (0.5, 1.5, 2.5, 3.5, 4.5, 5.5):
+        direction = torch.tensor([np.cos(angle), np.sin(angle), -0.15], dtype=torch.float64)
+        offset = (origin + step[:, None] * direction)[:, None] - solid.means
+        inside = (torch.einsum("pki,kij,pkj->pk", offset, precision, offset) < 4).any(1)
+        found = viewer_scene.first_hit(solid, origin, direction)
+        if inside.any() and not inside[0]:
+            n_hits += 1
+            assert found == pytest.approx(float(step[inside.long().argmax()]), abs=0.011)
+    assert n_hits >= 2
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
+    built, _ = maps[dim]
+    position = built.components().means[3]
+    known = viewer_scene.place_at(built, position, 0.1)
+    options = built.query_options
+    hits = known.hits * options.hit_length / 0.1
+    expected = (hits + options.prior) / (hits + known.misses + 2 * options.prior)
+    assert known.hits > 0
+    assert known.occupancy == pytest.approx(expected)
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, maps):
+    assert {"components", "path", "slice"} <= viewer._nodes.keys()
+    viewer._height.value = 0.8
+    viewer._redraw(viewer._draw_slice)
+    assert viewer._nodes["slice"].position[2] == pytest.approx(0.8)
+    n_all = len(viewer._nodes["components"].batched_positions)
+    viewer._cut.value = 1.0
+    viewer._redraw(viewer._draw_components)
+    assert 0 < len(viewer._nodes["components"].batched_positions) < n_all
+    viewer._show_place((2.0, 2.0, 0.81), (0.0, 0.0, -1.0))
+    theta = maps[3][0].occupancy(np.array([[2.0, 2.0, 0.8]]), 0.1)[0]
+    assert "at (2.00, 2.00, 0.80) m" in viewer._place.content
+    assert f"| occupancy θ | {theta:.3f} |" in viewer._place.content
+    viewer._visible.value = False
+    viewer._redraw(viewer._draw_slice)
+    assert "slice" not in viewer._nodes
+
+
+@pytest.mark.parametrize("shape", ["splats", "surfaces", "none"])
+def test_other_shapes(shape, viewer):
+    viewer._shape.value = shape
+    viewer._redraw(viewer._draw_components)
+    assert ("components" in viewer._nodes) == (shape != "none")
+
+
+def test_html_is_one_file_without_references_to_a_network(viewer, tmp_path):
+    text = viewer.save_html(tmp_path / "map.html").read_text(encoding="utf-8")
+    assert "__VISER_EMBED_DATA__" in text
+    assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=[\"']?https?:", text)
+    with pytest.raises(InvalidArgumentError, match=r"must end in \.html"):
+        viewer.save_html(tmp_path / "map.txt")
+
+
+def test_a_growing_map_is_shown_from_its_first_components(maps):
+    from gmmtorch.live.map_viewer import MapViewer
+
+    made = MapViewer(GaussianMap(), port=8393)
+    try:
+        assert not made._nodes
+        made.update(*maps[2])
+        assert {"components", "path", "slice"} <= made._nodes.keys()
+        assert not made._height.visible
+    finally:
+        made.stop()

@@ -1,0 +1,288 @@
+"""Covariance types of both estimators, and what else users of scikit-learn's classes rely on."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import sklearn.mixture
+import torch
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils._param_validation import InvalidParameterError
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, NumericalError
+from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+from gmmtorch.mixture.em.covariance_types import COVARIANCE_TYPES, compact, constrain, expand, type_shape
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+types = pytest.mark.parametrize("kind", COVARIANCE_TYPES)
+estimators = pytest.mark.parametrize("estimator", [GaussianMixture, VariationalGaussianMixture])
+
+
+def cloud(n: int = 300, dim: int = 3, seed: int = 0) -> np.ndarray:
+    """Three overlapping clusters of different shapes."""
+    rng = np.random.default_rng(seed)
+    centers = rng.normal(size=(3, dim)) * 2
+    roots = rng.normal(size=(3, dim, dim)) * 0.5 + 0.5 * np.eye(dim)
+    label = rng.integers(3, size=n)
+    return centers[label] + np.einsum("nij,nj->ni", roots[label], rng.normal(size=(n, dim)))
+
+
+def start(kind: str, k: int = 3, dim: int = 3, seed: int = 1) -> dict[str, Any]:
+    """Initial parameters of the type."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(k, dim, dim)) * 0.2
+    precisions = torch.from_numpy(np.eye(dim) + root @ root.transpose(0, 2, 1))
+    weights = rng.random(k) + 0.5
+    return {
+        "covariance_type": kind,
+        "weights_init": weights / weights.sum(),
+        "means_init": rng.normal(size=(k, dim)) * 1.5,
+        "precisions_init": compact(constrain(precisions, kind), kind).numpy(),
+    }
+
+
+# -- the result of scikit-learn ----------------------------------------------------------------------
+
+
+@types
+@pytest.mark.parametrize("options", [{}, {"tol": 1e-7, "max_iter": 300}, {"max_iter": 2, "reg_covar": 0.1}])
+def test_each_type_gives_the_result_of_scikit_learn(kind, options):
+    x, test = cloud(), cloud(50, seed=9)
+    found = GaussianMixture(3, dtype="float64", **start(kind), **options).fit(x)
+    expected = sklearn.mixture.GaussianMixture(3, **start(kind), **options).fit(x)
+    assert found.n_iter_ == expected.n_iter_
+    assert found.converged_ == expected.converged_
+    names = ("weights_", "means_", "covariances_", "precisions_", "precisions_cholesky_", "lower_bounds_")
+    for name in names:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
+    for name in ("score_samples", "predict_proba"):
+        np.testing.assert_allclose(getattr(found, name)(test), getattr(expected, name)(test), atol=1e-6)
+    assert found.bic(test) == pytest.approx(expected.bic(test), rel=1e-6)
+
+
+@types
+def test_equal_clusters_of_k_means_give_the_result_of_scikit_learn(kind):
+    """Well separated clusters: all runs of k-means find them, whatever the seed."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(150, 2)) + np.repeat([[0, 0], [20, 0], [0, 30]], [30, 50, 70], axis=0)
+    options = {"n_components": 3, "covariance_type": kind}
+    for ours, theirs in (
+        (GaussianMixture, sklearn.mixture.GaussianMixture),
+        (VariationalGaussianMixture, sklearn.mixture.BayesianGaussianMixture),
+    ):
+        tol = 1e-3
+        if theirs is sklearn.mixture.BayesianGaussianMixture:
+            options["weight_concentration_prior_type"] = "dirichlet_distribution"  # which has no order
+            tol *= len(x)  # the bound is a sum over the points
+        found = ours(random_state=0, **options).fit(x)
+        expected = theirs(random_state=5, tol=tol, **options).fit(x)
+        one, other = found.weights_.argsort(), expected.weights_.argsort()
+        np.testing.assert_allclose(found.means_[one], expected.means_[other], atol=1e-6)
+        if kind == "tied":
+            one = other = slice(None)
+        np.testing.assert_allclose(found.covariances_[one], expected.covariances_[other], atol=1e-6)
+
+
+# -- shapes and other operations ---------------------------------------------------------------------
+
+
+@types
+@estimators
+def test_attributes_have_the_shapes_of_scikit_learn(estimator, kind):
+    found = estimator(2, covariance_type=kind, random_state=0).fit(cloud())
+    for name in ("covariances_", "precisions_", "precisions_cholesky_"):
+        assert getattr(found, name).shape == type_shape(kind, 2, 3)
+    assert found.covariances.shape == (2, 3, 3)
+    again = torch.from_numpy(found.covariances_)
+    assert torch.equal(expand(again, kind, 2, 3), found.covariances)
+    tensors = estimator(2, covariance_type=kind, random_state=0).fit(torch.from_numpy(cloud()))
+    assert isinstance(tensors.precisions_, torch.Tensor)
+
+
+@types
+@estimators
+def test_files_and_motions_keep_the_type(estimator, kind, tmp_path):
+    x = cloud()
+    found = estimator(2, covariance_type=kind, random_state=0).fit(x)
+    found.save(tmp_path / "m.safetensors")
+    loaded = estimator.load(tmp_path / "m.safetensors")
+    assert loaded.covariance_type == kind
+    assert np.array_equal(loaded.covariances_, found.covariances_)
+    motion = np.eye(4)
+    motion[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
+    moved = loaded.moved(motion)
+    assert moved.covariance_type == ("full" if kind == "diag" else kind)
+    np.testing.assert_allclose(moved.score_samples(x @ motion[:3, :3].T), found.score_samples(x), atol=1e-9)
+    moved.save(tmp_path / "moved.safetensors")
+    assert estimator.load(tmp_path / "moved.safetensors").covariances_.shape == moved.covariances_.shape
+
+
+@types
+def test_given_parameters_have_the_shape_of_the_type_or_are_full(kind):
+    fitted = GaussianMixture(2, covariance_type=kind, random_state=0).fit(cloud())
+    arrays = fitted.weights_, fitted.means_
+    for covariances in (fitted.covariances_, fitted.covariances.numpy()):
+        same = GaussianMixture.from_parameters(*arrays, covariances, covariance_type=kind)
+        assert torch.equal(same.covariances, fitted.covariances)
+    other = np.array([[[2.0, 0.1, 0], [0.1, 1, 0], [0, 0, 1]], np.eye(3)])
+    if kind != "full":
+        with pytest.raises(InvalidArgumentError, match="covariance_type"):
+            GaussianMixture.from_parameters(*arrays, other, covariance_type=kind)
+
+
+@types
+def test_batches_of_all_points_give_an_em_step(kind):
+    x = cloud()
+    once = GaussianMixture(3, max_iter=1, dtype="float64", **start(kind)).fit(x)
+    batch = GaussianMixture(3, dtype="float64", **start(kind)).partial_fit(x)
+    np.testing.assert_allclose(batch.covariances_, once.covariances_, rtol=1e-9)
+    assert batch.partial_fit(cloud(seed=3)).covariances_.shape == type_shape(kind, 3, 3)
+
+
+def test_truncated_em_rejects_other_types():
+    with pytest.raises(InvalidArgumentError, match="truncated"):
+        GaussianMixture(2, algorithm="truncated", covariance_type="diag").fit(cloud())
+
+
+# -- iterations --------------------------------------------------------------------------------------
+
+
+@types
+def test_repeated_warm_starts_converge_as_those_of_scikit_learn(kind):
+    options = {"warm_start": True, "max_iter": 1, **start(kind)}
+    found = GaussianMixture(3, dtype="float64", **options)
+    expected = sklearn.mixture.GaussianMixture(3, **options)
+    x = cloud()
+    for _ in range(100):
+        expected.fit(x)
+        found.fit(x)
+        assert found.converged_ == expected.converged_
+        assert found.n_iter_ == 1
+        if found.converged_:
+            break
+    assert found.converged_
+    np.testing.assert_allclose(found.means_, expected.means_, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"algorithm": "truncated"}, {"max_cells": 200}, {"dtype": "float32"}])
+def test_repeated_warm_starts_converge_with_any_algorithm(options):
+    mixture = GaussianMixture(3, warm_start=True, max_iter=1, random_state=0, **options)
+    assert any(mixture.fit(cloud()).converged_ for _ in range(100))
+
+
+@types
+def test_repeated_warm_starts_of_variational_bayes_converge_to_the_same_posterior(kind):
+    x = cloud()
+    options = {"covariance_type": kind, "random_state": 0, "dtype": "float64"}
+    once = VariationalGaussianMixture(5, **options).fit(x)
+    parts = VariationalGaussianMixture(5, warm_start=True, max_iter=1, **options)
+    n_fits = next(i for i in range(1, 200) if parts.fit(x).converged_)
+    assert n_fits == once.n_iter_
+    np.testing.assert_allclose(parts.covariances_, once.covariances_, rtol=1e-7)
+    assert np.diff(once.lower_bounds_).min() > -1e-9
+
+
+@estimators
+def test_max_iter_zero_returns_the_start_without_a_warning(estimator):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mixture = estimator(3, max_iter=0, n_init=2, random_state=0).fit(cloud())
+    assert (mixture.n_iter_, mixture.lower_bounds_, mixture.lower_bound_) == (0, [], -math.inf)
+    assert not mixture.converged_
+    assert np.isfinite(mixture.score(cloud()))
+
+
+@estimators
+def test_verbose_prints_iterations(estimator, capsys):
+    estimator(3, random_state=0, verbose=0).fit(cloud())
+    assert capsys.readouterr().out == ""
+    fitted = estimator(3, random_state=0, verbose=1, verbose_interval=2).fit(cloud())
+    lines = capsys.readouterr().out.splitlines()
+    steps = [f"  Iteration {i}" for i in range(2, fitted.n_iter_ + 1, 2)]
+    assert lines == ["Initialization 0", *steps, "Initialization converged."]
+    estimator(3, random_state=0, verbose=2, verbose_interval=1, max_iter=2, tol=1e-9).fit(cloud())
+    assert "ll change" in (out := capsys.readouterr().out)
+    assert "did not converge" in out
+
+
+# -- errors, names and repr --------------------------------------------------------------------------
+
+
+@estimators
+@pytest.mark.parametrize(
+    ("name", "value"), [("tol", -1), ("covariance_type", "round"), ("verbose_interval", 0), ("max_iter", -1)]
+)
+def test_invalid_parameters_raise_the_error_of_scikit_learn(estimator, name, value):
+    with pytest.raises(
+        InvalidParameterError, match=f"The '{name}' parameter of {estimator.__name__} must be"
+    ) as e:
+        estimator(**{name: value}).fit(cloud())
+    assert isinstance(e.value, GmmTorchError)
+
+
+def test_a_collapse_has_the_message_of_scikit_learn():
+    with pytest.raises(NumericalError, match="ill-defined empirical covariance") as e:
+        GaussianMixture(2, reg_covar=0).fit(np.repeat(np.eye(2), 5, axis=0))
+    assert isinstance(e.value, ValueError)
+
+
+def test_no_convergence_has_the_message_of_scikit_learn():
+    with pytest.warns(ConvergenceWarning, match="Best performing initialization did not converge"):
+        GaussianMixture(3, max_iter=1, random_state=0).fit(cloud())
+
+
+class Table(np.ndarray):
+    """An array with the names of its columns."""
+
+    names: list[str]
+
+
+def table(values: np.ndarray, *names: str) -> Table:
+    found = values.view(Table)
+    found.names = list(names)
+    return found
+
+
+def test_names_of_columns_are_stored_and_compared(monkeypatch):
+    def names_of(X: object) -> np.ndarray | None:
+        return np.array(X.names, dtype=object) if isinstance(X, Table) else None
+
+    monkeypatch.setattr("sklearn.utils.validation._get_feature_names", names_of)
+    x = cloud()
+    mixture = GaussianMixture(2, random_state=0).fit(table(x, "east", "north", "up"))
+    assert list(mixture.feature_names_in_) == ["east", "north", "up"]
+    with pytest.raises(ValueError, match="feature names"):
+        mixture.predict(table(x, "north", "east", "up"))
+    assert not hasattr(mixture.fit(torch.from_numpy(x)), "feature_names_in_")
+
+
+def test_repr_is_one_line_with_the_changed_parameters():
+    assert repr(GaussianMixture()) == "GaussianMixture()"
+    mixture = GaussianMixture(3, covariance_type="diag", max_iter=7, means_init=np.zeros((3, 2)), tol=1e-5)
+    assert repr(mixture) == (
+        "GaussianMixture(covariance_type='diag', max_iter=7, means_init=<ndarray of shape (3, 2)>, "
+        "n_components=3, tol=1e-05)"
+    )
+    assert "\n" not in repr(VariationalGaussianMixture(3, init_params="random", reg_covar=1e-4, verbose=1))
+
+
+def test_estimators_have_no_transform():
+    mixture = GaussianMixture(2, random_state=0).fit(cloud())
+    assert not hasattr(mixture, "transform")
+    np.testing.assert_allclose(mixture.moved(np.eye(4)).means_, mixture.means_)
+
+
+@pytest.mark.parametrize("init", ["random", "random_from_data", "k-means++"])
+def test_initializations_of_scikit_learn(init):
+    x = cloud()
+    mixture = GaussianMixture(3, init_params=init, random_state=0, max_iter=0).fit(x)
+    if init == "random":
+        np.testing.assert_allclose(mixture.means_, np.tile(x.mean(0), (3, 1)), atol=0.5)
+        np.testing.assert_allclose(mixture.weights_, 1 / 3, atol=0.05)
+    else:
+        assert all((np.abs(x - mean).max(1) < 1e-9).any() for mean in mixture.means_)
+        np.testing.assert_allclose(mixture.covariances_, np.tile(1e-6 * np.eye(3), (3, 1, 1)))
