@@ -234,7 +234,8 @@ class Map:
     seed: seed of all random numbers.
     resolution: side (m) of the cells of queries, pictures and exports.
     export: list of map_server, octomap, cloud, mesh, distance_field.
-    z_min, z_max: height band (m) of map_server and distance_field; null: half a metre around the path.
+    view: show the map in the browser while it is built, and until Ctrl-C.
+    z_min, z_max: height band (m) of map_server in 3D; both null: between floor and ceiling.
     checkpoint_seconds: computing time between two checkpoints.
     """
 

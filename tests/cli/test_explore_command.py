@@ -592,11 +592,11 @@ def test_half_a_mesh_is_rejected(run, tmp_path, room):
     [
         ("duration=long", "duration=long could not be converted to Float"),
         ("team.size=two", "team.size=two could not be converted to Integer"),
-        ("team=gmm", "Could not find 'team/gmm' gmm_shared grid_isolated"),
-        ("world=moon", "Could not find 'world/moon' tunnels warehouse"),
-        ("world.size=[10,10,3]", "Could not override 'world.size'"),
-        ("sensor.widht=3", "Could not override 'sensor.widht'"),
-        ("runtime.memory_limit=1000", "Could not override 'runtime.memory_limit'"),
+        ("team=gmm", "team=gmm does not exist gmm_shared grid_isolated"),
+        ("world=moon", "world=moon does not exist tunnels warehouse"),
+        ("world.size=[10,10,3]", "world.size is not an option with world=mesh another choice of world= has it"),
+        ("sensor.widht=3", "sensor.widht is not an option did you mean sensor.width?"),
+        ("runtime.memory_limit=1000", "runtime.memory_limit is not an option"),
     ],
 )
 def test_wrong_types_and_unknown_options_are_explained_without_a_traceback(option, words, run):

@@ -46,7 +46,7 @@ def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypa
     monkeypatch.setitem(COMMANDS, "team", team)
     monkeypatch.delenv(KEY_VARIABLE, raising=False)
     options = ["world=mesh", f"world.path={room(tmp_path / 'room.obj')}", *SMALL, "team.size=2"]
-    options += ["duration=4", "speed=2", "settle=4", "evaluation.every=2", "network.announce=0.5"]
+    options += ["duration=4", "speed=2", "settle=12", "evaluation.every=2", "network.announce=0.5"]
     done = succeeded(run_here(monkeypatch, "team", tmp_path / "run", *options))
     assert done.results()["config"]["clock"] == "wall"
     summary, *rows = done.results()["rows"]
@@ -66,7 +66,7 @@ def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypa
     for row in rows:
         assert row["n_components"] > 0
         assert row["stopped"] is False
-        assert row["ticks_late"] <= 4
+        assert 0 <= row["ticks_late"] <= 8  # that many ticks fit into the mission
         assert row["socket_bytes"] + 28 * row["socket_datagrams"] == row["wire_bytes"]
 
     files = done.files()

@@ -152,12 +152,10 @@ def test_stop_ends_drive_and_settle(when):
     assert clock.now() == pytest.approx(when, abs=0.03)
 
 
-def test_an_event_of_another_thread_stops_a_mission_quickly():
-    toy, stopped = Toy(0.01), threading.Event()
+def test_an_event_of_another_thread_stops_a_mission_before_its_next_tick():
+    toy, stopped = Toy(1e-4), threading.Event()  # the second tick is due in hours
     threading.Timer(0.1, stopped.set).start()
-    begin = time.monotonic()
     drive(toy, WallClock(), stop=stopped.is_set)
-    assert time.monotonic() - begin < 5.0
     assert toy.ticks == pytest.approx([0.0], abs=0.1)
 
 
