@@ -594,7 +594,10 @@ def test_half_a_mesh_is_rejected(run, tmp_path, room):
         ("team.size=two", "team.size=two could not be converted to Integer"),
         ("team=gmm", "team=gmm does not exist gmm_shared grid_isolated"),
         ("world=moon", "world=moon does not exist tunnels warehouse"),
-        ("world.size=[10,10,3]", "world.size is not an option with world=mesh another choice of world= has it"),
+        (
+            "world.size=[10,10,3]",
+            "world.size is not an option with world=mesh another choice of world= has it",
+        ),
         ("sensor.widht=3", "sensor.widht is not an option did you mean sensor.width?"),
         ("runtime.memory_limit=1000", "runtime.memory_limit is not an option"),
     ],
