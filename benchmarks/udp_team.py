@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gmmtorch.cli.links import free_addresses
+from gmmtorch.cli.from_options.links import free_addresses
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.report.table import format_table

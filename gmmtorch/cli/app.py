@@ -22,8 +22,9 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from gmmtorch.cli import command_options, common, schema
-from gmmtorch.cli.sweep_table import ERROR_FILE
+from gmmtorch.cli import common
+from gmmtorch.cli.options import command_options, schema
+from gmmtorch.cli.reporting.sweep_table import ERROR_FILE
 from gmmtorch.errors import GmmTorchError
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"

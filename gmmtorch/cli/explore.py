@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common, missions
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import missions
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.mission import Mission
@@ -67,7 +68,7 @@ def _check_options(config: DictConfig) -> None:
 
 def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
     """One mission, with pictures; it is not run again in the folder of an equal run."""
-    from gmmtorch.cli.explore_pictures import MissionRecorder
+    from gmmtorch.cli.reporting.explore_pictures import MissionRecorder
     from gmmtorch.exploration.mission.results import compared
     from gmmtorch.exploration.mission.trials import STAGE, keep_row, kept_row, run_mission
 
@@ -119,7 +120,7 @@ def _status(mission: Mission) -> str:
 
 def _compare(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
     """A study: every variant with every seed."""
-    from gmmtorch.cli.explore_pictures import save_comparison
+    from gmmtorch.cli.reporting.explore_pictures import save_comparison
     from gmmtorch.errors import check_whole
     from gmmtorch.exploration.mission.results import compared
     from gmmtorch.exploration.mission.trials import STAGE, run_trials

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common, fit_stream, fit_studies, studies
-from gmmtorch.cli.fit_data import fit_data
+from gmmtorch.cli import app, common, fit_stream
+from gmmtorch.cli.from_options.fit_data import fit_data
+from gmmtorch.cli.studies import fit_studies, study
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,7 +41,7 @@ def run(config: DictConfig) -> float | None:
         if config.study is None:
             rows = _compare(config, device, folder, bars)
         else:
-            rows = studies.run("fit", fit_studies.STUDIES, config, device, folder, bars)
+            rows = study.run("fit", fit_studies.STUDIES, config, device, folder, bars)
     common.print_files(folder, folder / "results.json")
     return common.log_likelihood(rows[-1])
 

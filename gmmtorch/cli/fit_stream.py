@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.fit_data import fit_data
+from gmmtorch.cli.from_options.fit_data import fit_data
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.streamed_fit import Split, Streamed

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common, map_outputs, maps
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.view import serve
 
 if TYPE_CHECKING:

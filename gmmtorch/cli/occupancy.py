@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common, maps, occupancy_studies, studies
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.studies import occupancy_studies, study
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event, Row
@@ -34,7 +36,7 @@ def run(config: DictConfig) -> float | None:
         if config.study is None:
             rows = _compare(config, device, folder, bars)
         else:
-            rows = studies.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
+            rows = study.run("occupancy", occupancy_studies.STUDIES, config, device, folder, bars)
     common.print_files(folder, folder / "results.json")
     return rows[-1].get("auc")
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import app, common, links, maps, missions
-from gmmtorch.cli.outputs import Outputs, terse
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import links, maps, missions
+from gmmtorch.cli.reporting.outputs import Outputs, terse
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.driver import Drivable
@@ -232,7 +233,7 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
 
 def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path) -> None:
     """Runs the mission, waits until the team is quiet, and writes the results."""
-    from gmmtorch.cli.robot_report import RobotReport, print_refusals
+    from gmmtorch.cli.reporting.robot_report import RobotReport, print_refusals
     from gmmtorch.exploration.mission.driver import WallClock, drive, settle
 
     outputs = Outputs(folder)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import app, common, links, missions
-from gmmtorch.cli.outputs import Outputs, terse
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import links, missions
+from gmmtorch.cli.reporting.outputs import Outputs, terse
 from gmmtorch.cli.robot import check_options
 from gmmtorch.cli.robot_process import RobotProcess, end_all
 
@@ -39,7 +40,7 @@ def main() -> None:
 
 def run(config: DictConfig) -> None:
     """Runs a team until all its robots have ended."""
-    from gmmtorch.cli.robot_report import print_refusals
+    from gmmtorch.cli.reporting.robot_report import print_refusals
     from gmmtorch.report.progress import ProgressBars
 
     config.clock = config.clock or "wall"

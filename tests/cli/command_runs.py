@@ -20,7 +20,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, export, fit, map, occupancy, schema, view
+from gmmtorch.cli import common, export, fit, map, occupancy, view
+from gmmtorch.cli.options import schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())

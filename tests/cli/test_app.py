@@ -16,7 +16,8 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 from omegaconf import DictConfig
 
 import gmmtorch
-from gmmtorch.cli import command_options, common, explore, map, occupancy, robot, team
+from gmmtorch.cli import common, explore, map, occupancy, robot, team
+from gmmtorch.cli.options import command_options
 from gmmtorch.errors import InvalidArgumentError
 
 COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map"]

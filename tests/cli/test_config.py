@@ -20,7 +20,10 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export, fit_studies, maps, missions, occupancy_studies, schema
+from gmmtorch.cli import common, export
+from gmmtorch.cli.from_options import maps, missions
+from gmmtorch.cli.options import schema
+from gmmtorch.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.evaluation import methods
 from gmmtorch.evaluation.fit_comparison import ESTIMATORS

@@ -36,7 +36,8 @@ from command_runs import (
 )
 from exploration.replays import content
 
-from gmmtorch.cli import links, robot
+from gmmtorch.cli import robot
+from gmmtorch.cli.from_options import links
 from gmmtorch.cli.robot import facts_of
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.mapping.gaussian_map import GaussianMap

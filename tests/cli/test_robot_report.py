@@ -13,8 +13,8 @@ import pytest
 from command_runs import Disk, as_it_was, composed
 
 from gmmtorch.cli import common
-from gmmtorch.cli.outputs import Outputs, terse
-from gmmtorch.cli.robot_report import RobotReport, print_refusals
+from gmmtorch.cli.reporting.outputs import Outputs, terse
+from gmmtorch.cli.reporting.robot_report import RobotReport, print_refusals
 from gmmtorch.errors import OutputError
 from gmmtorch.files import write_bytes
 

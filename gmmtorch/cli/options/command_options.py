@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gmmtorch.cli import common
-from gmmtorch.cli.structured import DOCUMENTED
+from gmmtorch.cli.options.structured import DOCUMENTED
 from gmmtorch.errors import InvalidArgumentError
 
 _NEAR = 0.6

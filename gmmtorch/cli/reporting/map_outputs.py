@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gmmtorch.cli import common, export, schema
+from gmmtorch.cli import common, export
+from gmmtorch.cli.options import map_schema
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -76,7 +77,7 @@ def write_exports(
             "runtime": {key: config.runtime[key] for key in ("device", "threads", "memory_limit")},
             **({"z_min": config.z_min, "z_max": config.z_max} if name == "map_server" else {}),
         }
-        merged: Any = OmegaConf.merge(OmegaConf.structured(schema.Export), options)
+        merged: Any = OmegaConf.merge(OmegaConf.structured(map_schema.Export), options)
         try:
             written = export.write_space(merged, source, on_event)
         except GmmTorchError as error:

@@ -1,7 +1,7 @@
 """Runs a study: an experiment of gmmtorch-fit or gmmtorch-occupancy with rows and figures of its own.
 
 To add a study, write a function in `fit_studies` or `occupancy_studies` that returns `Found`, a class
-with its options in `evaluation.studies.study_options`, an entry in `schema.STUDIES`, and a file in
+with its options in `evaluation.studies.study_options`, an entry in `options.schema.STUDIES`, and a file in
 conf/experiment.
 """
 

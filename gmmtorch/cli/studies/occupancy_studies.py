@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, maps
-from gmmtorch.cli.structured import build
-from gmmtorch.cli.studies import Found, Study
+from gmmtorch.cli import common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.options.structured import build
+from gmmtorch.cli.studies.study import Found, Study
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Event, OnRows

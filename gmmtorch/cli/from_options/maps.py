@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.structured import build
+from gmmtorch.cli.options.structured import build
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.methods import MapFactory

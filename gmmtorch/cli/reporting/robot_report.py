@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.status_line import StatusLine
+from gmmtorch.cli.reporting.status_line import StatusLine
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.robot_view import RobotView

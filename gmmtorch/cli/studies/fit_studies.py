@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import common
-from gmmtorch.cli.fit_data import fit_data, fit_data_of, selected_scans
-from gmmtorch.cli.structured import build
-from gmmtorch.cli.studies import Found, Study
+from gmmtorch.cli.from_options.fit_data import fit_data, fit_data_of, selected_scans
+from gmmtorch.cli.options.structured import build
+from gmmtorch.cli.studies.study import Found, Study
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,0 +1,1 @@
+"""Objects of the library made from the options of a command."""

@@ -1,0 +1,118 @@
+"""The options of data sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+
+
+@dataclass
+class FileDataset:
+    """A data set in files.
+
+    path: file or folder.
+    max_range: readings at or beyond this distance (m) are beams without return; null: the data set's own.
+    no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
+    stride: use every n-th scan.
+    """
+
+    name: str = MISSING
+    path: str = MISSING
+    max_range: float | None = None
+    no_return_range: float | None = None
+    stride: int = 1
+    poses: str | None = None
+
+
+@dataclass
+class DepthFramesDataset(FileDataset):
+    """Depth images.
+
+    pixel_stride: every n-th pixel of every n-th row.
+    """
+
+    pixel_stride: int = 1
+    depth_scale: float = 0.001
+
+
+@dataclass
+class RosbagDataset(FileDataset):
+    topic: str | None = None
+    frame: str | None = None
+    sensor_frame: str | None = None
+    extrinsic: list[float] | None = None
+    max_gap: float = 2.0
+    clock: str = "header"
+    deskew: bool = True
+    camera_info: str | None = None
+    pixel_stride: int = 1
+
+
+@dataclass
+class KittiDataset(FileDataset):
+    max_gap: float = 2.0
+
+
+@dataclass
+class TumDataset(DepthFramesDataset):
+    intrinsics: list[float] | None = None
+    depth_scale: float = 0.0002
+    max_gap: float = 0.5
+
+
+@dataclass
+class MeshDataset(FileDataset):
+    """Points of a mesh.
+
+    n_points: number of points sampled from the surface.
+    noise: standard deviation (m) of the points along each axis.
+    seed: seed of points and noise.
+    """
+
+    n_points: int = 100_000
+    noise: float = 0.0
+    seed: int = 0
+
+
+@dataclass
+class MeshScansDataset(FileDataset):
+    """Simulated scans of a mesh.
+
+    n_scans: number of scans, about 2 m apart.
+    sensor: lidar or depth_camera.
+    seed: seed of the sensor's noise.
+    """
+
+    n_scans: int = 100
+    sensor: str = "lidar"
+    seed: int = 0
+
+
+@dataclass
+class SyntheticDataset:
+    """A simulated building.
+
+    max_range: readings at or beyond this distance (m) are beams without return; null: the sensor's own.
+    no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
+    stride: use every n-th scan.
+    seed: seed of the simulation.
+    n_scans: number of scans; null: the whole tour.
+    """
+
+    name: str = MISSING
+    max_range: float | None = None
+    no_return_range: float | None = None
+    stride: int = 1
+    seed: int = 0
+    n_scans: int | None = None
+
+
+@dataclass
+class SyntheticBuildingDataset(SyntheticDataset):
+    """A simulated building in 3D.
+
+    sensor: lidar or depth_camera.
+    """
+
+    sensor: str = "lidar"

@@ -1,0 +1,112 @@
+"""The options of gmmtorch-map, gmmtorch-occupancy, gmmtorch-export and gmmtorch-view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING
+
+from gmmtorch.cli.options.runtime_schema import ExportReport, ExportRuntime, Report, Runtime
+
+
+@dataclass
+class MapFile:
+    """codec: quantized, about 9 bytes for each component; or float, exact numbers."""
+
+    name: str = MISSING
+    codec: str = "quantized"
+
+
+@dataclass
+class Map:
+    """Options of gmmtorch-map.
+
+    seed: seed of all random numbers.
+    resolution: side (m) of the cells of queries, pictures and exports.
+    export: list of map_server, octomap, cloud, mesh, distance_field.
+    view: show the map in the browser while it is built, and until Ctrl-C.
+    z_min, z_max: height band (m) of map_server in 3D; both null: between floor and ceiling.
+    checkpoint_seconds: computing time between two checkpoints.
+    """
+
+    dataset: Any = MISSING
+    map: Any = MISSING
+    seed: int = 0
+    resolution: float = 0.1
+    export: list[str] = field(default_factory=list)
+    view: bool = False
+    z_min: float | None = None
+    z_max: float | None = None
+    checkpoint_seconds: float = 30.0
+    report: Report = field(default_factory=Report)
+    runtime: Runtime = field(default_factory=Runtime)
+
+
+@dataclass
+class OccupancyReport(Report):
+    """magnify: number of regions of a 2D map with a magnified figure."""
+
+    magnify: int = 0
+
+
+@dataclass
+class Occupancy:
+    """Options of gmmtorch-occupancy.
+
+    method: list of point, flux, cone, monte_carlo, occupancy_grid, octomap and other baselines.
+    method_options: options of one baseline, as in +method_options.hilbert.features=nystroem.
+    seed: seed of all random numbers.
+    """
+
+    dataset: Any = MISSING
+    map: Any = MISSING
+    method: list[str] = field(default_factory=list)
+    method_options: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    study: Any = None
+    report: OccupancyReport = field(default_factory=OccupancyReport)
+    runtime: Runtime = field(default_factory=Runtime)
+
+
+@dataclass
+class Export:
+    """Options of gmmtorch-export.
+
+    path: map, grid or mixture of gmmtorch (.safetensors), GIRA .csv, or .npz.
+    output: file to write.
+    format: map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture; null: by the ending.
+    method: form of evidence: point, flux, cone, monte_carlo; null: the map's own.
+    resolution: side (m) of the cells; null: the map's own.
+    bounds: [x0,y0,x1,y1], in 3D [x0,y0,z0,x1,y1,z1] (m); null: around the components.
+    z_min, z_max: height band (m); null: for map_server, between the floor and the ceiling of a 3D map.
+    occupied_thresh: cells above this probability are occupied.
+    free_thresh: cells below this probability are free; others are unknown.
+    n_points: number of points from which a mixture without support (GIRA) was learned.
+    """
+
+    path: str | None = None
+    output: str | None = None
+    format: str | None = None
+    method: str | None = None
+    resolution: float | None = None
+    bounds: list[float] | None = None
+    z_min: float | None = None
+    z_max: float | None = None
+    occupied_thresh: float = 0.65
+    free_thresh: float = 0.196
+    n_points: float | None = None
+    report: ExportReport = field(default_factory=ExportReport)
+    runtime: ExportRuntime = field(default_factory=ExportRuntime)
+
+
+@dataclass
+class View:
+    path: str | None = None
+    trajectory: str | None = None
+    html: str | None = None
+    shape: str = "ellipsoids"
+    colour: str = "height"
+    host: str = "127.0.0.1"
+    port: int = 8080
+    runtime: ExportRuntime = field(default_factory=ExportRuntime)

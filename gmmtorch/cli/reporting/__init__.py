@@ -1,0 +1,1 @@
+"""What a run shows and writes: status lines, pictures, tables of sweeps."""

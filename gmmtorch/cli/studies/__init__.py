@@ -1,0 +1,1 @@
+"""The studies that gmmtorch-fit and gmmtorch-occupancy run."""
