@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _OF_SPACE = ("map_server", "octomap", "ply", "pcd", "mesh", "distance_field")
 _OF_COMPONENTS = ("csv", "npz", "mixture")
+_OF_POSES = "kitti"
 _OF_ENDINGS = {
     **dict.fromkeys((".yaml", ".pgm"), "map_server"),
     **dict.fromkeys((".bt", ".ot"), "octomap"),
@@ -51,7 +52,9 @@ def run(config: DictConfig) -> None:
     config.format = _format(config)
     device = common.use_runtime(config.runtime)
     with ProgressBars(enabled=config.report.progress) as bars:
-        if config.format in _OF_COMPONENTS:
+        if config.format == _OF_POSES:
+            message = _export_poses(Path(config.path), Path(config.output))
+        elif config.format in _OF_COMPONENTS:
             message = _export_components(config)
         else:
             message = write_space(config, _map(Path(config.path), device), bars)
@@ -62,7 +65,7 @@ def _format(config: DictConfig) -> str:
     """The format that is given, or that of the output's ending."""
     from gmmtorch.errors import InvalidArgumentError
 
-    known = (*_OF_SPACE, *_OF_COMPONENTS)
+    known = (*_OF_SPACE, *_OF_COMPONENTS, _OF_POSES)
     if config.format is None:
         ending = Path(config.output).suffix.lower()
         if ending not in _OF_ENDINGS:
@@ -74,6 +77,19 @@ def _format(config: DictConfig) -> str:
     if config.format not in known:
         raise InvalidArgumentError(f"format={config.format!r} is not one of {', '.join(known)}.")
     return str(config.format)
+
+
+def _export_poses(path: Path, output: Path) -> str:
+    """Write the poses of a trajectory file as KITTI rows; returns a message."""
+    from gmmtorch.datasets.recordings.trajectory import read_trajectory
+    from gmmtorch.errors import MissingDataError
+    from gmmtorch.export.trajectory_files import write_kitti
+
+    if not path.is_file():
+        raise MissingDataError(f"path={path} does not exist; format=kitti needs a trajectory file.")
+    matrices = read_trajectory(path).matrices
+    write_kitti(output, matrices)
+    return f"{_size(output)}: {len(matrices):,} poses"
 
 
 # -- components -----------------------------------------------------------------------------------

@@ -26,18 +26,18 @@ def write_bag(
     times: Sequence[float] | None = None,
     topic: str = "/points",
 ) -> Path:
-    """Write 3D scans as PointCloud2 in the frame `lidar`, and their poses as TF from `map` to `lidar`.
+    """Write scans as PointCloud2 in the frame `lidar`, and their poses as TF from `map` to `lidar`.
 
     Args:
         path: .mcap, .db3 or .bag; replaced when all is written.
-        scans: in the world frame. Points are stored as float32 in the sensor frame; beams without return are
-            not stored.
-        poses: (4, 4) world ← sensor, one for each scan.
+        scans: in the world frame. Points are stored as float32 in the sensor frame, those in 2D at z = 0;
+            beams without return are not stored.
+        poses: (D+1, D+1) world ← sensor, one for each scan.
         times: seconds, one for each scan; None: ten scans a second.
         topic: of the clouds.
 
-    Raises `InvalidArgumentError` for 2D scans and for other numbers of poses or times, `OutputError` if the
-    file cannot be written, and `GmmTorchError` without rosbags.
+    Raises `InvalidArgumentError` for other shapes of poses and other numbers of poses or times,
+    `OutputError` if the file cannot be written, and `GmmTorchError` without rosbags.
     """
     stamps = [i / 10 for i in range(len(scans))] if times is None else list(times)
     if not len(scans) == len(poses) == len(stamps):
@@ -46,12 +46,17 @@ def write_bag(
         )
     with BagWriter(path) as bag:
         for scan, pose, time in zip(scans, poses, stamps, strict=True):
-            matrix = np.asarray(pose, dtype=np.float64)
-            if scan.dim != 3 or matrix.shape != (4, 4):
-                raise InvalidArgumentError("scans are 2D; a bag of clouds needs 3D scans with poses (4, 4).")
+            given, dim = np.asarray(pose, dtype=np.float64), scan.dim
+            if given.shape != (dim + 1, dim + 1):
+                raise InvalidArgumentError(
+                    f"a pose has shape {given.shape}; scans in {dim}D need ({dim + 1}, {dim + 1})."
+                )
             points = scan.points.detach().cpu().double().numpy()
+            local = (points - given[:dim, dim]) @ given[:dim, :dim]
+            matrix = np.eye(4)
+            matrix[:dim, :dim], matrix[:dim, 3] = given[:dim, :dim], given[:dim, dim]
             bag.transforms(time, {("map", "lidar"): matrix})
-            bag.cloud(topic, time, "lidar", (points - matrix[:3, 3]) @ matrix[:3, :3])
+            bag.cloud(topic, time, "lidar", np.pad(local, ((0, 0), (0, 3 - dim))))
     return Path(path)
 
 

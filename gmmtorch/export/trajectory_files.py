@@ -1,4 +1,4 @@
-"""Writes trajectories: poses over time in the text form of the TUM RGB-D benchmark."""
+"""Writes trajectories: poses over time in the text forms of the TUM RGB-D and KITTI odometry benchmarks."""
 
 from __future__ import annotations
 
@@ -23,22 +23,46 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
     """
     from scipy.spatial.transform import Rotation
 
-    stamp, pose = (torch.as_tensor(value).detach().cpu().double().numpy() for value in (times, poses))
-    n = len(stamp)
-    if stamp.shape != (n,) or pose.shape not in ((n, 3, 3), (n, 4, 4)):
+    matrices = _in_space(poses)
+    stamp = torch.as_tensor(times).detach().cpu().double().numpy()
+    if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
         raise InvalidArgumentError(
-            f"times has shape {stamp.shape} and poses {pose.shape}; expected (S,) and (S, 3, 3) or (S, 4, 4)."
+            f"times has shape {stamp.shape} or holds NaN or infinite values; give one time (s) for each of "
+            f"{len(matrices)} poses."
         )
-    if not (np.isfinite(stamp).all() and np.isfinite(pose).all()):
-        raise InvalidArgumentError("times or poses holds NaN or infinite values; drop these poses.")
-    dim = pose.shape[1] - 1
-    turn = np.tile(np.eye(3), (n, 1, 1))
-    turn[:, :dim, :dim] = pose[:, :dim, :dim]
-    place = np.pad(pose[:, :dim, dim], ((0, 0), (0, 3 - dim)))
-    spin = Rotation.from_matrix(turn).as_quat() if n else np.zeros((0, 4))
-    rows = np.column_stack([place, spin])
-    lines = [
-        f"{t:.9f} " + " ".join(f"{value:.9g}" for value in row) for t, row in zip(stamp, rows, strict=True)
-    ]
+    spin = Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
+    rows = np.column_stack([matrices[:, :3, 3], spin])
+    lines = [f"{t:.9f} " + _numbers(row, 9) for t, row in zip(stamp, rows, strict=True)]
     text = "\n".join(["# timestamp x y z qx qy qz qw", *lines]) + "\n"
     return write_bytes(path, text.encode())
+
+
+def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
+    """Writes a trajectory atomically, one line a pose: the 12 numbers of world ← sensor, row by row.
+
+    The form has no times. Numbers have 17 digits, which float64 needs to be read back without change.
+
+    Args:
+        poses: (S, D+1, D+1), world ← sensor, metres. Poses in 2D lie at z = 0.
+
+    Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
+    """
+    lines = [_numbers(matrix[:3].ravel(), 17) + "\n" for matrix in _in_space(poses)]
+    return write_bytes(path, "".join(lines).encode())
+
+
+def _in_space(poses: ArrayLike) -> np.ndarray:
+    """Poses (S, 4, 4), float64, of poses in 2D or 3D."""
+    given = torch.as_tensor(poses).detach().cpu().double().numpy()
+    if given.ndim != 3 or given.shape[1:] not in ((3, 3), (4, 4)):
+        raise InvalidArgumentError(f"poses has shape {given.shape}; expected (S, 3, 3) or (S, 4, 4).")
+    if not np.isfinite(given).all():
+        raise InvalidArgumentError("poses holds NaN or infinite values; drop these poses.")
+    dim = given.shape[1] - 1
+    matrices = np.tile(np.eye(4), (len(given), 1, 1))
+    matrices[:, :dim, :dim], matrices[:, :dim, 3] = given[:, :dim, :dim], given[:, :dim, dim]
+    return matrices
+
+
+def _numbers(row: np.ndarray, digits: int) -> str:
+    return " ".join(f"{value:.{digits}g}" for value in row)

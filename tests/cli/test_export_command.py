@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_runs import Finished, as_it_was, run_here, run_script
+from command_runs import Finished, as_it_was, refused, run_here, run_script, succeeded
 from export.map_examples import read_map_image
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.cli import common
 from gmmtorch.datasets import load
 from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
+from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.scan import Scan
@@ -61,11 +62,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = np.random.default_rng(0).normal(size=(200, 3))
     GaussianMixture(3, random_state=0).fit(points).save(folder / "mixture.safetensors")
     return folder
-
-
-def succeeded(done: Finished) -> Finished:
-    assert done.status == 0, done.stderr
-    return done
 
 
 # -- space ----------------------------------------------------------------------------------------
@@ -253,6 +249,16 @@ def test_a_fitted_mixture_is_written_as_csv(run, files, tmp_path):
     assert "3 components in 3D" in done.stdout
     fitted = GaussianMixture.load(files / "mixture.safetensors")
     np.testing.assert_allclose(read_gira_csv(tmp_path / "m.csv").means, fitted.means_, rtol=1e-15)
+
+
+def test_a_trajectory_becomes_kitti_rows(run, tmp_path):
+    poses = np.array([np.eye(4), [[0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]]])
+    write_tum(tmp_path / "t.tum", [0.5, 1.5], poses)
+    done = succeeded(run("path=t.tum", "output=poses.txt", "format=kitti"))
+    assert "2 poses" in done.stdout
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    np.testing.assert_allclose(rows[1], [0, -1, 0, 3, 1, 0, 0, 4, 0, 0, 1, 5], atol=1e-8)
+    assert "path=none.tum does not exist" in refused(run("path=none.tum", "output=a.txt", "format=kitti"))
 
 
 # -- errors ---------------------------------------------------------------------------------------

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from gmmtorch.datasets import load
+from gmmtorch.datasets.carmen import beam_angles
 from gmmtorch.datasets.depth_frames import back_project
 from gmmtorch.datasets.point_files.cloud_files import read_cloud
 from gmmtorch.errors import DataError
+from gmmtorch.export.trajectory_files import write_kitti
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.scan import Scan
 
 pytest.importorskip("rosbags")
 
@@ -62,6 +69,59 @@ def test_a_bag_without_a_sensor_lists_its_topics(real_data):
 
 
 # -- bags written from other formats ----------------------------------------------------------------
+
+
+def assert_same_map(bag: Sequence[Scan], own: Sequence[Scan], n_scans: int, folder: Path) -> None:
+    """Asserts that two sequences of scans give map files of the same bytes."""
+    for name, scans in (("bag", bag), ("own", own)):
+        assert len(scans) == n_scans
+        built = GaussianMap()
+        for scan in scans:
+            built.insert(scan)
+        built.save(folder / name)
+    assert (folder / "bag").stat().st_size > 1000
+    assert (folder / "bag").read_bytes() == (folder / "own").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_bag_of_intel_gives_its_map_to_the_bit(real_data, tmp_path):
+    """Beam ends as doubles; poses of the laser from TF. Scans differ by up to 1e-14 m, their maps do not."""
+    log = load("carmen", real_data / "laser2d" / "intel.log.gz", stride=7, no_return_range=0)
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for i, record in enumerate(log._records[::7]):
+            ranges, pose, matrix = record[:-3], log.pose(i), torch.eye(4, dtype=torch.float64)
+            matrix[:2, :2], matrix[:2, 3] = pose[:2, :2], pose[:2, 2]
+            bag.transforms(float(i), {("map", "laser"): matrix})
+            ends = ranges[:, None] * torch.stack(
+                [f(beam_angles(len(ranges))) for f in (torch.cos, torch.sin)], 1
+            )
+            table = np.zeros(len(ranges), np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
+            table["x"], table["y"] = ends.numpy().T
+            bag.cloud_table("/points", float(i), "laser", table)
+    assert_same_map(load("rosbag", tmp_path / "a.mcap", max_range=50.0), log, 130, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_bag_of_hall_gives_its_map_to_the_bit(real_data, tmp_path):
+    """Points are float32 in both files; a trajectory file has the poses, whose rows are not quite rigid."""
+    folder = load("scan_folder", real_data / "hall")
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for i, cloud in enumerate(sorted((real_data / "hall" / "scans").glob("*.pcd"))):
+            bag.cloud("/points", i / 10, "lidar", read_cloud(cloud).numpy())
+    poses = real_data / "hall" / "poses.txt"
+    assert_same_map(load("rosbag", tmp_path / "a.mcap", poses=poses, stride=3), folder[::3], 15, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_bag_of_kinect_gives_its_map_to_the_bit(real_data, tmp_path):
+    """Images of whole millimetres, and the poses of the frames in a trajectory file."""
+    frames = load("depth_frames", real_data / "kinect", stride=10, pixel_stride=4)
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for i in range(len(frames)):
+            depth = (frames.image(i)[0] * 1000).round().numpy()
+            bag.depth("/depth/image", i / 10, "camera", depth, frames.intrinsics)
+    poses = write_kitti(tmp_path / "poses.txt", torch.stack([frames.pose(i) for i in range(len(frames))]))
+    assert_same_map(load("rosbag", tmp_path / "a.mcap", poses=poses, pixel_stride=4), frames, 14, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])

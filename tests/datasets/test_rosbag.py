@@ -191,6 +191,24 @@ def test_clouds_have_any_layout_of_fields(tmp_path, order, suffix):
     assert points.tolist() == [[1, 0.5, -1], [2, 0.5, -1], [3, 0.5, -1]]
 
 
+def test_clouds_of_one_height_are_2d_scans(tmp_path):
+    """Merged laser scans are such clouds. A later cloud that leaves the plane is left out and counted."""
+    rng = np.random.default_rng(0)
+    merged = np.column_stack([rng.uniform(1, 9, (30, 2)), np.full(30, 0.25)])
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        for time, points in ((0.0, POINTS[:0]), (0.5, merged), (1.0, rng.normal(size=(30, 3)))):
+            bag.cloud("/points", time, "lidar", points)
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    assert [tuple(scan.points.shape) for scan in dataset] == [(0, 2), (30, 2), (0, 2)]
+    np.testing.assert_allclose(dataset[1].points.numpy(), merged[:, :2] + [0.5, 0], atol=1e-6)
+    assert dataset.pose(1).shape == (3, 3)
+    assert dataset.skipped == {
+        "message without a valid point": 1,
+        "points of several heights among planar scans": 1,
+    }
+
+
 @FORMATS
 def test_depth_images_are_back_projected(tmp_path, suffix):
     depth = np.array([[1000, 0], [65535, 2000]], np.uint16)

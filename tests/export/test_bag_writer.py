@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError, OutputError
 from gmmtorch.scan import Scan
 
@@ -41,12 +42,21 @@ def test_rosbags_reads_what_is_written(tmp_path, suffix):
     assert turn.z == pytest.approx(turn.w)
 
 
+def test_scans_in_2d_are_read_back_in_2d(tmp_path):
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-9, 9, (40, 2)))
+    turned = np.array([[0.0, -1, 2], [1, 0, 5], [0, 0, 1]])
+    path = write_bag(tmp_path / "a.mcap", [Scan(points, [2.0, 5.0])] * 2, [turned] * 2)
+    dataset = load("rosbag", path)
+    assert torch.allclose(dataset[1].points, points, rtol=0, atol=2e-6)
+    assert dataset[1].origin.tolist() == [2.0, 5.0]
+    np.testing.assert_allclose(dataset.pose(1).numpy(), turned, atol=1e-12)
+
+
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     path = write_bag(tmp_path / "a.mcap", [SCAN], [POSE])
     before = path.read_bytes()
-    flat = Scan(torch.zeros(1, 2, dtype=torch.float64), [0.0, 0.0])
-    with pytest.raises(InvalidArgumentError, match="scans are 2D"):
-        write_bag(path, [flat], [np.eye(3)])
+    with pytest.raises(InvalidArgumentError, match=r"shape \(3, 3\); scans in 3D need \(4, 4\)"):
+        write_bag(path, [SCAN], [np.eye(3)])
     with pytest.raises(InvalidArgumentError, match="1 scans, 2 poses and 1 times"):
         write_bag(path, [SCAN], [POSE, POSE])
     assert path.read_bytes() == before

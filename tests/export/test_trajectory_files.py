@@ -1,4 +1,4 @@
-"""Trajectories in TUM's form, compared with the quaternion of a rotation about a known axis."""
+"""Trajectories in TUM's form, compared with the quaternion of a known rotation, and in KITTI's form."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from gmmtorch.datasets.recordings.trajectory import read_trajectory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.trajectory_files import write_tum
+from gmmtorch.export.trajectory_files import write_kitti, write_tum
 
 
 def test_tum_lines_have_time_position_and_quaternion(tmp_path):
@@ -36,3 +37,23 @@ def test_tum_refuses_other_shapes_and_nan(tmp_path):
     with pytest.raises(InvalidArgumentError, match="NaN"):
         write_tum(tmp_path / "a.tum", [math.nan], torch.eye(4)[None])
     assert not (tmp_path / "a.tum").exists()
+
+
+def test_kitti_rows_are_read_back_to_the_bit(tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = Rotation.random(5, random_state=0).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(5, 3)) * 1e5
+    path = write_kitti(tmp_path / "a.txt", poses)
+    np.testing.assert_array_equal(np.loadtxt(path).reshape(5, 3, 4), poses[:, :3])
+    np.testing.assert_array_equal(read_trajectory(path).matrices, poses)
+
+
+def test_kitti_rows_of_poses_in_the_plane_and_refused_input(tmp_path):
+    write_kitti(tmp_path / "a.txt", [[[0.0, -1, 3], [1, 0, -2], [0, 0, 1]]])
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "a.txt"), [0, -1, 0, 3, 1, 0, 0, -2, 0, 0, 1, 0])
+    for poses, message in ((np.eye(4), "expected"), (np.full((1, 4, 4), np.nan), "NaN")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            write_kitti(tmp_path / "b.txt", poses)
+    assert not (tmp_path / "b.txt").exists()

@@ -73,9 +73,9 @@ class Occupancy:
 class Export:
     """Options of gmmtorch-export.
 
-    path: map, grid or mixture of gmmtorch (.safetensors), GIRA .csv, or .npz.
+    path: map, grid or mixture of gmmtorch (.safetensors), GIRA .csv, .npz; for kitti a trajectory.
     output: file to write.
-    format: map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture; null: by the ending.
+    format: map_server, octomap, ply, pcd, mesh, distance_field, csv, npz, mixture, kitti; null: by ending.
     method: form of evidence: point, flux, cone, monte_carlo; null: the map's own.
     resolution: side (m) of the cells; null: the map's own.
     bounds: [x0,y0,x1,y1], in 3D [x0,y0,z0,x1,y1,z1] (m); null: around the components.

@@ -26,6 +26,8 @@ from gmmtorch.scan import Scan
 HEADER = "std_msgs/msg/Header"
 _LEVEL = math.cos(math.radians(10))
 _SHORT_SKIP = 16
+_MIN_PLANAR = 16
+"""Fewer points at one height do not show that a cloud is the scan of a laser."""
 _KNOTS = 1024
 """Poses per sweep for deskewing: of a sweep of 0.1 s, one for every 0.1 ms."""
 
@@ -97,7 +99,8 @@ class RosBag(Dataset):
 
     The whole bag is read once when it is opened, for stamps and poses. Messages without a pose, out of order,
     or of another frame are left out and counted in `skipped`. A damaged message gives a scan without points.
-    Scans of a level laser are 2D. `topic` is the sensor's topic.
+    Scans of a level laser are 2D, and so are clouds of a level sensor whose points have one height. `topic`
+    is the sensor's topic.
     """
 
     def __init__(
@@ -125,10 +128,10 @@ class RosBag(Dataset):
         self._delay = float(np.median([record.time - record.stamp for record in records]))
         self._records, matrices = self._posed(records)
         level = bool((np.abs(matrices[:, 2, 2]) > _LEVEL).all())
-        self._is_flat = sensor.kind == bag_topics.LASER and level
         self._matrices = matrices
+        first = self._first_reading()
+        self._is_flat = level and (sensor.kind == bag_topics.LASER or _is_planar(first, _MIN_PLANAR))
         self._poses = torch.from_numpy(in_plane(matrices) if self._is_flat else matrices)
-        self._check_first()
 
     def _read_headers(self, messages: list[tuple[int, bytes]]) -> list[_Record]:
         records = []
@@ -188,16 +191,21 @@ class RosBag(Dataset):
                 self._skip("no pose at the time of the scan", record.number)
         return [record for record, is_known in zip(records, known, strict=True) if is_known], matrices[known]
 
-    def _check_first(self) -> None:
-        """Raises `DataError` now if the messages of the topic have an unusable layout."""
-        failures = []
+    def _first_reading(self) -> Reading:
+        """The first of ten readings that has points. Raises `DataError` if none of them can be decoded."""
+        empty, failures = [], []
         for index in range(min(len(self._records), 10)):
             try:
-                self._reading(index)
-                return
+                found = self._reading(index)
             except DataError as error:
                 failures.append(error)
-        raise failures[0]
+                continue
+            if len(found.points):
+                return found
+            empty.append(found)
+        if not empty:
+            raise failures[0]
+        return empty[0]
 
     def _count(self) -> int:
         return len(self._records)
@@ -218,6 +226,9 @@ class RosBag(Dataset):
             return Scan(origin.new_empty(0, dim), origin)
         if len(found.points) == 0:
             self._skip("message without a valid point", self._records[index].number)
+        elif self._is_flat and not _is_planar(found):
+            self._skip("points of several heights among planar scans", self._records[index].number)
+            return Scan(origin.new_empty(0, dim), origin)
         ends = self._in_world(index, found)
         return self.ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
 
@@ -280,6 +291,11 @@ class RosBag(Dataset):
         raise DataError(
             f"{self._where}: message {record.number} is missing; the bag changed while it was read."
         )
+
+
+def _is_planar(found: Reading, n_least: int = 1) -> bool:
+    """Whether a reading has at least `n_least` points, all at one height of the sensor's frame."""
+    return len(found.points) >= n_least and bool(np.ptp(found.points[:, 2]) == 0)
 
 
 class DepthBag(RosBag):
