@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gmmtorch.mapping.learning.rules import NoveltyRule as NoveltyRule
     from gmmtorch.mapping.learning.rules import WindowedRule as WindowedRule
     from gmmtorch.mapping.query_options import QueryOptions as QueryOptions
+    from gmmtorch.mapping.tiles import TiledMap as TiledMap
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
@@ -27,6 +28,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "IncrementalRule": "learning.rules",
         "NoveltyRule": "learning.rules",
         "QueryOptions": "query_options",
+        "TiledMap": "tiles",
         "WindowedRule": "learning.rules",
         "collision_probability": "clearance",
         "expected_returns": "clearance",

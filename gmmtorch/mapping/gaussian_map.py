@@ -202,7 +202,7 @@ class GaussianMap(nn.Module):
         check_scan(scan)
         self._prepare(scan.dim, scan.points.device, "scan is")
         self._forget()
-        learned = self._learner.add(self._final(), scan.copied(self._device), self._settings())
+        learned = self._learner.add(self._final(), scan.copied(self._device), self.settings)
         if learned is not None:
             self._set(learned)
 
@@ -243,7 +243,7 @@ class GaussianMap(nn.Module):
             self._commit(self._with_pending())
         self._learner.rule = self.learning.fitted([first])
         scans = (scan_of(index).to(self._device) for index in range(len(frames)))
-        self._set(self._learner.absorb(self._final(), scans, self._settings(), float(pixel_stride**2)))
+        self._set(self._learner.absorb(self._final(), scans, self.settings, float(pixel_stride**2)))
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""
@@ -286,10 +286,12 @@ class GaussianMap(nn.Module):
     def _with_pending(self) -> Components:
         """All components, not rounded."""
         if self._learned is None:
-            self._learned = self._learner.preview(self._final(), self._settings())
+            self._learned = self._learner.preview(self._final(), self.settings)
         return self._learned
 
-    def _settings(self) -> map_file.MapSettings:
+    @property
+    def settings(self) -> map_file.MapSettings:
+        """What the map's file states about it, besides the components and the learning rule."""
         return map_file.MapSettings(self.resolution, self.method, self.codec, self.robot, self.query_options)
 
     def _commit(self, components: Components) -> None:
@@ -385,7 +387,7 @@ class GaussianMap(nn.Module):
 
     def _file(self) -> bytes:
         rule = self.learning.fitted(self._learner.pending)
-        return map_file.to_bytes(self.components(), rule, self._settings(), self._learner.next_number)
+        return map_file.to_bytes(self.components(), rule, self.settings, self._learner.next_number)
 
     @property
     def nbytes(self) -> int:

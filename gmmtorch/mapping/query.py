@@ -23,8 +23,24 @@ _SHARP_CUTOFF, _MANY_POINTS = 3.0, 50
 
 def cutoff_by_support(cones: Cones) -> float:
     """The cutoff if none is given: 3 if the median count is at least 50 points, otherwise `CUTOFF`."""
-    counts = cones.counts[cones.counts > 0]
-    return _SHARP_CUTOFF if counts.numel() and float(counts.median()) >= _MANY_POINTS else CUTOFF
+    return cutoff_of(*count_many(cones))
+
+
+def count_many(cones: Cones) -> tuple[int, int]:
+    """Number of cones with a count, and number of cones with a count of at least 50 points."""
+    return int((cones.counts > 0).sum()), int((cones.counts >= _MANY_POINTS).sum())
+
+
+def cutoff_of(n_seen: int, n_many: int) -> float:
+    """`cutoff_by_support` of cones of which `n_seen` have a count and `n_many` one of at least 50 points."""
+    return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
+
+
+def probability(evidence: PointEvidence, resolution: float, options: QueryOptions) -> Tensor:
+    """θ (M,) of cubes of side `resolution` (m) with hits (M,) and misses (M,)."""
+    length = options.hit_length
+    hits = evidence.hits if length is None else evidence.hits * (length / resolution)
+    return occupancy_probability(hits, evidence.misses, options.prior)
 
 
 class Query:
@@ -44,27 +60,23 @@ class Query:
         Method "point" takes the cube centred at the point; the others take the cell of the lattice
         [i·resolution, (i+1)·resolution) that contains the point. Points at infinity are unknown (½).
         """
+        return probability(self.evidence_at(points, resolution, method), resolution, self.options)
+
+    def evidence_at(self, points: Tensor, resolution: float, method: str) -> PointEvidence:
+        """Hits and misses (M,) of the cubes of `occupancy`. Those of disjoint sets of cones add up."""
         check_method(method)
+        zeros = torch.zeros_like(points[:, 0])
         if len(self.cones.counts) == 0:
-            return torch.full_like(points[:, 0], 0.5)
+            return PointEvidence(zeros, zeros.clone())
         if method == "point":
-            return self._probability(self._form(resolution)(points), resolution)
+            return self._form(resolution)(points)
         if method == "monte_carlo":
-            return self._probability(self._lattice(resolution).at_points(points), resolution)
+            return PointEvidence(*self._lattice(resolution).at_points(points))
         finite = torch.isfinite(points).all(1)
         cells, cell = torch.unique(torch.floor(points[finite] / resolution), dim=0, return_inverse=True)
-        evidence = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
-        theta = torch.full_like(points[:, 0], 0.5)
-        theta[finite] = self._probability(evidence, resolution)[cell]
-        return theta
-
-    def _probability(self, evidence: tuple[Tensor, Tensor], resolution: float) -> Tensor:
-        """θ (M,) of hits (M,) and misses (M,)."""
-        hits, misses = evidence
-        length = self.options.hit_length
-        return occupancy_probability(
-            hits if length is None else hits * (length / resolution), misses, self.options.prior
-        )
+        found = self._in_boxes(cells * resolution, (cells + 1) * resolution, resolution, method)
+        place = finite.nonzero().squeeze(1)
+        return PointEvidence(*(zeros.index_copy(0, place, values[cell]) for values in found))
 
     def evidence(self, grid: VoxelGrid, method: str) -> Evidence:
         """Hits and misses of every cell of a grid: counts, which `hit_length` does not change.

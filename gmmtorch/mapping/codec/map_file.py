@@ -6,19 +6,25 @@ format. See docs/formats.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, GmmTorchError
-from gmmtorch.files import pack_tensors, read_tensors, require
+from gmmtorch.errors import (
+    DataError,
+    GmmTorchError,
+    check_choice,
+    check_resolution,
+    check_whole,
+)
+from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.mapping.codec.component_batch import batch_bytes, decode, encode, quantize_numbered
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import LearningRule, changed_options, rule_facts
-from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.mapping.query_options import QueryOptions, check_method
 
 FILE_KIND, FILE_VERSION = "gmmtorch.map", 2
 
@@ -78,7 +84,17 @@ def number_after(ids: Tensor, next_number: int) -> int:
 
 def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:
     """Components and settings of a map file. Raises `DataError` for a damaged or foreign file."""
-    tensors, facts = read_tensors(path, FILE_KIND, FILE_VERSION)
+    return _content(*read_tensors(path, FILE_KIND, FILE_VERSION), path)
+
+
+def from_bytes(data: bytes, path: str | Path) -> tuple[Components, dict[str, Any]]:
+    """`from_file` of bytes that were read from `path`."""
+    return _content(*unpack_tensors(data, path, FILE_KIND, FILE_VERSION), path)
+
+
+def _content(
+    tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
+) -> tuple[Components, dict[str, Any]]:
     facts = {"cutoff": FILE_OPTIONS.cutoff, "hit_length": FILE_OPTIONS.hit_length, **facts}
     if tensors.keys() == {f.name for f in fields(Components)}:
         return _exact(tensors, path), facts
@@ -90,15 +106,31 @@ def from_file(path: str | Path) -> tuple[Components, dict[str, Any]]:
 
 
 def _facts(rule: LearningRule, settings: MapSettings, next_number: int) -> dict[str, Any]:
+    return {"learning": rule_facts(rule), "n_numbered": next_number, **settings_facts(settings)}
+
+
+def settings_facts(settings: MapSettings) -> dict[str, Any]:
+    """The settings as plain values; query options only if they differ from `FILE_OPTIONS`."""
     return {
-        "learning": rule_facts(rule),
         "resolution": settings.resolution,
         "method": settings.method,
         "codec": settings.codec,
         "robot": settings.robot,
-        "n_numbered": next_number,
         **changed_options(settings.query, FILE_OPTIONS, leave_out=_MACHINE_OPTIONS),
     }
+
+
+def read_settings(facts: dict[str, Any], path: str | Path) -> MapSettings:
+    """The settings of `settings_facts`; other facts are ignored. Raises `DataError` if they are damaged."""
+    names = {field.name for field in fields(QueryOptions)} - {*_MACHINE_OPTIONS}
+    try:
+        check_choice("codec", facts["codec"], CODECS)
+        check_method(facts["method"])
+        resolution, robot = check_resolution(facts["resolution"]), check_whole("robot", facts["robot"], 0)
+        query = replace(FILE_OPTIONS, **{name: facts[name] for name in names & facts.keys()})
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: its settings are damaged ({error!r}).") from error
+    return MapSettings(resolution, facts["method"], facts["codec"], robot, query)
 
 
 def _container(batch: Tensor, facts: dict[str, Any]) -> bytes:
