@@ -115,17 +115,6 @@ def test_the_cheapest_pair_by_support_is_merged_first():
     assert sorted(left.support.tolist()) == [2.0, 10.0, 10.0]
 
 
-def test_merging_is_the_same_far_from_the_world_origin():
-    near = random_components(40, 3, 5)
-    shift = torch.tensor([5e5, -4e5, 100.0], dtype=torch.float64)
-    far = replace(near, means=near.means + shift, origins=near.origins + shift)
-    a, b = compact(near, 15), compact(far, 15)
-    torch.testing.assert_close(a.means + shift, b.means, rtol=0, atol=1e-8)
-    torch.testing.assert_close(a.covariances, b.covariances, rtol=1e-6, atol=1e-9)
-    assert torch.equal(a.seen_from, b.seen_from)
-    assert torch.equal(a.ids, b.ids)
-
-
 @pytest.mark.parametrize("bad", [{}, {"max_components": 0}, {"max_components": 2, "max_cost": -1.0}])
 def test_invalid_limits_are_refused(bad):
     with pytest.raises(InvalidArgumentError):

@@ -156,14 +156,6 @@ def test_rays_do_not_depend_on_other_components():
     assert rows_of(component_rays(renamed, 0.2)) != together
 
 
-def test_more_support_gives_the_same_rays_with_more_weight():
-    components = random_components(3, k=10, seed=6)
-    twice = replace(components, support=2 * components.support, seen_count=2 * components.seen_count)
-    one_ray, two = component_rays(components, 0.2), component_rays(twice, 0.2)
-    assert torch.equal(one_ray.ends, two.ends)
-    assert torch.equal(2 * one_ray.weights, two.weights)
-
-
 # -- evidence -------------------------------------------------------------------------------------
 
 
@@ -202,18 +194,6 @@ def test_component_evidence_equals_plain_monte_carlo(thickness):
         for seed in range(1, 9)
     ]
     assert error < 0.85 * sum(independent) / len(independent)
-
-
-@pytest.mark.parametrize("low", [(-12, -9, -4), (0, 0, 0), (20, 20, -60), (400, 0, 0)])
-def test_a_box_restricts_the_evidence_without_changing_it(low):
-    components = random_components(3, k=60, seed=8, deviations=(1e-3, 3.0))
-    box = Box(torch.tensor(low), torch.tensor(low) + torch.tensor([9, 30, 20]))
-    rays = component_rays(components, 0.2)
-    expected = cast_evidence(rays.origins, rays.ends, rays.is_hit, 0.2, box, rays.weights)
-    found = component_evidence(components, 0.2, box)
-    assert torch.equal(found.cells, expected.cells)
-    for index in (1, 2):
-        torch.testing.assert_close(found[index], expected[index], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("most", [1, 700])

@@ -76,15 +76,6 @@ def test_components_keep_at_most_max_origins_sensor_origins(max_origins):
     assert {place for seen in table for place in seen} <= real
 
 
-def test_with_all_origins_kept_counts_equal_the_numbers_of_points():
-    near, far = drive(5)[::4]
-    half = Scan(far.points[::2], far.origin)
-    parts = built([near, half], WindowedRule(max_origins=2, window=2)).components()
-    for seen in sightings(parts):
-        counts = [seen[tuple(s.origin.tolist())] for s in (near, half)]
-        assert counts[0] / counts[1] == pytest.approx(2, rel=0.15)
-
-
 def test_a_window_of_one_scan_gives_each_component_its_sensor_origin():
     scans, rule = drive(3), WindowedRule(max_origins=1, window=1)
     made = built(scans, rule)

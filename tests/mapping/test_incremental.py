@@ -81,25 +81,6 @@ def test_the_same_scans_give_the_same_map(dim):
     assert equal(whole, parts)
 
 
-@dims
-def test_walls_are_occupied_and_the_space_before_them_is_free(dim):
-    scans = [Scan(scan.points, scan.origin) for scan in drive(5, dim)]
-    found = grown(scans, replace(RULE, n_components=6, max_origins=3))
-    theta = occupancy(found, points([1.0, 2.0, 2.8, WALL, 3.9], dim))
-    assert (theta[:3] < 0.2).all()
-    assert theta[3] > 0.5
-    assert abs(float(theta[4]) - 0.5) < 0.05
-
-
-@pytest.mark.parametrize(("dim", "n"), [(2, 1), (2, 2), (3, 3)])
-def test_scans_of_few_points_are_learned(dim, n):
-    scan = wall_scan(dim)
-    few = Scan(scan.points[:: len(scan.points) // n][:n], scan.origin)
-    found = grown([few], replace(RULE, n_components=1))
-    assert len(found) == 1
-    assert float(found.support.sum()) == pytest.approx(n)
-
-
 def test_old_components_keep_their_ids_and_new_ones_have_none():
     scans = drive(4, 3)
     first = grown(scans[:2])

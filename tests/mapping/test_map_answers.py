@@ -71,17 +71,6 @@ def test_occupancy_is_the_same_far_from_the_world_origin(dim, method):
 
 @dims
 @methods
-def test_occupancy_does_not_depend_on_the_order_of_the_queries(dim, method):
-    made, query = fine_map(dim), lattice(dim)
-    order = torch.randperm(len(query), generator=torch.Generator().manual_seed(0))
-    theta = made.occupancy(query, method=method)
-    for part in (order, torch.arange(7), torch.arange(len(query)).repeat(2)):
-        found = made.occupancy(query[part], method=method)
-        torch.testing.assert_close(found, theta[part], rtol=0, atol=1e-12)
-
-
-@dims
-@methods
 def test_grid_evidence_equals_the_occupancy_at_cell_centres(dim, method):
     made = built(drive(2, dim), method=method, hit_length=None)
     grid = VoxelGrid.covering([-1.0] * dim, [3.5] * dim, 0.25)

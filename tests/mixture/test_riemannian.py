@@ -426,18 +426,6 @@ def test_overlapping_clusters_need_a_fifth_of_the_steps_of_em():
     assert found.lower_bound_ > run.lower_bounds[calls]
 
 
-def test_n_init_keeps_the_best_start():
-    points = blobs(2)
-    options = {"init_params": "random_points", "tol": 1e-6, "max_iter": 300}
-    seeds = torch.Generator().manual_seed(3)
-    single = [
-        RiemannianGaussianMixture(4, random_state=seeds, **options).fit(points).lower_bound_ for _ in range(4)
-    ]
-    several = RiemannianGaussianMixture(4, random_state=3, n_init=4, **options).fit(points)
-    assert several.lower_bound_ == max(single)
-    assert max(single) > min(single) + 1e-6
-
-
 @solvers
 def test_collapse_without_regularisation_is_an_error(solver):
     points = np.concatenate([blobs(2, 60), np.array([[40.0, 40.0], [40.0, 41.0]])])

@@ -173,38 +173,6 @@ def test_many_passes_in_small_batches_converge_to_em(size):
     assert gmm.score(x) > first.score(x) + 0.02
 
 
-@pytest.mark.parametrize("kappa", [0.7, 1.0])
-def test_stream_converges_to_its_density(kappa):
-    gmm, errors = exact(init_params="kmeans"), []
-    for batch in range(200):
-        gmm.partial_fit(blobs(200, 2, seed=batch), kappa=kappa)
-        if batch in (9, 199):
-            order = [int(np.abs(gmm.means_ - center).sum(1).argmin()) for center in CENTERS[:, :2]]
-            errors.append(
-                max(
-                    np.abs(gmm.means_[order] - CENTERS[:, :2]).max(),
-                    np.abs(gmm.weights_[order] - SHARES).max(),
-                    np.abs(gmm.covariances_[order] - np.diag([0.25, 1.0])).max(),
-                )
-            )
-    assert errors[1] < 0.03
-    assert errors[1] < errors[0]
-
-
-def test_batch_order_and_size_have_little_effect_with_kappa_one():
-    x = blobs(3000, 2, scale=0.5)
-    rng = np.random.default_rng(0)
-    cuts = [np.arange(0, 2700, 300), np.arange(0, 2700, 45), np.sort(rng.choice(2700, 20, replace=False))]
-    whole = exact(max_iter=1).fit(x)
-    for cut in cuts:
-        gmm = exact().partial_fit(x[:300], kappa=1.0)
-        order = 300 + rng.permutation(2700)
-        for part in np.split(order, cut[1:]):
-            gmm.partial_fit(x[part], kappa=1.0)
-        assert gmm.n_samples_seen_ == 3000
-        assert gmm.score(x) == pytest.approx(whole.score(x), abs=2e-3)
-
-
 def test_short_memory_follows_a_changing_scene():
     def at(time: int) -> np.ndarray:
         return blobs(200, 2, seed=time) + 0.02 * time
@@ -342,17 +310,6 @@ def test_batches_500_km_apart_keep_thin_components():
         np.testing.assert_allclose(gmm.means_[k] - piece, 0, atol=0.06)
         np.testing.assert_allclose(gmm.covariances_[k], np.diag([1e-6, 1 / 3]), rtol=0.15, atol=3e-5)
         assert gmm.covariances_[k][0, 0] == pytest.approx(1.01e-6, rel=0.1)
-
-
-def test_partial_fit_commutes_with_motions():
-    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    rotation[:, 0] *= np.sign(np.linalg.det(rotation))
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, [1.0, -2.0, 5.0]
-    one = exact().partial_fit(blobs(100, 3)).partial_fit(blobs(50, 3, seed=1)).moved(motion)
-    other = exact().partial_fit(blobs(100, 3)).moved(motion)
-    other.partial_fit(blobs(50, 3, seed=1) @ rotation.T + motion[:3, 3])
-    assert_same(one, other)
 
 
 def test_integer_weights_equal_repeated_points():

@@ -73,16 +73,6 @@ def test_start_equals_that_of_the_whole_cloud(init_params, random_state):
     assert_same(found, exact(4, init_params=init_params, random_state=state()).fit(points), 1e-10)
 
 
-def test_order_and_chunks_do_not_change_the_fit():
-    points = blobs(2000, 3)
-    start = {"means_init": points[:4].numpy(), "weights_init": np.full(4, 0.25)}
-    start["precisions_init"] = np.tile(np.eye(3), (4, 1, 1))
-    shuffled = points[torch.randperm(2000, generator=torch.Generator().manual_seed(1))]
-    one = fit_stream(exact(4, **start), in_memory(points, chunk_points=333))
-    other = fit_stream(exact(4, **start), in_memory(shuffled, chunk_points=50))
-    assert_same(other, one, 1e-9)
-
-
 def test_float32_fit_equals_to_float32_precision(generator):
     points = blobs(2000, 3)
     found = fit_stream(exact(4, dtype="float32"), in_memory(points, chunk_points=100))

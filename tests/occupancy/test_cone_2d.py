@@ -103,18 +103,6 @@ def test_cone_form_equals_the_exact_form_at_long_range():
     assert found == pytest.approx(float(angular_evidence(far, near - 1e-3, near)[1]), rel=0.01)
 
 
-def test_evidence_scales_with_counts_and_no_return_beams_give_only_misses():
-    low, high = boxes((2.0, -0.5, 3.0, 0.5), (4.0, -0.5, 6.0, 0.5))
-    one = cone_evidence(one_cone((5.0, 0.0), ROUND), low, high)
-    many = cone_evidence(one_cone((5.0, 0.0), ROUND, count=40.0), low, high)
-    free = cone_evidence(one_cone((5.0, 0.0), ROUND, count=40.0, max_range=True), low, high)
-    torch.testing.assert_close(many[0], 40 * one[0])
-    torch.testing.assert_close(many[1], 40 * one[1])
-    assert one[0][1] > 0.2
-    assert free[0].abs().max() == 0
-    torch.testing.assert_close(free[1], many[1])
-
-
 def test_evidence_sums_only_the_given_pairs():
     first = one_cone((5.0, 0.0), ROUND)
     both = Cones(*(torch.cat([part, part]) for part in first))
@@ -157,15 +145,6 @@ def test_shares_are_finite_and_in_0_1(p, deviations, size, place, origin, corner
     hits, misses = cone_evidence(cones, low, low + size)
     for part in (hits, misses):
         assert 0 <= float(part) <= 1 + 1e-9
-
-
-def test_no_boxes_or_no_cones_give_no_evidence():
-    empty = torch.empty(0, 2, dtype=torch.float64)
-    hits, misses = cone_evidence(one_cone((5.0, 0.0), ROUND), empty, empty)
-    assert hits.shape == misses.shape == (0,)
-    nothing = Cones(*(part[:0] for part in one_cone((5.0, 0.0), ROUND)))
-    hits, misses = cone_evidence(nothing, *boxes((1.0, 0.0, 2.0, 1.0)))
-    assert hits.tolist() == misses.tolist() == [0]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -5.0])

@@ -142,16 +142,6 @@ def test_rays_count_as_in_a_cell_by_cell_walk(dim):
     assert hits.sum() > 0 < misses.sum()
 
 
-def test_without_weights_each_ray_counts_one_and_hits():
-    grid = GRIDS[2]
-    origins, ends = random_rays(grid, 200)
-    evidence = Evidence.empty(grid)
-    evidence.add_rays(origins, ends)
-    hits, misses = brute_force(grid, origins, ends, [1.0] * 200, [True] * 200)
-    assert (evidence.hits.numpy() == hits).all()
-    assert (evidence.misses.numpy() == misses).all()
-
-
 def test_counts_do_not_depend_on_order_chunks_and_portions():
     grid = GRIDS[3]
     origins, ends = random_rays(grid, 200)
@@ -164,16 +154,6 @@ def test_counts_do_not_depend_on_order_chunks_and_portions():
     assert torch.equal(whole.misses, parts.misses)
 
 
-def test_no_return_beams_never_hit():
-    grid = GRIDS[2]
-    origins, ends = random_rays(grid, 100)
-    evidence = Evidence.empty(grid)
-    evidence.add_rays(origins, ends, is_hit=torch.zeros(100, dtype=torch.bool))
-    assert float(evidence.hits.abs().max()) == 0
-    assert float(evidence.misses.max()) > 0
-    assert float(evidence.probability().max()) <= 0.5
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
 def test_weights_can_have_any_number_type(dtype):
     grid = GRIDS[2]
@@ -183,12 +163,6 @@ def test_weights_can_have_any_number_type(dtype):
     other.add_rays(origins.repeat(2, 1), ends.repeat(2, 1))
     assert torch.equal(one.hits, other.hits)
     assert torch.equal(one.misses, other.misses)
-
-
-def test_no_rays_add_nothing():
-    evidence = Evidence.empty(GRIDS[2])
-    evidence.add_rays(torch.empty(0, 2), torch.empty(0, 2))
-    assert evidence.probability().unique().tolist() == [0.5]
 
 
 def test_lookup_reads_the_cell_and_is_half_outside():

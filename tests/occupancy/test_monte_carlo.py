@@ -196,15 +196,6 @@ def test_rays_start_at_the_sensor_origin_and_depend_on_the_seed(sampling):
     assert first.origins.unique(dim=0).tolist() == [[0.0, 0.0, 0.5]]
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_no_return_components_add_only_misses(sampling):
-    grid = VoxelGrid((0.0, 0.0), 0.4, (12, 8))
-    end, surface = (evidence_of(grid, one_cone(max_range=m), 2000, 0, sampling) for m in (True, False))
-    assert float(end.hits.max()) == 0
-    assert float(surface.hits.max()) > 0
-    assert torch.equal(end.misses, surface.misses)
-
-
 def test_only_no_return_components_add_no_hits():
     what = three_cones()._replace(max_range=torch.tensor([False, True, False]))
     rays = sample_rays(what, 300, seeded())
@@ -224,19 +215,6 @@ def test_a_flat_component_is_sampled_along_its_line(covariance):
 def test_invalid_covariances_are_refused(covariance):
     with pytest.raises(NumericalError, match=r"covariances\[0\]"):
         sample_rays(cones([[2.0, 3.0]], [covariance], [[0.0, 0.0]], [1.0]), 5, seeded())
-
-
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_components_with_count_zero_cast_no_rays(sampling):
-    rays = sample_rays(one_cone(count=0.0), 100, seeded(), sampling)
-    assert float(rays.weights.sum()) == 0
-
-
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_no_components_cast_no_rays(sampling):
-    nothing = torch.empty(0, 2, dtype=torch.float64)
-    empty = Cones(nothing, nothing[:, :, None].expand(0, 2, 2), nothing, nothing[:, 0], nothing[:, 0].bool())
-    assert sample_rays(empty, 100, seeded(), sampling).ends.shape == (0, 2)
 
 
 def test_invalid_arguments_are_refused():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -61,22 +60,6 @@ def numbered(n: int) -> list[bytes]:
 
 def received(network: Network, robot: int, now: float = 1e9) -> list[bytes]:
     return [data for _, data in network.deliver(robot, now)]
-
-
-# -- without losses --------------------------------------------------------------------------------------
-
-
-def test_all_others_receive_a_datagram_once_after_the_latency():
-    network = network_of(3, latency=0.5)
-    network.send(1, [b"a", b"b"], 10.0, "maps")
-    assert [network.deliver(robot, 10.49) for robot in range(3)] == [[], [], []]
-    assert [network.deliver(robot, 10.5) for robot in range(3)] == [
-        [(1, b"a"), (1, b"b")],
-        [],
-        [(1, b"a"), (1, b"b")],
-    ]
-    assert [network.deliver(robot, 99.0) for robot in range(3)] == [[], [], []]
-    assert network.n_in_flight == 0
 
 
 # -- brute-force model -----------------------------------------------------------------------------------
@@ -269,43 +252,6 @@ def test_jitter_is_exponential_and_independent(duplication, mean):
 # -- partitions and reach --------------------------------------------------------------------------------
 
 
-def set_partitions(items: list[int]) -> Iterator[list[list[int]]]:
-    """All partitions of the items into groups."""
-    if not items:
-        yield []
-        return
-    for rest in set_partitions(items[1:]):
-        yield [[items[0]], *rest]
-        for i, group in enumerate(rest):
-            yield [*rest[:i], [items[0], *group], *rest[i + 1 :]]
-
-
-def test_every_partition_of_four_robots_divides_its_groups():
-    ways = [groups for groups in set_partitions([0, 1, 2, 3]) if len(groups) > 1]
-    assert len(ways) == 14  # Bell's number of 4, without the trivial partition
-    for groups in ways:
-        group_of = {robot: i for i, group in enumerate(groups) for robot in group}
-        for named in (groups, groups[1:]):  # unnamed robots are one more group
-            network = network_of(4, partitions=[(1.0, 2.0, named)])
-            for sender in range(4):
-                network.send(sender, [bytes([sender])], 1.5, "maps")
-            for robot in range(4):
-                same = [other for other in group_of if group_of[other] == group_of[robot] and other != robot]
-                assert received(network, robot) == [bytes([other]) for other in sorted(same)]
-                assert network.reception(robot).cut_off == 3 - len(same)
-
-
-def test_reach_counts_at_the_time_of_sending_and_to_the_last_metre():
-    network = network_of(2, latency=1.0, reach=2.0)
-    for i, far in enumerate((2.0, 2.0 + 1e-9, 9.0, 0.0)):
-        positions = on_a_line([0.0, far])
-        network.place(positions)
-        positions[1] += 100.0  # the network keeps a copy
-        network.send(0, [bytes([i])], 0.1 * i, "maps")
-    network.place(on_a_line([0.0, 99.0]))
-    assert received(network, 1) == [b"\0", b"\3"]
-
-
 def test_only_reach_needs_positions():
     network = network_of(2, reach=5.0)
     with pytest.raises(InvalidArgumentError, match=r"reach=5.0 m needs positions; call place\(\)"):
@@ -342,14 +288,6 @@ def test_traffic_counts_each_broadcast_once_by_sender_and_kind(sent, conditions)
     everything = [d for _, ds, _, _ in sent for d in ds]
     assert network.traffic().bytes == sum(network.bytes_by_kind.values())
     assert network.traffic().wire_bytes == network.traffic().bytes + 28 * len(everything)
-
-
-def test_traffic_of_a_single_robot_counts():
-    network = network_of(1, jitter=1.0, loss=0.5, duplication=0.5)
-    network.send(0, [b"abc"], 0.0, "maps")
-    assert network.deliver(0, 10.0) == []
-    assert network.traffic().bytes == 3
-    assert network.reception() == Reception()
 
 
 # -- invalid input ---------------------------------------------------------------------------------------

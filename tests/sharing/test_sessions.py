@@ -130,30 +130,6 @@ def found(frames: list[tuple[float, bytes, int]]) -> list[bool]:
     return answers
 
 
-def test_a_continuing_foreign_session_is_a_duplicate_robot_id():
-    step = FRESH_SECONDS / (FRESH_FRAMES - 1)
-    steady = [(k * step, A, k) for k in range(FRESH_FRAMES + 2)]
-    assert found(steady) == [False] * (FRESH_FRAMES - 1) + [True] * 3
-    often = [(k * FRESH_SECONDS / 100, A, k) for k in range(101)]  # many frames do not shorten the time
-    assert found(often) == [False] * 100 + [True]
-    assert found([*often[:-1], (FRESH_SECONDS, B, 7), often[-1]])[-2:] == [False, True]
-    rarely = [(k * (SILENCE - 1), A, k) for k in range(FRESH_FRAMES)]
-    assert found(rarely) == [False] * (FRESH_FRAMES - 1) + [True]
-
-
-@given(
-    late=st.lists(st.integers(0, 10**6), min_size=1, max_size=50),
-    repeats=st.integers(1, 20),
-    begin=st.floats(0, 1e6),
-)
-def test_replays_of_an_earlier_session_are_no_duplicate_robot_id(late, repeats, begin):
-    burst = [(begin + 0.9 * FRESH_SECONDS * k / len(late), A, n) for k, n in enumerate(late)]
-    again = [(begin + 10.0 + k, A, n) for k in range(repeats) for n in late]
-    assert not any(found(burst + again))
-    one_each = [(float(k), k.to_bytes(8, "little"), n) for k, n in enumerate(late)]  # of many sessions
-    assert not any(found(one_each))
-
-
 def test_old_datagrams_do_not_count_for_a_duplicate_robot_id():
     few = [(float(k), A, k) for k in range(FRESH_FRAMES - 1)]
     later = [(few[-1][0] + SILENCE + 1 + k, A, FRESH_FRAMES + k) for k in range(FRESH_FRAMES - 1)]
