@@ -87,7 +87,7 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
     if not (config.report.figures or config.report.tensorboard):
         return
     from gmmtorch.evaluation.fit_comparison import NO_LIKELIHOODS, in_use
-    from gmmtorch.report.maps.fitting_figures import comparison_figure, convergence_figure
+    from gmmtorch.report.maps.accuracy_figures import comparison_figure, convergence_figure
     from gmmtorch.report.scenes.mixture_figures import mixture_figure
     from gmmtorch.report.style import label_of
     from gmmtorch.report.tensorboard_writer import Board

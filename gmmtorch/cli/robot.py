@@ -143,7 +143,7 @@ def _replaying(
     config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack
 ) -> tuple[Drivable, RobotView]:
     """A robot that maps a recorded log, or its part of one."""
-    from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
+    from gmmtorch.datasets.base import DatasetShard, shard_indices
     from gmmtorch.errors import check_whole
     from gmmtorch.exploration.mission.replay import ReplayMission
     from gmmtorch.exploration.mission.robot_view import ReplayingRobotView

@@ -29,14 +29,14 @@ class _Source(NamedTuple):
 _SOURCES = {
     "carmen": _Source("carmen", "CarmenLog", 50.0, 8.0),
     "scan_folder": _Source("scan_folder", "ScanFolder"),
-    "pcd_viewpoint": _Source("pcd_viewpoint", "PcdViewpoint"),
+    "pcd_viewpoint": _Source("scan_folder", "PcdViewpoint"),
     "depth_frames": _Source("depth_frames", "DepthFrames"),
     "octomap_log": _Source("octomap_log", "OctomapLog"),
     "rosbag": _Source("recordings.rosbag", "open_rosbag"),
     "kitti": _Source("recordings.kitti", "Kitti"),
     "tum": _Source("recordings.tum", "TumRgbd"),
-    "mesh": _Source("mesh_samples", "MeshSamples"),
-    "mesh_scans": _Source("mesh_scans", "MeshScans", None, 8.0),
+    "mesh": _Source("meshes", "MeshSamples"),
+    "mesh_scans": _Source("meshes", "MeshScans", None, 8.0),
     "synthetic_building": _Source("synthetic", "SyntheticBuilding", None, 8.0, needs_path=False),
     "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", None, 8.0, needs_path=False),
 }

@@ -1,4 +1,4 @@
-"""Data sets: sequences of scans, each read when it is accessed."""
+"""Data sets: sequences of scans, each read when it is accessed; and the share of a robot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
+from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.scan import Scan
 
 _ROUNDING = 1e-6
@@ -214,3 +214,45 @@ def gunzip(path: Path) -> bytes | None:
         return b"".join(blocks)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{path} is not a complete gzip file ({error}); fetch it again.") from error
+
+
+SPLITS = ("interleaved", "consecutive")
+
+
+def shard_indices(n_scans: int, k: int, n: int, split: str = "interleaved") -> range:
+    """Indices of the scans of robot k of n.
+
+    "interleaved" takes every n-th scan from scan k on; "consecutive" takes the k-th of n equal intervals.
+    """
+    check_whole("n_scans", n_scans, 0)
+    if check_whole("k", k, 0) >= check_whole("n", n, 1):
+        raise InvalidArgumentError(f"k={k} must be below n={n}: robots are counted from 0.")
+    if split not in SPLITS:
+        raise InvalidArgumentError(f"split={split!r} is not one of {', '.join(SPLITS)}.")
+    if split == "interleaved":
+        return range(k, n_scans, n)
+    return range(n_scans * k // n, n_scans * (k + 1) // n)
+
+
+class DatasetShard(Sequence[Scan]):
+    """A selection of the scans of a data set, each read when it is accessed.
+
+    Args:
+        scans: the data set.
+        indices: of the selected scans, in order, for example `shard_indices(len(scans), k, n)`.
+    """
+
+    def __init__(self, scans: Sequence[Scan], indices: Sequence[int]) -> None:
+        self._scans, self._indices = scans, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> Scan: ...
+    @overload
+    def __getitem__(self, index: slice) -> DatasetShard: ...
+    def __getitem__(self, index: int | slice) -> Scan | DatasetShard:
+        if isinstance(index, slice):
+            return DatasetShard(self._scans, self._indices[index])
+        return self._scans[self._indices[index]]

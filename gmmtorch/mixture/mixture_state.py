@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -13,12 +14,38 @@ from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from gmmtorch.arrays import as_tensor
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.files import pack_tensors, read_tensors, require, write_bytes
 from gmmtorch.linalg import check_rigid, check_symmetric, safe_cholesky
-from gmmtorch.mixture import mixture_file
 from gmmtorch.mixture.density import MixtureDensity
 from gmmtorch.mixture.em.covariance_types import check_type, expand, type_shape
 from gmmtorch.mixture.validation import Array, checked_parameter
+
+_FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
+_PARTS = ("weights", "means", "covariances")
+_EXTRA = "extra."  # prefix of the names of extra tensors in a file
+_EXTRA_DTYPES = (torch.float64, torch.int64, torch.bool)
+
+
+def _require_extra(tensors: Mapping[str, Tensor], name: str, path: str | Path) -> Tensor:
+    """An extra tensor.
+
+    Raises `DataError` unless it is finite and of an allowed dtype; any shape is allowed.
+    """
+    tensor = tensors[name]
+    if tensor.dtype not in _EXTRA_DTYPES:
+        raise DataError(f"{path}: {name} is {tensor.dtype}; expected one of {_EXTRA_DTYPES}.")
+    return require(tensors, name, (None,) * tensor.ndim, tensor.dtype, path)
+
+
+@contextmanager
+def _errors_naming(path: str | Path) -> Iterator[None]:
+    """Turns errors about the content of a file into a `DataError` that names the file."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, GmmTorchError) as error:
+        raise DataError(f"{path} does not hold a mixture: {error}") from error
+
 
 Self = TypeVar("Self", bound="MixtureState")
 
@@ -153,35 +180,43 @@ class MixtureState(MixtureDensity):
     def save(self, path: str | Path) -> None:
         """Write the fitted mixture to a safetensors file, atomically."""
         self._fitted()
-        stored = mixture_file.StoredMixture(
-            self.weights,
-            self.means,
-            self.covariances,
-            self.lower_bounds_,
-            self.converged_,
-            arrays=not self._tensors,
-            parameters=self._scalar_options(),
-            extra=self._extra_tensors(),
-        )
-        mixture_file.write(path, stored)
+        tensors = {name: getattr(self, name) for name in _PARTS}
+        tensors |= {_EXTRA + name: value for name, value in self._extra_tensors().items()}
+        facts = {
+            "lower_bounds": self.lower_bounds_,
+            "converged": self.converged_,
+            "arrays": not self._tensors,
+            "parameters": self._scalar_options(),
+        }
+        write_bytes(path, pack_tensors(tensors, _FILE_KIND, _FILE_VERSION, **facts))
 
     @classmethod
     def load(cls: type[Self], path: str | Path) -> Self:
         """Read a mixture that `save` wrote. Raises `DataError` if the file is not a valid mixture."""
-        stored = mixture_file.read(path)
+        tensors, facts = read_tensors(path, _FILE_KIND, _FILE_VERSION)
+        means = require(tensors, "means", (None, None), torch.float64, path)
+        k, dim = means.shape
+        weights = require(tensors, "weights", (k,), torch.float64, path)
+        covariances = require(tensors, "covariances", (k, dim, dim), torch.float64, path)
+        extra = {
+            name.removeprefix(_EXTRA): _require_extra(tensors, name, path)
+            for name in tensors
+            if name.startswith(_EXTRA)
+        }
         known = set(cls._get_param_names())
-        stored_n = stored.parameters.get("n_components", 0)
-        if stored_n is not None and not (cls._finds_n_components and isinstance(stored_n, int)):
-            known.remove("n_components")  # then it is the number of stored components
-        with mixture_file.errors_naming(path):
+        with _errors_naming(path):
+            parameters = dict(facts["parameters"])
+            stored_n = parameters.get("n_components", 0)
+            if stored_n is not None and not (cls._finds_n_components and isinstance(stored_n, int)):
+                known.remove("n_components")  # then it is the number of stored components
             mixture = cls.from_parameters(
-                stored.weights,
-                stored.means,
-                stored.covariances,
-                lower_bounds=stored.lower_bounds,
-                converged=stored.converged,
-                **{key: value for key, value in stored.parameters.items() if key in known},
+                weights,
+                means,
+                covariances,
+                lower_bounds=[float(x) for x in facts["lower_bounds"]],
+                converged=bool(facts["converged"]),
+                **{key: value for key, value in parameters.items() if key in known},
             )
-            mixture._set_extra(stored.extra)
-        mixture._tensors = not stored.arrays
+            mixture._set_extra(extra)
+            mixture._tensors = not facts["arrays"]
         return mixture

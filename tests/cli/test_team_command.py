@@ -17,9 +17,9 @@ from omegaconf import OmegaConf
 from sharing.test_publish import everything
 from test_robot_command import LOG, SMALL, room
 
-from gmmtorch.cli import robot_process, team
+from gmmtorch.cli import team
 from gmmtorch.cli.robot import facts_of
-from gmmtorch.cli.robot_process import RobotProcess
+from gmmtorch.cli.team import RobotProcess
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.store import Store
 from gmmtorch.sharing.transport.team_key import KEY_VARIABLE
@@ -173,7 +173,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     find = (
         "import sys, os, time, signal\nnumber = int([a for a in sys.argv if a.startswith('id=')][-1][3:])\n"
     )
-    monkeypatch.setattr(robot_process, "_COMMAND", (sys.executable, "-c", find + code))
+    monkeypatch.setattr(team, "_COMMAND", (sys.executable, "-c", find + code))
 
 
 FAILS = "if number == 1: sys.exit('gmmtorch: error: no more of this')\n"
@@ -211,7 +211,7 @@ def test_a_robot_that_fails_is_reported_and_ends_the_others(code, words, run, ro
 
 
 def test_robots_that_ignore_signals_are_killed(run, robots, monkeypatch):
-    monkeypatch.setattr(robot_process, "_PATIENCE", 0.3)
+    monkeypatch.setattr(team, "_PATIENCE", 0.3)
     pretend(monkeypatch, DEAF)
     refused(run(*LOG))
     assert [robot._process.returncode for robot in robots] == [-signal.SIGKILL, 1]
@@ -266,5 +266,5 @@ def test_bad_values_are_named_before_a_robot_is_started(options, words, run, rob
 
 @pytest.mark.parametrize("name", ["plain", "with space", "it's, [a] (strange) {place}=x", "ö"])
 def test_every_folder_name_is_quoted_for_hydra(name):
-    text = f"hydra.run.dir={robot_process._quoted(Path('/tmp') / name)}"
+    text = f"hydra.run.dir={team._quoted(Path('/tmp') / name)}"
     assert OverridesParser.create().parse_override(text).value() == f"/tmp/{name}"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets.dataset_shard import SPLITS, DatasetShard, shard_indices
+from gmmtorch.datasets.base import SPLITS, DatasetShard, shard_indices
 from gmmtorch.errors import InvalidArgumentError
 
 

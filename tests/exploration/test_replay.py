@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.dataset_shard import DatasetShard, shard_indices
+from gmmtorch.datasets.base import DatasetShard, shard_indices
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.exploration.mission.driver import WallClock, settle
 from gmmtorch.exploration.mission.replay import ReplayMission

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.report.maps.fitting_figures import comparison_figure
+from gmmtorch.report.maps.accuracy_figures import comparison_figure
 from gmmtorch.report.studies.fit_study_figures import (
     component_count_figures,
     initialization_figures,

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, roc_figure
-from gmmtorch.report.maps.fitting_figures import convergence_figure
+from gmmtorch.report.maps.accuracy_figures import auc_against_kept_figure, convergence_figure, roc_figure
 from gmmtorch.report.scenes.mixture_figures import mixture_figure
 from gmmtorch.report.style import save_figure
 

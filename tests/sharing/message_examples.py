@@ -13,7 +13,6 @@ from mapping.random_components import random_components
 
 from gmmtorch.mapping.codec.component_batch import spatial_order
 from gmmtorch.mapping.components import Components
-from gmmtorch.sharing.messages.announcements import encode_announcements
 from gmmtorch.sharing.messages.message_registry import (
     CODECS,
     ViewsMessage,
@@ -29,6 +28,7 @@ from gmmtorch.sharing.messages.record_messages import (
     RecordMessage,
     SupersessionMessage,
     counters_message,
+    encode_announcements,
     encode_record,
     pose_of,
 )

@@ -11,13 +11,13 @@ import pytest
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.sharing.messages.announcements import AnnouncementMessage
 from gmmtorch.sharing.messages.message_registry import (
     decode,
     encode_components,
 )
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
+    AnnouncementMessage,
     CountersMessage,
     RecordMessage,
     SupersessionMessage,

@@ -16,7 +16,6 @@ from sharing.replica_model import rows
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.broadcast import Broadcast
-from gmmtorch.sharing.messages.announcements import encode_announcements
 from gmmtorch.sharing.messages.message_registry import (
     ComponentsMessage,
     CountsMessage,
@@ -24,6 +23,7 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_components,
     encode_counts,
 )
+from gmmtorch.sharing.messages.record_messages import encode_announcements
 from gmmtorch.sharing.replica.record_keys import Intervals
 
 seeds = st.integers(0, 10**6)

@@ -26,7 +26,6 @@ from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
 from gmmtorch.mapping.codec.quantization import MOST_POINTS
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages import message_registry as messages
-from gmmtorch.sharing.messages.announcements import encode_announcements
 from gmmtorch.sharing.messages.component_messages import MOST_COMPONENTS_SENT
 from gmmtorch.sharing.messages.envelope import FARTHEST, Kind
 from gmmtorch.sharing.messages.message_registry import (
@@ -47,7 +46,7 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_points,
     encode_views,
 )
-from gmmtorch.sharing.messages.record_messages import encode_record
+from gmmtorch.sharing.messages.record_messages import encode_announcements, encode_record
 from gmmtorch.sharing.replica.replica import Replica
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.mesh_samples import read_triangles
+from gmmtorch.datasets.point_files.mesh_files import read_triangles
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.evaluation.events import Event, ignore
 from gmmtorch.exploration.planning.primitives import Dynamics, Primitives

@@ -27,8 +27,8 @@ from gmmtorch.mixture.estimators.gaussian_wishart import (
     log_predictive,
     unbiased_covariance,
     update,
+    variational_step,
 )
-from gmmtorch.mixture.estimators.variational_step import variational_step
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_parameter
 
 WEIGHT_PRIORS = ("dirichlet_process", "dirichlet_distribution")

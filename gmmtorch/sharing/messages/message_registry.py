@@ -10,20 +10,23 @@ from collections.abc import Callable
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.sharing.messages import (
-    announcements,
     component_messages,
     count_messages,
     point_messages,
     record_messages,
     view_messages,
 )
-from gmmtorch.sharing.messages.announcements import AnnouncementMessage
 from gmmtorch.sharing.messages.component_messages import ComponentsMessage, encode_components
 from gmmtorch.sharing.messages.count_messages import CountsMessage, encode_counts
 from gmmtorch.sharing.messages.envelope import CODECS, MAX_BYTES, Kind, parse_datagram
 from gmmtorch.sharing.messages.fields import quantized_poses
 from gmmtorch.sharing.messages.point_messages import PointsMessage, encode_points
-from gmmtorch.sharing.messages.record_messages import CorrectionMessage, CountersMessage, SupersessionMessage
+from gmmtorch.sharing.messages.record_messages import (
+    AnnouncementMessage,
+    CorrectionMessage,
+    CountersMessage,
+    SupersessionMessage,
+)
 from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
 
 __all__ = [
@@ -71,7 +74,7 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.POINTS: point_messages.read_points,
     Kind.VIEWS: view_messages.read_views,
     Kind.PLAN: view_messages.read_plan,
-    Kind.ANNOUNCEMENT: announcements.read_announcement,
+    Kind.ANNOUNCEMENT: record_messages.read_announcement,
     Kind.SUPERSESSION: record_messages.read_supersession,
     Kind.COUNTERS: record_messages.read_counters,
     Kind.CORRECTION: record_messages.read_correction,

@@ -1,4 +1,7 @@
-"""Records other than components, as datagrams: supersessions, counters, corrections. See docs/messages.md."""
+"""Datagrams of records other than components: supersessions, counters, corrections; and announcements.
+
+docs/messages.md describes the formats.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT
 from gmmtorch.sharing.messages.count_messages import count_steps, counts_of
-from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram
+from gmmtorch.sharing.messages.envelope import FARTHEST, MAX_BYTES, Kind, make_datagram, split
 from gmmtorch.sharing.messages.fields import (
     read_intervals,
     read_keys,
@@ -23,7 +26,16 @@ from gmmtorch.sharing.messages.fields import (
     write_keys,
     write_number,
 )
-from gmmtorch.sharing.replica.record_keys import END, Intervals, Ints, first_key, keys_of_robot, robot_of
+from gmmtorch.sharing.replica.record_keys import (
+    END,
+    LARGEST_INCARNATION,
+    LARGEST_ROBOT,
+    Intervals,
+    Ints,
+    first_key,
+    keys_of_robot,
+    robot_of,
+)
 
 RECORD_BYTES = 1000
 """Longest record. A datagram of 1200 bytes has room for it and for encryption."""
@@ -232,3 +244,67 @@ def pose_of(transform: Tensor) -> Tensor:
 
         turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
     return torch.cat([translation, turn]) + 0.0  # no −0
+
+
+@dataclass(frozen=True, eq=False)
+class AnnouncementMessage:
+    """Of the keys from `begin` to `end` − 1, incarnation `incarnation` of robot `sender` holds exactly
+    `held`."""
+
+    sender: int
+    incarnation: int
+    begin: int
+    end: int
+    held: Intervals
+
+    @property
+    def scope(self) -> Intervals:
+        return Intervals.span(self.begin, self.end)
+
+
+def encode_announcements(
+    sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES
+) -> list[bytes]:
+    """Datagrams of all keys that are held, at least one.
+
+    Each speaks of another range of keys, so that any of them may get lost. Raises `InvalidArgumentError` for
+    values out of range.
+    """
+    _check_sender(sender, incarnation)
+    if not Intervals.span(0, END).covers(held):
+        raise InvalidArgumentError(f"held={held!r} goes beyond the largest key, {END - 1}.")
+    n = len(held)
+
+    def part(begin: int, end: int) -> bytes:
+        first = int(held.edges[2 * begin]) if begin else 0
+        last = int(held.edges[2 * end]) - 1 if end < n else END - 1
+        writer = BitWriter()
+        for name, value in (("sender", sender), ("incarnation", incarnation)):
+            write_number(writer, name, value)
+        writer.number(first)
+        writer.number(last - first)
+        write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
+        return make_datagram(Kind.ANNOUNCEMENT, writer.to_bytes())
+
+    return split(n, part, "interval", max_bytes) if n else [part(0, 0)]
+
+
+def read_announcement(body: bytes) -> AnnouncementMessage:
+    reader = BitReader(body)
+    sender, incarnation = read_number(reader), read_number(reader)
+    _check_sender(sender, incarnation)
+    begin = reader.number()
+    end = begin + reader.number() + 1
+    if not 0 <= begin < end <= END:
+        raise DataError(f"An announcement of the keys from {begin} to {end}: it is damaged.")
+    held = read_intervals(reader, begin, end)
+    reader.finish()
+    return AnnouncementMessage(sender, incarnation, begin, end, held)
+
+
+def _check_sender(sender: int, incarnation: int) -> None:
+    if sender > LARGEST_ROBOT or incarnation > LARGEST_INCARNATION:
+        raise InvalidArgumentError(
+            f"sender={sender}, incarnation={incarnation}: robots go up to {LARGEST_ROBOT}, incarnations "
+            f"up to {LARGEST_INCARNATION}."
+        )

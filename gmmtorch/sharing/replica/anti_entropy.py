@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gmmtorch.mapping.codec.quantization import quantize
-from gmmtorch.sharing.messages.announcements import AnnouncementMessage
 from gmmtorch.sharing.messages.component_messages import fitted
-from gmmtorch.sharing.messages.record_messages import CountersMessage
+from gmmtorch.sharing.messages.record_messages import AnnouncementMessage, CountersMessage
 from gmmtorch.sharing.replica.materialized_view import information
 from gmmtorch.sharing.replica.record_keys import Intervals, Ints, authors, evict, keys_of, keys_of_robot
 from gmmtorch.sharing.replica.records import Records

@@ -15,14 +15,15 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, chec
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import ArrayLike
-from gmmtorch.sharing.messages.announcements import AnnouncementMessage, encode_announcements
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.messages.message_registry import ComponentsMessage, Message, decode
 from gmmtorch.sharing.messages.record_messages import (
+    AnnouncementMessage,
     CorrectionMessage,
     CountersMessage,
     SupersessionMessage,
     check_size,
+    encode_announcements,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
