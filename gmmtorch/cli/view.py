@@ -55,6 +55,7 @@ def _assigned(name: str, value: str) -> str:
 def run(config: DictConfig) -> None:
     """Run the command. Without `html` it serves the page until it is interrupted."""
     from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.live.map_page import write_page
     from gmmtorch.live.map_viewer import MapViewer
     from gmmtorch.mapping.gaussian_map import GaussianMap
 
@@ -65,20 +66,15 @@ def run(config: DictConfig) -> None:
     path = Path(config.path).expanduser()
     path = path / _MAP if path.is_dir() else path
     shown = GaussianMap.load(path).to(config.runtime.device)
-    viewer = MapViewer(
-        shown,
-        _trajectory(config, path, shown.dim),
-        shape=config.shape,
-        colour=config.colour,
-        host=config.host,
-        port=config.port,
-    )
+    trajectory = _trajectory(config, path, shown.dim)
+    look = {"shape": config.shape, "colour": config.colour}
+    if config.html:
+        written = write_page(config.html, shown, trajectory, **look)
+        print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
+        return
+    viewer = MapViewer(shown, trajectory, **look, host=config.host, port=config.port)
     try:
-        if config.html:
-            written = viewer.save_html(config.html)
-            print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
-        else:
-            serve(viewer)
+        serve(viewer)
     finally:
         viewer.stop()
 

@@ -14,26 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, OutputError, check_choice
+from gmmtorch.errors import OutputError, check_choice
 from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.files import write_bytes
 from gmmtorch.live import viewer_scene
+from gmmtorch.live.map_page import write_page
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.optional_packages import load_viser
 from gmmtorch.report.maps.map_regions import robust_bounds
-from gmmtorch.report.scenes.ellipsoids import cut_away, first_viewpoints, unit_sphere
-from gmmtorch.report.scenes.scene import SOUTH_WEST
+from gmmtorch.report.scenes.ellipsoids import unit_sphere
 
-SHAPES = ("ellipsoids", "splats", "surfaces", "none")
-"""How components are drawn: 2σ ellipsoids, Gaussian splats, or the triangle mesh of the surfaces."""
-
-_SPHERE_VERTICES = 162
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
 _MESH_COLOUR, _BACKGROUND = (205, 205, 210), (240, 242, 245)
 _OPACITY = 0.9  # of a splat
 _FINEST, _COARSEST = 0.02, 1.0  # m, of the slider of the resolution
-_FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
 _WELCOME = "Click a place to see what the map knows about it."
 
 
@@ -46,11 +40,11 @@ class MapViewer:
     Args:
         shown: the map; an empty map is shown once `update` gives another one.
         trajectory: (S, D) sensor positions, world metres; None draws no path.
-        shape: one of `SHAPES`. colour: one of `viewer_scene.COLOURS`.
+        shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.COLOURS`.
         host, port: where the page is served; another port is taken if this one is in use.
 
-    The page has controls for the shape, the colour, the height above which components are hidden, and the
-    height and resolution of the slice. A click shows occupancy, hits and misses at a place.
+    The page has controls for the shape, the colour, the height above which components are hidden, the path,
+    and the height and resolution of the slice. A click shows occupancy, hits and misses at a place.
 
     Raises `GmmTorchError` if viser is not installed, and `OutputError` if no port is free.
     """
@@ -65,7 +59,7 @@ class MapViewer:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        check_choice("shape", shape, SHAPES)
+        check_choice("shape", shape, viewer_scene.SHAPES)
         check_choice("colour", colour, viewer_scene.COLOURS)
         viser = load_viser()
         try:
@@ -110,27 +104,17 @@ class MapViewer:
             self._draw_slice()
 
     def save_html(self, path: str | Path) -> Path:
-        """Writes the scene as one HTML file, atomically, that a browser opens from disk without a network.
-
-        The file has no controls: it shows the shape, colour and slice that the viewer shows now.
-        """
-        path = Path(path)
-        if path.suffix not in (".html", ".htm"):
-            raise InvalidArgumentError(f"html={path} must end in .html.")
+        """Writes the map and the path as one HTML file; see `map_page.write_page`."""
         with self._lock:
-            text = self._server.get_scene_serializer().as_html()
-        return write_bytes(path, text.encode())
+            return write_page(path, self._map, self._path, shape=self._shape.value, colour=self._colour.value)
 
     # -- the scene ------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Limits of the controls, the camera and the lights, from the first map."""
-        assert self._box is not None
-        low, high = (np.asarray(corner) for corner in self._box)
-        if max(np.abs(low).max(), np.abs(high).max()) > _FAR:
-            self._shift = torch.from_numpy(np.round((low + high) / 2))
-        middle = (low + high) / 2 - self._shift.numpy()
-        away = 0.6 * float(np.linalg.norm((high - low)[:2])) + 2.0
+        begin = viewer_scene.frame(self._components, self._path)
+        self._shift, away = begin.shift, begin.distance
+        middle = ((begin.low + begin.high) / 2 - begin.shift).numpy()
         self._server.initial_camera.look_at = tuple(middle)
         self._add_lights(away)
         flat = self._map.dim == 2
@@ -140,10 +124,9 @@ class MapViewer:
             control.visible = visible
         with self._quiet():
             for control in (self._cut, self._height):
-                control.min, control.max = float(low[2]), float(high[2]) + 0.1
-            heights = self._path[:, 2]
-            self._height.value = float(heights.median()) if len(heights) else float(low[2] + high[2]) / 2
-            self._cut.value = min(self._open_height(), self._cut.max)
+                control.min, control.max = float(begin.low[2]), float(begin.high[2]) + 0.1
+            self._height.value = begin.height
+            self._cut.value = min(begin.open_height, self._cut.max)
             self._resolution.value = max(_FINEST, min(self._map.resolution, _COARSEST))
 
     def _add_lights(self, away: float) -> None:
@@ -161,15 +144,6 @@ class MapViewer:
                 position=tuple(10 * away * np.array(place)),
             )
 
-    def _open_height(self) -> float:
-        """The height (m) below a level ceiling; ∞ if there is none."""
-        if self._map.dim == 2:
-            return math.inf
-        rows = viewer_scene.surfaces(self._components).rows.to(self._components.means.device)
-        chosen = self._components.selected(rows)
-        seen_from = first_viewpoints(chosen).cpu()
-        return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, None, SOUTH_WEST)[1]
-
     def _draw_components(self) -> None:
         below = self._cut.value if self._map.dim == 3 else math.inf
         below = math.inf if below >= self._cut.max else below
@@ -178,7 +152,7 @@ class MapViewer:
         self._remove("components")
         if shape == "none" or len(solid.rows) == 0:
             return
-        colours = viewer_scene.colours(self._components, solid, self._colour.value)
+        colours = viewer_scene.colours(self._components, solid, self._colour.value).rgb
         scene = self._server.scene
         moved = (solid.means - self._shift).float().numpy()
         if shape == "surfaces" and self._map.dim == 3:
@@ -191,7 +165,7 @@ class MapViewer:
             )
         else:
             balls = viewer_scene.instances(solid)
-            vertices, faces = unit_sphere(_SPHERE_VERTICES)
+            vertices, faces = unit_sphere(viewer_scene.SPHERE_VERTICES)
             self._nodes["components"] = scene.add_batched_meshes_simple(
                 "/components",
                 vertices.float().numpy(),
@@ -222,7 +196,7 @@ class MapViewer:
 
     def _draw_path(self) -> None:
         self._remove("path")
-        if len(self._path) < 2:
+        if len(self._path) < 2 or not self._with_path.value:
             return
         moved = (self._path - self._shift).float().numpy()
         self._nodes["path"] = self._server.scene.add_line_segments(
@@ -264,9 +238,10 @@ class MapViewer:
         gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
         self._is_quiet = False
         with gui.add_folder("Components"):
-            self._shape = gui.add_dropdown("shape", SHAPES, initial_value=shape)
+            self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
             self._colour = gui.add_dropdown("colour", viewer_scene.COLOURS, initial_value=colour)
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
+            self._with_path = gui.add_checkbox("trajectory", True)
         with gui.add_folder("Occupancy"):
             self._visible = gui.add_checkbox("slice", True)
             self._height = gui.add_slider("height [m]", 0.0, 1.0, 0.05, 0.5)
@@ -275,6 +250,7 @@ class MapViewer:
             self._place = gui.add_markdown(_WELCOME)
         for control in (self._shape, self._colour, self._cut):
             control.on_update(lambda _: self._redraw(self._draw_components))
+        self._with_path.on_update(lambda _: self._redraw(self._draw_path))
         for control in (self._visible, self._height, self._resolution):
             control.on_update(lambda _: self._redraw(self._draw_slice))
         self._server.scene.on_click()(lambda event: self._show_place(event.ray_origin, event.ray_direction))

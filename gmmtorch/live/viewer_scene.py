@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +15,29 @@ from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.report.maps.map_figures import occupancy_colours
 from gmmtorch.report.maps.map_images import MapPanel, slice_image
-from gmmtorch.report.scenes.ellipsoids import N_SIGMA, height_colour_map, principal_axes
+from gmmtorch.report.maps.map_regions import robust_bounds
+from gmmtorch.report.scenes.ellipsoids import (
+    N_SIGMA,
+    cut_away,
+    first_viewpoints,
+    height_colour_map,
+    principal_axes,
+)
+from gmmtorch.report.scenes.scene import SOUTH_WEST
 from gmmtorch.report.style import height_scale
+
+SHAPES = ("ellipsoids", "splats", "surfaces", "none")
+"""How components are drawn: 2σ ellipsoids, Gaussian splats, or the triangle mesh of the surfaces."""
 
 COLOURS = ("height", "support", "age")
 """What colours the components: z of the mean; log of the support; order in which they were learned."""
 
+SPHERE_VERTICES = 162
+"""Vertices of a drawn ellipsoid."""
+
 _FLATNESS = 0.01  # m, thickness of a 2D component
 _FREE_ALPHA, _OCCUPIED_ALPHA = 90, 240
+_FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
 _SLICE_PIXELS = 1000  # along the longer side of a slice
 
 
@@ -82,20 +98,77 @@ def instances(solid: Solid) -> Instances:
     return Instances(turned, solid.means.numpy(), N_SIGMA * deviations.numpy())
 
 
-def colours(components: Components, solid: Solid, by: str) -> np.ndarray:
-    """Colours (K, 3) uint8 of the components by one of `COLOURS`."""
+class Colours(NamedTuple):
+    """Colours of components, rgb (K, 3) uint8, and what the first and the last colour of the scale mean."""
+
+    rgb: np.ndarray
+    ends: tuple[str, str]
+
+
+def colours(components: Components, solid: Solid, by: str) -> Colours:
+    """The colours of the components by one of `COLOURS`."""
     check_choice("colour", by, COLOURS)
     if by == "height":
         value = solid.means[:, 2]
         scale = height_scale(value)
+        ends = f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"
         share = np.asarray(scale(value.numpy()))
     else:
         chosen = components.support if by == "support" else components.ids[:, 1]
         value = chosen.cpu()[solid.rows].double()
-        value = value.clamp_min(1e-9).log() if by == "support" else value
         low, high = (float(value.min()), float(value.max())) if len(value) else (0.0, 1.0)
+        ends = (f"{low:.3g} points", f"{high:.3g} points") if by == "support" else ("oldest", "newest")
+        if by == "support":
+            value, low, high = value.clamp_min(1e-9).log(), *np.log(np.maximum([low, high], 1e-9))
         share = ((value - low) / max(high - low, 1e-9)).numpy()
+    return Colours(_shades(share), ends)
+
+
+def colour_scale(n_colours: int) -> list[str]:
+    """The scale of the colours as CSS colours, from the first to the last."""
+    return ["rgb({}, {}, {})".format(*shade) for shade in _shades(np.linspace(0, 1, n_colours)).tolist()]
+
+
+def _shades(share: np.ndarray) -> np.ndarray:
+    """Colours (K, 3) uint8 of shares (K,) of the scale."""
     return np.round(255 * height_colour_map(lighter=0.0)(share)[:, :3]).astype(np.uint8)
+
+
+class Frame(NamedTuple):
+    """What a first view of a map shows.
+
+    low, high (3,): corners of the box of the map and the path, world frame. shift (3,): origin of the scene's
+    frame, moved to the map where float32 is too coarse in the world frame. distance: of the camera from the
+    middle of the box. height: of the slice, that of the sensor. open_height: below a level ceiling; ∞ if
+    there is none. All in metres.
+    """
+
+    low: Tensor
+    high: Tensor
+    shift: Tensor
+    distance: float
+    height: float
+    open_height: float
+
+
+def frame(components: Components, path: Tensor) -> Frame:
+    """The first view of components and the sensor's path (S, 3)."""
+    solid = surfaces(components)
+    corners = robust_bounds(solid.means, path if len(path) else None, margin=0.5)
+    low, high = torch.tensor(corners, dtype=torch.float64)
+    far = max(float(low.abs().max()), float(high.abs().max())) > _FAR
+    shift = ((low + high) / 2).round() if far else torch.zeros(3, dtype=torch.float64)
+    distance = 0.6 * float((high - low)[:2].norm()) + 2.0
+    height = float(path[:, 2].median()) if len(path) else float(low[2] + high[2]) / 2
+    return Frame(low, high, shift, distance, height, _open_height(components, solid))
+
+
+def _open_height(components: Components, solid: Solid) -> float:
+    if components.dim == 2:
+        return math.inf
+    chosen = components.selected(solid.rows.to(components.means.device))
+    seen_from = first_viewpoints(chosen).cpu()
+    return cut_away(chosen.means.cpu(), chosen.covariances.cpu(), seen_from, None, SOUTH_WEST)[1]
 
 
 def occupancy_slice(

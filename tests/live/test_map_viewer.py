@@ -79,7 +79,7 @@ def test_surfaces_leave_out_free_ends_and_what_is_above(maps):
 def test_colours_follow_the_order_of_their_quantity(by, maps):
     components = maps[3][0].components()
     solid = viewer_scene.surfaces(components)
-    colours = viewer_scene.colours(components, solid, by).astype(int)
+    colours = viewer_scene.colours(components, solid, by).rgb.astype(int)
     quantity = {"height": solid.means[:, 2], "support": components.support, "age": components.ids[:, 1]}[by]
     quantity = quantity if by == "height" else quantity[solid.rows]
     low, high = int(quantity.argmin()), int(quantity.argmax())
@@ -162,8 +162,7 @@ def test_other_shapes(shape, viewer):
 
 def test_html_is_one_file_without_references_to_a_network(viewer, tmp_path):
     text = viewer.save_html(tmp_path / "map.html").read_text(encoding="utf-8")
-    assert "__VISER_EMBED_DATA__" in text
-    assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=[\"']?https?:", text)
+    assert not re.findall(r"https?:|//[a-z]+\.", text)
     with pytest.raises(InvalidArgumentError, match=r"must end in \.html"):
         viewer.save_html(tmp_path / "map.txt")
 

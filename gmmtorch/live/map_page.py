@@ -1,0 +1,144 @@
+"""A map as one HTML page with controls, which a browser opens from disk without a network (WebGL 2)."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.export.mesh import surface_mesh
+from gmmtorch.files import write_bytes
+from gmmtorch.live import viewer_scene
+from gmmtorch.live.viewer_scene import Frame, Solid
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.report.scenes.ellipsoids import unit_sphere
+from gmmtorch.report.table import byte_text
+
+_TEMPLATE = Path(__file__).with_suffix(".html")
+_PLACE = "__MAP__"
+_N_SHADES = 9  # of the legend
+
+
+def write_page(
+    path: str | Path,
+    shown: GaussianMap,
+    trajectory: Tensor | None = None,
+    *,
+    shape: str = "ellipsoids",
+    colour: str = "height",
+) -> Path:
+    """Writes a map as one HTML file, atomically.
+
+    The page has controls for the shape, the colour and the size of components, the height above which they
+    are hidden, the path and a slice of occupancy at the sensor's height.
+
+    Args:
+        path: FILE.html.
+        shown: the map.
+        trajectory: (S, 2) or (S, 3) sensor positions, world metres; None draws no path.
+        shape: one of `viewer_scene.SHAPES`, shown first. The mesh of the surfaces, which is large, is in the
+            file only with "surfaces".
+        colour: one of `viewer_scene.COLOURS`, shown first.
+
+    Raises `InvalidArgumentError` for another ending or choice, and for a map without surfaces.
+    """
+    check_choice("shape", shape, viewer_scene.SHAPES)
+    check_choice("colour", colour, viewer_scene.COLOURS)
+    path = Path(path)
+    if path.suffix not in (".html", ".htm"):
+        raise InvalidArgumentError(f"html={path} must end in .html.")
+    components = shown.components() if shown.dim else Components.empty(3)
+    solid = viewer_scene.surfaces(components)
+    if len(solid.rows) == 0:
+        raise InvalidArgumentError(f"html={path}: the map has no surface to show; insert scans with returns.")
+    positions = torch.zeros(0, 3) if trajectory is None else trajectory.detach().cpu()
+    positions = torch.nn.functional.pad(positions.double(), (0, 3 - positions.shape[1]))
+    frame = viewer_scene.frame(components, positions)
+    scene = {
+        "about": f"{len(components):,} components, {byte_text(shown.nbytes)}",
+        "flat": components.dim == 2,
+        "shape": shape,
+        "shapes": [name for name in viewer_scene.SHAPES if name != "surfaces" or shape == "surfaces"],
+        "colour": colour,
+        "scale": viewer_scene.colour_scale(_N_SHADES),
+        **_view(frame),
+        **_ellipsoids(components, solid, frame),
+        "path": _encoded(positions - frame.shift, "<f4"),
+        "slice": _slice(shown, frame),
+        "mesh": _mesh(components, shown.resolution, frame) if shape == "surfaces" else None,
+    }
+    text = json.dumps(scene).replace("</", "<\\/")  # a closing tag would end the element with the data
+    return write_bytes(path, _TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, text).encode())
+
+
+def _view(frame: Frame) -> dict[str, Any]:
+    """The first camera, and the heights (m) of the scene's frame between which components can be hidden."""
+    low, high = frame.low - frame.shift, frame.high - frame.shift
+    top = float(high[2]) + 0.1
+    return {
+        "middle": ((low + high) / 2).tolist(),
+        "distance": 1.35 * frame.distance,
+        "low": float(low[2]),
+        "high": top,
+        "cut": min(frame.open_height - float(frame.shift[2]), top),
+    }
+
+
+def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str, Any]:
+    """One sphere, its place, turn (x, y, z, w) and standard deviations of each component, and colours."""
+    balls = viewer_scene.instances(solid)
+    places = np.zeros((len(solid.rows), 3, 4))
+    places[:, 0, :3] = balls.positions - frame.shift.numpy()
+    places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
+    places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
+    vertices, faces = unit_sphere(viewer_scene.SPHERE_VERTICES)
+    colours = {}
+    for by in viewer_scene.COLOURS:
+        found = viewer_scene.colours(components, solid, by)
+        colours[by] = {"rgb": _encoded(found.rgb, "u1"), "ends": found.ends}
+    return {
+        "places": _encoded(places, "<f4"),
+        "sphere": {"vertices": _encoded(vertices, "<f4"), "faces": _encoded(faces, "<u2")},
+        "colours": colours,
+    }
+
+
+def _slice(shown: GaussianMap, frame: Frame) -> dict[str, Any]:
+    """The picture of occupancy at the sensor's height, as PNG, and its place in the scene."""
+    from PIL import Image
+
+    dim = shown.dim or 3
+    low, high = (tuple(corner[:dim].tolist()) for corner in (frame.low, frame.high))
+    picture = viewer_scene.occupancy_slice(shown, shown.resolution, frame.height, low, high)
+    file = io.BytesIO()
+    Image.fromarray(picture.pixels).save(file, "PNG")
+    place = torch.tensor([*picture.middle, frame.height if dim == 3 else -0.05], dtype=torch.float64)
+    return {
+        "png": "data:image/png;base64," + base64.b64encode(file.getvalue()).decode(),
+        "middle": (place - frame.shift).tolist(),
+        "size": picture.size,
+    }
+
+
+def _mesh(components: Components, resolution: float, frame: Frame) -> dict[str, str] | None:
+    """The triangles of the surfaces; None in 2D."""
+    if components.dim == 2:
+        return None
+    found = surface_mesh(components, resolution)
+    return {
+        "vertices": _encoded(found.vertices.cpu() - frame.shift, "<f4"),
+        "faces": _encoded(found.faces, "<u4"),
+    }
+
+
+def _encoded(values: Tensor | np.ndarray, kind: str) -> str:
+    """The values in row-major order as numbers of a NumPy type, in base64."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode()
