@@ -138,6 +138,18 @@ def _raising() -> Iterator[None]:
             os.environ[_FULL_ERROR] = before
 
 
+def _with_memory(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
+    """The result of a command. Raises `MemoryLimitError` if the memory of the device is too small."""
+    import torch
+
+    from gmmtorch.kernels.chunks import memory_error
+
+    try:
+        return run(config)
+    except torch.OutOfMemoryError as error:
+        raise memory_error(error) from error
+
+
 def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     """The result of a command; an error ends the command, or only its job of a sweep."""
     from gmmtorch.evaluation.processes import end_with_parent
@@ -145,13 +157,13 @@ def _guarded(run: Callable[[DictConfig], Any], config: DictConfig) -> Any:
     end_with_parent()  # a job of a sweep in its own process ends if the sweep's process ends
     if not common.is_job_of_sweep():
         try:
-            return run(config)
+            return _with_memory(run, config)
         except GmmTorchError as error:
             sys.exit(f"gmmtorch: error: {error}")
     note = common.run_dir() / ERROR_FILE
     note.unlink(missing_ok=True)  # of an earlier sweep in this folder
     try:
-        return run(config)
+        return _with_memory(run, config)
     except GmmTorchError as error:
         text = str(error)
     except Exception as error:

@@ -16,14 +16,7 @@ from torch import Tensor
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.simd import SIMD
 
-_BODY = """
-    const double* c = cones + cone[item] * 16;  // W (9), origin (3), m = W(mean - origin) (3), scale
-    const double *origin = c + 9, *m = c + 12;
-    const int64_t i0 = first[2 * item], j0 = first[2 * item + 1];
-    const int64_t n0 = number[2 * item], n1 = number[2 * item + 1], n_faces = n0 * n1;
-    const double height = place0 + (double)plane[item] * side - origin[axis0];
-    const double strength = (forward[item] ? height : -height) * area * c[15];
-    const int64_t cell0 = (forward[item] ? plane[item] - 1 : plane[item]) * stride0;
+RULES = """
     const double GAUSS[4][4] = {
         {0.0, 0.0, 0.0, 0.0},
         {-0.28867513459481287, 0.28867513459481287, 0.0, 0.0},
@@ -34,6 +27,18 @@ _BODY = """
         {0.5, 0.5, 0.0, 0.0},
         {0.2777777777777778, 0.4444444444444444, 0.2777777777777778, 0.0},
         {0.17392742256872693, 0.32607257743127307, 0.32607257743127307, 0.17392742256872693}};
+"""
+"""C++ of the nodes and weights of the Gauss-Legendre rules with 1 to 4 nodes on [−½, ½]."""
+
+_BODY = """
+    const double* c = cones + cone[item] * 16;  // W (9), origin (3), m = W(mean - origin) (3), scale
+    const double *origin = c + 9, *m = c + 12;
+    const int64_t i0 = first[2 * item], j0 = first[2 * item + 1];
+    const int64_t n0 = number[2 * item], n1 = number[2 * item + 1], n_faces = n0 * n1;
+    const double height = place0 + (double)plane[item] * side - origin[axis0];
+    const double strength = (forward[item] ? height : -height) * area * c[15];
+    const int64_t cell0 = (forward[item] ? plane[item] - 1 : plane[item]) * stride0;
+    RULES
     double edge[2][3], edge_length[2], turned[2];
     for (int b = 0; b < 2; ++b) {
         const int64_t column = b == 0 ? axis1 : axis2;  // -1: a grid of the plane has one edge
@@ -177,7 +182,7 @@ _KERNEL = FusedKernel(
     " double place0, double place1, double place2, double side, double area, int64 stride0, int64 stride1,"
     " int64 stride2, double cutoff, double limit0, double limit1, double limit2, double limit3,"
     " double* misses",
-    SIMD + _BODY,
+    SIMD + _BODY.replace("RULES", RULES),
     shares=True,
 )
 

@@ -20,6 +20,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.near_pairs import MOST_TESTED, near_pairs
+from gmmtorch.kernels.pair_overlap import overlap_sums
 from gmmtorch.mapping.surfaces import touching
 from gmmtorch.mixture.em.exact import Parameters
 
@@ -90,6 +93,25 @@ def generators(dim: int) -> Tensor:
 
 def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pairs) -> Overlap:
     """Log score, gradient, information and scatter of each motion, over the given pairs only."""
+    if is_fused(*source, *target, *motions, *pairs):
+        turned = motions.rotations[:, None]
+        levers = (turned @ source.means[..., None]).squeeze(-1)
+        moved = turned @ source.covariances @ turned.mT
+        weights = source.weights, target.weights
+        sums = overlap_sums(pairs, levers, moved, motions.translations, target[1:], weights)
+    else:
+        sums = _batched_sums(source, target, motions, pairs)
+    total, first, second, squares = sums
+    scale = total.clamp_min(1e-300)[:, None]
+    gradient = first / scale
+    scatter = squares / scale[:, None] - gradient[:, :, None] * gradient[:, None]
+    return Overlap(total.log(), gradient, second / scale[:, None], scatter)
+
+
+def _batched_sums(
+    source: Parameters, target: Parameters, motions: Motions, pairs: Pairs
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The twin of `kernels.pair_overlap`."""
     n, dim = motions.translations.shape
     n_free = dim + dim * (dim - 1) // 2
     lever = torch.einsum("bij,kj->ibk", motions.rotations, source.means).flatten(1)
@@ -109,10 +131,7 @@ def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pai
         first.index_add_(0, b, weighted.T)
         second.index_add_(0, b, (share * information).flatten(0, 1).T)
         squares.index_add_(0, b, (weighted[:, None] * slope).flatten(0, 1).T)
-    scale = total.clamp_min(1e-300)[:, None]
-    gradient = first / scale
-    scatter = (squares / scale).view(n, n_free, n_free) - gradient[:, :, None] * gradient[:, None]
-    return Overlap(total.log(), gradient, (second / scale).view(n, n_free, n_free), scatter)
+    return total, first, second.view(n, n_free, n_free), squares.view(n, n_free, n_free)
 
 
 def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -236,15 +255,20 @@ class Ascent:
         """Pairs within the cutoff now, or after components have moved by the slack."""
         k, n = len(self.source.weights), len(motions.translations)
         moved = torch.einsum("bij,kj->bki", motions.rotations, self.source.means)
-        moved = (moved + motions.translations[:, None]).flatten(0, 1)
-        reach = (self.reach[0] + self.slack).repeat(n)
+        moved = moved + motions.translations[:, None]
         shapes = motions.rotations[:, None] @ self.source.covariances @ motions.rotations[:, None].mT
-        shapes = shapes.flatten(0, 1)
+        # This ellipsoid contains the ellipsoid of the cutoff enlarged by the ball of the slack.
+        scale, wide = 1.2 * CUTOFF**2, 6 * self.slack**2
+        few = n * k * len(self.target.weights) <= MOST_TESTED
+        if few and is_fused(moved, *self.target, *self.source):
+            reaches = self.reach[0] + self.slack, self.reach[1]
+            return Pairs(*near_pairs(moved, shapes, reaches, *self.target[1:], scale, wide))
+        moved, shapes = moved.flatten(0, 1), shapes.flatten(0, 1)
+        reach = (self.reach[0] + self.slack).repeat(n)
         found = [torch.zeros(2, 0, dtype=torch.int64, device=moved.device)]
         for point, center in touching(self.target.means, self.reach[1], moved, reach):
-            # This ellipsoid contains the ellipsoid of the cutoff enlarged by the ball of the slack.
-            near = CUTOFF**2 * 1.2 * (shapes[point] + self.target.covariances[center])
-            near.diagonal(dim1=1, dim2=2).add_(6 * self.slack**2)
+            near = scale * (shapes[point] + self.target.covariances[center])
+            near.diagonal(dim1=1, dim2=2).add_(wide)
             offset = (moved[point] - self.target.means[center])[:, :, None]
             inside = (offset.mT @ torch.linalg.solve(near, offset))[:, 0, 0] <= 1
             found.append(torch.stack([point[inside], center[inside]]))

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from gmmtorch.arrays import check_unmasked
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.covariance_types import compact, count_free_entries
@@ -98,7 +99,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         center = (self.weights[:, None] * self.means).sum(0)
         centered = points - center
         parameters = Parameters(self.weights, self.means - center, self.covariances)
-        rows = max(64, em.CHUNK_ELEMENTS // self.weights.shape[0])
+        rows = max(64, chunk_elements(points.device) // self.weights.shape[0])
         if em.is_ill_conditioned(parameters) or bool((centered.abs() > _FAR).any()):
             return [em.log_joint(part, parameters) for part in centered.split(rows)]
         natural = em.natural_parameters(parameters).T.contiguous()

@@ -1,4 +1,4 @@
-"""The fused flux through the faces of a grid against its twin, which test_flux compares with quadrature."""
+"""The fused flux and mass of a grid against their twins, which test_flux compares with quadrature."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ def test_fused_flux_equals_the_twin(dim, kind):
             found.append(flux_evidence(cones, grid, 7.0, tolerance=1e-6))  # no jump at the cutoff
     assert found[0].misses.count_nonzero() > 50
     torch.testing.assert_close(found[1].misses, found[0].misses, rtol=1e-5, atol=1e-5)
+    assert found[0].hits.count_nonzero() > 50
+    torch.testing.assert_close(found[1].hits, found[0].hits, rtol=1e-5, atol=1e-5)
 
 
 def test_a_looser_tolerance_stays_within_itself():
@@ -32,5 +34,6 @@ def test_a_looser_tolerance_stays_within_itself():
     cones = Cones(*cones[:3], torch.ones(12), cones.max_range)
     grid = VoxelGrid((-3.0,) * 3, 0.5, (12, 12, 12))
     with kernels("fused"):
-        loose, exact = (flux_evidence(cones, grid, 4.0, tolerance=t).misses for t in (1e-3, 1e-6))
-    assert 0 < float((loose - exact).abs().max()) < 1e-3
+        loose, exact = (flux_evidence(cones, grid, 4.0, tolerance=t) for t in (1e-3, 1e-6))
+    assert 0 < float((loose.misses - exact.misses).abs().max()) < 1e-3
+    assert 0 < float((loose.hits - exact.hits).abs().max()) < 1e-3

@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
+from gmmtorch.kernels import chunks
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
@@ -105,7 +106,7 @@ def test_chunks_do_not_change_the_statistics(generator, monkeypatch):
     natural = em.natural_parameters(parameters)
     whole = em.expectation(features, weight, natural, torch.float64)
     labels = em.most_likely(features, parameters)
-    monkeypatch.setattr(em, "CHUNK_ELEMENTS", 1)  # chunks of 64 rows, the last one shorter
+    monkeypatch.setattr(chunks, "CHUNK_ELEMENTS", 1)  # chunks of 64 rows, the last one shorter
     parts = em.expectation(features, weight, natural, torch.float64)
     torch.testing.assert_close(parts, whole, rtol=1e-12, atol=1e-10)
     assert torch.equal(em.most_likely(features, parameters), labels)

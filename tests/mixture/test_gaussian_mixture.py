@@ -27,6 +27,7 @@ from gmmtorch.errors import (
     NumericalError,
 )
 from gmmtorch.files import pack_tensors
+from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -126,7 +127,7 @@ def test_float64_fit_and_queries_create_no_float32_tensor(init, kind):
 
 
 def test_dtype_recorder_detects_float32():
-    with DtypeRecorder() as recorder:
+    with kernels("torch"), DtypeRecorder() as recorder:
         GaussianMixture(2, random_state=0, dtype="float32").fit(blobs(100))
     assert torch.float32 in recorder.seen
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels import chunks
 from gmmtorch.mixture import GaussianMixture, gaussian_mixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import grouping, loop, truncated
@@ -142,7 +143,7 @@ def test_group_rows_puts_each_row_into_one_slot_of_its_owner(
 @kinds
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-5)])
 def test_e_step_over_all_candidates_equals_exact_e_step(dim, are_points, dtype, tolerance, monkeypatch):
-    monkeypatch.setattr(grouping, "CHUNK_ELEMENTS", 500)  # several chunks
+    monkeypatch.setattr(chunks, "CHUNK_ELEMENTS", 500)  # several chunks
     points, weight, parameters = cloud(400, dim), random_weight(400), random_parameters(7, dim)
     owner = torch.randint(0, 7, (400,), generator=torch.Generator().manual_seed(3))
     groups = group_rows(rows_of(points, weight, are_points), owner, parameters.means, dtype)

@@ -69,8 +69,7 @@ def test_most_boxes_without_rays_are_no_candidates():
 @pytest.mark.parametrize("seed", range(6))
 def test_a_face_that_a_ray_crosses_is_visited(dim, seed):
     grid, cones = GRIDS[dim], some_cones(dim, 4, seed, inside=seed % 3 == 0)
-    for axis in range(dim):
-        rows = face_rows(cones, grid, axis)
+    for axis, rows in enumerate(face_rows(cones, grid)):
         visited = set()
         for row, cells in cells_in_chunks(rows.first, rows.number, 1000):
             key = [rows.cone[row], rows.forward[row].long(), rows.plane[row], *cells]

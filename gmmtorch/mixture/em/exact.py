@@ -18,10 +18,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import e_step
+from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels.e_step import expectation as expectation
+from gmmtorch.kernels.e_step import exponent_floor as exponent_floor
 from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
-
-CHUNK_ELEMENTS = 1 << 17
-"""Entries of an N×K block, small enough for the cache of a core."""
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 """Dtypes for the exponentials of the E-step, by name."""
@@ -75,43 +76,9 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
 
 
-def expectation(
-    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype = torch.float32
-) -> tuple[Tensor, Tensor]:
-    """One E-step: sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar).
-
-    Products are computed in the dtype of the features (float64, because the quadratic form cancels many
-    digits). Exponentials are computed in `softmax_dtype`, after subtraction of the row's maximum.
-    """
-    n, k = features.shape[0], natural.shape[0]
-    rows = max(64, CHUNK_ELEMENTS // k)
-    floor = exponent_floor(softmax_dtype)
-    statistics = torch.zeros_like(natural.T, memory_format=torch.contiguous_format)
-    total = features.new_zeros(())
-    transposed = natural.T.contiguous()
-    block = features.new_empty(min(rows, n), k)
-    for begin in range(0, n, rows):
-        part, p = features[begin : begin + rows], sample_weight[begin : begin + rows]
-        logits = torch.mm(part, transposed, out=block[: part.shape[0]])
-        peak = logits.amax(1)
-        gamma = logits.sub_(peak[:, None]).to(softmax_dtype).clamp_(min=floor).exp_()
-        norm = gamma.sum(1)
-        total += torch.dot(p, peak + norm.to(p.dtype).log())
-        gamma.mul_((p / norm).to(softmax_dtype)[:, None])
-        statistics.addmm_(part.T, gamma.to(part.dtype))
-    return statistics.T, total
-
-
-def exponent_floor(dtype: torch.dtype) -> float:
-    """Smallest exponent whose exp is not denormal: denormals are negligible, but slow to compute."""
-    return -80.0 if dtype == torch.float32 else -700.0
-
-
 def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
     """The component (N,) with the largest responsibility for each row of features."""
-    natural = natural_parameters(parameters).T.contiguous()
-    rows = max(64, CHUNK_ELEMENTS // natural.shape[1])
-    return torch.cat([(part @ natural).argmax(1) for part in features.split(rows)])
+    return e_step.most_likely(features, natural_parameters(parameters))
 
 
 def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | None = None) -> Parameters:
@@ -186,7 +153,7 @@ def _responsibilities(
     points: Tensor, sample_weight: Tensor, parameters: Parameters
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Points (n, D), their weighted responsibilities (n, K) and Σ_n p_n log p(x_n), in chunks."""
-    rows = max(1, CHUNK_ELEMENTS // parameters.weights.shape[0])
+    rows = max(1, chunk_elements(points.device) // parameters.weights.shape[0])
     for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
         joint = log_joint(part, parameters)
         norm = torch.logsumexp(joint, 1)

@@ -17,6 +17,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels.truncated_e_step import (
+    GroupedRows,
+    fused_candidates,
+    fused_expectation,
+    is_fused_on,
+)
 from gmmtorch.linalg import (
     argsort,
     inverse_factor,
@@ -26,7 +33,6 @@ from gmmtorch.linalg import (
     unpack_symmetric,
 )
 from gmmtorch.mixture.em.exact import (
-    CHUNK_ELEMENTS,
     Parameters,
     exponent_floor,
     feature_dimension,
@@ -86,6 +92,15 @@ class Groups(NamedTuple):
     spread: Tensor
     row: Tensor
     slot: Tensor
+
+    def rows(self) -> GroupedRows:
+        """The slots of each group, for the fused kernels."""
+        block = self.weight.shape[1]
+        n_slots = (self.n_rows + block - 1) // block * block
+        begin = torch.cat([n_slots.new_zeros(1), n_slots.cumsum(0)])
+        return GroupedRows(
+            self.features.flatten(0, 1), self.weight.flatten(), begin, self.centers.contiguous()
+        )
 
 
 def group_rows(rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype) -> Groups:
@@ -153,10 +168,12 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     count, steps = groups.n_rows[:, None], torch.arange(n_samples, device=groups.n_rows.device)
     place = torch.cumsum(count, 0) - count + (2 * steps + 1) * count // (2 * n_samples)
     place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
-    samples = groups.features.flatten(0, 1)[groups.slot[place]]
-    natural = natural_parameters(parameters).T.contiguous()
+    natural, rows = natural_parameters(parameters), groups.rows()
+    if is_fused_on(rows, natural):
+        return fused_candidates(rows, groups.slot[place], natural, n_candidates)
+    natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
     chosen = []
-    step = max(1, 4 * CHUNK_ELEMENTS // (n_samples * k))
+    step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
     for begin in range(0, k, step):
         part = slice(begin, min(begin + step, k))
         moved = shift_features(samples[part].double(), groups.centers[part, None])
@@ -195,6 +212,10 @@ def truncated_expectation(
 
     With `want_owner`, also returns each row's most likely candidate. `compiled`: use torch.compile.
     """
+    rows, own = groups.rows(), centered_parameters(parameters)
+    if not compiled and is_fused_on(rows, own, candidates):
+        fused = fused_expectation(rows, candidates, own, parameters.means, want_owner)
+        return Expectation(fused[0], float(fused[1]), _owner_of_rows(groups, fused[2]))
     n_groups, m = candidates.shape
     n_blocks, block, n_features = groups.features.shape
     dtype = groups.features.dtype
@@ -203,7 +224,7 @@ def truncated_expectation(
     value = torch.zeros((), dtype=torch.float64, device=candidates.device)
     likeliest = torch.empty_like(groups.weight, dtype=torch.int64) if want_owner else None
     block_sums = _compiled_block_sums() if compiled else _block_sums
-    step = max(1, CHUNK_ELEMENTS // (block * m))
+    step = max(1, chunk_elements(groups.owner.device) // (block * m))
     for begin in range(0, n_blocks, step):
         part = slice(begin, begin + step)
         owner = groups.owner[part]
@@ -217,17 +238,26 @@ def truncated_expectation(
     about_means = shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
     statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)
     statistics.index_add_(0, candidates.flatten(), about_means.flatten(0, 1))
-    owners = None
-    if likeliest is not None:
-        owners = torch.empty_like(groups.row)
-        owners[groups.row] = likeliest.flatten()[groups.slot]
-    return Expectation(statistics, float(value), owners)
+    return Expectation(statistics, float(value), _owner_of_rows(groups, likeliest))
+
+
+def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
+    """The most likely candidates of all slots in the order of the rows, (N,)."""
+    if likeliest is None:
+        return None
+    owners = torch.empty_like(groups.row)
+    owners[groups.row] = likeliest.flatten()[groups.slot]
+    return owners
+
+
+def centered_parameters(parameters: Parameters) -> Tensor:
+    """Natural parameters (K, F) of the components about their own means."""
+    return natural_parameters(parameters._replace(means=torch.zeros_like(parameters.means)))
 
 
 def local_parameters(parameters: Parameters, centers: Tensor, candidates: Tensor) -> Tensor:
     """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D)."""
-    zero = Parameters(parameters.weights, torch.zeros_like(parameters.means), parameters.covariances)
-    natural = natural_parameters(zero)  # of the components relative to their own means
+    natural = centered_parameters(parameters)
     dim = centers.shape[1]
     doubled = natural[:, 1 + dim :]
     scale = pack_symmetric(0.5 + 0.5 * torch.eye(dim, dtype=natural.dtype, device=natural.device))

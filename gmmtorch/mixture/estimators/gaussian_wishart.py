@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
@@ -198,7 +199,7 @@ def log_predictive(points: Tensor, posterior: Posterior) -> Tensor:
         squared = torch.einsum("nkd,kde->nke", offset, whiten).square().sum(-1)
         return constant - 0.5 * (dof + dim) * torch.log1p(squared / dof)
 
-    rows = max(1, em.CHUNK_ELEMENTS // k)
+    rows = max(1, chunk_elements(points.device) // k)
     return torch.cat([torch.logsumexp(joint(part), 1) for part in points.split(rows)])
 
 

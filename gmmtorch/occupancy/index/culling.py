@@ -61,19 +61,32 @@ class FaceRows(NamedTuple):
     number: Tensor
 
 
-def face_rows(cones: Cones, grid: VoxelGrid, axis: int, cutoff: float = CUTOFF) -> FaceRows:
-    """Faces perpendicular to `axis` that the rays of each cone can cross.
+def face_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> Iterator[FaceRows]:
+    """Faces that the rays of each cone can cross: those perpendicular to each axis in turn.
 
     In the plane at c of axis a, the cone extends along another axis b over s_b + (c − s_a) m, where m lies
     between the slopes of the two tangents from the sensor origin s to the projection of the component's
     ellipsoid on the axes (a, b).
     """
-    device = cones.means.device
     sensor = grid.to_units(cones.origins).detach()
     mean = grid.to_units(cones.means).detach()
     covariance = cones.covariances.detach().double() * (cutoff / grid.resolution) ** 2
     spread = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     below, above = torch.minimum(sensor, mean - spread), torch.maximum(sensor, mean + spread)
+    for axis in range(grid.dim):
+        yield _rows_of_axis(sensor, mean, covariance, (below, above), grid, axis)
+
+
+def _rows_of_axis(
+    sensor: Tensor,
+    mean: Tensor,
+    covariance: Tensor,
+    bounds: tuple[Tensor, Tensor],
+    grid: VoxelGrid,
+    axis: int,
+) -> FaceRows:
+    """Rows perpendicular to `axis`; sensor, mean, covariance times cutoff², and bounds, in cells."""
+    below, above = bounds
     n = grid.shape[axis]
     # Forward: planes 1 … n above the sensor origin, each the upper face of a cell; backward: 0 … n − 1.
     begin = torch.stack([sensor[:, axis].floor() + 1, below[:, axis].floor() + 1])
@@ -82,7 +95,10 @@ def face_rows(cones: Cones, grid: VoxelGrid, axis: int, cutoff: float = CUTOFF) 
     stop = torch.stack([stop[0].clamp(1, n + 1), stop[1].clamp(0, n)]).long()
     planes = (stop - begin).clamp_min(0).flatten()
     row = torch.repeat_interleave(planes)
-    plane = torch.arange(len(row), device=device) - (torch.cumsum(planes, 0) - planes - begin.flatten())[row]
+    plane = (
+        torch.arange(len(row), device=sensor.device)
+        - (torch.cumsum(planes, 0) - planes - begin.flatten())[row]
+    )
     cone, forward = row % len(sensor), row < len(sensor)
     height = plane - sensor[cone, axis]
     first, count = [], []

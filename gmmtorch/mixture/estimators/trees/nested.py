@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.chunks import chunk_elements
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em import exact as em
-from gmmtorch.mixture.em.exact import CHUNK_ELEMENTS, Parameters, feature_dimension, natural_parameters
+from gmmtorch.mixture.em.exact import Parameters, feature_dimension, natural_parameters
 from gmmtorch.mixture.em.grouping import Rows, group_rows
 
 _LEAST_SHARE = 1e-30  # smaller shares of the largest responsibility are treated as zero
@@ -63,7 +64,7 @@ class Packed(NamedTuple):
 
     def chunks(self, n_children: int) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
         """Slices of blocks, and their features, weight and node, small enough for the cache."""
-        step = max(1, CHUNK_ELEMENTS // (self.weight.shape[1] * n_children))
+        step = max(1, chunk_elements(self.weight.device) // (self.weight.shape[1] * n_children))
         for begin in range(0, self.node.shape[0], step):
             part = slice(begin, begin + step)
             yield part, self.features[part], self.weight[part], self.node[part]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.cell_mass import add_cell_mass
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.face_flux import add_row_flux, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
@@ -167,17 +168,19 @@ def flux_evidence(
     white = WhitenedCones.of(cones)
     misses = white.log_norm.new_zeros(grid.n_cells)
     counts = cones.counts.double()
-    fused = dtype == torch.float64 and is_fused(*white, counts)
-    for axis in range(grid.dim):
-        rows = face_rows(cones, grid, axis, cutoff)
-        if fused:
-            table = whitened_rows(white.matrix, white.origin, white.toward, white.log_norm)
-            place = grid.origin, grid.resolution, grid.shape
-            add_row_flux(misses, table, counts, rows, axis, place, cutoff, variation_limits(tolerance))
-        else:
-            misses = _add_faces(misses, white, counts, grid, axis, rows, cutoff, tolerance, dtype)
-    hits = torch.zeros_like(misses)
     balls = ball_rows(cones, grid, cutoff)
+    if dtype == torch.float64 and is_fused(*white, counts):
+        table = whitened_rows(white.matrix, white.origin, white.toward, white.log_norm)
+        place = grid.origin, grid.resolution, grid.shape
+        limits = variation_limits(tolerance)
+        hits = torch.zeros_like(misses)
+        add_cell_mass(hits, table, counts, balls, place, cutoff, limits)
+        for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
+            add_row_flux(misses, table, counts, rows, axis, place, cutoff, limits)
+        return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
+    for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
+        misses = _add_faces(misses, white, counts, grid, axis, rows, cutoff, tolerance, dtype)
+    hits = torch.zeros_like(misses)
     for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
         cone, low = balls.cone[row], _corner(grid, cell)
         mass = box_mass(white.take(cone), low, low + grid.resolution, cutoff, tolerance, dtype)

@@ -1,0 +1,216 @@
+"""E-step of exact EM: responsibilities of all components for all rows, summed into sufficient statistics.
+
+The fused kernel runs on the CPU. It works on eight rows at a time, in float64, and skips responsibilities
+below e⁻³⁷ of the row's largest term: a far component costs its log-density and nothing more. Statistics
+differ from the twin's with float64 exponentials by at most 10⁻¹² of their largest entry. On a GPU the twin
+runs: it is two matrix products.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.chunks import chunk_elements, chunked
+from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.simd import CPU_LANES, SIMD
+
+SKIPPED = 37.0
+"""Nats below a row's largest term from which on a responsibility counts as 0: K e⁻³⁷ is below 10⁻¹² of it."""
+
+_PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
+
+_LOGITS = """
+    // Component by component for LANES rows: what four components share is loaded once.
+    const int64_t lane_rows = GMM_MIN((int64_t)LANES, stop - row);
+    for (int l = 0; l < LANES; ++l) {
+        const double* given = features + (row + GMM_MIN((int64_t)l, lane_rows - 1)) * WIDTH;
+        for (int f = 0; f < WIDTH; ++f) set(x[f], l, given[f]);
+    }
+    vec peak = (vec)(-1e300);
+    LIKELIEST_BEGIN
+    for (int64_t k = 0; k < n_components; k += 4) {
+        const double* w = natural + k * WIDTH;
+        vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
+        for (int f = 1; f < WIDTH; ++f) {
+            a = fused(x[f], (vec)(w[f]), a);
+            b = fused(x[f], (vec)(w[WIDTH + f]), b);
+            c = fused(x[f], (vec)(w[2 * WIDTH + f]), c);
+            d = fused(x[f], (vec)(w[3 * WIDTH + f]), d);
+        }
+        LOGITS
+    }
+"""
+_SUMS = """
+    const int64_t begin = n_rows * item / n_parts, stop = n_rows * (item + 1) / n_parts;
+    vec* logits = (vec*)(scratch + item * n_components * LANES);
+    vec* sums = (vec*)(partial + item * n_components * WIDTH * LANES);
+    vec x[WIDTH];
+    for (int64_t row = begin; row < stop; row += LANES) {
+        LOGITS_OF_ROWS
+        vec norm = (vec)(0.0), p = (vec)(0.0);
+        for (int l = 0; l < lane_rows; ++l) set(p, l, weight[row + l]);
+        int64_t n_near = 0;
+        for (int64_t k = 0; k < n_components; ++k) {
+            const vec under = logits[k] - peak;
+            if (!any(under > -SKIPPED)) continue;
+            const vec term = under > -SKIPPED ? expo(under) : (vec)(0.0);
+            norm += term;
+            logits[n_near] = term;  // n_near is at most k
+            near[item * n_components + n_near++] = k;
+        }
+        const vec share = p / norm;
+        for (int64_t place = 0; place < n_near; ++place) {
+            vec* sum = sums + near[item * n_components + place] * WIDTH;
+            const vec gamma = logits[place] * share;
+            for (int f = 0; f < WIDTH; ++f) sum[f] = fused(gamma, x[f], sum[f]);
+        }
+        for (int l = 0; l < lane_rows; ++l) {
+            peaks[row + l] = get(peak, l);
+            norms[row + l] = get(norm, l);
+        }
+    }
+"""
+_LIKELIEST = """
+    const int64_t begin = n_rows * item / n_parts, stop = n_rows * (item + 1) / n_parts;
+    vec x[WIDTH];
+    for (int64_t row = begin; row < stop; row += LANES) {
+        LOGITS_OF_ROWS
+        for (int l = 0; l < lane_rows; ++l) likeliest[row + l] = (int64_t)get(first, l);
+    }
+"""
+_STORED = """
+        logits[k] = a, logits[k + 1] = b, logits[k + 2] = c, logits[k + 3] = d;
+        a = a > b ? a : b;
+        c = c > d ? c : d;
+        a = a > c ? a : c;
+        peak = a > peak ? a : peak;
+"""
+_BEST = "".join(
+    f"first = {name} > peak ? (vec)((double)(k + {i})) : first; peak = {name} > peak ? {name} : peak;"
+    for i, name in enumerate("abcd")
+)
+
+
+def _kernel(name: str, body: str, parameters: str, dim: int) -> FusedKernel:
+    width = 1 + dim + dim * (dim + 1) // 2
+    keeps = "vec first = (vec)(0.0);" if name == "most_likely" else ""
+    logits = _LOGITS.replace("LOGITS", _BEST if keeps else _STORED).replace("LIKELIEST_BEGIN", keeps)
+    body = body.replace("LOGITS_OF_ROWS", logits)
+    body = body.replace("WIDTH", str(width)).replace("SKIPPED", str(SKIPPED))
+    rows = "const double* features, int64 n_rows, const double* natural, int64 n_components, int64 n_parts, "
+    return FusedKernel(f"{name}_{dim}d", rows + parameters, SIMD + body)
+
+
+_EXPECTATION = {
+    dim: _kernel(
+        "e_step",
+        _SUMS,
+        "const double* weight, double* scratch, int64* near, double* partial, double* peaks, double* norms",
+        dim,
+    )
+    for dim in (1, 2, 3)
+}
+_MOST_LIKELY = {dim: _kernel("most_likely", _LIKELIEST, "int64* likeliest", dim) for dim in (1, 2, 3)}
+_DIMENSIONS = {1 + dim + dim * (dim + 1) // 2: dim for dim in _EXPECTATION}
+
+
+def expectation(
+    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype = torch.float32
+) -> tuple[Tensor, Tensor]:
+    """One E-step: sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar), L = φWᵀ.
+
+    Products are computed in the dtype of the features (float64, because the quadratic form cancels many
+    digits). The twin computes exponentials in `softmax_dtype`, after subtraction of the row's maximum.
+
+    Args:
+        features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
+    """
+    if _is_fused(features, sample_weight, natural):
+        return _fused(features, sample_weight, natural)
+    return _batched(features, sample_weight, natural, softmax_dtype)
+
+
+def most_likely(features: Tensor, natural: Tensor) -> Tensor:
+    """The component (N,) with the largest L_nk for each row of features (N, F); natural: W (K, F)."""
+    if _is_fused(features, natural):
+        likeliest = torch.empty(features.shape[0], dtype=torch.int64)
+        n_parts = _n_parts(features)
+        rows = features.contiguous(), features.shape[0], *_by_four(natural), n_parts
+        _MOST_LIKELY[_DIMENSIONS[features.shape[1]]](n_parts, *rows, likeliest, device=features.device)
+        return likeliest
+    transposed = natural.T.contiguous()
+    rows = max(64, chunk_elements(features.device) // transposed.shape[1])
+    parts = chunked(features.shape[0], rows, lambda part: (features[part] @ transposed).argmax(1))
+    return torch.cat([features.new_empty(0, dtype=torch.int64), *parts])
+
+
+def _is_fused(*tensors: Tensor) -> bool:
+    features = tensors[0]
+    fits = features.device.type == "cpu" and features.shape[1] in _DIMENSIONS
+    return fits and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
+
+
+def _n_parts(features: Tensor) -> int:
+    threads = torch.get_num_threads()
+    return max(1, min(threads, _PARTS, features.shape[0] // (4 * CPU_LANES)))
+
+
+def _by_four(natural: Tensor) -> tuple[Tensor, int]:
+    """W with rows of impossible components added, so that four make a step; and the number of rows."""
+    missing = -natural.shape[0] % 4
+    if missing:
+        none = natural.new_zeros(missing, natural.shape[1])
+        none[:, 0] = -1e300
+        natural = torch.cat([natural, none])
+    return natural.contiguous(), natural.shape[0]
+
+
+def _fused(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, Tensor]:
+    n, width = features.shape
+    padded, k = _by_four(natural)
+    n_parts = _n_parts(features)
+    scratch = features.new_empty(n_parts, k, CPU_LANES)
+    near = torch.empty(n_parts, k, dtype=torch.int64)
+    partial = features.new_zeros(n_parts, k, width, CPU_LANES)
+    peaks, norms = features.new_empty(2, n)
+    arguments = (weight.contiguous(), scratch, near, partial, peaks, norms)
+    rows = features.contiguous(), n, padded, k, n_parts
+    _EXPECTATION[_DIMENSIONS[width]](n_parts, *rows, *arguments, device=features.device)
+    return partial.sum((0, 3))[: natural.shape[0]], torch.dot(weight, peaks + norms.log())
+
+
+def _batched(
+    features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """The twin."""
+    n, k = features.shape[0], natural.shape[0]
+    rows = max(64, chunk_elements(features.device) // k)
+    floor = exponent_floor(softmax_dtype)
+    transposed = natural.T.contiguous()
+    kept: list[Tensor] = []  # the block of all chunks; one that the device has no memory for is not kept
+
+    def sums_of(part: slice) -> tuple[Tensor, Tensor]:
+        rows_of, p = features[part], sample_weight[part]
+        if not kept or kept[0].shape[0] < rows_of.shape[0]:
+            kept[:] = [features.new_empty(rows_of.shape[0], k)]
+        logits = torch.mm(rows_of, transposed, out=kept[0][: rows_of.shape[0]])
+        peak = logits.amax(1)
+        gamma = logits.sub_(peak[:, None]).to(softmax_dtype).clamp_(min=floor).exp_()
+        norm = gamma.sum(1)
+        value = torch.dot(p, peak + norm.to(p.dtype).log())
+        gamma.mul_((p / norm).to(softmax_dtype)[:, None])
+        return rows_of.T @ gamma.to(rows_of.dtype), value
+
+    statistics = torch.zeros_like(transposed)
+    total = features.new_zeros(())
+    for sums, value in chunked(n, rows, sums_of):
+        statistics += sums
+        total += value
+    return statistics.T, total
+
+
+def exponent_floor(dtype: torch.dtype) -> float:
+    """Smallest exponent whose exp is not denormal: denormals are negligible, but slow to compute."""
+    return -80.0 if dtype == torch.float32 else -700.0
