@@ -205,6 +205,21 @@ def add_cell_mass(
     dim = len(shape)
     pad = 3 - dim
     strides = [math.prod(shape[a + 1 :]) for a in range(dim)]
-    place = (*origin, *[0.0] * pad, side, *strides, *[0] * pad)
-    arguments = (cones.contiguous(), counts.contiguous(), cone, first, number, dim, *place, cutoff)
-    _KERNEL(len(cone), *arguments, *limits, hits, device=hits.device)
+    _KERNEL(
+        len(cone),
+        cones.contiguous(),
+        counts.contiguous(),
+        cone,
+        first,
+        number,
+        dim,
+        *origin,
+        *[0.0] * pad,
+        side,
+        *strides,
+        *[0] * pad,
+        cutoff,
+        *limits,
+        hits,
+        device=hits.device,
+    )

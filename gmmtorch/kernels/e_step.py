@@ -137,8 +137,8 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
     if _is_fused(features, natural):
         likeliest = torch.empty(features.shape[0], dtype=torch.int64)
         n_parts = _n_parts(features)
-        rows = features.contiguous(), features.shape[0], *_by_four(natural), n_parts
-        _MOST_LIKELY[_DIMENSIONS[features.shape[1]]](n_parts, *rows, likeliest, device=features.device)
+        given = features.contiguous(), features.shape[0], *_by_four(natural), n_parts
+        _MOST_LIKELY[_DIMENSIONS[features.shape[1]]](n_parts, *given, likeliest, device=features.device)
         return likeliest
     transposed = natural.T.contiguous()
     rows = max(64, chunk_elements(features.device) // transposed.shape[1])
