@@ -126,13 +126,6 @@ def test_least_support_is_twice_the_parameters_from_3d_on():
         assert least_support(dim) == 2 * (1 + dim + dim * (dim + 1) // 2)
 
 
-def test_stray_returns_do_not_prevent_the_partition():
-    points = torch.cat([wall(1000, (0, 0, 0), 2, 0), torch.tensor([[900.0, 5.0, 300.0]])])
-    found, labels = surface_pieces(points - points.mean(0), points.new_ones(len(points)), NOISE, 1e-6)
-    assert len(found.weights) <= 4
-    assert (labels == labels[-1]).sum() == 1
-
-
 def test_weights_count_as_points():
     points = room(100)
     weight = torch.randint(1, 4, (len(points),), generator=torch.Generator().manual_seed(1)).double()

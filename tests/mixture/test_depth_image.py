@@ -193,15 +193,6 @@ def test_only_the_smallest_cells_cross_a_step(at, turn, near, gap, center):
     assert mixed.numel() == 0 or float(mixed.max()) <= 64
 
 
-def test_step_off_the_axis_is_not_flat():
-    intrinsics = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
-    depth = torch.full((480, 640), 2.0)
-    depth[:, 610:] = 3.0
-    cells = pool_depth_image(depth, intrinsics)
-    mixed = cells.values[:, 9] - cells.values[:, 3] ** 2 > 1e-3
-    assert cells.weight[mixed].tolist() == [64.0] * 60
-
-
 @pytest.mark.parametrize(("z", "is_merged"), [(0.5, False), (1.0, False), (3.0, True), (6.0, True)])
 def test_noise_grows_with_the_square_of_depth_beyond_one_metre(z, is_merged):
     noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -179,16 +179,6 @@ def test_bound_on_cells_never_decreases_and_is_below_the_log_likelihood(seed, di
         previous = bound
 
 
-def test_cells_of_one_point_equal_plain_em(generator):
-    points = random_points(100, 3, generator)
-    start = random_parameters(3, 3, generator)
-    cells = pool_into_cells(points, 100, 0.01)
-    one, bound = loop.natural_step(cells.features, cells.weight, 1e-6)(start)
-    other, expected = loop.natural_step(quadratic_features(points), torch.ones(100).double(), 1e-6)(start)
-    torch.testing.assert_close(one, other)
-    assert bound == expected
-
-
 # -- the direct form, and when it is used -----------------------------------------------------------
 
 

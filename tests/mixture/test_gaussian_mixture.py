@@ -241,25 +241,18 @@ def test_warm_start_continues_the_last_fit():
     assert not np.allclose(again.means_, straight.means_, atol=1e-6)
 
 
-def test_warm_start_with_another_n_components_is_rejected_or_restarts():
+@pytest.mark.parametrize(
+    ("n_components", "dim", "words"), [(5, 2, ("n_components",)), (3, 3, ("warm_start", "X"))]
+)
+def test_warm_start_with_another_shape_is_rejected_or_restarts(n_components, dim, words):
     gmm = GaussianMixture(3, warm_start=True, random_state=0).fit(blobs())
-    gmm.set_params(n_components=5)
+    gmm.set_params(n_components=n_components)
     try:
-        gmm.fit(blobs())
+        gmm.fit(blobs(dim=dim))
     except InvalidArgumentError as error:
-        assert "n_components" in str(error)  # noqa: PT017 - either result is correct
+        assert any(word in str(error) for word in words)  # noqa: PT017 - either result is correct
     else:
-        assert gmm.means_.shape == (5, 2)
-
-
-def test_warm_start_in_another_dimension_is_rejected_or_restarts():
-    gmm = GaussianMixture(3, warm_start=True, random_state=0).fit(blobs())
-    try:
-        gmm.fit(blobs(dim=3))
-    except InvalidArgumentError as error:
-        assert "warm_start" in str(error) or "X" in str(error)  # noqa: PT017 - either result is correct
-    else:
-        assert gmm.means_.shape == (3, 3)
+        assert gmm.means_.shape == (n_components, dim)
 
 
 # -- awkward clouds -----------------------------------------------------------------------------------
@@ -283,17 +276,8 @@ def test_more_components_than_distinct_points_share_weights(init):
 
 
 @pytest.mark.parametrize("init", INITS)
-def test_equal_points_give_the_least_variance(init):
-    gmm = GaussianMixture(2, init_params=init, random_state=0).fit(np.full((50, 2), 0.1))
-    assert all_finite(gmm)
-    np.testing.assert_allclose(
-        gmm.covariances_, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), rtol=1e-6, atol=1e-15
-    )
-
-
-@pytest.mark.parametrize("init", INITS)
-@pytest.mark.parametrize(("dim", "rank"), [(2, 1), (3, 1), (3, 2)])
-def test_collinear_and_coplanar_points_give_flat_components(init, dim, rank):
+@pytest.mark.parametrize(("dim", "rank"), [(2, 0), (2, 1), (3, 1), (3, 2)])
+def test_equal_collinear_and_coplanar_points_give_flat_components(init, dim, rank):
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.normal(size=(dim, dim)))[0]
     x = rng.normal(size=(200, rank)) @ basis[:rank] + 7.0

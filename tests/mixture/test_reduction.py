@@ -303,23 +303,6 @@ def test_rounds_cost_little_more_than_greedy_merging(dim, n):
 
 
 @costs
-def test_rounds_stop_at_nearly_the_same_cost_as_greedy_merging(cost):
-    parameters = mixture(300, 2, spread=6.0)
-    limit = {"kullback_leibler": 4.0, "hellinger": 0.4}[cost]
-    left = []
-    for path in ("exact", "rounds"):
-        left.append(
-            len(
-                simplify(
-                    parameters, max_cost=limit, cost=cost, most_exact=MOST_EXACT[path]
-                ).parameters.weights
-            )
-        )
-    assert 30 < left[0] < 270
-    assert abs(left[1] - left[0]) <= 0.05 * left[0]
-
-
-@costs
 @paths
 def test_no_pair_below_max_cost_remains(cost, path):
     limit = {"kullback_leibler": 4.0, "hellinger": 0.4}[cost]

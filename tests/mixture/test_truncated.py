@@ -30,7 +30,6 @@ from gmmtorch.mixture.em.grouping import (
     Rows,
     choose_candidates,
     group_rows,
-    local_parameters,
     nearest,
     rounding,
     truncated_expectation,
@@ -189,17 +188,6 @@ def test_e_step_over_few_candidates_equals_brute_force(dim, m, dtype):
         local = em.quadratic_features(points - parameters.means[component]).numpy()
         expected = (gamma[:, component, None] * local).sum(0)
         np.testing.assert_allclose(found.statistics[component], expected, atol=tolerance * n)
-
-
-@dims
-def test_local_parameters_give_weighted_log_densities(dim):
-    k = 6
-    points, parameters, centers = cloud(20, dim), random_parameters(k, dim), cloud(k, dim, seed=9)
-    candidates = torch.arange(k).expand(k, k)
-    natural = local_parameters(parameters, centers, candidates)
-    for group in range(k):
-        joint = em.quadratic_features(points - centers[group]) @ natural[group].T
-        np.testing.assert_allclose(joint.numpy(), scipy_joint(points, parameters), rtol=1e-10, atol=1e-9)
 
 
 # -- candidates ------------------------------------------------------------------------------------

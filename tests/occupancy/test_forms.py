@@ -11,7 +11,7 @@ from occupancy.cone_examples import random_cones
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
-from gmmtorch.occupancy.forms.flux.box_flux import box_flux
+from gmmtorch.occupancy.forms.flux.box_flux import box_flux, flux_evidence
 from gmmtorch.occupancy.forms.monte_carlo import sample_rays
 from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -33,6 +33,11 @@ def by_boxes(form: Callable[..., tuple[Hits, Misses]], **options: bool) -> Form:
     return evidence
 
 
+def by_grid(cones: Cones, grid: VoxelGrid) -> tuple[Hits, Misses]:
+    found = flux_evidence(cones, grid)
+    return found.hits.flatten(), found.misses.flatten()
+
+
 def by_rays(sampling: str) -> Form:
     def evidence(cones: Cones, grid: VoxelGrid) -> tuple[Hits, Misses]:
         found = Evidence.empty(grid)
@@ -46,6 +51,7 @@ FORMS: dict[str, Form] = {
     "point": by_points(indexed=True),
     "point without index": by_points(indexed=False),
     "flux": by_boxes(box_flux),
+    "flux, grid": by_grid,
     "cone": by_boxes(cone_evidence),
     "cone, exact": by_boxes(cone_evidence, exact=True),
     **{f"{sampling} rays": by_rays(sampling) for sampling in ("sobol", "stratified", "plain")},

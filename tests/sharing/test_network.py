@@ -177,16 +177,6 @@ def test_losses_of_receivers_are_independent():
     assert [network.reception(robot).lost for robot in range(3)] == [0, n - len(got[0]), n - len(got[1])]
 
 
-def test_the_seed_decides_losses_delays_and_copies():
-    def run(seed: int) -> list[list[bytes]]:
-        network = network_of(2, loss=0.2, jitter=1.0, duplication=0.3, seed=seed)
-        network.send(0, numbered(64), 0.0, "maps")
-        return [received(network, 1, now / 4) for now in range(40)]
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)
-
-
 def test_a_seed_loses_the_same_datagrams_in_all_conditions():
     """The losses are those of earlier versions: one draw for each receiver from a generator of that seed."""
     n, seed, loss = 300, 7, 0.4
