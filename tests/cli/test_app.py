@@ -17,10 +17,10 @@ from omegaconf import DictConfig
 
 import gmmtorch
 from gmmtorch.cli import common, explore, map, occupancy, robot, team
-from gmmtorch.cli.options import command_options
+from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 
-COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map"]
+COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "view"]
 
 
 @pytest.fixture
@@ -108,9 +108,23 @@ def test_the_help_describes_every_option_in_a_line(command, run):
     assert "evaluation.every" not in shown or "seconds between" in shown
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_every_choice_is_described(command):
+    schema.register()
+    for group, choices in command_options.groups_of(command).items():
+        for choice in choices:
+            options = command_options.options_of(
+                command_options.configuration(command, [f"{group}={choice}"])
+            )
+            assert not [one for one in options if len(one.about) < 4 or one.about[-1] in ",;:"], choice
+
+
 def test_the_help_shows_the_options_of_the_chosen_data_set(run):
     shown = succeeded(run("occupancy", "--help", "dataset=depth_frames")).stdout
     assert re.search(r"^dataset\.pixel_stride=1 +every n-th pixel of every n-th row$", shown, re.MULTILINE)
+    shown = succeeded(run("map", "--help", "dataset=rosbag")).stdout
+    assert re.search(r"^dataset\.deskew=true +each point with a time gets", shown, re.MULTILINE)
     # From the docstring of the library's class, whose module loads torch.
     shown = succeeded(run("explore", "--help")).stdout
     assert re.search(r"^sensor\.dropout=0\.01 +share of the pixels without a reading$", shown, re.MULTILINE)
@@ -148,6 +162,7 @@ def test_descriptions_are_read_from_docstrings():
         ("export", "bounds", "bounds="),
         ("robot", "dataset@log.dataset=ca", "dataset@log.dataset=carmen"),
         ("team", "network.b", "network.budget="),
+        ("view", "map.safetensors sh", "shape="),
     ],
 )
 def test_completion_offers_what_the_command_can_run(command, line, expected, run, monkeypatch):

@@ -15,6 +15,7 @@ class FileDataset:
     max_range: readings at or beyond this distance (m) are beams without return; null: the data set's own.
     no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
     stride: use every n-th scan.
+    poses: trajectory file (TUM or KITTI) whose poses replace those of the data set.
     """
 
     name: str = MISSING
@@ -30,6 +31,7 @@ class DepthFramesDataset(FileDataset):
     """Depth images.
 
     pixel_stride: every n-th pixel of every n-th row.
+    depth_scale: metres per unit of the images.
     """
 
     pixel_stride: int = 1
@@ -38,6 +40,20 @@ class DepthFramesDataset(FileDataset):
 
 @dataclass
 class RosbagDataset(FileDataset):
+    """A ROS bag.
+
+    poses: tf, standing, a topic of poses, or a trajectory file; null: tf.
+    topic: topic of the sensor; null: the only one of its kind.
+    frame: the fixed frame of TF, such as odom; null: the root of the sensor's tree.
+    sensor_frame: read only messages of this frame; null: all.
+    extrinsic: [x,y,z,qx,qy,qz,qw] (m) of the sensor on the body with the poses; null: from /tf_static.
+    max_gap: longest time (s) between two poses that are interpolated.
+    clock: header, stamps of the messages; or received, times of recording.
+    deskew: each point with a time gets the pose of its own time.
+    camera_info: topic of the camera parameters of depth images; null: the nearest by name.
+    pixel_stride: every n-th pixel of every n-th row of depth images.
+    """
+
     topic: str | None = None
     frame: str | None = None
     sensor_frame: str | None = None
@@ -51,11 +67,22 @@ class RosbagDataset(FileDataset):
 
 @dataclass
 class KittiDataset(FileDataset):
+    """A sequence of the KITTI benchmark.
+
+    max_gap: longest time (s) between two poses of a TUM trajectory that are interpolated.
+    """
+
     max_gap: float = 2.0
 
 
 @dataclass
 class TumDataset(DepthFramesDataset):
+    """A sequence of the TUM RGB-D benchmark.
+
+    intrinsics: [fx,fy,cx,cy] in pixels; null: [525,525,319.5,239.5].
+    max_gap: longest time (s) between two poses that are interpolated.
+    """
+
     intrinsics: list[float] | None = None
     depth_scale: float = 0.0002
     max_gap: float = 0.5

@@ -102,6 +102,17 @@ class Export:
 
 @dataclass
 class View:
+    """Options of gmmtorch-view.
+
+    path: map file, or run directory of gmmtorch-map.
+    trajectory: TUM file; null: trajectory.tum beside the map, if it exists.
+    html: file to write, .html, instead of serving a page.
+    shape: ellipsoids, splats, surfaces or none.
+    colour: height, support or age.
+    host: address of the page; 0.0.0.0: other machines can open it, too.
+    port: port of the page; the next free one if it is in use.
+    """
+
     path: str | None = None
     trajectory: str | None = None
     html: str | None = None

@@ -36,13 +36,17 @@ class ApproximationErrorStudy:
 
     Attributes:
         dims: dimensions, 2 and 3.
-        support: rays of a component, and prior: prior count, for which the occupancy (3.9) is computed.
+        support: rays of a component, for which the occupancy (3.9) is computed.
+        prior: prior count, for which the occupancy (3.9) is computed.
         n_pixels: of the error maps along each axis.
-        n_components: of the sweep; n_cells: cells for each of them.
+        n_components: number of components of the sweep.
+        n_cells: number of cells for each component of the sweep.
         n_samples: Monte Carlo rays of one component, in map and sweep.
         n_large_samples: rays of the large Monte Carlo in the sweep.
-        n_scans, resolution (m): of the map that the curve is measured on.
-        n_rays: Monte Carlo rays, and tolerance: tolerances of flux, along the curve.
+        n_scans: number of scans of the map that the curve is measured on.
+        resolution: side (m) of the cells of the map that the curve is measured on.
+        n_rays: numbers of Monte Carlo rays along the curve.
+        tolerance: tolerances of flux along the curve.
     """
 
     dims: Sequence[int] = (2, 3)
@@ -124,7 +128,8 @@ class VarianceThresholdStudy:
         method: form of evidence.
         n_components: sizes; a map is built for each.
         variance_threshold: values v of (3.10); each is applied to every map.
-        resolution (m), test_every, max_beams: the test, as in `Protocol`.
+        resolution: side (m) of the cells of the test.
+        test_every, max_beams: the test, as in `Protocol`.
         thin_radius: radius (m) of the neighbourhoods in which the points of a thin structure form a line.
     """
 
@@ -160,8 +165,10 @@ class VarianceThresholdStudy:
 class InitializationStudy:
     """Options of `studies.initialization_study`.
 
-    Every initialization in `init_params` is run with each number of components and each of `n_seeds` seeds.
-    The first seed is the seed of the run.
+    Attributes:
+        n_components: numbers of components.
+        init_params: initializations; each is run with each number of components and each seed.
+        n_seeds: number of seeds; the first is the seed of the run.
     """
 
     n_components: Sequence[int] = (4, 8, 32, 64, 128, 256, 512)
@@ -188,7 +195,8 @@ class ComponentCountStudy:
         bandwidths: of the mean shift, as shares of the cloud's root mean square distance from its mean.
         window: number of scans in the middle of the log that form the cloud; a map's window has as many.
         window_components: components of each window of a map; empty: no maps are built.
-        resolution (m), test_every, max_beams: the test of the maps, as in `Protocol`.
+        resolution: side (m) of the cells of the test of the maps.
+        test_every, max_beams: the test of the maps, as in `Protocol`.
         n_samples: Monte Carlo rays of a query.
     """
 
@@ -222,10 +230,12 @@ class SensorModelStudy:
     """Options of `studies.sensor_noise`.
 
     Attributes:
-        sensor: name of a sensor model in `sensor_noise.SENSORS`; sensor_options: its fields that are changed.
+        sensor: name of a sensor model in `sensor_noise.SENSORS`.
+        sensor_options: fields of the sensor model that are changed.
         n_components: sizes K.
         n_points: training points, drawn at random from all training scans.
-        resolution (m), test_every, max_beams: the test, as in `Protocol`.
+        resolution: side (m) of the cells of the test.
+        test_every, max_beams: the test, as in `Protocol`.
         max_iter, tol: of EM.
         n_neighbors: points from which a point's normal is estimated, for the incidence angle; 0 assumes that
             every surface faces the sensor.
