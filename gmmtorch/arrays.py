@@ -82,6 +82,11 @@ def _array(value: Any, name: str) -> np.ndarray:
     return array if fits else array.copy(order="C")
 
 
+def is_floating(value: ArrayLike) -> bool:
+    """Whether an array has a floating type."""
+    return value.is_floating_point() if isinstance(value, Tensor) else np.asarray(value).dtype.kind == "f"
+
+
 def check_unmasked(value: Any, name: str) -> None:
     """Raise `InvalidArgumentError` for a masked array, whose mask would be lost."""
     if isinstance(value, np.ma.MaskedArray):

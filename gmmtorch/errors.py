@@ -6,6 +6,8 @@ import math
 import numbers
 from collections.abc import Collection
 
+_LARGEST_CELL = 1e9  # metres; powers of larger sides overflow
+
 
 class GmmTorchError(Exception):
     """Base class of all errors that gmmtorch raises deliberately."""
@@ -55,10 +57,15 @@ def check_number(name: str, value: object, largest: float = math.inf, above: boo
     """Raise `InvalidArgumentError` unless `value` is a finite number from 0 (exclusive if `above`) to
     `largest`.
     """
-    number = float(value) if isinstance(value, numbers.Real) else math.nan
+    number = _as_float(value)
     if not (0 <= number <= largest and number < math.inf) or (above and number == 0):
         limit = "above 0" if above else "of at least 0" if largest == math.inf else f"from 0 to {largest:g}"
         raise InvalidArgumentError(f"{name}={value!r} must be a finite number {limit}.")
+
+
+def _as_float(value: object) -> float:
+    """The value of a real number; NaN for anything else."""
+    return float(value) if isinstance(value, numbers.Real) else math.nan
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
@@ -69,10 +76,10 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 def check_resolution(resolution: float) -> float:
     """Returns the cell size as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
-    value = float(resolution)
-    if not (math.isfinite(value) and value > 0):
+    value = _as_float(resolution)
+    if not 0 < value <= _LARGEST_CELL:
         raise InvalidArgumentError(
-            f"resolution={resolution} is not a cell size; give metres above zero, such as 0.1."
+            f"resolution={resolution!r} is not a cell size; give metres above zero, such as 0.1."
         )
     return value
 
@@ -82,7 +89,7 @@ def check_prior(prior: float) -> float:
 
     Raises `InvalidArgumentError` unless it is finite and at least zero.
     """
-    value = float(prior)
+    value = _as_float(prior)
     if not (math.isfinite(value) and value >= 0):
-        raise InvalidArgumentError(f"prior={prior} must be a count of at least zero; the thesis uses 1.")
+        raise InvalidArgumentError(f"prior={prior!r} must be a count of at least zero; the thesis uses 1.")
     return value

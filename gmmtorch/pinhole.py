@@ -5,11 +5,10 @@ Camera frame: x right, y down, z forward, metres.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike, as_tensor, is_floating
 from gmmtorch.errors import InvalidArgumentError, check_number
 
 _LARGEST_SKEW = 1e-3  # share of the focal length
@@ -33,7 +32,7 @@ def metric_depth(depth: ArrayLike, depth_scale: float | None = None) -> Tensor:
     if depth_scale is not None:
         check_number("depth_scale", depth_scale, above=True)
         return image * float(depth_scale)
-    if not (depth.is_floating_point() if isinstance(depth, Tensor) else np.asarray(depth).dtype.kind == "f"):
+    if not is_floating(depth):
         raise InvalidArgumentError(
             f"depth is an image of whole numbers ({getattr(depth, 'dtype', type(depth).__name__)}); give "
             "depth_scale, its metres per unit: 0.001 for millimetres, 0.0002 for the TUM data set."

@@ -11,19 +11,26 @@ import pytest
 import torch
 
 import gmmtorch as gt
-from gmmtorch import baselines
+from gmmtorch import baselines, simulation
 from gmmtorch.arrays import as_tensor
+from gmmtorch.datasets import Ranges
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.localization.registration import register
 from gmmtorch.mapping.clearance import clearance, expected_returns
-from gmmtorch.mixture import Parameters, merge, prune, simplify
+from gmmtorch.mixture import DepthCameraModel, LaserModel, Parameters, merge, prune, score_stream, simplify
 from gmmtorch.occupancy import (
     Boundary,
+    Box,
     ConeIndex,
     Cones,
+    RollingWindow,
+    SparseEvidence,
+    Thresholds,
     box_flux,
+    cast_evidence,
     cone_evidence,
     expected_range,
+    occupancy_probability,
     point_evidence,
     sample_rays,
 )
@@ -47,6 +54,10 @@ DEPTH = 1.0 + np.add.outer(np.arange(64) // 16, np.arange(96) // 24).astype(np.f
 INTRINSICS = np.array([[80.0, 0.0, 48.0], [0.0, 75.0, 32.0], [0.0, 0.0, 1.0]])
 POSE3, POSE2 = np.diag([-1.0, -1.0, 1.0, 1.0]), np.diag([-1.0, -1.0, 1.0])
 FLAGS = np.array([0.0, 1.0, 0.0])
+PLACES = whole(3, 3, seed=3)
+SEGMENTS = whole(4, 2, 2, seed=4)
+TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
 def given_map() -> gt.GaussianMap:
@@ -77,6 +88,25 @@ def rays(**fields: Any) -> torch.Tensor:
     evidence = gt.Evidence.empty(gt.VoxelGrid((-5, -5), 1.0, (20, 20)))
     evidence.add_rays(**given)
     return torch.stack([evidence.hits, evidence.misses])
+
+
+def sparse_rays(**fields: Any) -> torch.Tensor:
+    given = {"origins": ORIGINS, "ends": MEANS, "weights": SUPPORT, "is_hit": FLAGS, **fields}
+    evidence = SparseEvidence(1.0, 2)
+    evidence.add_rays(**given)
+    return torch.cat(evidence.in_key_order())
+
+
+def cast_rays(**fields: Any) -> torch.Tensor:
+    given = {"origins": PLACES[0], "ends": PLACES, "is_hit": FLAGS, "weights": SUPPORT, **fields}
+    box = Box(torch.full((3,), -9), torch.full((3,), 9))
+    return torch.stack(cast_evidence(resolution=0.5, box=box, **given)[1:])
+
+
+def window_at(position: Any) -> torch.Tensor:
+    window = RollingWindow(0.5, (8, 8, 8), 2)
+    window.center_on(position)
+    return torch.stack(window.around(position, (4, 4, 4), 2))
 
 
 def components(**fields: Any) -> torch.Tensor:
@@ -126,6 +156,37 @@ CASES = {
     "Evidence.add_rays ends": Case(lambda x: rays(ends=x), MEANS),
     "Evidence.add_rays weights": Case(lambda x: rays(weights=x), SUPPORT),
     "Evidence.add_rays is_hit": Case(lambda x: rays(is_hit=x), FLAGS),
+    "Evidence.hits": Case(lambda x: gt.Evidence(gt.VoxelGrid((0, 0), 1, (3, 2)), x, x).probability(), MEANS),
+    "SparseEvidence.add_rays origins": Case(lambda x: sparse_rays(origins=x), ORIGINS),
+    "SparseEvidence.add_rays ends": Case(lambda x: sparse_rays(ends=x), MEANS),
+    "SparseEvidence.add_rays weights": Case(lambda x: sparse_rays(weights=x), SUPPORT),
+    "SparseEvidence.add_rays is_hit": Case(lambda x: sparse_rays(is_hit=x), FLAGS),
+    "SparseEvidence.lookup": Case(lambda x: SparseEvidence(1.0, 2).lookup(x), QUERIES),
+    "cast_evidence origins": Case(lambda x: cast_rays(origins=x), PLACES),
+    "cast_evidence ends": Case(lambda x: cast_rays(ends=x), PLACES),
+    "cast_evidence is_hit": Case(lambda x: cast_rays(is_hit=x), FLAGS),
+    "cast_evidence weights": Case(lambda x: cast_rays(weights=x), SUPPORT),
+    "cast_evidence free_until": Case(lambda x: cast_rays(free_until=x), PLACES),
+    "cast_evidence hit_places": Case(lambda x: cast_rays(hit_places=(x, SUPPORT)), PLACES),
+    "RollingWindow": Case(lambda x: window_at(x), PLACES[0]),
+    "occupancy_probability": Case(lambda x: occupancy_probability(x, SUPPORT), SUPPORT),
+    "Thresholds.classify": Case(lambda x: Thresholds().classify(x), FLAGS),
+    "Ranges.scan": Case(lambda x: Ranges(6.0, 2.0).scan(x, ORIGIN).no_return, POINTS),
+    "Ranges.scan origin": Case(lambda x: Ranges(6.0, 2.0).scan(POINTS, x).points, ORIGIN),
+    "sensor noise points": Case(lambda x: LaserModel().noise_covariances(x, ORIGIN), POINTS),
+    "sensor noise normals": Case(lambda x: LaserModel().noise_covariances(MEANS, ORIGIN, x), LOW[[1, 1, 1]]),
+    "sensor point_density": Case(lambda x: DepthCameraModel().point_density(x, 0.5), SUPPORT),
+    "sensor deviations": Case(lambda x: DepthCameraModel().deviations(x).along, SUPPORT),
+    "ray_segments": Case(lambda x: nearness(simulation.ray_segments(ORIGINS, MEANS - ORIGINS, x)), SEGMENTS),
+    "ray_triangles": Case(
+        lambda x: nearness(simulation.ray_triangles(x, TETRAHEDRON[1:] + 0.25 - PLACES, TETRAHEDRON[FACES])),
+        PLACES,
+    ),
+    "smooth_path": Case(lambda x: simulation.smooth_path(x), POLYGON),
+    "poses_2d": Case(lambda x: simulation.poses_2d(x, 3), POLYGON),
+    "simulate_scan": Case(lambda x: sensed(x).points, POSE2),
+    "fit_stream": Case(lambda x: gt.fit_stream(mixture_of(3), x).means, POINTS),
+    "score_stream": Case(lambda x: torch.tensor(score_stream(mixture(), x)[0]), QUERIES),
     "Evidence.lookup": Case(lambda x: gt.Evidence.empty(gt.VoxelGrid((0, 0), 1, (2, 2))).lookup(x), QUERIES),
     "box_flux.low": Case(lambda x: torch.stack(box_flux(cones(), x, HIGH)), LOW),
     "box_flux cones": Case(lambda x: torch.stack(box_flux(cones(means=x), LOW, HIGH)), MEANS),
@@ -151,6 +212,20 @@ CASES = {
     "from_parameters": Case(lambda x: mixture(x).means, MEANS),
     "GaussianMixture.moved": Case(lambda x: mixture().moved(x).means, POSE2),
 }
+
+
+def nearness(distance: torch.Tensor) -> torch.Tensor:
+    """1/t, which is finite for rays that hit nothing."""
+    return 1 / distance
+
+
+def sensed(pose: Any) -> gt.Scan:
+    world = simulation.World2D(torch.from_numpy(SEGMENTS), torch.zeros(2, 2))
+    return simulation.simulate_scan(simulation.laser_2d(9), pose, world, torch.Generator().manual_seed(0))
+
+
+def mixture_of(k: int) -> gt.GaussianMixture:
+    return gt.GaussianMixture(k, algorithm="exact", random_state=0, max_iter=2, tol=0.0)
 
 
 def fitted(X: Any, weight: Any = None) -> gt.GaussianMixture:
@@ -267,6 +342,14 @@ def test_large_unsigned_numbers_and_lists_keep_their_values():
     assert as_tensor([torch.tensor(0.5), 2], "x").tolist() == [0.5, 2]
 
 
+def test_the_faces_of_a_mesh_are_arrays_of_whole_numbers():
+    edges = Boundary.of_mesh(TETRAHEDRON, FACES.tolist()).edges
+    for faces in (FACES, FACES.astype(">u2"), torch.from_numpy(FACES)):
+        assert torch.equal(Boundary.of_mesh(TETRAHEDRON, faces).edges, edges)
+    with pytest.raises(InvalidArgumentError, match=r"triangles.*whole numbers"):
+        Boundary.of_mesh(TETRAHEDRON, FACES.astype(float))
+
+
 def test_gradients_flow_through():
     x = torch.ones(2, requires_grad=True)
     as_tensor([x, 2 * x], "x").sum().backward()
@@ -287,6 +370,30 @@ def test_evidence_says_which_shape_does_not_match():
     for name, value in wrong.items():
         with pytest.raises(InvalidArgumentError, match=rf"^{name} has shape"):
             rays(**{name: value})
+
+
+def test_the_attributes_of_an_empty_map_say_that_it_is_empty():
+    with pytest.raises(AttributeError, match=r"^means: the map is empty; insert a scan first"):
+        _ = gt.GaussianMap().means
+    assert not hasattr(gt.GaussianMap(), "no_such_name")
+
+
+@pytest.mark.parametrize("resolution", ["0.1", None, 1e300, float("inf"), 0, -1.0])
+def test_a_resolution_that_is_no_cell_size_is_refused(resolution):
+    for call in (
+        lambda: gt.VoxelGrid((0, 0), resolution, (2, 2)),
+        lambda: gt.GaussianMap(resolution=resolution),
+        lambda: gt.OccupancyGrid(resolution),
+    ):
+        with pytest.raises(InvalidArgumentError, match=r"^resolution=.* is not a cell size"):
+            call()
+    with pytest.raises(InvalidArgumentError, match=r"^prior='1'"):
+        gt.GaussianMap(prior="1")
+
+
+def test_a_streamed_fit_without_an_estimator_says_what_it_wants():
+    with pytest.raises(InvalidArgumentError, match="mixture is a ndarray; give a GaussianMixture"):
+        gt.fit_stream(POINTS, 3)
 
 
 def test_repr_says_in_one_line_what_matters():

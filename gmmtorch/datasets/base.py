@@ -15,6 +15,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.scan import Scan
 
@@ -52,17 +53,21 @@ class Ranges:
                 "or a distance in metres."
             )
 
-    def scan(self, ends: Tensor, origin: Tensor, no_return: Tensor | None = None) -> Scan:
+    def scan(self, ends: ArrayLike, origin: ArrayLike, no_return: ArrayLike | None = None) -> Scan:
         """A scan from beam ends (N, D) and the sensor origin (D,), world frame, metres.
 
         Ends at or beyond `max_range`, and those marked in `no_return` (N,), become beams without return.
         Their free part is `no_return_range` metres long, or as long as the beam if that is shorter. Ends
         that are not finite or equal the sensor origin are invalid and dropped.
         """
+        ends = as_tensor(ends, "ends")
+        origin = as_tensor(origin, "origin", device=ends.device)
         offset = ends - origin
         distance = offset.norm(dim=1)
         valid = torch.isfinite(distance) & (distance > 0)
-        empty = torch.zeros_like(valid) if no_return is None else no_return.clone()
+        empty = torch.zeros_like(valid)
+        if no_return is not None:
+            empty |= as_tensor(no_return, "no_return", torch.bool, ends.device)
         if self.max_range is not None:
             empty |= is_beyond(distance, self.max_range)
         hit, empty = valid & ~empty, valid & empty

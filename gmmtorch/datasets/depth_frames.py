@@ -7,6 +7,7 @@ pixels.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import IO
 
@@ -114,7 +115,9 @@ def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:
     from PIL import Image
 
     try:
-        with Image.open(source, formats=("PNG",)) as image:
+        # From memory, because Pillow asks a file for as many bytes as a damaged chunk announces.
+        content = io.BytesIO(source.read_bytes()) if isinstance(source, Path) else source
+        with Image.open(content, formats=("PNG",)) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise DataError(
                     f"{where} announces {image.width} × {image.height} pixels; at most "

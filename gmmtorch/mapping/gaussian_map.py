@@ -38,7 +38,7 @@ def _field(name: str) -> Any:
 
     def read(self: GaussianMap) -> Tensor:
         if self.dim is None:
-            raise AttributeError("The map is empty; insert a scan first.")
+            raise AttributeError(name)  # `__getattr__` explains it
         return cast(Tensor, getattr(self._with_pending(), name))
 
     return property(read)
@@ -151,6 +151,11 @@ class GaussianMap(nn.Module):
             size = f"{len(known)} components in {self.dim}D{extent(known.means)}, {self.nbytes} bytes"
             size += f", {scans}" if self.n_pending else ""
         return f"GaussianMap({size}, {type(self.learning).__name__}, {self._device})"
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _BUFFERS:
+            raise AttributeError(f"{name}: the map is empty; insert a scan first.")
+        return super().__getattr__(name)
 
     @classmethod
     def from_components(

@@ -82,7 +82,7 @@ def fit_depth_image(
     max_iter: int = 4,
     depth_scale: float | None = None,
 ) -> GaussianMixture:
-    """A mixture of a depth image (H, W) in the camera frame. `transform(T_world_camera)` moves it.
+    """A mixture of a depth image (H, W) in the camera frame. `moved(T_world_camera)` moves it.
 
     `intrinsics` is the pinhole matrix (3, 3) in pixels. `depth_scale` is the number of metres per unit of
     the image, such as 0.001 for millimetres; an image of integers needs it.

@@ -25,12 +25,13 @@ class CellClass(IntEnum):
     OCCUPIED = 1
 
 
-def occupancy_probability(hits: Tensor, misses: Tensor, prior: float = 1.0) -> Tensor:
+def occupancy_probability(hits: ArrayLike, misses: ArrayLike, prior: float = 1.0) -> Tensor:
     """Occupancy θ = (H + N_p)/(H + M + 2N_p) of hits H and misses M, thesis (3.9); ½ without evidence.
 
     Raises `InvalidArgumentError` if the prior count N_p is negative or not finite.
     """
     check_prior(prior)
+    hits, misses = as_tensor(hits, "hits"), as_tensor(misses, "misses")
     total = hits + misses + 2 * prior
     return torch.where(total > 0, (hits + prior) / total.clamp_min(torch.finfo(total.dtype).tiny), 0.5)
 
@@ -47,7 +48,7 @@ def bernoulli_entropy(probability: Tensor) -> Tensor:
     ) / math.log(2)
 
 
-def classify(probability: Tensor, variance_threshold: float) -> Tensor:
+def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
     """`CellClass` values (int8) of probabilities, any shape, with the dead band of thesis (3.10).
 
     With the variance threshold v a cell is occupied above ½(1 + √(1 − 4v)), free below ½(1 − √(1 − 4v)), and
@@ -62,7 +63,8 @@ def classify(probability: Tensor, variance_threshold: float) -> Tensor:
     return _labels(probability, 0.5 - half_width, 0.5 + half_width)
 
 
-def _labels(probability: Tensor, free: float, occupied: float) -> Tensor:
+def _labels(values: ArrayLike, free: float, occupied: float) -> Tensor:
+    probability = as_tensor(values, "probability")
     label = torch.full_like(probability, CellClass.UNKNOWN, dtype=torch.int8)
     label[probability > occupied] = int(CellClass.OCCUPIED)
     label[probability < free] = int(CellClass.FREE)
@@ -83,7 +85,7 @@ class Thresholds:
                 "and the first must not exceed the second."
             )
 
-    def classify(self, probability: Tensor) -> Tensor:
+    def classify(self, probability: ArrayLike) -> Tensor:
         """`CellClass` values (int8) of probabilities, any shape."""
         return _labels(probability, self.free, self.occupied)
 
@@ -92,12 +94,21 @@ class Thresholds:
 class Evidence:
     """Expected number of rays that end in each cell of a grid (`hits`) and that pass through it (`misses`).
 
-    Both have the shape of the grid, and are float64.
+    Both have the shape of the grid, and are float64. Raises `InvalidArgumentError` for another shape.
     """
 
     grid: VoxelGrid
     hits: Tensor
     misses: Tensor
+
+    def __post_init__(self) -> None:
+        for name in ("hits", "misses"):
+            value = as_tensor(getattr(self, name), name, torch.float64)
+            if tuple(value.shape) != self.grid.shape:
+                raise InvalidArgumentError(
+                    f"{name} has shape {tuple(value.shape)}; the grid has {self.grid.shape} cells."
+                )
+            object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         seen = int(((self.hits != 0) | (self.misses != 0)).sum())
@@ -155,7 +166,8 @@ class Evidence:
 
         Raises `InvalidArgumentError` for shapes that do not match.
         """
-        origins, ends, weights, is_hit = self._rays(origins, ends, weights, is_hit)
+        rays = checked_rays(origins, ends, weights, is_hit, self.grid.dim, self.misses.device)
+        origins, ends, weights, is_hit = rays
         starts, stops = self.grid.to_units(origins), self.grid.to_units(ends)
         misses, shape = self.misses.view(-1), self.grid.shape
         count_in_grid(misses, starts, stops, shape, weights, chunk_visits=chunk_visits, compiled=compiled)
@@ -165,22 +177,30 @@ class Evidence:
         source = torch.ones_like(cell, dtype=torch.float64) if weights is None else weights
         self.hits.view(-1).scatter_add_(0, cell[counted], source[counted])
 
-    def _rays(
-        self, origins: ArrayLike, ends: ArrayLike, weights: ArrayLike | None, is_hit: ArrayLike | None
-    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        """The arguments of `add_rays` as tensors on the device of the evidence, if their shapes match."""
-        device = self.misses.device
-        starts = as_tensor(origins, "origins", torch.float64, device).detach()
-        stops = as_tensor(ends, "ends", torch.float64, device).detach()
-        counts = None if weights is None else as_tensor(weights, "weights", torch.float64, device)
-        hits = None if is_hit is None else as_tensor(is_hit, "is_hit", torch.bool, device)
-        n = len(stops) if stops.ndim else 0
-        for name, value, expected in (
-            ("origins", starts, (n, self.grid.dim)),
-            ("ends", stops, (n, self.grid.dim)),
-            ("weights", counts, (n,)),
-            ("is_hit", hits, (n,)),
-        ):
-            if value is not None and tuple(value.shape) != expected:
-                raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {expected}.")
-        return starts, stops, counts, hits
+
+def checked_rays(
+    origins: ArrayLike,
+    ends: ArrayLike,
+    weights: ArrayLike | None,
+    is_hit: ArrayLike | None,
+    dim: int,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    """The arguments of `Evidence.add_rays` as tensors on a device: positions and weights in float64.
+
+    Raises `InvalidArgumentError` for shapes that do not match.
+    """
+    starts = as_tensor(origins, "origins", torch.float64, device).detach()
+    stops = as_tensor(ends, "ends", torch.float64, device).detach()
+    counts = None if weights is None else as_tensor(weights, "weights", torch.float64, device)
+    hits = None if is_hit is None else as_tensor(is_hit, "is_hit", torch.bool, device)
+    n = len(stops) if stops.ndim else 0
+    for name, value, expected in (
+        ("origins", starts, (n, dim)),
+        ("ends", stops, (n, dim)),
+        ("weights", counts, (n,)),
+        ("is_hit", hits, (n,)),
+    ):
+        if value is not None and tuple(value.shape) != expected:
+            raise InvalidArgumentError(f"{name} has shape {tuple(value.shape)}; expected {expected}.")
+    return starts, stops, counts, hits

@@ -193,6 +193,32 @@ def test_the_chunk_table_of_a_laz_file_is_checked_before_it_is_allocated(tmp_pat
 
 
 @needs_laspy
+def test_the_size_of_the_chunks_of_a_laz_file_is_checked_before_they_are_allocated(tmp_path):
+    path = written(tmp_path, "a.laz")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(b"laszip encoded") + 52 + 12, 2**31)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"chunks have 2,147,483,648 points"):
+        open_points(path)
+
+
+@needs_laspy
+def test_every_damaged_byte_of_the_chunk_table_of_a_laz_file_is_survived(tmp_path):
+    """The table is compressed. A wrong length of a chunk made the decompressor panic or run out of memory."""
+    path = written(tmp_path, "a.laz")
+    data = path.read_bytes()
+    refused = 0
+    for place in range(struct.unpack_from("<q", data, struct.unpack_from("<I", data, 96)[0])[0], len(data)):
+        for byte in (0, 127, 255):
+            path.write_bytes(data[:place] + bytes([byte]) + data[place + 1 :])
+            try:
+                list(open_points(path))
+            except DataError:
+                refused += 1
+    assert refused > 10
+
+
+@needs_laspy
 def test_a_las_file_must_contain_the_points_it_announces(tmp_path):
     path = written(tmp_path, "a.las")
     data = bytearray(path.read_bytes())
@@ -228,6 +254,11 @@ def test_open_points_rejects_arrays_of_other_shapes_and_types(tmp_path, array):
     np.save(path, array)
     with pytest.raises(DataError, match="odd"):
         open_points(path)
+
+
+def test_the_mask_of_an_array_is_not_lost():
+    with pytest.raises(InvalidArgumentError, match=r"^points is a masked array"):
+        in_memory(np.ma.masked_less(np.ones((3, 2)), 2.0))
 
 
 def test_open_points_rejects_pickled_arrays(tmp_path):

@@ -17,6 +17,10 @@ _RECORD_HEADER = struct.Struct("<2x16sHH32x")
 _COMPRESSED = 0x80
 _LASZIP = (b"laszip encoded", 22204)
 _LASZIP_ITEMS = 34
+_LASZIP_CHUNK = 12
+_MAX_CHUNK_POINTS = 1 << 22
+"""Writers use 50 000. The decompressor allocates about 32 bytes for each point of a chunk."""
+_CHUNKS_VARY = 0xFFFFFFFF
 
 
 class LasHeader(NamedTuple):
@@ -55,8 +59,8 @@ def read_las_header(path: Path) -> LasHeader:
             raise _damaged(path, f"a point has {point_bytes} bytes; at least 20 are needed")
         if form & _COMPRESSED:
             file.seek(header_size)
-            _check_laszip(path, file.read(data_start - header_size), n_records, point_bytes)
-            _check_chunks(path, file, data_start, size, n_points)
+            record = _laszip_record(path, file.read(data_start - header_size), n_records, point_bytes)
+            _check_chunks(path, file, data_start, size, n_points, record)
         elif n_points * point_bytes > size - data_start:
             raise _damaged(
                 path,
@@ -65,8 +69,8 @@ def read_las_header(path: Path) -> LasHeader:
     return LasHeader(n_points, point_bytes)
 
 
-def _check_laszip(path: Path, records: bytes, n_records: int, point_bytes: int) -> None:
-    """Checks that the compressor's record describes points of `point_bytes`."""
+def _laszip_record(path: Path, records: bytes, n_records: int, point_bytes: int) -> bytes:
+    """The compressor's record, if it describes points of `point_bytes`."""
     start = 0
     for _ in range(n_records):
         if start + _RECORD_HEADER.size > len(records):
@@ -86,15 +90,24 @@ def _check_laszip(path: Path, records: bytes, n_records: int, point_bytes: int) 
         )
         if sum(widths) != point_bytes:
             raise _damaged(path, "its LASzip record does not describe its points")
-        return
+        (chunk_points,) = struct.unpack_from("<I", content, _LASZIP_CHUNK)
+        if chunk_points > _MAX_CHUNK_POINTS and chunk_points != _CHUNKS_VARY:
+            raise _damaged(
+                path, f"its chunks have {chunk_points:,} points; at most {_MAX_CHUNK_POINTS:,} are read"
+            )
+        return content
     raise _damaged(path, "its points are compressed, but the LASzip record is missing")
 
 
-def _check_chunks(path: Path, file: BinaryIO, data_start: int, size: int, n_points: int) -> None:
-    """Checks the position and the length of the table of compressed chunks.
+def _check_chunks(
+    path: Path, file: BinaryIO, data_start: int, size: int, n_points: int, record: bytes
+) -> None:
+    """Checks the position, the length and the sums of the table of compressed chunks.
 
-    A chunk has at least one byte; the decompressor allocates the whole table.
+    A chunk has at least one byte; the decompressor allocates the whole table, and each chunk.
     """
+    import lazrs
+
     file.seek(data_start)
     start = file.read(8)
     table = struct.unpack("<q", start)[0] if len(start) == 8 else -1
@@ -109,6 +122,12 @@ def _check_chunks(path: Path, file: BinaryIO, data_start: int, size: int, n_poin
     (n_chunks,) = struct.unpack("<I", file.read(4))
     if n_chunks > table - data_start - 8:
         raise _damaged(path, f"{n_chunks} chunks do not fit into {table - data_start - 8} bytes")
+    file.seek(data_start)
+    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+    if sum(n_bytes for _, n_bytes in chunks) > table - data_start - 8:
+        raise _damaged(path, f"its chunks do not fit into {table - data_start - 8} bytes")
+    if max(count for count, _ in chunks) > _MAX_CHUNK_POINTS:
+        raise _damaged(path, f"a chunk has more than {_MAX_CHUNK_POINTS:,} points")
 
 
 def _damaged(path: Path, reason: str) -> DataError:

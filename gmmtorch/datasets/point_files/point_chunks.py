@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.datasets.base import is_beyond
 from gmmtorch.datasets.point_files.point_rows import ArrayRows, Rows, open_rows
 from gmmtorch.errors import InvalidArgumentError, check_whole
@@ -129,9 +130,7 @@ def open_points(
     return PointChunks(open_rows(path), chunk_points, max_range)
 
 
-def in_memory(
-    points: Tensor | np.ndarray, name: str = "points", *, chunk_points: int = CHUNK_POINTS
-) -> PointChunks:
+def in_memory(points: ArrayLike, name: str = "points", *, chunk_points: int = CHUNK_POINTS) -> PointChunks:
     """Points (N, D) in memory, in chunks."""
     return PointChunks(ArrayRows(points, name), chunk_points)
 

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor, check_unmasked
 from gmmtorch.datasets.point_files.cloud_files import (
     AXES,
     Layout,
@@ -43,8 +44,11 @@ class Rows(Protocol):
 class ArrayRows:
     """The rows of an array or tensor (N, D) in memory."""
 
-    def __init__(self, points: np.ndarray | Tensor, name: str = "points") -> None:
-        self._array = points.detach().cpu().numpy() if isinstance(points, Tensor) else np.asarray(points)
+    def __init__(self, points: ArrayLike, name: str = "points") -> None:
+        check_unmasked(points, name)
+        # Arrays stay as they are: a block of them is converted at a time, and a memory map is not loaded.
+        is_tensor = isinstance(points, Tensor)
+        self._array = as_tensor(points, name).detach().cpu().numpy() if is_tensor else np.asarray(points)
         self.name = name
         self.n_rows, self.dim = _table_shape(self._array, name)
 
@@ -95,7 +99,8 @@ class LasRows:
         self._laspy: Any = laspy
         self._path = path
         self.name = path.stem
-        self.n_rows, self._point_bytes = read_las_header(path)
+        with _las_errors(path):
+            self.n_rows, self._point_bytes = read_las_header(path)
         with _las_errors(path), self._open() as reader:
             if int(reader.header.point_count) != self.n_rows:
                 raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
@@ -124,7 +129,10 @@ def _las_errors(path: Path) -> Iterator[None]:
         yield
     except GmmTorchError:
         raise
-    except Exception as error:
+    except BaseException as error:
+        # lazrs is written in Rust, whose panics are no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise DataError(
             f"{path} cannot be read as LAS or LAZ ({error}); it is truncated or damaged. "
             "Write or fetch it again."

@@ -25,6 +25,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 
 _CLOSEST = 1e-3
@@ -44,11 +45,13 @@ class Deviations(NamedTuple):
 class SensorModel(Protocol):
     """The sensor properties that fitting and pruning use."""
 
-    def noise_covariances(self, points: Tensor, origin: Tensor, normals: Tensor | None = None) -> Tensor:
+    def noise_covariances(
+        self, points: ArrayLike, origin: ArrayLike, normals: ArrayLike | None = None
+    ) -> Tensor:
         """Covariances (N, D, D), m², of the errors of the points, world frame."""
         ...
 
-    def point_density(self, distance: Tensor, cos_incidence: Tensor | float = 1.0) -> Tensor:
+    def point_density(self, distance: ArrayLike, cos_incidence: ArrayLike | float = 1.0) -> Tensor:
         """Expected points of one scan on a surface, per square metre in 3D and per metre in 2D."""
         ...
 
@@ -70,14 +73,16 @@ class _BeamModel(ABC):
             )
 
     @abstractmethod
-    def deviations(self, distance: Tensor) -> Deviations:
+    def deviations(self, distance: ArrayLike) -> Deviations:
         """Standard deviations at ranges (m) of any shape, at incidence 0."""
 
     @abstractmethod
     def _density(self, distance: Tensor) -> Tensor:
         """Points per m² (or per metre) of a surface that faces the sensor."""
 
-    def noise_covariances(self, points: Tensor, origin: Tensor, normals: Tensor | None = None) -> Tensor:
+    def noise_covariances(
+        self, points: ArrayLike, origin: ArrayLike, normals: ArrayLike | None = None
+    ) -> Tensor:
         """Covariances (N, D, D), m², positive definite, of the errors of the points, world frame.
 
         Args:
@@ -85,20 +90,23 @@ class _BeamModel(ABC):
             origin: (D,) or (N, D) sensor origins, world frame, metres.
             normals: (N, D) unit normals of the surfaces, of either sign. None: incidence 0.
         """
-        points, origin = points.double(), origin.to(points.device).double()
+        points = as_tensor(points, "points", torch.float64)
+        origin = as_tensor(origin, "origin", torch.float64, points.device)
         beam, distance = beams(points, origin)
         along, across, footprint = self.deviations(distance)
         if normals is not None:
+            normals = as_tensor(normals, "normals", torch.float64, points.device)
             cos = self._cosine(cos_incidence(points, origin, normals))
             along = torch.hypot(along, footprint * (1 - cos**2).sqrt() / cos)
         eye = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
         outer = beam[:, :, None] * beam[:, None, :]
         return across[:, None, None] ** 2 * (eye - outer) + along[:, None, None] ** 2 * outer
 
-    def point_density(self, distance: Tensor, cos_incidence: Tensor | float = 1.0) -> Tensor:
+    def point_density(self, distance: ArrayLike, cos_incidence: ArrayLike | float = 1.0) -> Tensor:
         """Expected points of one scan on a surface at range `distance` (m), per m² (per metre in 2D)."""
-        distance = distance.clamp_min(_CLOSEST)
-        return self._cosine(torch.as_tensor(cos_incidence).to(distance)) * self._density(distance)
+        distance = _ranges(distance)
+        cos = as_tensor(cos_incidence, "cos_incidence", distance.dtype, distance.device)
+        return self._cosine(cos) * self._density(distance)
 
     def _cosine(self, cos: Tensor) -> Tensor:
         return cos.abs().clamp(math.cos(self.max_incidence), 1)
@@ -126,9 +134,9 @@ class DepthCameraModel(_BeamModel):
         if not (a > 0 and c >= 0 and b > -2 * math.sqrt(a * c) and all(map(math.isfinite, self.axial))):
             raise InvalidArgumentError(f"axial={self.axial} must give noise above zero at every range.")
 
-    def deviations(self, distance: Tensor) -> Deviations:
+    def deviations(self, distance: ArrayLike) -> Deviations:
         a, b, c = self.axial
-        z = distance.clamp_min(_CLOSEST)
+        z = _ranges(distance)
         pixel = z * self.pixel_angle
         # The footprint is uniform within the pixel.
         return Deviations(a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12))
@@ -164,7 +172,7 @@ class LidarModel(_BeamModel):
         )
         _not_negative(proportional_noise=self.proportional_noise)
 
-    def deviations(self, distance: Tensor) -> Deviations:
+    def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
 
     def _density(self, distance: Tensor) -> Tensor:
@@ -188,7 +196,7 @@ class LaserModel(_BeamModel):
         _above_zero(noise=self.noise, divergence=self.divergence, angular_step=self.angular_step)
         _not_negative(proportional_noise=self.proportional_noise)
 
-    def deviations(self, distance: Tensor) -> Deviations:
+    def deviations(self, distance: ArrayLike) -> Deviations:
         return _laser(distance, self.noise, self.proportional_noise, self.divergence)
 
     def _density(self, distance: Tensor) -> Tensor:
@@ -213,14 +221,15 @@ def cos_incidence(points: Tensor, origin: Tensor, normals: Tensor) -> Tensor:
     return (beams(points, origin)[0] * normals.to(points)).sum(1).abs()
 
 
-def estimate_normals(points: Tensor, n_neighbors: int = 16) -> Tensor:
+def estimate_normals(points: ArrayLike, n_neighbors: int = 16) -> Tensor:
     """Unit normals (N, D), float64, of either sign: directions of least variance of each point's neighbours.
 
     Points (N, D) with N ≥ 1. If the neighbours do not span a surface (a single lidar ring, or too few
     points), the normal is one of the directions that they do not span; use more neighbours there.
     """
     check_whole("n_neighbors", n_neighbors, 1)
-    cloud = (points.double() - points.double().mean(0)).cpu()
+    points = as_tensor(points, "points", torch.float64)
+    cloud = (points - points.mean(0)).cpu()
     array = cloud.numpy()
     nearest = cKDTree(array).query(array, k=np.arange(1, min(n_neighbors, len(array)) + 1))[1]
     normals = []
@@ -231,9 +240,15 @@ def estimate_normals(points: Tensor, n_neighbors: int = 16) -> Tensor:
     return torch.cat(normals).to(points.device)
 
 
-def _laser(distance: Tensor, noise: float, proportional: float, divergence: float) -> Deviations:
-    width = distance.clamp_min(_CLOSEST) * divergence / 4
-    return Deviations(noise + proportional * distance, width, width)
+def _laser(distance: ArrayLike, noise: float, proportional: float, divergence: float) -> Deviations:
+    ranges = _ranges(distance)
+    width = ranges * divergence / 4
+    return Deviations(noise + proportional * ranges, width, width)
+
+
+def _ranges(distance: ArrayLike) -> Tensor:
+    """Ranges (m) of any shape, at least `_CLOSEST`."""
+    return as_tensor(distance, "distance").clamp_min(_CLOSEST)
 
 
 def _above_zero(**values: float) -> None:

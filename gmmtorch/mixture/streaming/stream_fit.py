@@ -16,7 +16,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets.point_files.point_chunks import PointChunks
+from gmmtorch.arrays import ArrayLike
+from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
 from gmmtorch.datasets.point_files.point_survey import Survey
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
@@ -64,7 +65,7 @@ class ExactEStep:
 
 def fit_stream(
     mixture: GaussianMixture,
-    source: PointChunks,
+    source: PointChunks | ArrayLike,
     *,
     sample_points: int | None = SAMPLE_POINTS,
     survey: Survey | None = None,
@@ -86,7 +87,7 @@ def fit_stream(
 
     Args:
         mixture: the estimator with its options; it is fitted in place. It makes one start (`n_init=1`).
-        source: the points of this process; each of several processes has a share.
+        source: the points of this process, in chunks or (N, D); each of several processes has a share.
         sample_points: size of the uniform sample (at least K) that the start is computed from. The
             sample does not depend on chunks or processes. None: all points, which must fit into memory.
         survey: result of `survey_all` for the source, if it is known already.
@@ -103,6 +104,11 @@ def fit_stream(
         LostProcessError: another process ended; names the iteration, and how to continue.
         NumericalError: a component collapsed, which happens with reg_covar = 0.
     """
+    if not isinstance(mixture, GaussianMixture):
+        raise InvalidArgumentError(
+            f"mixture is a {type(mixture).__name__}; give a GaussianMixture, then the points."
+        )
+    source = _in_chunks(source)
     mixture.check_parameters()
     if mixture.n_components is None:
         raise InvalidArgumentError(
@@ -175,15 +181,19 @@ def _add_iteration_to_errors(done: list[float], checkpoint: Checkpoint | None) -
 
 
 def score_stream(
-    mixture: MixtureEstimator, source: PointChunks, processes: Processes = SINGLE_PROCESS
+    mixture: MixtureEstimator, source: PointChunks | ArrayLike, processes: Processes = SINGLE_PROCESS
 ) -> tuple[float, int]:
     """Mean log-likelihood (nats) of the points of all processes (NaN if there are none), and their number."""
     sums = torch.zeros(2, dtype=torch.float64)
-    for points, _, _ in source:
+    for points, _, _ in _in_chunks(source):
         if points.shape[0]:
             sums += torch.tensor([float(mixture(points).sum()), points.shape[0]], dtype=torch.float64)
     total, count = processes.sum(sums).tolist()
     return (total / count if count else float("nan")), int(count)
+
+
+def _in_chunks(source: PointChunks | ArrayLike) -> PointChunks:
+    return source if isinstance(source, PointChunks) else in_memory(source, "source")
 
 
 def _truncated(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_resolution
 
 _FARTHEST = 2.0**32  # cells from the world's origin; sums of the ray traversal are exact within
@@ -53,12 +54,12 @@ def contains(box: Box, cells: Tensor) -> Tensor:
     return inside
 
 
-def to_lattice(points: Tensor, resolution: float, name: str = "points") -> Tensor:
+def to_lattice(points: ArrayLike, resolution: float, name: str = "points") -> Tensor:
     """Points (…, 3), world metres, in units of cells, float64.
 
     Raises `InvalidArgumentError` if a point is not finite, or 2³² cells or more from the world's origin.
     """
-    units = points.double() / check_resolution(resolution)
+    units = as_tensor(points, name, torch.float64) / check_resolution(resolution)
     if units.numel() and not bool(units.abs().max() < _FARTHEST):  # not `>=`: NaN must fail, too
         raise InvalidArgumentError(
             f"{name} must be finite and less than 2**32 cells of resolution={resolution} m from the world's "

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.ray_counting import count_in_grid
 from gmmtorch.kernels.ray_traversal import Visits, traverse
@@ -20,14 +21,14 @@ _CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
 
 
 def cast_evidence(
-    origins: Tensor,
-    ends: Tensor,
-    is_hit: Tensor,
+    origins: ArrayLike,
+    ends: ArrayLike,
+    is_hit: ArrayLike,
     resolution: float,
     box: Box,
-    weights: Tensor | None = None,
-    free_until: Tensor | None = None,
-    hit_places: tuple[Tensor, Tensor] | None = None,
+    weights: ArrayLike | None = None,
+    free_until: ArrayLike | None = None,
+    hit_places: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> CellEvidence:
     """Evidence of rays in the cells of a box; rays are trimmed to the box (thesis Fig 4.2).
 
@@ -55,7 +56,7 @@ def cast_evidence(
     places = None if hit_places is None else to_lattice(hit_places[0], resolution, "hit_places")
     rays = rays_in_box(starts, stops, box, until, places)
     if rays is None:
-        return CellEvidence.empty(ends.device)
+        return CellEvidence.empty(stops.device)
     window, block = rays.window, rays.block
     n_bytes = math.prod(block.shape) * BYTES_PER_CELL
     if n_bytes > MEMORY_LIMIT:
@@ -63,14 +64,17 @@ def cast_evidence(
             f"resolution={resolution} m over rays that span {' × '.join(map(str, window.shape))} cells takes "
             f"{n_bytes:,} bytes, above the limit of {MEMORY_LIMIT:,}; use coarser cells or a smaller box."
         )
-    weight = torch.ones_like(stops[:, 0]) if weights is None else weights.double()
+    weight = torch.ones_like(stops[:, 0])
+    if weights is not None:
+        weight = as_tensor(weights, "weights", torch.float64, stops.device)
     misses = rays.count_rays(weight).view(block.shape)
     if block is not window:
         misses = misses[1:-1, 1:-1, 1:-1]
     if places is None or hit_places is None:
-        places, counts = stops[is_hit], weight[is_hit]
+        struck = as_tensor(is_hit, "is_hit", torch.bool, stops.device)
+        places, counts = stops[struck], weight[struck]
     else:
-        counts = hit_places[1].double()
+        counts = as_tensor(hit_places[1], "hit_places[1]", torch.float64, stops.device)
     flat, inside = flat_index(places.floor().long() - window.low, window.shape)
     hits = weight.new_zeros(math.prod(window.shape)).index_add_(0, flat[inside], counts[inside])
     return CellEvidence.from_dense(window.low, hits.view(window.shape), misses)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.occupancy.voxels.boxes import Box, difference, to_lattice
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
@@ -42,14 +43,14 @@ class RollingWindow(SparseEvidence):
                 f"step={step} must be at most half the smallest side of shape={shape}."
             )
 
-    def center_on(self, position: Tensor) -> list[Box]:
+    def center_on(self, position: ArrayLike) -> list[Box]:
         """Move the box along each axis on which the robot at (3,), world metres, is a step or more off its
         middle.
 
         Returns the cells that the box did not contain before, as disjoint boxes; they have no evidence.
         These are all cells at first, and after a jump by more than the shape.
         """
-        cell = to_lattice(position, self.resolution, "position").floor().long()
+        cell = self._cell(position)
         size = torch.tensor(self.shape, device=self.device)
         if self._box is None:
             low = (cell - size // 2 + self.step // 2) // self.step * self.step
@@ -77,7 +78,7 @@ class RollingWindow(SparseEvidence):
             )
         return self.dense(box)
 
-    def around(self, position: Tensor, shape: tuple[int, int, int], step: int = 8) -> Box:
+    def around(self, position: ArrayLike, shape: tuple[int, int, int], step: int = 8) -> Box:
         """The box of `shape` cells within the window whose middle is nearest to the point (3,), world metres.
 
         Boxes start at multiples of `step` cells from the lowest cell of the window. Raises
@@ -88,10 +89,17 @@ class RollingWindow(SparseEvidence):
         if bool((spare < 0).any()):
             raise InvalidArgumentError(f"shape={tuple(shape)} is more than the window's {self.shape} cells.")
         low = self.box.low
-        cell = to_lattice(position, self.resolution, "position").floor().long() - low
+        cell = self._cell(position) - low
         steps = (2 * cell - size + step) // (2 * step)  # rounded
         low = low + torch.minimum(steps.clamp_min(0), spare // step) * step
         return Box(low, low + size)
+
+    def _cell(self, position: ArrayLike) -> Tensor:
+        """The cell (3,) that contains a position, on the device of the store."""
+        units = to_lattice(position, self.resolution, "position")
+        if units.shape != (3,):
+            raise InvalidArgumentError(f"position has shape {tuple(units.shape)}; expected (3,).")
+        return units.floor().long().to(self.device)
 
     def _check_cells(self, cells: Tensor) -> None:
         _ = self.box  # raises before the first `center_on`

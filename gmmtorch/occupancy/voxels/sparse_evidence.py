@@ -7,9 +7,10 @@ import functools
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
-from gmmtorch.occupancy.evidence import occupancy_probability
+from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.block_table import count_misses
 from gmmtorch.occupancy.voxels.boxes import Box, contains, intersection
@@ -99,27 +100,28 @@ class SparseEvidence(SparseLattice):
 
     def add_rays(
         self,
-        origins: Tensor,
-        ends: Tensor,
-        weights: Tensor | None = None,
-        is_hit: Tensor | None = None,
+        origins: ArrayLike,
+        ends: ArrayLike,
+        weights: ArrayLike | None = None,
+        is_hit: ArrayLike | None = None,
         chunk_visits: int = CHUNK_VISITS,
     ) -> None:
         """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
         Arguments as in `Evidence.add_rays`. Requires a store without a `box`.
 
-        Raises `MemoryLimitError` if the blocks exceed `memory_limit` bytes. Then these rays are counted in
-        part, and no more can be added.
+        Raises `InvalidArgumentError` for shapes that do not match, and `MemoryLimitError` if the blocks
+        exceed `memory_limit` bytes. Then these rays are counted in part, and no more can be added.
         """
         if self._box is not None:
             raise InvalidArgumentError("add_rays needs evidence without a box; use cast_evidence and add.")
+        origins, ends, weights, is_hit = checked_rays(origins, ends, weights, is_hit, self.dim, self.device)
         if ends.shape[0] == 0:
             return
         count_misses(self, origins, ends, weights, chunk_visits)
         columns = self.columns(self.cells_of(ends).long())
         index = self._first_of(self.block_keys(columns)) + self.places(columns)
-        source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+        source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights
         if is_hit is not None:
             index, source = index[is_hit], source[is_hit]
         self.counts[0].view(-1).scatter_add_(0, index, source.to(self.counts.dtype))
@@ -258,13 +260,13 @@ class SparseEvidence(SparseLattice):
 
     # -- reading ----------------------------------------------------------------------------------
 
-    def at_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def at_points(self, points: ArrayLike) -> tuple[Tensor, Tensor]:
         """Hits (M,) and misses (M,) of the cells that contain points (M, D), world metres; 0 without
         evidence.
 
         Points can be NaN or infinite: they have no evidence.
         """
-        return self.at_cells(self.cells_of(points))
+        return self.at_cells(self.cells_of(as_tensor(points, "points", device=self.device)))
 
     def at_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Hits (C,) and misses (C,) of cells (C, D); 0 without evidence."""
@@ -278,7 +280,7 @@ class SparseEvidence(SparseLattice):
         hits, misses = (counts.view(-1).index_select(0, index) for counts in self.counts)
         return hits, misses
 
-    def lookup(self, points: Tensor, prior: float = 1.0) -> Tensor:
+    def lookup(self, points: ArrayLike, prior: float = 1.0) -> Tensor:
         """Occupancy (M,) of the cells that contain points (M, D), world metres; ½ without evidence."""
         return occupancy_probability(*self.at_points(points), prior)
 

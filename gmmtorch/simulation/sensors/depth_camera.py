@@ -13,6 +13,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.sensors.range_sensors import pixel_rays
@@ -94,8 +95,8 @@ class DepthCamera:
     def sense(
         self,
         world: MeshWorld,
-        pose: Tensor,
-        others: Tensor,
+        pose: ArrayLike,
+        others: ArrayLike,
         radius: float,
         generator: torch.Generator,
     ) -> DepthFrame:
@@ -110,9 +111,11 @@ class DepthCamera:
             others: (M, 3) centres of the teammates' bodies, metres.
             radius: radius of a teammate's body (m).
         """
+        pose = as_tensor(pose, "pose", torch.float64)
+        others = as_tensor(others, "others", torch.float64)
         _check_finite("pose", pose, (4,))
         _check_finite("others", others, (len(others), 3))
-        origin, directions = pose[:3].double(), self._turned(float(pose[3]))
+        origin, directions = pose[:3], self._turned(float(pose[3]))
         error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
         kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
         truth = world.distances(origin, directions, threads=torch.get_num_threads())

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 
 _CHUNK_PAIRS = 1 << 15
@@ -37,7 +38,7 @@ _SLACK = 64 * torch.finfo(torch.float64).eps
 adjacent primitives. A ray whose angle to a primitive is below four times this counts as parallel to it."""
 
 
-def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tensor:
+def ray_segments(origins: ArrayLike, directions: ArrayLike, segments: ArrayLike) -> Tensor:
     """Distances (N,), float64, to the nearest segment, in multiples of the direction's length; inf if none.
 
     Solves o + t d = a + s (b − a) for t > 0 and 0 ≤ s ≤ 1. A ray parallel to a segment does not hit it.
@@ -66,7 +67,7 @@ def ray_segments(origins: Tensor, directions: Tensor, segments: Tensor) -> Tenso
     return best
 
 
-def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Tensor:
+def ray_triangles(origins: ArrayLike, directions: ArrayLike, triangles: ArrayLike) -> Tensor:
     """Distances (N,), float64, to the nearest triangle, in multiples of the direction's length; inf if none.
 
     A ray passes through a triangle if it passes all three edges on the same side. The side of the edge
@@ -79,6 +80,7 @@ def ray_triangles(origins: Tensor, directions: Tensor, triangles: Tensor) -> Ten
         directions: (N, 3).
         triangles: (T, 3, 3), the three corners of each triangle.
     """
+    origins = as_tensor(origins, "origins", torch.float64)
     one_origin = origins.ndim == 1
     origins, directions, triangles = _checked(origins, directions, triangles, (3, 3))
     best = torch.full_like(directions[:, 0], torch.inf)
@@ -127,10 +129,13 @@ def _cross_2d(u: Tensor, v: Tensor) -> Tensor:
 
 
 def _checked(
-    origins: Tensor, directions: Tensor, primitives: Tensor, shape: tuple[int, int]
+    origins: ArrayLike, directions: ArrayLike, primitives: ArrayLike, shape: tuple[int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Origins (N, D), directions (N, D) and primitives as float64, because the products above cancel."""
     dim = shape[1]
+    origins = as_tensor(origins, "origins", torch.float64)
+    directions = as_tensor(directions, "directions", torch.float64)
+    primitives = as_tensor(primitives, "segments" if dim == 2 else "triangles", torch.float64)
     if directions.ndim != 2 or directions.shape[1] != dim:
         raise InvalidArgumentError(f"directions has shape {tuple(directions.shape)}; expected (N, {dim}).")
     if origins.shape not in ((dim,), directions.shape):
@@ -142,7 +147,7 @@ def _checked(
         raise InvalidArgumentError(
             f"segments or triangles have shape {tuple(primitives.shape)}; expected (N, {shape[0]}, {dim})."
         )
-    return origins.double().expand(directions.shape), directions.double(), primitives.double()
+    return origins.expand(directions.shape), directions, primitives
 
 
 # -- bundles of rays --------------------------------------------------------------------------------

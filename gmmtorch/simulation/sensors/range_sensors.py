@@ -12,6 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import Scan
 
@@ -44,6 +45,7 @@ class RangeSensor:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "directions", as_tensor(self.directions, "directions", torch.float64))
         if not (math.isfinite(self.max_range) and self.max_range > 0):
             raise InvalidArgumentError(f"max_range={self.max_range} must be a distance above zero metres.")
         if not (math.isfinite(self.range_noise) and self.range_noise >= 0):
@@ -119,14 +121,15 @@ def pixel_rays(width: int, height: int, focal: tuple[float, float]) -> Tensor:
 
 
 def sense(
-    sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator
+    sensor: RangeSensor, pose: ArrayLike, world: World, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Beam ends (N, D) in the world frame, and whether each beam (N,) had no return.
 
     The pose (D+1, D+1) is world ← sensor. A beam without return ends at the sensor's maximum range. Dropped
     beams are absent. The number of random draws does not depend on the world.
     """
-    origin, directions = pose[:-1, -1], sensor.directions @ pose[:-1, :-1].T
+    matrix = as_tensor(pose, "pose", torch.float64)
+    origin, directions = matrix[:-1, -1], sensor.directions @ matrix[:-1, :-1].T
     n_beams = directions.shape[0]
     noise = torch.randn(n_beams, generator=generator, dtype=torch.float64) * sensor.range_noise
     kept = torch.rand(n_beams, generator=generator, dtype=torch.float64) >= sensor.dropout
@@ -137,10 +140,10 @@ def sense(
     return (origin + directions * reading[:, None])[kept], no_return[kept]
 
 
-def simulate_scan(sensor: RangeSensor, pose: Tensor, world: World, generator: torch.Generator) -> Scan:
+def simulate_scan(sensor: RangeSensor, pose: ArrayLike, world: World, generator: torch.Generator) -> Scan:
     """The scan at a pose (D+1, D+1), world ← sensor. Beams without return end at the maximum range."""
     ends, no_return = sense(sensor, pose, world, generator)
-    return Scan(ends[~no_return], pose[:-1, -1], ends[no_return])
+    return Scan(ends[~no_return], as_tensor(pose, "pose", torch.float64)[:-1, -1], ends[no_return])
 
 
 def _at_least_one(**counts: int) -> None:

@@ -7,26 +7,28 @@ import math
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 
 _CORNER_CUTS = 5
 _TANGENT_STEP = 0.05
 
 
-def smooth_path(waypoints: Tensor, spacing: float = 0.05) -> Tensor:
+def smooth_path(waypoints: ArrayLike, spacing: float = 0.05) -> Tensor:
     """A smooth path (P, 2) along waypoints (W, 2), with a point every `spacing` metres.
 
     Repeated corner cutting (Chaikin) converges to a quadratic B-spline. The path stays inside the
     triangles at the corners, so it cannot overshoot into a wall. It is straight where three waypoints lie
     on a line: place them so at doors.
     """
+    waypoints = as_tensor(waypoints, "waypoints", torch.float64)
     if waypoints.ndim != 2 or waypoints.shape[0] < 2 or waypoints.shape[1] != 2:
         raise InvalidArgumentError(
             f"waypoints has shape {tuple(waypoints.shape)}; expected (W, 2) with W of 2 or more."
         )
     if not spacing > 0:
         raise InvalidArgumentError(f"spacing={spacing} must be above zero metres.")
-    path = waypoints.double()
+    path = waypoints
     for _ in range(_CORNER_CUTS):
         a, b = path[:-1], path[1:]
         cut = torch.stack([0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b], 1).flatten(0, 1)
@@ -37,7 +39,7 @@ def smooth_path(waypoints: Tensor, spacing: float = 0.05) -> Tensor:
     )
 
 
-def poses_2d(path: Tensor, n: int) -> Tensor:
+def poses_2d(path: ArrayLike, n: int) -> Tensor:
     """`n` poses (n, 3, 3), world ← sensor, evenly spaced along the path (P, 2) and facing forward."""
     position, heading = _stations(path, n)
     pose = torch.eye(3, dtype=torch.float64).repeat(n, 1, 1)
@@ -46,7 +48,7 @@ def poses_2d(path: Tensor, n: int) -> Tensor:
     return pose
 
 
-def poses_3d(path: Tensor, n: int, height: float, pitch: float = 0.0, swing: float = 0.0) -> Tensor:
+def poses_3d(path: ArrayLike, n: int, height: float, pitch: float = 0.0, swing: float = 0.0) -> Tensor:
     """`n` poses (n, 4, 4), world ← sensor, evenly spaced along the path (P, 2) at `height` metres.
 
     The sensor faces forward, `pitch` radians below the horizon. Its yaw swings up to `swing` radians to
@@ -67,10 +69,11 @@ def poses_3d(path: Tensor, n: int, height: float, pitch: float = 0.0, swing: flo
     return pose
 
 
-def _stations(path: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def _stations(given: ArrayLike, n: int) -> tuple[Tensor, Tensor]:
     """Positions (n, 2) and headings (n,) in radians, evenly spaced along the path."""
     if n < 1:
         raise InvalidArgumentError(f"n={n} must be at least 1 pose.")
+    path = as_tensor(given, "path", torch.float64)
     length = float(_arc_length(path)[-1])
     s = torch.linspace(0, length, n, dtype=path.dtype)
     ahead = _point_at(path, (s + _TANGENT_STEP).clamp_max(length))

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
 from gmmtorch.simulation.sensors.trajectories import smooth_path
 from gmmtorch.simulation.worlds.floor_plan import DrawPiece, Room, furnish
@@ -74,7 +75,7 @@ class World3D:
     triangles: Tensor
     path: Tensor
 
-    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+    def distances(self, origin: ArrayLike, directions: ArrayLike) -> Tensor:
         """Range (N,) in metres from the origin (3,) along unit directions (N, 3); inf without a hit."""
         return ray_triangles(origin, directions, self.triangles)
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.optional_packages import load_open3d
 
@@ -71,9 +72,9 @@ class MeshWorld:
     Open3D does not load.
     """
 
-    def __init__(self, triangles: Tensor) -> None:
+    def __init__(self, triangles: ArrayLike) -> None:
         open3d = load_open3d("Rays cannot be cast in a mesh")
-        corners = triangles.detach().double().cpu().reshape(-1, 3)
+        corners = as_tensor(triangles, "triangles", torch.float64, "cpu").detach().reshape(-1, 3)
         self.low, self.high = corners.amin(0), corners.amax(0)
         self._middle = (self.low + self.high) / 2
         self._tensor = open3d.core.Tensor
@@ -81,7 +82,7 @@ class MeshWorld:
         faces = np.arange(corners.shape[0], dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(self._tensor((corners - self._middle).float().numpy()), self._tensor(faces))
 
-    def distances(self, origin: Tensor, directions: Tensor, threads: int = 0) -> Tensor:
+    def distances(self, origin: ArrayLike, directions: ArrayLike, threads: int = 0) -> Tensor:
         """Distances (N,) in metres to the first surface along unit directions (N, 3); inf if none is hit.
 
         Args:
@@ -89,17 +90,20 @@ class MeshWorld:
             directions: (N, 3).
             threads: number of threads; 0 uses all cores.
         """
-        starts = (origin - self._middle).expand_as(directions)
+        directions = as_tensor(directions, "directions", torch.float64, "cpu")
+        starts = (as_tensor(origin, "origin", torch.float64, "cpu") - self._middle).expand_as(directions)
         rays = torch.cat([starts, directions], 1).float().contiguous()
         cast = self._scene.cast_rays(self._tensor(rays.numpy()), nthreads=threads)
         return torch.from_numpy(cast["t_hit"].numpy()).double()
 
-    def clearance(self, points: Tensor, threads: int = 0) -> Tensor:
+    def clearance(self, points: ArrayLike, threads: int = 0) -> Tensor:
         """Distance (N,) in metres from each point (N, 3) to the nearest surface.
 
         `threads` is the number of threads; 0 uses all cores.
         """
-        moved = (points - self._middle).float().contiguous().numpy()
+        moved = (
+            (as_tensor(points, "points", torch.float64, "cpu") - self._middle).float().contiguous().numpy()
+        )
         found = self._scene.compute_distance(self._tensor(moved), nthreads=threads)
         return torch.from_numpy(found.numpy()).double()
 

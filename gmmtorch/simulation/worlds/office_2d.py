@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments
 from gmmtorch.simulation.sensors.trajectories import smooth_path
 from gmmtorch.simulation.worlds.floor_plan import (
@@ -88,7 +89,7 @@ class World2D:
     segments: Tensor
     path: Tensor
 
-    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+    def distances(self, origin: ArrayLike, directions: ArrayLike) -> Tensor:
         """Range (N,) in metres from the origin (2,) along unit directions (N, 2); inf without a hit."""
         return ray_segments(origin, directions, self.segments)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.arrays import ArrayLike, as_tensor, is_floating
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import TOLERANCE, check_tolerance, integrate
@@ -57,7 +57,7 @@ class Boundary(NamedTuple):
         return cls(vertices, edges[:, None])
 
     @classmethod
-    def of_mesh(cls, vertices: ArrayLike, triangles: Tensor) -> Boundary:
+    def of_mesh(cls, vertices: ArrayLike, triangles: ArrayLike) -> Boundary:
         """Boundary of a closed mesh with vertices (V, 3) and triangles (F, 3) of vertex indices.
 
         The corners of a triangle run counter-clockwise as seen from outside. Raises `InvalidArgumentError`
@@ -66,18 +66,18 @@ class Boundary(NamedTuple):
         """
         vertices = as_tensor(vertices, "vertices", torch.float64)
         _check_vertices(vertices, 3)
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.is_floating_point():
+        corner = as_tensor(triangles, "triangles", torch.int64, vertices.device)
+        if corner.ndim != 2 or corner.shape[1] != 3 or is_floating(triangles):
             raise InvalidArgumentError(
-                f"triangles has shape {tuple(triangles.shape)} and dtype {triangles.dtype}; expected (F, 3) "
-                "vertex indices."
+                f"triangles has shape {tuple(corner.shape)} and dtype {getattr(triangles, 'dtype', None)}; "
+                "expected (F, 3) indices of the vertices, whole numbers."
             )
-        triangles = triangles.long()
-        if len(triangles) == 0 or int(triangles.min()) < 0 or int(triangles.max()) >= len(vertices):
+        if len(corner) == 0 or int(corner.min()) < 0 or int(corner.max()) >= len(vertices):
             raise InvalidArgumentError(
                 f"triangles must have entries from 0 to {len(vertices) - 1}: indices of the vertices."
             )
-        _check_closed(triangles, len(vertices))
-        corners = vertices[triangles]
+        _check_closed(corner, len(vertices))
+        corners = vertices[corner]
         edges = corners[:, 1:] - corners[:, :1]
         volume = torch.linalg.det(corners - vertices[0]).sum() / 6
         if not bool(volume > 0):
