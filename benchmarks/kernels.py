@@ -1,29 +1,36 @@
 """Fused kernels against their twins in tensor operations, in the same run; and the operations of each.
 
     python benchmarks/kernels.py --data $GMMTORCH_DATA [--threads 1] [--device cuda]
+    python benchmarks/kernels.py --data $GMMTORCH_DATA --against FOLDER_OF_ANOTHER_VERSION
 
-Writes the tables `kernels` and `operations` of BENCHMARKS.md. A time is the least of several runs.
+Writes the tables `kernels` and `operations` of BENCHMARKS.md, or with --against the table `against`: the work
+of `public_work.py` by both versions in turn, on one thread. A time is the least of several runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
-from tables import hardware, markdown, publish
+from public_work import counted
+from tables import ROOT, hardware, markdown, publish
 from threadpoolctl import threadpool_limits
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.e_step import expectation
 from gmmtorch.kernels.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import IncrementalRule
+from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
@@ -111,48 +118,11 @@ def map_work(data: Path, n_points: int, device: str) -> Iterator[Work]:
             yield f"flux, {label}, {grid.n_cells:,} cells, tolerance 10⁻³", flux, 0, "s"
 
 
-class Operations(TorchDispatchMode):
-    """Counts dispatched operations, launches of fused kernels, and operations that wait for the device."""
-
-    WAITS = (
-        "_local_scalar_dense",
-        "nonzero",
-        "unique",
-        "masked_select",
-        "repeat_interleave",
-        "equal",
-        "bincount",
-    )
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.n, self.n_waits = 0, 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
-        name = func.overloadpacket.__name__
-        self.n += not any(word in name for word in ("view", "reshape", "expand", "detach", "select", "slice"))
-        self.n_waits += any(word in name for word in self.WAITS)
-        return func(*args, **(kwargs or {}))
-
-
-def counted(work: Callable[[], object]) -> str:
-    """Operations (synchronisations) of the work."""
-    launches, call = [0], FusedKernel.__call__
-
-    def launch(self: FusedKernel, *arguments: object, **options: object) -> None:
-        launches[0] += 1
-        call(self, *arguments, **options)  # type: ignore[arg-type]
-
-    FusedKernel.__call__ = launch  # type: ignore[method-assign,assignment]
-    try:
-        with Operations() as operations:
-            work()
-    finally:
-        FusedKernel.__call__ = call  # type: ignore[method-assign]
-    return f"{operations.n + launches[0]:,} ({operations.n_waits:,})"
-
-
 def small_work(device: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    rows = quadratic_features(torch.rand(100_000, 3, dtype=torch.float64))
+    natural = torch.randn(1000, 10, dtype=torch.float64)
+    parts = [part.to(device) for part in (rows, torch.ones(len(rows)).double(), natural)]
+    yield "E-step, 10⁵ rows, 1,000 components", lambda: expectation(*parts)
     starts, ends, grid = rays(100_000, 0.2, device)
     yield "10⁵ rays, counted, dense", lambda: Evidence.empty(grid, device).add_rays(starts, ends)
     yield "10⁵ rays, counted, sparse", lambda: SparseEvidence(0.2, 3, device).add_rays(starts, ends)
@@ -178,9 +148,28 @@ def operations_table(device: str) -> str:
         cells = []
         for choice in ("torch", "fused"):
             with kernels(choice):
-                cells.append(counted(function))
+                cells.append("{:,} ({:,})".format(*counted(function)))
         rows.append([name, *cells])
     return markdown(["work", "tensor operations", "fused"], rows)
+
+
+def against(other: Path, data: Path, repeats: int) -> str:
+    """The table of the work of another version, in a folder, and of this one; processor seconds."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for _ in range(repeats):  # in turn, because the load of a shared machine changes
+        for folder in (other, ROOT):
+            command = [sys.executable, str(ROOT / "benchmarks/public_work.py"), "--data", str(data)]
+            environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+            done = subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE)
+            for name, result in json.loads(done.stdout.splitlines()[-1]).items():
+                best = found.setdefault(name, {}).setdefault(str(folder), result)
+                best[0] = min(best[0], result[0])
+    rows = []
+    for name, by_folder in found.items():
+        before, after = by_folder[str(other)], by_folder[str(ROOT)]
+        counts = [f"{int(result[1]):,} ({int(result[2]):,})" for result in (before, after)]
+        rows.append([name, f"{before[0]:.3g}", f"{after[0]:.3g}", f"{before[0] / after[0]:.1f}", *counts])
+    return markdown(["work", "s before", "s now", "times faster", "operations before", "now"], rows)
 
 
 def least(work: Callable[[], object], repeats: int, device: str) -> float:
@@ -207,6 +196,7 @@ def compared(work: Work, repeats: int, device: str) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="folder of real scans, for the rows about maps")
+    parser.add_argument("--against", type=Path, help="folder of another version, such as a git worktree")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--rays", type=int, default=1_000_000)
@@ -214,6 +204,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    if options.against:
+        if not options.data:
+            parser.error("--against needs --data")
+        table = against(options.against.resolve(), options.data.resolve(), options.repeats)
+        publish("against", f"{hardware()}\n\n{table}")
+        return
     with threadpool_limits(options.threads):
         rows = [
             compared(work, options.repeats, options.device) for work in ray_work(options.rays, options.device)

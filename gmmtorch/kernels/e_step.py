@@ -19,6 +19,7 @@ from gmmtorch.kernels.simd import CPU_LANES, SIMD
 SKIPPED = 37.0
 """Nats below a row's largest term from which on a responsibility counts as 0: K e⁻³⁷ is below 10⁻¹² of it."""
 
+_FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
 
 _LOGITS = """
@@ -144,6 +145,24 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
     rows = max(64, chunk_elements(features.device) // transposed.shape[1])
     parts = chunked(features.shape[0], rows, lambda part: (features[part] @ transposed).argmax(1))
     return torch.cat([features.new_empty(0, dtype=torch.int64), *parts])
+
+
+def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows (N, F), (N,) in an order in which neighbours follow each other, if the fused kernel runs.
+
+    The kernel skips what all of eight rows are far from. The order is that of a Morton curve through 32 cells
+    along each axis.
+    """
+    dim = _DIMENSIONS.get(features.shape[1], 0)
+    if not _is_fused(features, sample_weight) or features.shape[0] < _FEW_ROWS:
+        return features, sample_weight
+    places = features[:, 1 : 1 + dim].contiguous()
+    low, high = places.amin(0), places.amax(0)
+    cell = ((places - low) * (31.99 / (high - low).max().clamp_min(1e-300))).long().clamp_(0, 31)
+    bits = torch.tensor([sum((n >> b & 1) << (b * dim) for b in range(5)) for n in range(32)])
+    keys = sum((bits[cell[:, axis]] << axis for axis in range(dim)), torch.zeros_like(cell[:, 0]))
+    order = keys.short().argsort(stable=True)
+    return features.index_select(0, order), sample_weight.index_select(0, order)
 
 
 def _is_fused(*tensors: Tensor) -> bool:

@@ -81,3 +81,20 @@ def test_gradients_come_from_the_twin():
     natural = natural_parameters(mixture(3, 2, "any")).requires_grad_()
     with kernels("auto"):
         assert not e_step._is_fused(features, natural)
+
+
+def test_rows_in_spatial_order_are_the_same_rows():
+    generator = torch.Generator().manual_seed(0)
+    features = quadratic_features(torch.rand(3000, 3, generator=generator, dtype=torch.float64))
+    weight = torch.rand(3000, generator=generator, dtype=torch.float64)
+    with kernels("fused"):
+        ordered, weights = e_step.in_spatial_order(features, weight)
+        same = e_step.in_spatial_order(torch.ones_like(features), weight)
+    rows = torch.cat([features, weight[:, None]], 1)
+    moved = torch.cat([ordered, weights[:, None]], 1)
+    assert sorted(rows.tolist()) == sorted(moved.tolist())
+    step = (ordered[1:, 1:4] - ordered[:-1, 1:4]).norm(dim=1).mean()
+    assert float(step) < 0.3 * float((features[1:, 1:4] - features[:-1, 1:4]).norm(dim=1).mean())
+    assert torch.equal(same[1], weight)
+    with kernels("torch"):
+        assert e_step.in_spatial_order(features, weight)[0] is features

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
@@ -158,3 +159,20 @@ def test_fit_of_cells_is_nearly_as_likely_as_fit_of_points():
     assert pooled.lower_bound_ < pooled.score(points)
     assert pooled.score(points) > plain.score(points) - 0.1
     assert pooled.n_samples_seen_ == 4800
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["any", "equal", "lattice"])
+@pytest.mark.parametrize("limit", [1, 40, 1500])
+def test_fused_cells_are_those_of_the_twin(dim, kind, limit):
+    points = cloud(2000, dim, 5)
+    if kind == "equal":
+        points[:] = points[0].clone()
+    if kind == "lattice":  # points on the planes between cells
+        points = (points * 4).round() / 4
+    weight, found = 1 + torch.arange(2000).double() % 3, []
+    for choice in ("torch", "fused"):
+        with kernels(choice):
+            found.append(pool_into_cells(points, limit, 0.25, weight))
+    assert torch.equal(found[1].member, found[0].member)
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-12)

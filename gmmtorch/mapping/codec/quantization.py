@@ -171,7 +171,7 @@ def _largest(values: Tensor, owner: Tensor, n: int) -> Tensor:
 
 def _first_uses(rows: Tensor) -> tuple[Tensor, Tensor]:
     """The first row of each distinct value of (N, …), in order; and for each row, the number of its value."""
-    distinct, which = torch.unique(rows, dim=0, return_inverse=True)
+    distinct, which = torch.unique(rows, dim=0 if rows.ndim > 1 else None, return_inverse=True)
     places = torch.arange(len(rows))
     first = torch.full((len(distinct),), len(rows)).scatter_reduce_(0, which, places, "amin")
     order = torch.argsort(first)

@@ -136,6 +136,7 @@ def compact_to_bytes(
     """
     check_whole("max_bytes", max_bytes, 1)
     components = limit_origins(components, max_origins, mean_origins)
+    fixed = size(Components.empty(components.dim, components.means.device))
     while len(components) and (taken := size(components)) > max_bytes:
         if len(components) == 1:
             if components.seen_by.shape[0] == 1:
@@ -144,7 +145,6 @@ def compact_to_bytes(
                 )
             components = limit_origins(components, 1)
             continue
-        fixed = size(Components.empty(components.dim, components.means.device))
         room = max(0, max_bytes - fixed) / max(1, taken - fixed)
         wanted = max(1, min(len(components) - 1, int(len(components) * room)))
         components = limit_origins(compact(components, wanted), max_origins, mean_origins)

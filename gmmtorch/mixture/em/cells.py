@@ -7,16 +7,18 @@ an increasing bound (see `exact`). Its cost depends on the number of cells, not 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.cell_moments import KEY_BITS, cell_moments
+from gmmtorch.kernels.choice import is_fused
 from gmmtorch.linalg import count_distinct, dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 
-_KEY_BITS = 20  # bits of one cell coordinate in a key
-_MAX_CELLS_ALONG = (1 << _KEY_BITS) - 2  # along the longest side
+_MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
 _CHUNK_POINTS = 1 << 17
 
 
@@ -41,38 +43,54 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
     weight = points.new_ones(n) if weight is None else weight
     if n <= max_cells:
         return Cells(quadratic_features(points), weight, torch.arange(n, device=points.device))
-    member, n_cells = dense_ranks(_cell_keys(points, max_cells, finest))
-    n_features = 1 + points.shape[1] + points.shape[1] * (points.shape[1] + 1) // 2
-    sums = points.new_zeros(n_cells, n_features)
-    for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):
-        sums.index_add_(0, cell, quadratic_features(part) * p[:, None])
-    return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
-
-
-def _cell_keys(points: Tensor, max_cells: int, finest: float) -> Tensor:
-    """A key (N,) for each point; points of one cell have the same key."""
     low = points.amin(0)
     extent = float((points.amax(0) - low).max())
     side = max(finest, extent / _MAX_CELLS_ALONG) or 1.0  # equal points share one cell
-    fine = (points - low) / side
 
-    def keys(thirds: int) -> Tensor:
-        return _pack((fine * 2 ** (-thirds / 3)).to(torch.int64))
+    def pooled(thirds: int) -> tuple[Tensor, Tensor] | None:
+        """Sums and members of cells of side · 2^(thirds/3); None if there are too many cells."""
+        factor = 2 ** (-thirds / 3)
+        if points.device.type == "cpu" and is_fused(points, weight):
+            return cell_moments(points, weight, low, side, factor, max_cells)
+        return _sums_by_key(points, weight, _pack(((points - low) / side * factor).long()), max_cells)
 
-    if count_distinct(keys(0)) <= max_cells:
-        return keys(0)
-    too_fine, enough = 0, 3 * math.ceil(math.log2(extent / side + 2))  # the upper limit gives one cell
+    last = 3 * math.ceil(math.log2(extent / side + 2))  # gives one cell
+    sums, member = pooled(0) or _coarsest_allowed(pooled, last)
+    return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
+
+
+def _coarsest_allowed(
+    pooled: Callable[[int], tuple[Tensor, Tensor] | None], enough: int
+) -> tuple[Tensor, Tensor]:
+    """The first result between 0, which has too many cells, and `enough`, by bisection."""
+    too_fine, best = 0, None
     while enough - too_fine > 1:
         middle = (too_fine + enough) // 2
-        if count_distinct(keys(middle)) <= max_cells:
-            enough = middle
-        else:
+        found = pooled(middle)
+        if found is None:
             too_fine = middle
-    return keys(enough)
+        else:
+            enough, best = middle, found
+    best = best or pooled(enough)
+    assert best is not None
+    return best
+
+
+def _sums_by_key(
+    points: Tensor, weight: Tensor, keys: Tensor, max_cells: int
+) -> tuple[Tensor, Tensor] | None:
+    """The twin of `kernels.cell_moments`: sums (C, F) over points of one key, and the cell of each point."""
+    if count_distinct(keys) > max_cells:
+        return None
+    member, n_cells = dense_ranks(keys)
+    sums = points.new_zeros(n_cells, quadratic_features(points[:1]).shape[1])
+    for part, cell, p in zip(*(t.split(_CHUNK_POINTS) for t in (points, member, weight)), strict=True):
+        sums.index_add_(0, cell, quadratic_features(part) * p[:, None])
+    return sums, member
 
 
 def _pack(cells: Tensor) -> Tensor:
     key = cells[:, 0]
     for axis in range(1, cells.shape[1]):
-        key = key << _KEY_BITS | cells[:, axis]
+        key = key << KEY_BITS | cells[:, axis]
     return key

@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.e_step import in_spatial_order
 from gmmtorch.mixture.em import exact
 from gmmtorch.mixture.em.covariance_types import constrain
 from gmmtorch.mixture.em.exact import Parameters
@@ -85,9 +86,10 @@ def natural_step(
     digits to cancellation uses the direct form instead.
     """
 
+    rows = in_spatial_order(features, sample_weight)
+
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
-        natural = exact.natural_parameters(parameters)
-        return exact.expectation(features, sample_weight, natural, softmax_dtype)
+        return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
     direct = None
     if points is not None:

@@ -1,0 +1,218 @@
+"""Seconds of work by public names, which do not change between versions; `kernels.py --against` runs it.
+
+    python benchmarks/public_work.py --data FOLDER [--only NAME ...]
+
+Prints a JSON object: for each work the processor seconds of its second run, on one thread, and its dispatched
+operations and synchronisations. To measure another version, set PYTHONPATH to its folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import gmmtorch as gt
+
+Work = Callable[[], object]
+MAP = {"cutoff": 3.0, "hit_length": 1.0}
+FAST = {"cell": 0.05, "iterations": 4, "window": 16, "window_components": 200}
+
+
+class Operations(TorchDispatchMode):
+    """Counts dispatched operations, launches of fused kernels, and operations that wait for the device."""
+
+    WAITS = (
+        "_local_scalar_dense",
+        "nonzero",
+        "unique",
+        "masked_select",
+        "repeat_interleave",
+        "equal",
+        "bincount",
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n, self.n_waits = 0, 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        name = func.overloadpacket.__name__
+        self.n += not any(word in name for word in ("view", "reshape", "expand", "detach", "select", "slice"))
+        self.n_waits += any(word in name for word in self.WAITS)
+        return func(*args, **(kwargs or {}))
+
+
+def counted(work: Callable[[], object]) -> tuple[int, int]:
+    """Operations, with launches of fused kernels, and synchronisations of the work."""
+    try:
+        from gmmtorch.kernels.compiler import FusedKernel
+    except ImportError:  # a version without fused kernels
+        with Operations() as operations:
+            work()
+        return operations.n, operations.n_waits
+    launches, call = [0], FusedKernel.__call__
+
+    def launch(self: FusedKernel, *arguments: object, **options: object) -> None:
+        launches[0] += 1
+        call(self, *arguments, **options)  # type: ignore[arg-type]
+
+    FusedKernel.__call__ = launch  # type: ignore[method-assign,assignment]
+    try:
+        with Operations() as operations:
+            work()
+    finally:
+        FusedKernel.__call__ = call  # type: ignore[method-assign]
+    return operations.n + launches[0], operations.n_waits
+
+
+def uniform(*shape: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def room(n: int) -> Tensor:
+    """Points on the faces of a box of 8 × 6 × 3 m, 1 cm noise."""
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([8.0, 6.0, 3.0])
+    points, axis = torch.rand(n, 3, generator=generator) * size, torch.randint(3, (n,), generator=generator)
+    points[torch.arange(n), axis] = size[axis] * torch.randint(2, (n,), generator=generator)
+    return (points + 0.01 * torch.randn(n, 3, generator=generator)).double()
+
+
+def rays(resolution: float) -> Work:
+    """300,000 rays of about 5 m, counted in a dense grid of 20 × 20 × 4 m."""
+    extent = torch.tensor([20.0, 20.0, 4.0], dtype=torch.float64)
+    starts = uniform(300_000, 3) * extent
+    steps = 3 * torch.randn(300_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    ends = (starts + steps).clamp(torch.full_like(extent, 1e-6), extent - 1e-6)
+    grid = gt.VoxelGrid((0.0, 0.0, 0.0), resolution, tuple(round(float(x) / resolution) for x in extent))
+    return lambda: gt.Evidence.empty(grid).add_rays(starts, ends)
+
+
+def exact_em() -> Work:
+    """Five iterations of exact EM on 100,000 points with 1,000 components."""
+    points = room(100_000)
+    start = {
+        "means_init": points[::100].numpy(),
+        "precisions_init": 25.0 * torch.eye(3).repeat(1000, 1, 1).numpy(),
+    }
+    return lambda: gt.GaussianMixture(1000, algorithm="exact", max_iter=5, tol=0.0, **start).fit(points)
+
+
+def em(n: int, k: int) -> Work:
+    points = room(n)
+    return lambda: gt.GaussianMixture(k, tol=2e-3, reg_covar=1e-5, random_state=0).fit(points)
+
+
+def frames(data: Path) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+    dataset = gt.datasets.load("depth_frames", data / "kinect", pixel_stride=2)
+    return [dataset.image(i) for i in range(len(dataset)) if i % 5], dataset.intrinsics
+
+
+def built(data: Path, stride: int, **rule: float) -> gt.GaussianMap:
+    made = gt.GaussianMap(gt.IncrementalRule(max_bytes=8000, **rule), **MAP)
+    made.insert_depth(*FRAMES, stride)
+    made.finish()
+    return made
+
+
+FRAMES: tuple[list[tuple[Tensor, Tensor]], Tensor] = ([], torch.eye(3))
+
+
+def queries(data: Path, name: str) -> Work:
+    if name == "kinect":
+        made, resolution = built(data, 4), 0.05
+    else:
+        made, resolution = gt.GaussianMap(gt.IncrementalRule(max_bytes=26_000), **MAP), 0.2
+        for number, scan in enumerate(gt.datasets.load("scan_folder", data / name)):
+            if number % 5 == 0:
+                made.insert(scan)
+        made.finish()
+    low, high = made.means.amin(0), made.means.amax(0)
+    points = low + (high - low) * uniform(20_000, 3)
+    made.occupancy(points[:100], resolution)  # makes the spatial index
+    return lambda: made.occupancy(points, resolution)
+
+
+def flux(data: Path) -> Work:
+    made = built(data, 4)
+    low, high = made.means.quantile(0.02, 0), made.means.quantile(0.98, 0)
+    shape = tuple(((high - low) / 0.1).ceil().long().tolist())
+    grid = gt.VoxelGrid(tuple(low.tolist()), 0.1, shape)
+    return lambda: made.evidence(grid, "flux")
+
+
+def frame() -> Work:
+    """A cloud of 20,000 points becomes a map of its own, as a frame inserted into a map does."""
+    scan = gt.Scan(room(20_000), torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
+
+    def insert() -> None:
+        made = gt.GaussianMap(gt.IncrementalRule(noise=0.01, length=0.5, cell=0.05, window=1), **MAP)
+        made.insert(scan)
+        made.finish()
+
+    return insert
+
+
+def registration(data: Path) -> Work:
+    try:
+        from gmmtorch import register
+    except ImportError:
+        from gmmtorch.mapping.registration import register
+    scans = list(gt.datasets.load("scan_folder", data / "hall"))
+    made = []
+    for place in (10, 14):
+        part = gt.GaussianMap(gt.IncrementalRule(noise=0.02, length=0.6, cell=0.05, window=1))
+        part.insert(scans[place])
+        part.finish()
+        made.append(part)
+    start = torch.eye(4, dtype=torch.float64)
+    start[:3, 3] = torch.tensor([0.4, -0.3, 0.1], dtype=torch.float64)
+    return lambda: register(made[1], made[0], start)
+
+
+def works(data: Path) -> dict[str, Callable[[], Work]]:
+    return {
+        "rays through 0.2 m, counted, dense": lambda: rays(0.2),
+        "rays through 0.05 m, counted, dense": lambda: rays(0.05),
+        "exact EM, 100,000 points, K = 1,000, five iterations": exact_em,
+        "EM, 20,000 points, K = 1,000": lambda: em(20_000, 1000),
+        "EM, 1,000,000 points, K = 2,000": lambda: em(1_000_000, 2000),
+        "112 frames to a map, default rule": lambda: lambda: built(data, 4),
+        "112 frames to a map, fast rule": lambda: lambda: built(data, 8, **FAST),
+        "a frame of 20,000 points inserted": frame,
+        "20,000 point queries, kinect in 8 kB": lambda: queries(data, "kinect"),
+        "20,000 point queries, hall in 26 kB": lambda: queries(data, "hall"),
+        "flux, kinect in 8 kB, cells of 0.1 m": lambda: flux(data),
+        "registration of two scans of hall": lambda: registration(data),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", nargs="*", help="parts of names")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    FRAMES[0][:], intrinsics = frames(options.data)
+    FRAMES[1].copy_(intrinsics)
+    found = {}
+    for name, prepared in works(options.data).items():
+        if options.only and not any(part in name for part in options.only):
+            continue
+        work = prepared()
+        counts = counted(work)  # and what is loaded once
+        begin = time.process_time()
+        work()
+        found[name] = (time.process_time() - begin, *counts)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
