@@ -80,3 +80,39 @@ def test_a_wrong_export_is_refused_before_any_work(run):
     error = refused(run(*QUIET, "export=[mesch]"))
     assert "'mesch' is not one of map_server" in error
     assert "resolution=0" in refused(run(*QUIET, "resolution=0"))
+
+
+def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch, tmp_path):
+    pytest.importorskip("rosbags")
+    from gmmtorch.export.bag import BagWriter
+
+    room = np.random.default_rng(0).uniform(-4, 4, (400, 3))
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for time in (0.0, 1.5, 3.0):
+            bag.transforms(time, {("odom", "lidar"): np.eye(4)})
+        for time in (0.5, 1.0, 1.5, 2.0, 4.0):  # the last one is after the last pose
+            bag.cloud("/points", time, "lidar", room if time != 1.0 else room[:0])
+        for stamp in ({"sec": 2, "nanosec": 500_000_000}, {"sec": 0, "nanosec": 1}):  # one jumps back
+            damaged = {
+                "header": {"frame_id": "lidar", "stamp": stamp},
+                "width": 9,
+                "height": 1,
+                "point_step": 2**31,
+            }
+            bag.message("/points", "sensor_msgs/msg/PointCloud2", 2.5, damaged)
+    bag_options = ["dataset=rosbag", f"dataset.path={tmp_path / 'a.mcap'}"]
+    done = succeeded(run_here(monkeypatch, "map", tmp_path / "run", *bag_options, *QUIET))
+    row = done.results()["rows"][0]
+    assert (row["n_scans"], row["n_skipped"]) == (3, 4)
+    for line in (
+        "1 scans: stamp out of order (the clock jumped)",
+        "1 scans: no pose at the time of the scan",
+        "1 scans: message without a valid point",
+        "1 scans: message that cannot be decoded",
+    ):
+        assert f"skipped   {line}" in done.stdout
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.transforms(0.0, {("odom", "lidar"): np.eye(4)})
+        bag.cloud("/points", 0.0, "lidar", room[:0])
+    empty = run_here(monkeypatch, "map", tmp_path / "empty", *bag_options, *QUIET)
+    assert "a: no scan of 1 can be used: message without a valid point" in refused(empty)

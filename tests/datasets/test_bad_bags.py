@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,43 @@ def test_an_unknown_compression_is_named(tmp_path, suffix, codec):
     name = b"w" * len(codec)
     path.write_bytes(path.read_bytes().replace(codec, name))
     with pytest.raises(DataError, match=f"{name.decode()}.*unknown compression"):
+        load("rosbag", path)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "db3"])
+def test_compressed_messages_are_read_without_metadata(tmp_path, suffix):
+    """`ros2 bag record --compression-mode message` states the compression only in metadata.yaml."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    bag = BagWriter(tmp_path / f"a.{suffix}")
+    bag.writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with bag:
+        drive(bag)
+        bag.cloud("/points", 0.0, "lidar", np.ones((1000, 3)))
+    assert (tmp_path / f"a.{suffix}").stat().st_size < 100_000
+    assert load("rosbag", tmp_path / f"a.{suffix}")[0].points.shape == (1000, 2)
+
+
+def test_a_topic_without_a_type_is_left_out(tmp_path):
+    import sqlite3
+
+    path = clouds(tmp_path / "a.db3")
+    with sqlite3.connect(path) as database:
+        database.executescript(
+            "CREATE TABLE copied AS SELECT * FROM topics; DROP TABLE topics; "  # without its constraints
+            "ALTER TABLE copied RENAME TO topics; UPDATE topics SET type = NULL WHERE name = '/tf_static'"
+        )
+    database.close()
+    with pytest.raises(DataError, match=r"/points: TF has no frame lidar"):
+        load("rosbag", path)
+
+
+def test_transforms_whose_definition_is_damaged_are_left_out(tmp_path):
+    path = clouds(tmp_path / "a.bag")
+    path.write_bytes(
+        path.read_bytes().replace(b"TransformStamped[] transforms", b"TransformStamped[] trans2orms")
+    )
+    with pytest.raises(DataError, match=r"/points: TF has no frame lidar"):
         load("rosbag", path)
 
 
@@ -235,6 +273,25 @@ def test_a_damaged_message_gives_an_empty_scan_and_is_counted(tmp_path):
     dataset = load("rosbag", tmp_path / "a.mcap")
     assert [len(scan.points) for scan in dataset] == [2, 0]
     assert dataset.skipped == {"message that cannot be decoded": 1}
+
+
+def test_random_bytes_as_coordinates_give_finite_points_and_no_warning(tmp_path):
+    table = np.frombuffer(np.random.default_rng(0).bytes(12 * 4000), [(axis, "<f4") for axis in "xyz"]).copy()
+    table["x"][:9] = np.array([0x7FA00000], np.uint32).view(np.float32)  # a signalling NaN
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.transforms(0.0, {("base", "far"): moved(0)}, static=True)
+        entry = {"header": {"frame_id": "base"}, "child_frame_id": "far"}
+        huge = {"rotation": dict.fromkeys("xyzw", 1e300)}
+        bag.message(
+            "/tf_static", "tf2_msgs/msg/TFMessage", 0.0, {"transforms": [{**entry, "transform": huge}]}
+        )
+        bag.cloud_table("/points", 1.0, "lidar", table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        points = load("rosbag", tmp_path / "a.mcap")[0].points
+    assert 0 < len(points) < 4000
+    assert bool(points.isfinite().all())
 
 
 def test_an_unusable_layout_is_refused_at_once(tmp_path):

@@ -98,7 +98,7 @@ class BagSurvey:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
                 return
             time, matrix, body = pose_sample(content, message.type)
-        except (DataError, ValueError):
+        except (DataError, ValueError, KeyError, TypeError):  # also a definition in the bag that is damaged
             return  # a transform that is missed leaves a gap, which `max_gap` notices
         self._samples.append((time, matrix))
         self._bodies[body] += 1

@@ -17,6 +17,8 @@ from gmmtorch.datasets.recordings.rosbags_access import load_rosbags
 from gmmtorch.errors import DataError, GmmTorchError
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
 _REPAIRS = {
     ".bag": "'rosbag reindex' repairs a recording that was interrupted",
     ".mcap": "'mcap recover' repairs a recording that was interrupted",
@@ -57,12 +59,13 @@ class BagReader:
         with self._errors():
             self._reader: Any = (rosbags.ros1 if self._is_ros1 else rosbags.ros2)(_bounded(self.path))
             self._reader.open()
-            self._unpack = None
+            self._unpack = rosbags.unpack_zstd
             if not self._is_ros1 and self._reader.compression_mode == "message":
                 storage = self._reader.storage  # messages are unpacked here, with a limit
                 storage.metadata = storage.metadata._replace(compression_mode=None)
-                self._unpack = rosbags.unpack_zstd
-            self._connections = list(self._reader.connections)
+            self._connections = [
+                c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
+            ]  # columns of a damaged database can be empty
             self._decoder = MessageDecoder(
                 {**self._own_definitions(rosbags), **rosbags.definitions(self._is_ros1)},
                 packed=self._is_ros1,
@@ -87,7 +90,9 @@ class BagReader:
             return
         with self._errors():
             for connection, time, data in self._reader.messages(connections=chosen, start=start):
-                content = bytes(data) if self._unpack is None else self._unpack(bytes(data))
+                content = bytes(data)
+                if not self._is_ros1 and content.startswith(_ZSTD):  # CDR starts with a zero
+                    content = self._unpack(content)
                 yield RawMessage(connection.topic, connection.msgtype, time, content)
 
     def decode(self, message: RawMessage) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, incre
 from gmmtorch.datasets.recordings.transform_tree import frame_name, stamp_of
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_choice, check_whole
 from gmmtorch.pinhole import back_project
-from gmmtorch.scan import Scan
+from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
 _LEVEL = math.cos(math.radians(10))
@@ -177,6 +177,7 @@ class RosBag(Dataset):
             of_frame = np.array([i for i, record in enumerate(records) if record.frame == frame])
             times = np.array([records[i].stamp for i in of_frame])
             matrices[of_frame], known[of_frame] = self._source.at(times, frame)
+        known &= (np.abs(matrices[:, :3, 3]) <= FARTHEST).all(1)
         if not known.any():
             first, last = records[0], records[-1]
             raise DataError(
@@ -230,6 +231,7 @@ class RosBag(Dataset):
             self._skip("points of several heights among planar scans", self._records[index].number)
             return Scan(origin.new_empty(0, dim), origin)
         ends = self._in_world(index, found)
+        ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         return self.ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
 
     def _in_world(self, index: int, found: Reading) -> Tensor:

@@ -71,8 +71,14 @@ def cloud_points(message: dict[str, Any], stamp: int) -> Reading:
             f"{height} × {width} points of {step} bytes are announced, but the cloud has {len(data)} bytes"
         )
     table = np.ndarray((height, width), np.dtype(cast(Any, layout)), bytes(data), 0, (row, step)).ravel()
-    points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+    points = _coordinates(table)
     return reading(points, None, point_offsets(table[time], stamp) if time else None)
+
+
+def _coordinates(table: np.ndarray) -> np.ndarray:
+    """The fields x, y, z of a structured array (N,) as (N, 3) float64."""
+    with np.errstate(invalid="ignore"):  # signalling NaNs, which random bytes contain
+        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
 
 
 def listed_points(message: dict[str, Any], field: str, stamp: int) -> Reading:
@@ -80,7 +86,7 @@ def listed_points(message: dict[str, Any], field: str, stamp: int) -> Reading:
     table = message[field]
     if len(table) == 0:
         return reading(np.empty((0, 3)), None, None)
-    points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+    points = _coordinates(table)
     time = next((name for name in table.dtype.names if name.lower() in _TIME_FIELDS), None)
     return reading(points, None, point_offsets(table[time], stamp) if time else None)
 

@@ -106,7 +106,8 @@ def pose_matrix(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
 
     Raises `ValueError` if a number is not finite or a quaternion is zero.
     """
-    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
     if not (np.isfinite(position).all() and np.isfinite(norm).all() and (norm > MIN_NORM).all()):
         raise ValueError(f"position {position} with quaternion {quaternion} is not a pose")
     x, y, z, w = np.moveaxis(quaternion / norm, -1, 0)
