@@ -41,3 +41,15 @@ def load_viser() -> Any:
             "pip install 'gmmtorch[viewer]'."
         ) from error
     return viser
+
+
+def load_ray() -> Any:
+    """The module ray. Raises `GmmTorchError` if it does not load."""
+    try:
+        import ray
+    except ImportError as error:
+        raise GmmTorchError(
+            f"Several workers and clusters need the package ray, which does not load ({error}); install it: "
+            "pip install 'gmmtorch[cluster]'."
+        ) from error
+    return ray

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import maps
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -50,14 +51,14 @@ def run(config: DictConfig) -> None:
         if not config[name]:
             raise InvalidArgumentError(f"{name} is not set; give {name}=FILE.")
     config.format = _format(config)
-    device = common.use_runtime(config.runtime)
+    common.use_runtime(config.runtime)
     with ProgressBars(enabled=config.report.progress) as bars:
         if config.format == _OF_POSES:
             message = _export_poses(Path(config.path), Path(config.output))
         elif config.format in _OF_COMPONENTS:
             message = _export_components(config)
         else:
-            message = write_space(config, _map(Path(config.path), device), bars)
+            message = write_space(config, _map(config), bars)
     print(message)
 
 
@@ -100,7 +101,7 @@ def _export_components(config: DictConfig) -> str:
     from gmmtorch.export import mixture_formats
     from gmmtorch.mixture import GaussianMixture
 
-    mixture = mixture_formats.checked(_components(Path(config.path), config.n_points))
+    mixture = mixture_formats.checked(_components(config))
     output = Path(config.output)
     if config.format == "csv":
         mixture_formats.write_gira_csv(output, mixture)
@@ -112,19 +113,19 @@ def _export_components(config: DictConfig) -> str:
     return f"{_size(output)}: {k:,} components in {dim}D"
 
 
-def _components(path: Path, n_points: float | None) -> PlainMixture:
+def _components(config: DictConfig) -> PlainMixture:
     """The mixture in a file of any supported format; the surface components of a map."""
     from gmmtorch.errors import DataError
     from gmmtorch.export import mixture_formats
-    from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mixture import GaussianMixture
 
+    path, n_points = Path(config.path), config.n_points
     if path.suffix == ".csv":
         return mixture_formats.read_gira_csv(path, n_points)
     if path.suffix == ".npz":
         return mixture_formats.read_npz(path)
     try:
-        found = GaussianMap.load(path).components()
+        found = maps.open_map(path, config.runtime, config.bounds).components()
         surface = ~found.max_range
         return mixture_formats.PlainMixture.of_support(
             found.means[surface], found.covariances[surface], found.support[surface]
@@ -142,14 +143,14 @@ def _components(path: Path, n_points: float | None) -> PlainMixture:
 # -- space ----------------------------------------------------------------------------------------
 
 
-def _map(path: Path, device: str) -> GaussianMap | OccupancyGrid:
-    """The map in a file. Raises `DataError` with the errors of all readers if it contains no map."""
+def _map(config: DictConfig) -> GaussianMap | OccupancyGrid:
+    """The map in a file or folder. Raises `DataError` with the errors of all readers if it has no map."""
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid
     from gmmtorch.errors import DataError
-    from gmmtorch.mapping.gaussian_map import GaussianMap
 
+    path = Path(config.path)
     try:
-        return GaussianMap.load(path).to(device)
+        return maps.open_map(path, config.runtime, config.bounds, config.resolution)
     except DataError as error:
         no_map = error
     try:

@@ -14,11 +14,11 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.recordings import map_recordings
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.view import serve
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.events import Row
     from gmmtorch.live.map_viewer import MapViewer
     from gmmtorch.mapping.map_builder import MapBuilder
     from gmmtorch.report.progress import ProgressBars
@@ -45,6 +45,9 @@ def run(config: DictConfig) -> None:
     device, folder = common.set_up(config), common.run_dir()
     check_resolution(config.resolution)
     map_outputs.check_exports(config)
+    if config.inputs:
+        map_recordings.run(config)
+        return
     dataset = common.open_dataset(config.dataset)
     target = maps.map_factory(config, resolution=config.resolution)()
     builder = MapBuilder(dataset, target, device)
@@ -53,7 +56,7 @@ def run(config: DictConfig) -> None:
         _build(config, builder, folder / _CHECKPOINT, bars, viewer)
         target.save(folder / "map.safetensors")
         trajectory = map_outputs.write_trajectory(builder, folder)
-        row = _row(dataset.name, builder, config)
+        row = map_outputs.result_row(dataset.name, builder, config)
         exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
         map_outputs.draw(config, builder, trajectory, row, folder)
@@ -146,29 +149,6 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
-    """The row of results.json."""
-    now, record, built = builder.progress(), builder.record, builder.map
-    nbytes, seconds = built.nbytes, max(now.seconds, 1e-9)
-    return {
-        "dataset": name,
-        "n_scans": len(record.indices),
-        "n_skipped": now.n_skipped,
-        "skipped": [{"reason": reason, "n_scans": n} for reason, n in builder.skipped.items()],
-        "n_points": now.n_points,
-        "metres": now.metres,
-        "n_components": built.n_components,
-        "nbytes": nbytes,
-        "bytes_per_metre": nbytes / now.metres if now.metres else None,
-        "resolution": config.resolution,
-        "seconds": now.seconds,
-        "scans_per_second": now.n_read / seconds,
-        "metres_per_second": now.metres / seconds,
-        "memory_bytes": max(row["memory_bytes"] for row in record.history),
-        "history": record.history,
-    }
 
 
 if __name__ == "__main__":

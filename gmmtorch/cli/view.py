@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import maps
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 # Flags of Hydra whose values are words of their own.
 _FLAGS_WITH_A_VALUE = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp"}
 _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
-_MAP, _TRAJECTORY = "map.safetensors", "trajectory.tum"
+_TRAJECTORY = "trajectory.tum"
 
 
 def main() -> None:
@@ -57,15 +58,13 @@ def run(config: DictConfig) -> None:
     from gmmtorch.errors import InvalidArgumentError
     from gmmtorch.live.map_page import write_page
     from gmmtorch.live.map_viewer import MapViewer
-    from gmmtorch.mapping.gaussian_map import GaussianMap
 
     if not config.path:
         raise InvalidArgumentError("path is not set; give a map file or the run directory of gmmtorch-map.")
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
     common.use_runtime(config.runtime)
     path = Path(config.path).expanduser()
-    path = path / _MAP if path.is_dir() else path
-    shown = GaussianMap.load(path).to(config.runtime.device)
+    shown = maps.open_map(path, config.runtime, config.bounds)
     trajectory = _trajectory(config, path, shown.dim)
     look = {"shape": config.shape, "colour": config.colour}
     if config.html:
@@ -93,7 +92,11 @@ def _trajectory(config: DictConfig, path: Path, dim: int | None) -> Tensor | Non
     from gmmtorch.errors import DataError, MissingDataError
 
     given = config.trajectory is not None
-    file = Path(config.trajectory).expanduser() if given else path.parent / _TRAJECTORY
+    file = (
+        Path(config.trajectory).expanduser()
+        if given
+        else (path if path.is_dir() else path.parent) / _TRAJECTORY
+    )
     if not file.is_file():
         if given:
             raise MissingDataError(f"trajectory={file} does not exist; give a TUM file, or null.")

@@ -209,12 +209,7 @@ class MapBuilder:
         stored = facts.get("run")
         if not isinstance(stored, dict):
             raise DataError(f"{path} lacks the description of its run; the file is damaged.")
-        for name in dict.fromkeys([*run, *stored]):
-            if stored.get(name) != run.get(name):
-                raise InvalidArgumentError(
-                    f"{path} is of another run: it has {name}={stored.get(name)!r}, this run has "
-                    f"{name}={run.get(name)!r}. Use the same value, or another folder, or delete the file."
-                )
+        check_same_run(path, stored, run)
         try:
             state = joined_tensors(facts["tree"], tensors)
             record, poses = BuildRecord(**state["record"]), state["poses"]
@@ -227,6 +222,16 @@ class MapBuilder:
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise DataError(f"{path} is damaged: {error!r}; delete it to start again.") from error
         self.record, self._poses = record, list(poses.double())
+
+
+def check_same_run(path: str | Path, stored: Mapping[str, Any], run: Mapping[str, Any]) -> None:
+    """Raises `InvalidArgumentError` if a file is of a run with other settings than those of this run."""
+    for name in dict.fromkeys([*run, *stored]):
+        if stored.get(name) != run.get(name):
+            raise InvalidArgumentError(
+                f"{path} is of another run: it has {name}={stored.get(name)!r}, this run has "
+                f"{name}={run.get(name)!r}. Use the same value, or another folder, or delete the file."
+            )
 
 
 def resident_bytes() -> int:

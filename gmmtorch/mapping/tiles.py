@@ -47,6 +47,7 @@ class TiledMap:
         folder: with the index file.
         device: of the evidence.
         most_open: number of tiles that stay in memory between queries.
+        memory_limit: bytes of the evidence, and of the components of an opened box, at most.
 
     Attributes:
         index: see `TileIndex`. dim: 2 or 3. side: of the tiles (m).
@@ -57,7 +58,13 @@ class TiledMap:
     Raises `MissingDataError` if there is no index, and `DataError` if it is damaged.
     """
 
-    def __init__(self, folder: str | Path, device: str | torch.device = "cpu", most_open: int = 16) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        device: str | torch.device = "cpu",
+        most_open: int = 16,
+        memory_limit: int = 4 << 30,
+    ) -> None:
         self.folder, self.device = Path(folder), torch.device(device)
         self.most_open = check_whole("most_open", most_open, 1)
         self.index, facts = read_index(self.folder / INDEX)
@@ -66,7 +73,7 @@ class TiledMap:
         self.resolution, self.method = self.settings.resolution, self.settings.method
         query = self.settings.query
         self._cutoff = self.index.cutoff if query.cutoff is None else query.cutoff
-        self.query_options = replace(query, cutoff=self._cutoff)
+        self.query_options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
         self.n_read = 0
         self._open: OrderedDict[int, Query] = OrderedDict()
 

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_runs import refused, run_here, succeeded
+from command_runs import composed, refused, run_here, succeeded
 
 from gmmtorch.cli import map as map_command
+from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.view import overrides
 from gmmtorch.datasets import load
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.tile_merging import tile_files
 
 pytest.importorskip("viser")
 
@@ -38,6 +40,20 @@ def test_html_of_a_run_directory_and_errors(monkeypatch, tmp_path):
     assert "path is not set" in refused(run_here(monkeypatch, "view", tmp_path))
     (tmp_path / "trajectory.tum").write_text("no numbers\n")
     assert "is not a TUM file" in refused(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html))
+
+
+def test_html_of_a_part_of_a_map_in_tiles(monkeypatch, tmp_path):
+    built = GaussianMap()
+    for scan in load("synthetic_building_2d", n_scans=2):
+        built.insert(scan)
+    (tmp_path / "tiles").mkdir()
+    for name, data in tile_files(built.components(), built.settings, 5.0).items():
+        (tmp_path / "tiles" / name).write_bytes(data)
+    html = f"html={tmp_path / 'map.html'}"
+    succeeded(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html, "bounds=[2,10,3,11]"))
+    assert (tmp_path / "map.html").stat().st_size > 10_000
+    part = maps.open_map(tmp_path, composed("view").runtime, [2, 10, 3, 11])
+    assert 0 < part.n_components <= maps.open_map(tmp_path, composed("view").runtime).n_components
 
 
 def test_a_map_is_shown_while_it_is_built(monkeypatch, tmp_path):

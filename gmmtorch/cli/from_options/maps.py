@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
@@ -46,6 +47,36 @@ def check_factories(factories: Mapping[str, MapFactory], resolution: float) -> N
             raise InvalidArgumentError(
                 f"method_options.{name} has a value of the wrong type: {error}."
             ) from error
+
+
+def open_map(
+    path: Path, runtime: DictConfig, bounds: Sequence[float] | None = None, resolution: float | None = None
+) -> GaussianMap:
+    """The map in a file, or in a folder: a run directory of gmmtorch-map, or a tiled map.
+
+    Args:
+        bounds: the lowest corner of a box and then the highest (m). Of a tiled map only the tiles are opened
+            that give evidence in the box. None: all.
+        resolution: side (m) of the largest cells that will be asked; None: that of the map.
+    """
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+    from gmmtorch.mapping.tile_index import INDEX
+    from gmmtorch.mapping.tiles import TiledMap
+
+    folders = [folder for folder in (path / "tiles", path) if (folder / INDEX).exists()]
+    if (path / "map.safetensors").exists() or not folders:
+        file = path / "map.safetensors" if path.is_dir() else path
+        return GaussianMap.load(file).to(runtime.device)
+    tiled = TiledMap(folders[0], runtime.device, memory_limit=runtime.memory_limit)
+    if bounds is None:
+        return tiled.open(resolution=resolution)
+    if len(bounds) != 2 * tiled.dim:
+        raise InvalidArgumentError(
+            f"bounds={list(bounds)} must be {2 * tiled.dim} numbers in {tiled.dim}D: the lowest corner, then "
+            "the highest."
+        )
+    return tiled.open(list(bounds[: tiled.dim]), list(bounds[tiled.dim :]), resolution)
 
 
 def map_factory(config: DictConfig, resolution: float = 0.1, **changes: Any) -> Callable[[], GaussianMap]:

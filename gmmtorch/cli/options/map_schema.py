@@ -28,6 +28,11 @@ class Map:
     view: show the map in the browser while it is built, and until Ctrl-C.
     z_min, z_max: height band (m) of map_server in 3D; both null: between floor and ceiling.
     checkpoint_seconds: computing time between two checkpoints.
+    inputs: list of paths, globs and URLs of recordings, in place of dataset.path.
+    tile: side (m) of the tiles into which the maps of inputs are merged.
+    tile_bytes: bytes of a tile's file, at most; null: no limit.
+    workers: processes of this machine that map inputs; more than one needs Ray.
+    cluster: address of a Ray cluster that maps inputs; null: this machine.
     """
 
     dataset: Any = MISSING
@@ -39,6 +44,11 @@ class Map:
     z_min: float | None = None
     z_max: float | None = None
     checkpoint_seconds: float = 30.0
+    inputs: list[str] = field(default_factory=list)
+    tile: float = 100.0
+    tile_bytes: int | None = None
+    workers: int = 1
+    cluster: str | None = None
     report: Report = field(default_factory=Report)
     runtime: Runtime = field(default_factory=Runtime)
 
@@ -104,8 +114,9 @@ class Export:
 class View:
     """Options of gmmtorch-view.
 
-    path: map file, or run directory of gmmtorch-map.
+    path: map file, run directory of gmmtorch-map, or folder of tiles.
     trajectory: TUM file; null: trajectory.tum beside the map, if it exists.
+    bounds: of a map in tiles, the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened.
     html: file to write, .html, instead of serving a page.
     shape: ellipsoids, splats, surfaces or none.
     colour: height, support or age.
@@ -115,6 +126,7 @@ class View:
 
     path: str | None = None
     trajectory: str | None = None
+    bounds: list[float] | None = None
     html: str | None = None
     shape: str = "ellipsoids"
     colour: str = "height"

@@ -87,6 +87,29 @@ def write_exports(
     return messages, errors
 
 
+def result_row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
+    """The row of results.json of a recording."""
+    now, record, built = builder.progress(), builder.record, builder.map
+    nbytes, seconds = built.nbytes, max(now.seconds, 1e-9)
+    return {
+        "dataset": name,
+        "n_scans": len(record.indices),
+        "n_skipped": now.n_skipped,
+        "skipped": [{"reason": reason, "n_scans": n} for reason, n in builder.skipped.items()],
+        "n_points": now.n_points,
+        "metres": now.metres,
+        "n_components": built.n_components,
+        "nbytes": nbytes,
+        "bytes_per_metre": nbytes / now.metres if now.metres else None,
+        "resolution": config.resolution,
+        "seconds": now.seconds,
+        "scans_per_second": now.n_read / seconds,
+        "metres_per_second": now.metres / seconds,
+        "memory_bytes": max(row["memory_bytes"] for row in record.history),
+        "history": record.history,
+    }
+
+
 def draw(config: DictConfig, builder: MapBuilder, trajectory: Tensor, row: Row, folder: Path) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):

@@ -1,0 +1,231 @@
+"""gmmtorch-map inputs=[…]: maps each recording as a task, and merges the maps tile by tile."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import tempfile
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from gmmtorch.cli import common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.recordings.inputs import find_recordings, local_copy
+from gmmtorch.cli.recordings.tasks import Outcome, run_tasks
+from gmmtorch.cli.reporting import map_outputs
+
+if TYPE_CHECKING:
+    from gmmtorch.evaluation.events import Row
+    from gmmtorch.report.progress import ProgressBars
+
+_STAGE = "recordings"
+_DONE = "recording.json"  # written last: it says that a recording is complete
+_SUMS = ("n_scans", "n_skipped", "n_points", "metres", "seconds", "cpu_seconds")
+TABLE = "dataset n_recordings n_failed n_scans n_points metres n_tiles n_components nbytes cpu_seconds"
+
+
+class Mapped(NamedTuple):
+    """The files and the row of results.json of a recording; or its error."""
+
+    files: dict[str, bytes]
+    row: Row
+    error: str | None
+
+
+def run(config: DictConfig) -> None:
+    """Run the command. Recordings that an earlier run in this folder has finished are kept."""
+    from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+    from gmmtorch.report.progress import ProgressBars
+
+    begin, folder = time.monotonic(), common.run_dir()
+    if config.view:
+        raise InvalidArgumentError(
+            "view=true shows one recording; with inputs, use gmmtorch-view afterwards."
+        )
+    if "path" not in config.dataset.keys() or not OmegaConf.is_missing(config.dataset, "path"):  # noqa: SIM118
+        raise InvalidArgumentError(
+            f"inputs are paths of dataset={config.dataset.name}: choose the data set whose files they are, "
+            "such as dataset=rosbag, and leave dataset.path out."
+        )
+    maps.map_factory(config, resolution=config.resolution)  # an invalid option fails before any work
+    found = find_recordings(config.inputs)
+    facts = {name: _facts(config, address) for name, address in found.items()}
+    with ProgressBars(enabled=config.report.progress) as bars:
+        rows = _map_all(config, facts, folder / "recordings", bars)
+        failed = [row for row in rows if row["error"]]
+        finished = [name for name in found if (folder / "recordings" / name / _DONE).exists()]
+        if finished:
+            rows.append(_merge(config, finished, rows, folder, bars))
+            rows[-1]["seconds_of_run"] = time.monotonic() - begin
+            exported, errors = _export(config, folder, bars)
+        else:
+            exported, errors = [], []
+    common.write_results("map", config, rows, folder)
+    if finished:
+        common.print_table(rows[-1:], TABLE.split(), f"{len(found)} recordings")
+        print(f"\nmap       {folder / 'tiles'}")
+        print(*exported, sep="\n", end="\n" if exported else "")
+    common.print_files(folder, folder / "results.json")
+    if failed:
+        reasons = " ".join(f"{row['input']}: {row['error'].splitlines()[-1]}" for row in failed)
+        raise GmmTorchError(
+            f"{len(failed)} of {len(found)} recordings could not be mapped. {reasons} The same options with "
+            f"hydra.run.dir={folder} try them again."
+        )
+    if errors:
+        raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
+
+
+def _facts(config: DictConfig, address: str) -> dict[str, Any]:
+    """What the map of a recording depends on."""
+    import gmmtorch
+
+    dataset = OmegaConf.to_container(config.dataset, resolve=False)
+    assert isinstance(dataset, dict)
+    return {
+        "input": address,
+        "version": gmmtorch.__version__,
+        "dataset": {key: value for key, value in dataset.items() if key != "path"},
+        "map": common.as_options(config.map),
+        "seed": config.seed,
+        "dtype": config.runtime.dtype,
+        "resolution": config.resolution,
+        "tile": config.tile,
+    }
+
+
+def _map_all(
+    config: DictConfig, facts: dict[str, dict[str, Any]], folder: Path, bars: ProgressBars
+) -> list[Row]:
+    """Maps the recordings that are not finished; returns the rows of all, in the order of their names."""
+    rows = {name: _finished(folder / name, known) for name, known in facts.items()}
+    options = {"runtime": common.as_options(config.runtime)}
+    arguments = {name: (facts[name], options) for name, row in rows.items() if row is None}
+    n_done = len(facts) - len(arguments)
+    if n_done:
+        print(f"continues: {n_done} of {len(facts)} recordings are finished in {folder}")
+    if arguments:
+        bars(_STAGE, n_done, len(facts))
+        for outcome in run_tasks(map_recording, arguments, config.workers, config.cluster):
+            rows[outcome.name] = _keep(outcome, facts[outcome.name], folder / outcome.name)
+            n_done += 1
+            bars(_STAGE, n_done, len(facts))
+    return [row for row in rows.values() if row is not None]
+
+
+def _finished(folder: Path, facts: dict[str, Any]) -> Row | None:
+    """The row of a recording that is finished. Raises an error if it was mapped with other options."""
+    from gmmtorch.errors import DataError
+    from gmmtorch.mapping.map_builder import check_same_run
+
+    path = folder / _DONE
+    if not path.exists():
+        return None
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        run_facts, row = dict(stored["run"]), dict(stored["row"])
+        if not all(isinstance(row[name], int | float) for name in _SUMS):
+            raise TypeError("a count is not a number")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DataError(f"{path} is damaged ({error!r}); delete {folder} to map it again.") from error
+    check_same_run(path, run_facts, facts)
+    return row
+
+
+def _keep(outcome: Outcome, facts: dict[str, Any], folder: Path) -> Row:
+    """Writes the files of a recording, and returns its row."""
+    from gmmtorch.files import write_bytes, write_json
+
+    mapped = outcome.result
+    if mapped is None:
+        mapped = Mapped({}, {}, outcome.error)
+    row = {"input": facts["input"], "error": mapped.error, "n_lost": outcome.n_lost, **mapped.row}
+    if mapped.error is None:
+        for name, data in mapped.files.items():
+            write_bytes(folder / name, data)
+        write_json(folder / _DONE, {"run": facts, "row": row})
+    return row
+
+
+def map_recording(facts: dict[str, Any], options: dict[str, Any]) -> Mapped:
+    """The map of one recording in tiles, its trajectory and its row. Runs in a worker; raises nothing."""
+    from gmmtorch.errors import GmmTorchError
+
+    config = OmegaConf.create({**facts, **options})
+    config.runtime.dtype = facts["dtype"]
+    try:
+        with local_copy(facts["input"]) as path:
+            return _mapped(config, path)
+    except GmmTorchError as error:
+        return Mapped({}, {}, str(error))
+    except Exception as error:
+        return Mapped({}, {}, f"{traceback.format_exc()}{type(error).__name__}: {error}")
+
+
+def _mapped(config: DictConfig, path: Path) -> Mapped:
+    from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.mapping.tile_merging import tile_files
+
+    begin = time.process_time()
+    device = common.use_runtime(config.runtime)
+    config.dataset.path = str(path)
+    dataset = common.open_dataset(config.dataset)
+    builder = MapBuilder(dataset, maps.map_factory(config, resolution=config.resolution)(), device)
+    for _ in builder.insert_all():
+        pass
+    builder.finish()
+    files = tile_files(builder.map.components(), builder.map.settings, config.tile)
+    with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
+        map_outputs.write_trajectory(builder, Path(folder))
+        files |= {file.name: file.read_bytes() for file in Path(folder).iterdir()}
+    row = map_outputs.result_row(dataset.name, builder, config)
+    row |= {"cpu_seconds": time.process_time() - begin, "worker": f"{platform.node()}:{os.getpid()}"}
+    return Mapped(files, row, None)
+
+
+def _merge(
+    config: DictConfig, names: Sequence[str], rows: Sequence[Row], folder: Path, bars: ProgressBars
+) -> Row:
+    """Merges the finished recordings into tiles/; returns the row of the merged map."""
+    from gmmtorch.mapping.tile_merging import merge
+    from gmmtorch.mapping.tiles import TiledMap
+
+    begin = time.process_time()
+    parts = [TiledMap(folder / "recordings" / name) for name in names]
+    tiled = merge(folder / "tiles", parts, config.tile_bytes, bars)
+    mapped = [row for row in rows if not row["error"]]
+    metres = sum(row["metres"] for row in mapped)
+    return {
+        "dataset": config.dataset.name,
+        "input": None,
+        "error": None,
+        "n_recordings": len(mapped),
+        "n_failed": len(rows) - len(mapped),
+        "n_lost": sum(row["n_lost"] for row in rows),
+        **{name: sum(row[name] for row in mapped) for name in _SUMS},
+        "n_tiles": len(tiled.index),
+        "n_components": tiled.n_components,
+        "nbytes": tiled.nbytes,
+        "bytes_per_metre": tiled.nbytes / metres if metres else None,
+        "merge_cpu_seconds": time.process_time() - begin,
+    }
+
+
+def _export(config: DictConfig, folder: Path, bars: ProgressBars) -> tuple[list[str], list[str]]:
+    """Writes the exports of the whole map; returns messages, and the errors of those that failed."""
+    from gmmtorch.errors import GmmTorchError
+    from gmmtorch.mapping.tiles import TiledMap
+
+    if not config.export:
+        return [], []
+    tiled = TiledMap(folder / "tiles", config.runtime.device, memory_limit=config.runtime.memory_limit)
+    try:
+        return map_outputs.write_exports(config, tiled.open(), folder, bars)
+    except GmmTorchError as error:
+        return [], [str(error)]
