@@ -191,6 +191,8 @@ def _opened_store(
         return None
     given = config.journal.folder
     path = Path(folder if given is None else given) / f"robot_{config.id}.sqlite"
+    if given is not None and not path.exists():  # a mistyped folder would lose the map without a word
+        common.logger.warning("journal.folder=%s holds no %s: the map starts empty.", given, path.name)
     with common.naming({"path": "hydra.run.dir" if given is None else "journal.folder"}):
         store = stack.enter_context(Store(path, config.id, facts_of(config)))
     transport.disown(store.begin_session(transport.session))

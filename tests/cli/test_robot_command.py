@@ -465,9 +465,11 @@ def test_a_robot_without_peers_is_warned_of(run):
 
 def test_a_store_of_another_log_is_rejected(run, tmp_path):
     kept = f"journal.folder={tmp_path / 'kept'}"
-    succeeded(run(*LOG, "log.rate=50", kept))
+    said = f"{kept} holds no robot_0.sqlite: the map starts empty."
+    assert said in succeeded(run(*LOG, "log.rate=50", kept)).stdout
     assert "every" in refused(run(*LOG, "log.rate=50", kept, "log.every=2", name="other"))
-    succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # the rate may change
+    again = succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # the rate may change
+    assert said not in again.stdout
 
 
 def test_a_store_of_another_world_is_rejected(run, tmp_path):
