@@ -119,9 +119,10 @@ def _hydra_main(name: str, run: Callable[[DictConfig], Any]) -> None:
         if is_running:
             raise
         place = f" of {error.filename}" if error.filename else ""
+        option = "hydra.sweep.dir" if flags.multirun else "hydra.run.dir"
         sys.exit(
-            f"gmmtorch: error: hydra.run.dir cannot be written because{place}: {error.strerror or error}; "
-            "give another folder, as in hydra.run.dir=/tmp/run."
+            f"gmmtorch: error: {option} cannot be written because{place}: {error.strerror or error}; "
+            f"give another folder, as in {option}=/tmp/run."
         )
 
 

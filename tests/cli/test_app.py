@@ -87,6 +87,8 @@ def test_a_folder_that_cannot_be_written_is_a_one_line_error(run, tmp_path):
     line = refused(run("occupancy", f"hydra.run.dir={tmp_path / 'file' / 'run'}"))
     assert "hydra.run.dir" in line
     assert str(tmp_path / "file") in line
+    line = refused(run("occupancy", "-m", f"hydra.sweep.dir={tmp_path / 'file' / 'runs'}"))
+    assert "as in hydra.sweep.dir=" in line
 
 
 # -- version, help, completion --------------------------------------------------------------------
