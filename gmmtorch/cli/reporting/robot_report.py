@@ -18,43 +18,6 @@ if TYPE_CHECKING:
     from gmmtorch.exploration.mission.robot_view import RobotView
 
 
-class StatusLine(logging.Handler):
-    """On a terminal, each status line replaces the last; in a file it is appended.
-
-    As a handler of the log it ends the status line before each record, so that records have their own lines.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._width = 0  # of the line that the terminal's cursor is on
-
-    def show(self, line: str) -> None:
-        """Shows a line. Raises `OSError` if standard error cannot be written."""
-        self.acquire()  # other threads may log
-        try:
-            if sys.stderr.isatty():
-                sys.stderr.write("\r" + line.ljust(self._width))
-                self._width = len(line)
-            else:
-                sys.stderr.write(line + "\n")
-            sys.stderr.flush()
-        finally:
-            self.release()
-
-    def end(self) -> None:
-        """Starts a new line if there is a status line. Raises `OSError`."""
-        if self._width:
-            self._width = 0
-            sys.stderr.write("\n")
-            sys.stderr.flush()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            self.end()
-        except OSError:
-            self.handleError(record)
-
-
 _PERIOD = 1.0
 """Seconds of the robot's time between two updates of the displays."""
 _CURVES = {"entropy_bits": "entropy_bits", "records": "records_over_time", "bytes_sent": "bytes_over_time"}
@@ -89,7 +52,7 @@ class RobotReport:
         self.series: dict[str, list[float]] = {"times": []}
         self._displays: list[_Display] = []
         if config.report.progress and sys.stderr is not None:  # it is None if the process has closed it
-            self._displays.append(_StatusDisplay(view))
+            self._displays.append(_StatusLine(view))
         if config.report.tensorboard:
             try:
                 self._displays.append(_BoardDisplay(folder / "tensorboard"))
@@ -150,22 +113,52 @@ class RobotReport:
         self.close()
 
 
-class _StatusDisplay:
-    """A status line on standard error, with the log above it."""
+class _StatusLine(logging.Handler):
+    """A status line on standard error, below the log.
+
+    On a terminal, each status line replaces the last; in a file it is appended. As a handler of the log it
+    ends the status line before each record, so that records have their own lines.
+    """
 
     option = "report.progress"
 
     def __init__(self, view: RobotView) -> None:
-        self._view, self._line = view, StatusLine()
-        common.logger.addHandler(self._line)  # runs before the handlers of the root logger
+        super().__init__()
+        self._view = view
+        self._width = 0  # of the line that the terminal's cursor is on
+        common.logger.addHandler(self)  # runs before the handlers of the root logger
 
     def show(self, now: float, scalars: dict[str, float]) -> None:
         refused = f", {scalars['refused']:,.0f} refused" if scalars["refused"] else ""
-        self._line.show(f"robot {self._view.robot}  {now:6.0f} s  {self._view.status()}{refused}")
+        line = f"robot {self._view.robot}  {now:6.0f} s  {self._view.status()}{refused}"
+        self.acquire()  # other threads may log
+        try:
+            if sys.stderr.isatty():
+                sys.stderr.write("\r" + line.ljust(self._width))
+                self._width = len(line)
+            else:
+                sys.stderr.write(line + "\n")
+            sys.stderr.flush()
+        finally:
+            self.release()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._end()
+        except OSError:
+            self.handleError(record)
 
     def close(self) -> None:
-        common.logger.removeHandler(self._line)
-        self._line.end()
+        common.logger.removeHandler(self)
+        super().close()
+        self._end()
+
+    def _end(self) -> None:
+        """Starts a new line if there is a status line."""
+        if self._width:
+            self._width = 0
+            sys.stderr.write("\n")
+            sys.stderr.flush()
 
 
 class _BoardDisplay:
