@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap as BayesianHilbertMap
     from gmmtorch.baselines.bgk_map import BGKMap as BGKMap
     from gmmtorch.baselines.bgk_points_map import BGKPointsMap as BGKPointsMap
     from gmmtorch.baselines.gp_map import GPMap as GPMap
-    from gmmtorch.baselines.hilbert_map import HilbertMap as HilbertMap
+    from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap as BayesianHilbertMap
+    from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap as HilbertMap
     from gmmtorch.baselines.ndt_map import NDTMap as NDTMap
     from gmmtorch.baselines.occupancy_grid import LogOdds as LogOdds
     from gmmtorch.baselines.occupancy_grid import OccupancyGrid as OccupancyGrid
@@ -25,9 +25,9 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "BGKMap": "bgk_map",
         "BGKPointsMap": "bgk_points_map",
-        "BayesianHilbertMap": "bayesian_hilbert_map",
+        "BayesianHilbertMap": "hilbert.bayesian_hilbert_map",
         "GPMap": "gp_map",
-        "HilbertMap": "hilbert_map",
+        "HilbertMap": "hilbert.hilbert_map",
         "LogOdds": "occupancy_grid",
         "NDTMap": "ndt_map",
         "OccupancyGrid": "occupancy_grid",

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap
 from gmmtorch.baselines.bgk_map import BGKMap
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
 from gmmtorch.baselines.gp_map import GPMap
-from gmmtorch.baselines.hilbert_map import HilbertMap
+from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap
 from gmmtorch.baselines.ndt_map import NDTMap
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap

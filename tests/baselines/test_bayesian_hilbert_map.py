@@ -11,9 +11,9 @@ import torch
 from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
 from torch import Tensor
 
-from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap
-from gmmtorch.baselines.lattice_features import LatticeDesign, LatticeFeatures
-from gmmtorch.baselines.logistic_regression import (
+from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.baselines.hilbert.lattice_features import LatticeDesign, LatticeFeatures
+from gmmtorch.baselines.hilbert.logistic_regression import (
     Posterior,
     evidence_bound,
     fit_posterior,
@@ -223,7 +223,7 @@ def test_a_map_with_full_covariance_is_saved_and_continues(tmp_path):
 
 def test_a_large_scan_learned_in_parts_gives_similar_occupancy(monkeypatch):
     whole = TestMeanField().built(wall_scan(2))
-    monkeypatch.setattr("gmmtorch.baselines.lattice_features.CHUNK_VALUES", 1500)
+    monkeypatch.setattr("gmmtorch.baselines.hilbert.lattice_features.CHUNK_VALUES", 1500)
     parts = TestMeanField().built(wall_scan(2))
     theta = [made.occupancy(lattice(2)) for made in (whole, parts)]
     assert not torch.equal(*theta)
@@ -231,7 +231,7 @@ def test_a_large_scan_learned_in_parts_gives_similar_occupancy(monkeypatch):
 
 
 def test_full_covariance_rejects_too_many_hinges(monkeypatch):
-    monkeypatch.setattr("gmmtorch.baselines.bayesian_hilbert_map._MAX_FULL", 10)
+    monkeypatch.setattr("gmmtorch.baselines.hilbert.bayesian_hilbert_map._MAX_FULL", 10)
     with pytest.raises(MemoryLimitError, match="mean_field"):
         full_map().insert(wall_scan(2))
 

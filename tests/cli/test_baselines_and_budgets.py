@@ -10,11 +10,11 @@ import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 from gmmtorch import datasets
-from gmmtorch.baselines.bayesian_hilbert_map import BayesianHilbertMap
 from gmmtorch.baselines.bgk_map import BGKMap
 from gmmtorch.baselines.bgk_points_map import BGKPointsMap
 from gmmtorch.baselines.gp_map import GPMap
-from gmmtorch.baselines.hilbert_map import HilbertMap
+from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
+from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap
 from gmmtorch.baselines.ndt_map import NDTMap
 from gmmtorch.baselines.occupancy_grid import OccupancyGrid
 from gmmtorch.baselines.octomap_map import OctoMapMap

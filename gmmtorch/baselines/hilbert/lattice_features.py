@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.bgk_map import kernel_offsets, sparse_kernel
-from gmmtorch.baselines.hilbert_features import CHUNK_VALUES, Design, Features, rbf_kernel
+from gmmtorch.baselines.hilbert.hilbert_features import CHUNK_VALUES, Design, Features, rbf_kernel
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.voxels.cell_table import CellTable
 

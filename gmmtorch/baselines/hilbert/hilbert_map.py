@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import TensorFileMap, check_between, check_length
-from gmmtorch.baselines.hilbert_features import Features, FourierFeatures, NystroemFeatures
-from gmmtorch.baselines.lattice_features import LatticeFeatures, check_lattice
-from gmmtorch.baselines.logistic_regression import logistic_regression
+from gmmtorch.baselines.hilbert.hilbert_features import Features, FourierFeatures, NystroemFeatures
+from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures, check_lattice
+from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression
 from gmmtorch.baselines.samples import beam_samples
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.files import require

@@ -10,8 +10,14 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import TensorFileMap, check_between, check_length
-from gmmtorch.baselines.lattice_features import LatticeFeatures, check_lattice
-from gmmtorch.baselines.logistic_regression import Covariance, Posterior, fit_posterior, moderated, moments
+from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures, check_lattice
+from gmmtorch.baselines.hilbert.logistic_regression import (
+    Covariance,
+    Posterior,
+    fit_posterior,
+    moderated,
+    moments,
+)
 from gmmtorch.baselines.samples import beam_samples
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import require

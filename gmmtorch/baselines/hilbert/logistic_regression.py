@@ -14,8 +14,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gmmtorch.baselines.hilbert_features import Design
-from gmmtorch.baselines.lattice_features import LatticeDesign
+from gmmtorch.baselines.hilbert.hilbert_features import Design
+from gmmtorch.baselines.hilbert.lattice_features import LatticeDesign
 
 _CONJUGATE_STEPS = 10  # each step lowers the error, and each round starts from the last round's mean
 

@@ -1,0 +1,1 @@
+"""Hilbert maps: features, logistic regression, and its Bayesian form."""
