@@ -68,7 +68,11 @@ def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_
     two = torchrun(tmp_path / "two", *options)
     assert two.returncode == 0, two.stderr
     assert_same(one, tmp_path / "two")
-    assert len(two.stdout.splitlines()) == len(one.stdout.splitlines())
+    # A process logs when it loads the kernels; in this one they may be loaded already.
+    shown, expected = (
+        [x for x in text.splitlines() if "[INFO]" not in x] for text in (two.stdout, one.stdout)
+    )
+    assert len(shown) == len(expected)
     assert two.stdout.count("results.json") == 1
     written = {str(path.relative_to(tmp_path / "two")) for path in (tmp_path / "two").rglob("*.*")}
     assert {"results.json", "em.safetensors", ".hydra/config.yaml"} <= written
