@@ -342,6 +342,11 @@ class GaussianMap(nn.Module):
         return len(self.components()) if self.dim is not None else 0
 
     @property
+    def n_final(self) -> int:
+        """Number of components without those of the unfinished window, which is not learned for it."""
+        return 0 if self.dim is None else len(self._final())
+
+    @property
     def n_pending(self) -> int:
         """Number of scans of the unfinished window. If it is 0, all components are final."""
         return len(self._learner.pending)

@@ -138,7 +138,7 @@ class MapBuilder:
             len(self._dataset),
             sum(self.skipped.values()),
             record.n_points,
-            0 if self.map.dim is None else self.map.means.shape[0],
+            self.map.n_final,
             record.metres,
             record.seconds,
         )

@@ -10,6 +10,7 @@ import torch
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.learning.learner import Learner
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mapping.map_builder import MapBuilder
 from gmmtorch.scan import Scan
@@ -73,6 +74,22 @@ def test_the_builder_inserts_its_scans_and_counts_them():
     assert one.record.history[-1]["nbytes"] == plain.nbytes
     assert one.record.history[-1]["n_components"] == plain.n_components
     assert all(row["memory_bytes"] > 1e6 for row in one.record.history)
+
+
+def test_progress_learns_no_unfinished_window(monkeypatch):
+    """A preview of the window for each scan would cost more than the map itself."""
+    previews: list[int] = []
+    preview = Learner.preview
+
+    def counted(self, *arguments):
+        previews.append(len(self.pending))
+        return preview(self, *arguments)
+
+    monkeypatch.setattr(Learner, "preview", counted)
+    one = builder()
+    shown = [now.n_components for now in one.insert_all()]
+    assert shown[-1] > 0
+    assert set(previews) <= {0, 4}  # none, or a complete window
 
 
 @pytest.mark.parametrize("stop", [1, 6])
