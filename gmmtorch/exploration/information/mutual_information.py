@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.beam_information import banded_csqmi, first_block, shannon, sharpened
 
 _NEGLIGIBLE = 1e-5
 """Kernel values below this count as zero."""
@@ -30,28 +31,6 @@ def first_hit(occupancy: Tensor, lengths: Tensor | None = None) -> Tensor:
         (..., C + 1): o_i Π_{j<i} (1 − o_j), and last Π_j (1 − o_j); rows sum to one.
     """
     return first_block(_ended(check_occupancy(occupancy), lengths))
-
-
-def first_block(occupancy: Tensor) -> Tensor:
-    """Return the probability (..., C) that each cell is the first occupied one; the last must have
-    occupancy 1.
-    """
-    return _reach(occupancy).mul_(occupancy)
-
-
-def _reach(occupancy: Tensor) -> Tensor:
-    """Return the probability (..., C) that all cells before each cell are free."""
-    clear = torch.empty_like(occupancy)
-    torch.sub(1, occupancy[..., :-1], out=clear[..., 1:])
-    clear[..., 0] = 1
-    return torch.cumprod(clear, -1)
-
-
-def sharpened(occupancy: Tensor) -> Tensor:
-    """Return o²/(o² + (1 − o)²), the occupancy under squared and normalized probabilities."""
-    occupied = occupancy * occupancy
-    clear = (1 - occupancy).square_()
-    return occupied / clear.add_(occupied)
 
 
 def csqmi(
@@ -123,26 +102,6 @@ def depth_kernel(depths: Tensor, sigma: float, band: int, lengths: Tensor | None
     return kernel
 
 
-def banded_csqmi(hit: Tensor, hit_sharp: Tensor, kernel: Tensor) -> Tensor:
-    """Return log(pᵀKp) − 2 log(pᵀKv), nats (...,).
-
-    Args:
-        hit, hit_sharp: p and v (..., C), contiguous: `first_block` of the occupancy, and of the
-            `sharpened` one.
-        kernel: (band, ..., C) from `depth_kernel`: upper diagonals of K, whose main diagonal is one.
-    """
-    p, v = hit.reshape(-1), hit_sharp.reshape(-1)
-    half_p, half_v = p / 2, v / 2  # the upper halves of Kp and Kv, with half of the diagonal
-    # Rows lie end to end: the kernel is zero where a shift would reach the next beam.
-    for s, diagonal in enumerate(kernel, start=1):
-        upper = diagonal.reshape(-1)
-        half_p[:-s].addcmul_(upper[:-s], p[s:])
-        half_v[:-s].addcmul_(upper[:-s], v[s:])
-    like = (p * half_p).view(hit.shape).sum(-1).mul_(2)
-    cross = half_v.mul_(p).addcmul_(half_p, v).view(hit.shape).sum(-1)
-    return (like.log_() - cross.log_().mul_(2)).clamp_min_(0)
-
-
 def fsmi(
     occupancy: Tensor,
     *,
@@ -173,26 +132,6 @@ def fsmi(
         )
     ended = _ended(check_occupancy(occupancy), lengths)
     return shannon(first_block(ended), ended, delta_occ, delta_emp)
-
-
-def shannon(hit: Tensor, occupancy: Tensor, delta_occ: float = 1.5, delta_emp: float = 1 / 1.5) -> Tensor:
-    """Compute `fsmi` (...,) from the first hits (..., C) of an occupancy (..., C) whose last cell is
-    occupied.
-
-    Cell i is passed through with probability Σ_{j>i} P(e_j) = Π_{j≤i} (1 − o_j), so the sum runs over cells.
-    """
-    passed = _reach(occupancy).mul_(1 - occupancy)
-    information = hit * _information_of(delta_occ, occupancy) + passed * _information_of(delta_emp, occupancy)
-    return information.sum(-1).clamp_min_(0)
-
-
-def _information_of(delta: float, occupancy: Tensor) -> Tensor:
-    """Return f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r); finite at 0 and
-    1.
-    """
-    clear = 1 - occupancy
-    after = (occupancy + clear / delta).log_()
-    return after.neg_().sub_(math.log(delta) * clear / (occupancy * delta + clear))
 
 
 def check_sigma(sigma: float) -> None:

@@ -19,16 +19,13 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.information.beam_templates import beam_templates
 from gmmtorch.exploration.information.mutual_information import (
-    banded_csqmi,
     check_occupancy,
     check_sigma,
     depth_kernel,
-    first_block,
     needed_band,
-    shannon,
-    sharpened,
 )
 from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.kernels.beam_information import Beams, Cells, information_by_block
 from gmmtorch.occupancy.grid import check_resolution
 
 BLOCK = 4
@@ -36,16 +33,12 @@ BLOCK = 4
 
 INFORMATION = ("csqmi", "fsmi")
 
-_CHUNK_VIEWS = 16  # views that fit in a core's cache
-_WORTHLESS = 1e-4  # cells: a beam that resolves less is left out
 _BEYOND = 1 << 30  # offset of cells that do not exist
-_IMAGE_ODDS = 100.0  # factor on a cell's odds (FSMI): dozens of pixels see a cell, not one beam
 
 # A second image from the same pose gains nothing, even if the first was probably blocked before some
 # cells, and even if a block is only partly in the field of view: the pose cannot see the rest. A cell
-# therefore counts as measured if a beam reaches it with this probability, and a block if this share of
-# its information is gained.
-_REACHED = 0.05
+# therefore counts as measured if a beam reaches it with the probability `beam_information.REACHED`, and a
+# block if this share of its information is gained.
 _SATURATED = 0.25
 
 
@@ -75,8 +68,7 @@ class _Layout(NamedTuple):
 class _Window(NamedTuple):
     """Data shared by all evaluations of one local map."""
 
-    layout: _Layout
-    occupancy: Tensor  # (n + 1,) float32
+    cells: Cells
     unresolved: Tensor  # (G,) sum of o(1 − o)
 
 
@@ -96,6 +88,7 @@ class ViewEvaluator:
         known_free, known_occupied: observed cells below and above these probabilities count as certain.
             They do not weaken the beams behind them, and they do not attract a robot to space that it has
             seen well.
+        device: of the values.
     """
 
     def __init__(
@@ -112,6 +105,7 @@ class ViewEvaluator:
         sigma: float = 0.05,
         known_free: float = 0.05,
         known_occupied: float = 0.5,
+        device: torch.device | str = "cpu",
     ) -> None:
         if information not in INFORMATION:
             raise InvalidArgumentError(f"information={information!r} is not one of {', '.join(INFORMATION)}.")
@@ -125,18 +119,25 @@ class ViewEvaluator:
         self.n_yaws = check_whole("n_yaws", n_yaws, 1)
         self.stride = check_whole("stride", stride, 1)
         self.information = information
+        self.device = torch.device(device)
         self._known = (known_free, known_occupied)
         templates = beam_templates(
             horizontal_fov, vertical_fov, max_range, self.resolution, n_beams, self.n_yaws
         )
         self.n_beams, n_cells = templates.depths.shape[1:]
-        self._offsets, self._lengths = templates.offsets, templates.lengths
-        self._exists = torch.arange(n_cells) < templates.lengths[..., None]
-        self._leading = templates.leading.movedim(2, 0).contiguous()
-        self._ahead = (templates.offsets > 0).any(2).movedim(2, 0).contiguous()
-        self._volumes = _with_end(templates.volumes.float()).flatten(0, 1)
-        band = needed_band(torch.where(self._exists, templates.depths, math.inf), sigma)
-        self._kernel = depth_kernel(templates.depths, sigma, band, templates.lengths).float().flatten(1, 2)
+        self._offsets = templates.offsets.to(device)
+        self._exists = (torch.arange(n_cells) < templates.lengths[..., None]).to(device)
+        depths = torch.where(self._exists.cpu(), templates.depths, math.inf)
+        band = needed_band(depths, sigma)
+        kernel = depth_kernel(templates.depths, sigma, band, templates.lengths).float().flatten(1, 2)
+        self._beams = Beams(
+            self.n_beams,
+            templates.lengths.flatten().to(device),
+            templates.leading.movedim(2, 0).flatten(1, 2).contiguous().to(device),
+            (templates.offsets > 0).any(2).movedim(2, 0).flatten(1, 2).contiguous().to(device),
+            _with_end(templates.volumes.float()).flatten(0, 1).to(device),
+            kernel.to(device),
+        )
         self._layout: _Layout | None = None
         self._windows: weakref.WeakKeyDictionary[LocalMap, _Window] = weakref.WeakKeyDictionary()
 
@@ -167,19 +168,10 @@ class ViewEvaluator:
         """
         self._check_keys(keys)
         window = self._window(local_map)
-        shape = torch.tensor(local_map.shape)
-        cameras = keys[:, :3] * self.stride - local_map.low
-        template = keys[:, 3:] * self.n_beams + torch.arange(self.n_beams)
-        lengths = self._lengths_within(cameras, template, shape)
-        base = (cameras[:, 0] * shape[1] + cameras[:, 1]) * shape[2] + cameras[:, 2]
-        base = torch.where(lengths[:, 0] > 0, base, 0).int()
-        gain = window.unresolved.new_empty(len(keys), window.layout.n_blocks)
-        taken = torch.empty_like(gain)
-        for begin in range(0, len(keys), _CHUNK_VIEWS):
-            part = slice(begin, begin + _CHUNK_VIEWS)
-            gain[part], taken[part] = self._blocks(
-                window, keys[part, 3], base[part], template[part], lengths[part]
-            )
+        cameras = (keys[:, :3] * self.stride - local_map.low.to(keys.device)).to(self.device)
+        gain, taken = information_by_block(
+            self._beams, window.cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
+        )
         enough = (_SATURATED * window.unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
         return ViewValues(gain.sum(1), gain, taken.div_(enough).clamp_max_(1))
 
@@ -215,74 +207,22 @@ class ViewEvaluator:
             raise InvalidArgumentError(f"A local map of {shape} cells is too large; the limit is 2³⁰ cells.")
         _, ny, nz = shape
         counts = [-(-n // BLOCK) for n in shape]
-        x, y, z = (torch.arange(n, dtype=torch.int32) // BLOCK for n in shape)
+        x, y, z = (torch.arange(n, dtype=torch.int32, device=self.device) // BLOCK for n in shape)
         block = ((x[:, None, None] * counts[1] + y[:, None]) * counts[2] + z).view(-1)
         x, y, z = self._offsets.unbind(-1)
         offsets = torch.where(self._exists, (x * ny + y) * nz + z, _BEYOND)
         return _Layout(shape, math.prod(counts), _with_end(block), _with_end(offsets, _BEYOND).int())
 
     def _prepared(self, local_map: LocalMap, layout: _Layout) -> _Window:
-        occupancy, observed = check_occupancy(local_map.occupancy).float(), local_map.observed
+        occupancy = check_occupancy(local_map.occupancy).float().to(self.device)
+        observed = local_map.observed.to(self.device)
         free, occupied = self._known
         occupancy = occupancy.masked_fill(observed & (occupancy <= free), 0.0)
         occupancy.masked_fill_(observed & (occupancy >= occupied), 1.0)
         occupancy = _with_end(occupancy.view(-1))
         unresolved = torch.bincount(layout.block, (1 - occupancy).mul_(occupancy), layout.n_blocks)
-        return _Window(layout, occupancy, unresolved)
-
-    def _lengths_within(self, cameras: Tensor, template: Tensor, shape: Tensor) -> Tensor:
-        """Return the number of cells (V, B) of each beam inside the local map; 0 if the camera is outside."""
-        lengths = self._lengths.take(template)
-        for axis in range(3):
-            below = cameras[:, axis]
-            above = shape[axis] - 1 - below
-            inside = (below >= 0) & (above >= 0)
-            farthest = self._leading.shape[-1] - 1
-            ahead = self._ahead[axis].take(template)
-            room = torch.where(ahead, above.clamp(0, farthest)[:, None], below.clamp(0, farthest)[:, None])
-            before = self._leading[axis].take(template * (farthest + 1) + room)
-            lengths = torch.minimum(lengths, before).mul_(inside[:, None])
-        return lengths
-
-    def _blocks(
-        self, window: _Window, yaw: Tensor, base: Tensor, template: Tensor, lengths: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the gain and the resolved variance, (v, G) each, of a few views."""
-        layout, n_cells = window.layout, len(window.occupancy) - 1
-        cell = layout.offsets.index_select(0, yaw).add_(base[:, None, None])
-        if bool((lengths < self._lengths.take(template)).any()):
-            cell.masked_fill_(torch.arange(cell.shape[-1]) >= lengths[..., None], n_cells)
-        cell = cell.clamp_max_(n_cells).view(-1, cell.shape[-1])  # (N, C + 1), N beams
-        template = template.reshape(-1)
-        occupancy = window.occupancy.index_select(0, cell.view(-1)).view(cell.shape)
-        occupancy[:, -1] = 1  # the rest of a beam ends there: a reading without a hit
-        hit = first_block(occupancy)
-        resolved = (1 - occupancy).mul_(hit)  # o (1 − o) of each cell, if it is reached
-        total = resolved.sum(1)
-        beams = (total > _WORTHLESS).nonzero()[:, 0]
-        if len(beams) < len(cell):
-            template, total = template[beams], total[beams]
-            cell, occupancy, hit, resolved = (
-                a.index_select(0, beams) for a in (cell, occupancy, hit, resolved)
-            )
-        information = self._information(hit, occupancy, template)
-        volumes = self._volumes.index_select(0, template)
-        taken = (1 - occupancy).mul_(occupancy)  # by min(reach / _REACHED, 1)
-        taken = torch.minimum(taken, resolved / _REACHED).mul_(volumes)
-        gain = resolved.mul_(volumes).mul_((information / total)[:, None])
-        block = layout.block.index_select(0, cell.view(-1)).view(cell.shape)
-        block = block.add_((beams // self.n_beams * layout.n_blocks).int()[:, None]).view(-1)
-        size = len(yaw) * layout.n_blocks
-        gain = torch.bincount(block, gain.view(-1), size).to(gain)  # without beams bincount returns integers
-        taken = torch.bincount(block, taken.view(-1), size).to(taken)
-        return gain.view(len(yaw), -1), taken.view(len(yaw), -1)
-
-    def _information(self, hit: Tensor, occupancy: Tensor, template: Tensor) -> Tensor:
-        """Return the information (N,) of each beam in nats, from its first hits (N, C + 1)."""
-        if self.information == "fsmi":
-            return shannon(hit, occupancy, _IMAGE_ODDS, 1 / _IMAGE_ODDS)
-        kernel = self._kernel.index_select(1, template)
-        return banded_csqmi(hit, first_block(sharpened(occupancy)), kernel)
+        cells = Cells(layout.shape, layout.n_blocks, layout.block, occupancy, layout.offsets)
+        return _Window(cells, unresolved)
 
 
 def residual_of(values: ViewValues) -> Tensor:
