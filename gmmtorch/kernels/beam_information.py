@@ -257,9 +257,7 @@ def _few_views(
     chosen = (total > WORTHLESS).nonzero()[:, 0]
     if len(chosen) < len(cell):
         template, total = template[chosen], total[chosen]
-        cell, occupancy, hit, resolved = (
-            a.index_select(0, chosen) for a in (cell, occupancy, hit, resolved)
-        )
+        cell, occupancy, hit, resolved = (a.index_select(0, chosen) for a in (cell, occupancy, hit, resolved))
     if shannon_information:
         information = shannon(hit, occupancy, IMAGE_ODDS, 1 / IMAGE_ODDS)
     else:

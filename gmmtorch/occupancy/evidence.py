@@ -12,6 +12,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.errors import check_prior as check_prior
+from gmmtorch.kernels.cell_entropy import bernoulli_entropy as bernoulli_entropy
+from gmmtorch.kernels.cell_entropy import occupancy_probability as occupancy_probability
 from gmmtorch.kernels.ray_counting import count_in_grid
 from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -25,27 +27,9 @@ class CellClass(IntEnum):
     OCCUPIED = 1
 
 
-def occupancy_probability(hits: ArrayLike, misses: ArrayLike, prior: float = 1.0) -> Tensor:
-    """Occupancy θ = (H + N_p)/(H + M + 2N_p) of hits H and misses M, thesis (3.9); ½ without evidence.
-
-    Raises `InvalidArgumentError` if the prior count N_p is negative or not finite.
-    """
-    check_prior(prior)
-    hits, misses = as_tensor(hits, "hits"), as_tensor(misses, "misses")
-    total = hits + misses + 2 * prior
-    return torch.where(total > 0, (hits + prior) / total.clamp_min(torch.finfo(total.dtype).tiny), 0.5)
-
-
 def bernoulli_variance(probability: Tensor) -> Tensor:
     """θ(1 − θ): ¼ for an unknown cell, 0 for a certain cell."""
     return probability * (1 - probability)
-
-
-def bernoulli_entropy(probability: Tensor) -> Tensor:
-    """−θ log₂ θ − (1 − θ) log₂(1 − θ) in bits: 1 for an unknown cell, 0 for a certain cell."""
-    return -(
-        torch.xlogy(probability, probability) + torch.xlogy(1 - probability, 1 - probability)
-    ) / math.log(2)
 
 
 def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:

@@ -11,6 +11,7 @@ from mapping.random_components import random_components
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
+from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.rays import component_rays as module
 from gmmtorch.mapping.rays.component_rays import component_evidence, component_rays
@@ -196,6 +197,14 @@ def test_component_evidence_equals_plain_monte_carlo(thickness):
     assert error < 0.85 * sum(independent) / len(independent)
 
 
+@pytest.fixture
+def twin():
+    """The fused kernel draws no portions."""
+    with kernels("torch"):
+        yield
+
+
+@pytest.mark.usefixtures("twin")
 @pytest.mark.parametrize("most", [1, 700])
 def test_evidence_does_not_depend_on_the_portion_size(monkeypatch, most):
     components = random_components(3, k=60, seed=8, deviations=(1e-3, 3.0))

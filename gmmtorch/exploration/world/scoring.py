@@ -10,6 +10,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.cell_entropy import entropy_removed
 from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
@@ -82,12 +83,13 @@ class BeliefMap:
 
     def add(self, evidence: CellEvidence) -> Tensor:
         """Add evidence; returns which of its cells (C,) are observable."""
-        h, m = self.grid.add(evidence)
+        before = self.grid.add(evidence)
         chosen = self._is_observable(evidence.cells)
-        gone = self.rule.entropy(h, m) - self.rule.entropy(h + evidence.hits, m + evidence.misses)
-        self.known_bits += float(gone.sum(dtype=torch.float64))
-        self.entropy_bits -= float(gone[chosen].sum(dtype=torch.float64))
-        self.n_observed += int((h + m == 0)[chosen].sum())
+        added = evidence.hits, evidence.misses
+        removed = entropy_removed(before, added, chosen, self.rule.prior, self.rule.clamp)
+        self.known_bits += removed.bits
+        self.entropy_bits -= removed.chosen_bits
+        self.n_observed += removed.n_new
         return chosen
 
     def _is_observable(self, cells: Tensor) -> Tensor:

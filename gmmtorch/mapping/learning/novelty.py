@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.cell_entropy import cell_entropy, reduction_along_rays
 from gmmtorch.kernels.ray_traversal import traverse
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
@@ -134,30 +135,25 @@ def beam_novelty(
     # A beam reduces the entropy by at most one bit for each cell that it crosses. So one sum can hold both
     # the bits and the number of unobserved cells, as multiples of a mark that is more than twice that.
     mark = 2.0 * (sum(window.shape) + 3)
-    hits, misses = (counts.double() for counts in window.evidence(rays.window))
-    table = _cell_reduction(hits, misses, 0, 1, rule, mark)
-    if rays.block is not rays.window:
-        table = torch.nn.functional.pad(table, (1,) * 6)
-    table = table.view(-1)
-    for visit in rays.visits():
-        bits.index_add_(0, visit.ray, table.index_select(0, visit.voxel))
+    hits, misses = window.evidence(rays.window)
+    along = reduction_along_rays(
+        rays.starts,
+        rays.stops,
+        rays.low,
+        hits,
+        misses,
+        prior=rule.prior,
+        observed=rule.observed,
+        mark=mark,
+        margin=0 if rays.block is rays.window else 1,
+    )
+    bits = along if rays.ray is None else bits.index_copy_(0, rays.ray, along)
     flat, inside = flat_index(stops.floor().long() - rays.window.low, rays.window.shape)
     ended = (is_hit & inside).nonzero().squeeze(1)
     flat = flat[ended]
-    hits, misses = hits.view(-1)[flat], misses.view(-1)[flat]
-    bits[ended] += _cell_reduction(hits, misses, 1, 0, rule, mark)
+    hits, misses = hits.view(-1)[flat].double(), misses.view(-1)[flat].double()
+    before, after = (cell_entropy(hits + hit, misses, rule.prior) for hit in (0, 1))
+    bits[ended] += before - after + mark * (hits + misses < rule.observed)
     bits[ended] += mark * ((hits < rule.observed) & (hits + misses >= rule.observed))
     n_unobserved = (bits / mark).round()
     return bits - n_unobserved * mark, n_unobserved > 0
-
-
-def _cell_reduction(
-    hits: Tensor, misses: Tensor, hit: int, miss: int, rule: NoveltyRule, mark: float
-) -> Tensor:
-    """Bits by which one more hit or miss reduces the entropy of cells, plus `mark` for unobserved cells."""
-
-    def entropy(h: Tensor, m: Tensor) -> Tensor:
-        return bernoulli_entropy(occupancy_probability(h, m, rule.prior))
-
-    bits = entropy(hits, misses) - entropy(hits + hit, misses + miss)
-    return bits + mark * (hits + misses < rule.observed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,19 +10,25 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.component_casting import (
+    THINNING,
+    Seen,
+    cast_components,
+    hidden_area,
+    truncated_normals,
+)
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.forms.monte_carlo import RayBundle
 from gmmtorch.occupancy.grid import check_resolution
-from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
+from gmmtorch.occupancy.voxels.boxes import Box, intersection, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
 
-_EFFECTIVE_AREA = 4 * math.pi
-_THINNING = 4
 _MOST_DRAWS = 1 << 19  # draws at a time, about 250 bytes each
-_RADII = 4096  # steps of the table of truncated radii
-_FARTHEST_DRAW = 11.0  # deviations: an upper bound of every draw, because quantiles end at 6.4 on an axis
+_FARTHEST = 2.0**31  # cells from the world's origin
+_MOST_CELLS = 1 << 23  # of the window of the fused kernel, 16 bytes each
 
 
 def component_rays(
@@ -89,6 +94,10 @@ def component_evidence(
         raise InvalidArgumentError(f"shell={shell} must be finite, at least zero cells.")
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
     seen = _counted(components, resolution)
+    if is_fused(components.means, box.low):
+        found = _fused(components, seen, box, density, shell, hits_per_ray, thinned)
+        if found is not None:
+            return found
     seen = seen[_in_reach(components, seen, box, density)]
     # If a component's points cannot be in the box, only its passing rays matter.
     ends_here = (
@@ -102,6 +111,59 @@ def component_evidence(
         for some in _portions(number * times)
     ]
     return parts[0] if len(parts) == 1 else sum_evidence(parts)
+
+
+def _fused(
+    components: Components,
+    seen: Tensor,
+    box: Box,
+    density: _Density,
+    shell: float,
+    hits_per_ray: int,
+    thinned: bool,
+) -> CellEvidence | None:
+    """`component_evidence` by the fused kernel; None where the twin repairs, refuses, or takes less memory."""
+    if len(seen) == 0:
+        return CellEvidence.empty(seen.device)
+    extent = _extent(components, seen, density)
+    if extent is None:
+        return None
+    window = intersection(box, extent)
+    if window is None:
+        return CellEvidence.empty(seen.device)
+    if math.prod(window.shape) > _MOST_CELLS:
+        return None
+    count = components.seen_count[seen].double()
+    found = cast_components(
+        components.means.double(),
+        components.covariances.double(),
+        components.origins.double(),
+        components.max_range,
+        components.ids,
+        Seen(components.seen_by[seen], components.seen_from[seen], count),
+        torch.stack([*box, *window]).double(),
+        resolution=density.resolution,
+        rays_per_cell=density.rays_per_cell,
+        least=density.least,
+        most=density.most,
+        cutoff=density.cutoff,
+        shell=shell * density.resolution,
+        hits_per_ray=hits_per_ray,
+        thinned=thinned,
+    )
+    return None if found is None else CellEvidence.from_dense(window.low, *found)
+
+
+def _extent(components: Components, seen: Tensor, density: _Density) -> Box | None:
+    """Cells that the rays of the viewpoints `seen` (C,) can meet; None if they are too far away."""
+    means, origins = components.means.double(), components.origins.double()
+    spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
+    corners = torch.cat([means - spread, means + spread, origins[components.seen_from[seen]]])
+    cells = (corners / density.resolution).floor().nan_to_num(math.inf)
+    if not bool(cells.abs().max() < _FARTHEST):
+        return None
+    cells = cells.long()
+    return Box(cells.amin(0) - 1, cells.amax(0) + 2)
 
 
 def _portions(draws: Tensor) -> Iterator[slice]:
@@ -151,7 +213,7 @@ def _thinned(
     The first half ends where the second begins, in a cell that only the second half counts as left.
     """
     n_each = torch.bincount(viewpoint)
-    n_some = (n_each + _THINNING - 1) // _THINNING
+    n_some = (n_each + THINNING - 1) // THINNING
     number = torch.arange(len(viewpoint), device=viewpoint.device)
     number = number - (torch.cumsum(n_each, 0) - n_each)[viewpoint]
     # The first points of a Sobol sequence fill the cube; every fourth point would fill one corner.
@@ -222,7 +284,7 @@ def _numbers(components: Components, seen: Tensor, density: _Density) -> Tensor:
     """Number of rays (C,) of each of the viewpoints `seen` (C,)."""
     by, viewpoint = components.seen_by[seen], components.seen_from[seen]
     toward = components.means[by].double() - components.origins[viewpoint].double()
-    hidden = _hidden_area(toward, components.covariances[by].double()) / density.resolution**2
+    hidden = hidden_area(toward, components.covariances[by].double()) / density.resolution**2
     wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
     return wanted.clamp(density.least, density.most).long()
 
@@ -245,7 +307,7 @@ def _rays(
     draw = torch.arange(len(viewpoint), device=seen.device) - first[viewpoint]
     component = by[viewpoint]
     longest = density.most * (int(times.max()) if len(times) else 1)
-    normal = _normals(components.ids[used], component, draw, longest, density.cutoff)
+    normal = truncated_normals(components.ids[used], component, draw, longest, density.cutoff)
     # Sums and products of single columns: a matrix product may round differently in another batch.
     ends = []
     for row in range(3):
@@ -260,103 +322,3 @@ def _rays(
         ~components.max_range[used][component],
     )
     return rays, viewpoint, (draw < once[viewpoint]).nonzero().squeeze(1)
-
-
-def _hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
-    """Area (C,), m², that Gaussians hide from the sensor; `toward` (C, 3): from the sensor to the mean.
-
-    The determinant of the covariance across a unit direction d is dᵀ adj(Σ) d.
-    """
-    scale = covariance.diagonal(dim1=1, dim2=2).amax(1).clamp_min(torch.finfo(torch.float64).tiny)
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (
-        row.unbind(1) for row in (covariance / scale[:, None, None]).unbind(1)
-    )
-    largest = toward.abs().amax(1).clamp_min(torch.finfo(torch.float64).tiny)
-    x, y, z = (toward / largest[:, None]).unbind(1)
-    a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    mixed = x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz)
-    length = x * x + y * y + z * z
-    along = (a * x * x + b * y * y + c * z * z + 2 * mixed) / length
-    # From the mean itself there is no direction: take an upper bound of the area.
-    determinant = torch.where(length > 0, along, a + b + c).clamp_min(0)
-    return _EFFECTIVE_AREA * scale * determinant.sqrt()
-
-
-# -- draws -----------------------------------------------------------------------------------------
-
-
-def _normals(ids: Tensor, component: Tensor, draw: Tensor, n: int, cutoff: float) -> list[Tensor]:
-    """Draws from a standard normal truncated at a radius: three coordinates, (R,) each.
-
-    Points of one Sobol sequence, rotated on the unit cube by a hash of the component's id.
-
-    Args:
-        ids: (K, 2). component: (R,), row of the id. draw: (R,), number of the draw, below n.
-        cutoff: radius in deviations.
-    """
-    shifts = _shifts(ids)
-    points = _sobol(n).to(shifts.device)
-    normal, square = [], torch.zeros((), dtype=torch.float64, device=shifts.device)
-    for axis in range(3):
-        cube = points[axis][draw] + shifts[:, axis][component]
-        cube = torch.where(cube >= 1, cube - 1, cube)
-        normal.append(torch.special.ndtri(cube.clamp(2.0**-33, 1 - 2.0**-33)))
-        square = square + normal[-1] * normal[-1]
-    table = _shrinkage(cutoff).to(shifts.device)
-    position = square.sqrt() * (_RADII / _FARTHEST_DRAW)
-    step = position.long()
-    below = table[step]
-    shrunk = below + (position - step) * (table[step + 1] - below)
-    return [coordinate * shrunk for coordinate in normal]
-
-
-def _shifts(ids: Tensor) -> Tensor:
-    """A pseudo-random point (K, 3) of the unit cube for each id (K, 2)."""
-    key = _scrambled(_scrambled(ids[:, 0]) ^ ids[:, 1])
-    words = torch.stack([_scrambled(key + axis) for axis in range(1, 4)], 1)
-    return ((words >> 11) & (2**53 - 1)).double() * 2.0**-53
-
-
-def _scrambled(word: Tensor) -> Tensor:
-    """Bijective hash of int64 words: the finalizer of SplitMix64 (Steele, Lea and Flood 2014)."""
-    word = word + _signed(0x9E3779B97F4A7C15)
-    word = (word ^ _shifted(word, 30)) * _signed(0xBF58476D1CE4E5B9)
-    word = (word ^ _shifted(word, 27)) * _signed(0x94D049BB133111EB)
-    return word ^ _shifted(word, 31)
-
-
-def _shifted(word: Tensor, bits: int) -> Tensor:
-    """Logical shift to the right; the shift of torch keeps the sign."""
-    return (word >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def _signed(word: int) -> int:
-    return word - (1 << 64) if word >= 1 << 63 else word
-
-
-@functools.cache
-def _sobol(n: int) -> Tensor:
-    """The first n points of the Sobol sequence, (3, n) float64."""
-    points: Tensor = torch.quasirandom.SobolEngine(3).draw(n, dtype=torch.float64)
-    return points.T.contiguous()
-
-
-@functools.cache
-def _shrinkage(cutoff: float) -> Tensor:
-    """Factors (_RADII + 2,) that truncate a normal draw of radius r, in even steps from 0, at `cutoff`:
-    F⁻¹(F(r) F(cutoff))/r, with F the distribution function of χ₃."""
-    radius = torch.arange(_RADII + 2, dtype=torch.float64) * (_FARTHEST_DRAW / _RADII)
-    target = _chi3(radius) * _chi3(torch.tensor(cutoff, dtype=torch.float64))
-    low, high = torch.zeros_like(radius), radius.clamp_max(cutoff)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        above = _chi3(middle) > target
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    shrunk = low / radius.clamp_min(1e-9)
-    shrunk[:8] = shrunk[8]  # F loses its digits near 0, where the factor is constant
-    return shrunk
-
-
-def _chi3(radius: Tensor) -> Tensor:
-    """Mass of a standard normal in 3D within a radius."""
-    return torch.erf(radius * math.sqrt(0.5)) - math.sqrt(2 / math.pi) * radius * torch.exp(-0.5 * radius**2)

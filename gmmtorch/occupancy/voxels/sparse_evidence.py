@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.kernels.cell_index import BlockKeys, cell_index
 from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
@@ -132,20 +132,15 @@ class SparseEvidence(SparseLattice):
         Cells outside the box are ignored, and have 0 before.
         """
         self._check_cells(evidence.cells)
-        columns = self.columns(evidence.cells)
-        inside = self._inside(columns)
-        keys = torch.where(inside, self.block_keys(columns), -1)
-        # Neighbouring cells often share a block: each run of equal keys is searched once.
-        runs, run = torch.unique_consecutive(keys, return_inverse=True)
-        first = self._first_of(runs)
-        missing = runs[(first == 0) & (runs >= 0)]
-        if missing.numel():
-            self._allocate(missing.unique())
-            first = self._first_of(runs)
-        index = torch.where(inside, first[run] + self.places(columns), 0)
+        index = self._index_of(evidence.cells)
+        if len(index) and bool(index.min() < 0):
+            columns = self.columns(evidence.cells[index < 0])
+            self._allocate(self.block_keys(columns).unique())
+            index = self._index_of(evidence.cells)
+        # Index 0, of cells outside, is in the empty block, which stays empty.
+        inside = index > 0
         before = [counts.view(-1).index_select(0, index) for counts in self.counts]
         for counts, old, more in zip(self.counts, before, evidence[1:], strict=True):
-            # Ignored cells add 0 to cell 0 of the empty block.
             counts.view(-1).index_copy_(0, index, old + torch.where(inside, more, 0.0).to(old.dtype))
         return before[0], before[1]
 
@@ -173,12 +168,15 @@ class SparseEvidence(SparseLattice):
         if self._box is None:
             self.check_reachable(cells)
 
-    def _inside(self, columns: list[Tensor]) -> Tensor:
-        """Whether each cell (M,) is in the box."""
+    def _index_of(self, cells: Tensor) -> Tensor:
+        """Flat index (C,) of cells (C, D) in the counts; −1 in blocks that are not stored, 0 outside the box."""
+        low = self.origin() * self.block_side
         if self._box is None:
-            return torch.ones_like(columns[0], dtype=torch.bool)
-        sides = zip(columns, *(self.columns(side[None]) for side in self._box), strict=True)
-        return functools.reduce(torch.logical_and, [(c >= low) & (c < high) for c, low, high in sides])
+            reach = torch.full_like(low, (self._half - 1) * self.block_side)
+            bounds = torch.stack([low, low - reach, low + reach]).to(self.device)
+        else:
+            bounds = torch.stack([low.to(self.device), *self._box])
+        return cell_index(cells, BlockKeys(self.keys, self._slots, bounds, self.local_bits, self._axis_bits))
 
     def _first_of(self, keys: Tensor) -> Tensor:
         """Flat index (M,) of the first cell of each block; 0 for blocks that are not stored."""
