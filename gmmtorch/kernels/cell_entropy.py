@@ -33,7 +33,7 @@ _ENTROPY = """
 
 
 class Removed(NamedTuple):
-    """Bits removed from all cells, and from the chosen ones; number of chosen cells without evidence before."""
+    """Bits removed from all cells and from the chosen ones; chosen cells without evidence before."""
 
     bits: float
     chosen_bits: float
@@ -109,7 +109,8 @@ _ALONG = FusedKernel(
         double bits = table[voxel];
         if (bits != bits) {
             const double h = hits[voxel], m = misses[voxel];
-            bits = entropy(h, m, prior, 0.0) - entropy(h, m + 1.0, prior, 0.0) + (h + m < observed ? mark : 0.0);
+            bits = entropy(h, m, prior, 0.0) - entropy(h, m + 1.0, prior, 0.0);
+            if (h + m < observed) bits += mark;
             table[voxel] = bits;
         }
         sum += bits;

@@ -26,11 +26,11 @@ _PARTS = 32  # items that share a viewpoint on CUDA
 
 
 class Seen(NamedTuple):
-    """C viewpoints: by: rows of the components; from_: rows of the origins, int64; count: rays, float64."""
+    """C viewpoints: rows (C,) of the components and of their origins, int64, and counts (C,) float64."""
 
-    by: Tensor
-    from_: Tensor
-    count: Tensor
+    component: Tensor
+    origin: Tensor
+    rays: Tensor
 
 
 _QUANTILE = """
@@ -92,7 +92,8 @@ _COMPONENT = """
         const double edge[2] = {(mean[a] - spread) / resolution, (mean[a] + spread) / resolution};
         for (int side = 0; side < 2; ++side) {
             const double sign = side ? -1.0 : 1.0;
-            const double room = sign * (box[side ? a : 3 + a] - apex) + 0.5, slope = sign * (edge[side] - apex);
+            const double room = sign * (box[side ? a : 3 + a] - apex) + 0.5;
+            const double slope = sign * (edge[side] - apex);
             if (slope > 0.0) near_to = GMM_MIN(near_to, room / slope);
             if (slope < 0.0) near_from = GMM_MAX(near_from, room / slope);
             if (slope == 0.0 && room < 0.0) near_to = -1.0;
@@ -125,11 +126,13 @@ _COMPONENT = """
         }
         const double x = to[0] / largest, y = to[1] / largest, z = to[2] / largest;
         const double a = yy * zz - yz * yz, b = xx * zz - xz * xz, c = xx * yy - xy * xy;
-        const double mixed = x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz);
+        const double mixed =
+            x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz);
         const double length = x * x + y * y + z * z;
         const double along = (a * x * x + b * y * y + c * z * z + 2.0 * mixed) / length;
         const double determinant = GMM_MAX(length > 0.0 ? along : a + b + c, 0.0);
-        const double wanted = ceil(rays_per_cell * (area * scale * sqrt(determinant) / (resolution * resolution)));
+        const double hidden = area * scale * sqrt(determinant) / (resolution * resolution);
+        const double wanted = ceil(rays_per_cell * hidden);
         n_rays = (int64_t)GMM_MIN(GMM_MAX(wanted, (double)least), (double)most);
     }
     double thinnest[3] = {0.0, 0.0, 0.0};
@@ -174,7 +177,8 @@ _DRAWS = f"""
     const int dim = 3;
     const double unit = 1.0, CLOSEST = 0x1p-33, STEP = {_RADII / _FARTHEST_DRAW!r};
     const int64_t size0 = (int64_t)(bounds[9] - lows[0]), size1 = (int64_t)(bounds[10] - lows[1]);
-    const int64_t size2 = (int64_t)(bounds[11] - lows[2]), stride0 = size1 * size2, stride1 = size2, stride2 = 1;
+    const int64_t size2 = (int64_t)(bounds[11] - lows[2]);
+    const int64_t stride0 = size1 * size2, stride1 = size2, stride2 = 1;
     const int64_t n_draws = n_rays * times, n_some = thinned ? (n_rays + {THINNING - 1}) / {THINNING} : 0;
     const double per_draw = seen_count[row] / (double)n_draws, per_ray = per_draw * (double)times;
     const double per_first_half = n_some ? per_ray * ((double)n_rays / (double)n_some) : 0.0;
@@ -272,7 +276,7 @@ def cast_components(
     parts = 1 if device.type == "cpu" else _PARTS
     points = sobol_points(most * hits_per_ray, str(device))
     _CAST(
-        len(seen.by) * parts,
+        len(seen.rays) * parts,
         *(value.contiguous() for value in (means, covariances, origins, max_range, ids, *seen)),
         points,
         points.shape[1],

@@ -122,7 +122,7 @@ def _fused(
     hits_per_ray: int,
     thinned: bool,
 ) -> CellEvidence | None:
-    """`component_evidence` by the fused kernel; None where the twin repairs, refuses, or takes less memory."""
+    """`component_evidence` by the fused kernel; None where the twin repairs, refuses or saves memory."""
     if len(seen) == 0:
         return CellEvidence.empty(seen.device)
     extent = _extent(components, seen, density)

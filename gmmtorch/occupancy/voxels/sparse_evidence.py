@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import torch
 from torch import Tensor
 
@@ -169,7 +168,7 @@ class SparseEvidence(SparseLattice):
             self.check_reachable(cells)
 
     def _index_of(self, cells: Tensor) -> Tensor:
-        """Flat index (C,) of cells (C, D) in the counts; −1 in blocks that are not stored, 0 outside the box."""
+        """Flat index (C,) of cells (C, D) in the counts; −1 in blocks not stored, 0 outside the box."""
         low = self.origin() * self.block_side
         if self._box is None:
             reach = torch.full_like(low, (self._half - 1) * self.block_side)
