@@ -49,10 +49,7 @@ def run(config: DictConfig) -> float | None:
 def _check_options(config: DictConfig) -> None:
     from gmmtorch.errors import InvalidArgumentError
 
-    if common.set_up(config) != "cpu":
-        raise InvalidArgumentError(
-            f"runtime.device={config.runtime.device} is not available for exploration; use cpu."
-        )
+    common.set_up(config)
     if config.transport != "in_process":
         raise InvalidArgumentError(
             f"transport={config.transport!r} is not one of in_process; gmmtorch-team has the others."

@@ -74,9 +74,9 @@ def check_options(config: DictConfig) -> None:
     from gmmtorch.errors import InvalidArgumentError, check_whole
     from gmmtorch.exploration.mission.driver import check_pace
 
-    if common.set_up(config) != "cpu":
+    if common.set_up(config) != "cpu" and config.source == "log":
         raise InvalidArgumentError(
-            f"runtime.device={config.runtime.device} is not available for robots; use cpu."
+            f"runtime.device={config.runtime.device} is not available for source=log; use cpu."
         )
     if config.clock == "lockstep":
         raise InvalidArgumentError(

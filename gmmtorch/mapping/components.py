@@ -101,6 +101,12 @@ class Components:
         joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)}
         return cls(**{**joined, "seen_by": torch.cat(seen_by), "seen_from": torch.cat(seen_from)})
 
+    def to(self, device: torch.device | str) -> Components:
+        """The components on a device."""
+        if self.means.device == torch.device(device):
+            return self
+        return Components(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+
     def cones(self) -> Cones:
         """One cone for each viewpoint: the argument of the evidence functions."""
         return Cones(

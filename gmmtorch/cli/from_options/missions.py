@@ -148,6 +148,7 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
             sample_every=config.evaluation.every,
             codecs=tuple(config.evaluation.get("codecs", ())),
             start=None if start is None else _poses(start),
+            device=config.runtime.device,
         )
 
 

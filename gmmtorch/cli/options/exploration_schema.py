@@ -118,7 +118,7 @@ class RobotEvaluation:
 
 @dataclass
 class WorldRuntime:
-    """device: cpu, the only device of missions.
+    """device: of maps, learning and the information of views: cpu, cuda, cuda:1, …
     threads: CPU threads; null: torch chooses.
     kernels: fused kernels: auto, fused or torch.
     cache: store the results that depend only on the world.

@@ -117,7 +117,7 @@ class MissionRecorder:
             stored = mission.score.union.grid.cells()
             rule = mission.score.union.rule
             occupied = rule.probability(stored.hits, stored.misses) > rule.occupied
-            content["cells"] = stored.cells[occupied].int()
+            content["cells"] = stored.cells[occupied].int().cpu()
         return content
 
     def _snapshot(self, mission: Mission, snapshot: Snapshot, paths: list[Tensor]) -> TeamSnapshot:
@@ -260,7 +260,7 @@ def _team_view(mission: Mission) -> MapImage:
     box, (first, last) = mission.world.box, _layers(mission)
     low, high = box.low.clone(), box.high.clone()
     low[2], high[2] = box.low[2] + first, box.low[2] + last
-    hits, misses = mission.score.union.grid.dense(Box(low, high))
+    hits, misses = (counts.cpu() for counts in mission.score.union.grid.dense(Box(low, high)))
     return _view(mission, mission.score.union.rule.probability(hits, misses))
 
 
@@ -277,7 +277,7 @@ def _coverage(mission: Mission) -> Any:
     import torch
 
     first, last = _layers(mission)
-    seen = mission.score.seen_by.view(mission.world.box.shape)[:, :, first:last]
+    seen = mission.score.seen_by.cpu().view(mission.world.box.shape)[:, :, first:last]
     bits = torch.zeros(seen.shape[:2], dtype=torch.int64)
     for robot in mission.robots:
         bits += ((seen >> robot.number) & 1).any(2)

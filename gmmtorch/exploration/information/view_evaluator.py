@@ -88,7 +88,8 @@ class ViewEvaluator:
         known_free, known_occupied: observed cells below and above these probabilities count as certain.
             They do not weaken the beams behind them, and they do not attract a robot to space that it has
             seen well.
-        device: of the values.
+        device: of the computation. Poses and values are on the CPU, where the planner's tree is: it decides
+            after every few views, so it would wait for each of its operations on another device.
     """
 
     def __init__(
@@ -173,7 +174,10 @@ class ViewEvaluator:
             self._beams, window.cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
         )
         enough = (_SATURATED * window.unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
-        return ViewValues(gain.sum(1), gain, taken.div_(enough).clamp_max_(1))
+        measured = taken.div_(enough).clamp_max_(1)
+        if self.device.type != "cpu":
+            gain, measured = torch.stack([gain, measured]).cpu()
+        return ViewValues(gain.sum(1), gain, measured)
 
     def residual(self, local_map: LocalMap, poses: Tensor) -> Tensor:
         """Return the residual (G,) float32 of each block after views from poses (M, 4), such as

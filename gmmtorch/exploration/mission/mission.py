@@ -21,7 +21,7 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
-from gmmtorch.occupancy.voxels.boxes import flat_index
+from gmmtorch.occupancy.voxels.boxes import Box, flat_index
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.sharing.transport.simulated_network import Network
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
@@ -40,9 +40,10 @@ class MissionScore:
     """
 
     def __init__(self, world: World, agents: Sequence[Agent], network: Network, options: TeamOptions) -> None:
-        self.union = BeliefMap(world.resolution, world.box, world.observable, options.belief)
+        self.union = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
         bits = torch.int16 if len(agents) < 16 else torch.int32
-        self.seen_by = torch.zeros(world.observable.numel(), dtype=bits)
+        self.seen_by = torch.zeros(world.observable.numel(), dtype=bits, device=options.device)
+        self._box = Box(*(side.to(options.device) for side in world.box))
         self.samples: dict[str, list[Any]] = {
             "times": [],
             "entropy_bits": [],
@@ -85,7 +86,7 @@ class MissionScore:
         """Bytes of the novel beams in each compared codec: of returns, and of the ends of no-return beams."""
         sizes = dict.fromkeys(self._options.codecs, 0)
         for kind in (frame.is_hit, ~frame.is_hit):
-            ends = frame.ends[update.novel & kind]
+            ends = frame.ends[update.novel & kind].cpu()
             if sizes and len(ends):
                 encoded = bytes_of_points(
                     ends, self._world.resolution, self._options.frame.noise, names=tuple(sizes)
@@ -99,8 +100,8 @@ class MissionScore:
         width, world = self._options.camera.width, self._world
         row, column = frame.pixel // width, frame.pixel % width
         some = (row % _SEEN_STRIDE == 0) & (column % _SEEN_STRIDE == 0)
-        seen = cast_evidence(frame.origin, frame.ends[some], frame.is_hit[some], world.resolution, world.box)
-        flat, _ = flat_index(seen.cells - world.box.low, world.box.shape)
+        seen = cast_evidence(frame.origin, frame.ends[some], frame.is_hit[some], world.resolution, self._box)
+        flat, _ = flat_index(seen.cells - self._box.low, world.box.shape)
         self.seen_by[flat] |= 1 << robot.number
 
     def _missing_share(self) -> float:

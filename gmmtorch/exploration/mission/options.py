@@ -47,6 +47,8 @@ class TeamOptions:
     sample_every: simulated seconds between the values of curves, rounded to whole frames.
     codecs: other codecs whose bytes for the novel points are measured.
     margin: metres between robots. start: (size, 4) poses; None: chosen by the world.
+    device: of the maps, of learning, and of the information of views. Sensing, planning and messages are on
+        the CPU.
     """
 
     framework: str = "gmm_shared"
@@ -83,6 +85,7 @@ class TeamOptions:
     codecs: tuple[str, ...] = ()
     margin: float = 0.1
     start: tuple[tuple[float, ...], ...] | None = None
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         if self.framework not in FRAMEWORKS:

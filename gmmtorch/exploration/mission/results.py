@@ -29,7 +29,7 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
     traffic = network.traffic()
     cells = world.observable.nonzero() + world.box.low
     occupied = world.occupied[world.observable]
-    seen = score.seen_by[world.observable.reshape(-1)]
+    seen = score.seen_by.cpu()[world.observable.reshape(-1)]
     robots_seeing = sum(((seen >> k) & 1 for k in range(options.size)), torch.zeros_like(seen))
     length = sum(robot.path_length for robot in mission.robots)
     components = [robot.mapper.components() for robot in mission.robots]

@@ -106,6 +106,7 @@ def make_agent(
         world.resolution,
         information=options.information,
         n_beams=options.n_beams,
+        device=options.device,
     )
     primitives = Primitives(options.dynamics)
     start = initial_free_space(world, pose[:3].double(), primitives)
@@ -145,8 +146,8 @@ def _mapper(
     number: int, world: World, options: TeamOptions, memo: Memo, evidence: Memo, incarnation: int
 ) -> Mapper:
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
-    local = RollingWindow(world.resolution, (x, y, z), _SLACK)
-    belief = BeliefMap(world.resolution, world.box, world.observable, options.belief)
+    local = RollingWindow(world.resolution, (x, y, z), _SLACK, options.device)
+    belief = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
     width = options.camera.width
     if options.framework != "gmm_shared":
         team = options.shares, options.size

@@ -104,9 +104,11 @@ class Agent:
     def capture(self, mesh: MeshWorld, others: Tensor) -> DepthFrame:
         """A depth image of the world, in which teammates at (M, 3) are masked."""
         with self.watch("rendering"):
-            return self.options.camera.sense(
-                mesh, self.robot.state[:4], others, self.options.dynamics.radius, self._generator
+            options = self.options
+            frame = options.camera.sense(
+                mesh, self.robot.state[:4], others, options.dynamics.radius, self._generator
             )
+            return frame.to(options.device)
 
     def learn(self, frame: DepthFrame, now: float) -> FrameUpdate:
         """Learns from a frame, and sends what is due of the map."""

@@ -127,7 +127,7 @@ class GmmMapper(Mapper):
         short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
         novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
         self._count(frame, ~novel)
-        self.shared.add(self._learned(frame, novel))
+        self.shared.add(self._learned(frame, novel).to("cpu"))  # where messages are encoded
         self._n_frames += 1
         if self._n_frames % _FRAMES_PER_COUNT == 0:
             self.shared.count(self._due)
@@ -153,10 +153,12 @@ class GmmMapper(Mapper):
                 counted, ends, frame.origin, self._novelty.distance, None, max_range, weight
             ).components
         gain = counted.support - nearby.support
-        for row in (gain > 0).nonzero().squeeze(1).tolist():
-            key = (int(nearby.ids[row, 0]), int(nearby.ids[row, 1]))
-            total = self._gained.pop(key, 0.0) + float(gain[row])
-            if total >= (self._rule.update_at - 1) * float(nearby.support[row]):
+        rows = (gain > 0).nonzero().squeeze(1)
+        columns = (nearby.ids[rows], gain[rows], nearby.support[rows])
+        for (robot, sequence), gained, support in zip(*(c.tolist() for c in columns), strict=True):
+            key = (robot, sequence)
+            total = self._gained.pop(key, 0.0) + gained
+            if total >= (self._rule.update_at - 1) * support:
                 self._due[key] = self._due.get(key, 0.0) + total
             else:
                 self._gained[key] = total
@@ -207,11 +209,12 @@ class GmmMapper(Mapper):
 
     def _enter(self, batch: Components) -> CellEvidence:
         """Enters a batch of components, or of counts added to some; returns its evidence."""
-        self.tiles.add(len(self.tiles), batch)
-        for cell in {self._origin_cell(origin) for origin in batch.origins}:
-            self._by_origin.setdefault(cell, []).append(batch)
         grid = self.belief.grid
-        evidence = self._memo(_key(batch), lambda: self._evidence(batch, grid.resolution, grid.box))
+        there = batch.to(grid.device)
+        self.tiles.add(len(self.tiles), there)
+        for cell in {self._origin_cell(origin) for origin in batch.origins}:
+            self._by_origin.setdefault(cell, []).append(there)
+        evidence = self._memo(_key(batch), lambda: self._evidence(there, grid.resolution, grid.box))
         self._add(evidence)
         return evidence
 
@@ -241,7 +244,7 @@ class GmmMapper(Mapper):
                     empty, resolution, box, rays_per_cell=rays, cutoff=_EMPTY_CUTOFF, thinned=True
                 )
             )
-        return sum_evidence(parts) if parts else CellEvidence.empty()
+        return sum_evidence(parts) if parts else CellEvidence.empty(box.low.device)
 
 
 def _key(batch: Components) -> bytes:

@@ -53,7 +53,11 @@ class SharedPoints(SendOnce):
         datagrams = []
         if bool(novel.any()):
             datagrams = encode_points(
-                self._robot, self._n_frames, frame.origin, frame.ends[novel], frame.is_hit[novel]
+                self._robot,
+                self._n_frames,
+                frame.origin.cpu(),
+                frame.ends[novel].cpu(),
+                frame.is_hit[novel].cpu(),
             )
         self._n_frames += 1
         self._due += datagrams
@@ -138,10 +142,11 @@ class GridMapper(Mapper):
         def make() -> CellEvidence:
             messages = [self._decode(datagram) for datagram in datagrams]
             points = [message for message in messages if isinstance(message, PointsMessage)]
-            ends = torch.cat([message.ends for message in points]).double()
-            is_hit = torch.cat([message.is_hit for message in points])
             grid = self.belief.grid
-            return cast_evidence(points[0].origin.double(), ends, is_hit, grid.resolution, grid.box)
+            ends = torch.cat([message.ends for message in points]).double().to(grid.device)
+            is_hit = torch.cat([message.is_hit for message in points]).to(grid.device)
+            origin = points[0].origin.double().to(grid.device)
+            return cast_evidence(origin, ends, is_hit, grid.resolution, grid.box)
 
         return self._memo(tuple(datagrams), make)
 

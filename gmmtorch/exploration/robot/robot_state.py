@@ -184,9 +184,9 @@ class Robot:
         if len(cells) == 0:
             return
         low, size = cells.amin(0), cells.amax(0) - cells.amin(0) + 1
-        hit = torch.zeros(size.tolist(), dtype=torch.bool)
+        hit = torch.zeros(size.tolist(), dtype=torch.bool, device=cells.device)
         hit[(cells - low).unbind(1)] = True
-        self._recent.append(hit.nonzero() + low)
+        self._recent.append((hit.nonzero() + low).cpu())
 
     def local_map(
         self, planning_prior: float, radius: float, window: tuple[int, int, int] | None = None
@@ -198,10 +198,10 @@ class Robot:
         """
         local, rule = self.mapper.local, self.mapper.belief.rule
         box = local.box if window is None else local.around(self.position, window)
-        hits, misses = local.evidence(box)
+        hits, misses = torch.stack(local.evidence(box)).cpu()  # the planner works on the CPU
         recent = list(self._recent)
         return local_map_of(
-            box.low,
+            box.low.cpu(),
             local.resolution,
             hits,
             misses,

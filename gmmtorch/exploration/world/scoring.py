@@ -61,15 +61,24 @@ class BeliefMap:
 
     Args:
         observable: (nx, ny, nz) bool over `box`: cells that a sensor could ever see.
+        device: of the evidence.
     """
 
-    def __init__(self, resolution: float, box: Box, observable: Tensor, rule: BeliefRule) -> None:
+    def __init__(
+        self,
+        resolution: float,
+        box: Box,
+        observable: Tensor,
+        rule: BeliefRule,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        box = Box(*(side.to(device) for side in box))
         # Noise can move hits on a wall just outside the bounds; they must not count as unseen.
         bounds = Box(box.low - _MARGIN, box.high + _MARGIN)
         self.grid = SparseEvidence(resolution, box=bounds, dtype=torch.float32)
         self.rule = rule
         self._low = box.low
-        self._observable = observable.reshape(-1)
+        self._observable = observable.reshape(-1).to(device)
         self._shape = box.shape
         self.observable_bits = float(observable.sum())
         self.clear()
@@ -97,8 +106,9 @@ class BeliefMap:
         return inside & self._observable[flat]
 
     def probability(self, cells: Tensor) -> Tensor:
-        """Occupancy (C,) of cells (C, 3)."""
-        return self.rule.probability(*self.grid.at_cells(cells))
+        """Occupancy (C,) of cells (C, 3), on the device of the cells."""
+        evidence = self.grid.at_cells(cells.to(self.grid.device))
+        return self.rule.probability(*evidence).to(cells.device)
 
 
 def accuracy(belief: BeliefMap, cells: Tensor, occupied: Tensor) -> dict[str, float | None]:

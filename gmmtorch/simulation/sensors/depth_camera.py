@@ -38,6 +38,12 @@ class DepthFrame:
     is_hit: Tensor
     pixel: Tensor
 
+    def to(self, device: torch.device | str) -> DepthFrame:
+        """The frame on a device."""
+        if self.ends.device == torch.device(device):
+            return self
+        return DepthFrame(*(value.to(device) for value in vars(self).values()))
+
     def scan(self) -> Scan:
         """The frame as a scan: hits, and ends of beams without return."""
         return Scan(self.ends[self.is_hit], self.origin, self.ends[~self.is_hit])
