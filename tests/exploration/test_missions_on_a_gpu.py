@@ -50,9 +50,9 @@ def test_missions_on_a_gpu_give_the_results_of_the_cpu(world, framework, options
             there, row = flown(world, framework, "cuda", **options)
             assert isinstance(there.robots[0].mapper.local.counts, GPUTensor)
             assert isinstance(there.score.seen_by, GPUTensor)
+            assert torch.equal(_team_view(there).image, _team_view(mission).image)
+            assert torch.equal(_coverage(there), _coverage(mission))
     assert gpu.waits
     assert row == expected
-    assert torch.equal(_team_view(mission).image, _team_view(there).image)
-    assert torch.equal(_coverage(mission), _coverage(there))
     for one, other in zip(mission.trajectories, there.trajectories, strict=True):
         assert torch.equal(torch.stack(one), torch.stack(other))

@@ -50,6 +50,7 @@ class SparseEvidence(SparseLattice):
         super().__init__(resolution, dim, _AXIS_BITS[dim], device, memory_limit)
         self.compiled = compiled
         self._box = box
+        self._bounds: tuple[Tensor | None, Box | None, Tensor | None] = (None, None, None)
         if box is not None:
             self._check_box(box)
         self._slots = torch.empty(
@@ -169,13 +170,20 @@ class SparseEvidence(SparseLattice):
 
     def _index_of(self, cells: Tensor) -> Tensor:
         """Flat index (C,) of cells (C, D) in the counts; −1 in blocks not stored, 0 outside the box."""
+        anchor, box, bounds = self._bounds
+        if bounds is None or anchor is not self.anchor or box is not self._box:
+            bounds = self._new_bounds()
+            self._bounds = self.anchor, self._box, bounds
+        keys = BlockKeys(self.keys, self._slots, bounds, self.local_bits, self._axis_bits)
+        return cell_index(cells, keys)
+
+    def _new_bounds(self) -> Tensor:
+        """The bounds of `BlockKeys`."""
         low = self.origin() * self.block_side
         if self._box is None:
             reach = torch.full_like(low, (self._half - 1) * self.block_side)
-            bounds = torch.stack([low, low - reach, low + reach]).to(self.device)
-        else:
-            bounds = torch.stack([low.to(self.device), *self._box])
-        return cell_index(cells, BlockKeys(self.keys, self._slots, bounds, self.local_bits, self._axis_bits))
+            return torch.stack([low, low - reach, low + reach]).to(self.device)
+        return torch.stack([low.to(self.device), *self._box])
 
     def _first_of(self, keys: Tensor) -> Tensor:
         """Flat index (M,) of the first cell of each block; 0 for blocks that are not stored."""
