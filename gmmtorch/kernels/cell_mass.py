@@ -12,7 +12,7 @@ import math
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.face_flux import RULES
+from gmmtorch.kernels.face_flux import with_panels
 from gmmtorch.kernels.simd import SIMD
 
 _BODY = """
@@ -74,7 +74,7 @@ _BODY = """
     RULES
     constexpr int STACK = LANES * 15 * 27;  // panels that wait: 27 levels down to the smallest
     int64_t waiting = 0, next = 0;
-    int64_t stack_cell[STACK];
+    int64_t stack_index[STACK];
     double stack_panel[STACK][4];
     while (waiting > 0 || next < n_cells) {
         vec base0 = (vec)(0.0), base1 = (vec)(0.0), scale0 = (vec)(1.0), scale1 = (vec)(1.0);
@@ -83,7 +83,7 @@ _BODY = """
         for (int l = 0; l < LANES; ++l) {
             if (waiting > 0) {
                 --waiting;
-                cell[l] = stack_cell[waiting];
+                cell[l] = stack_index[waiting];
                 set(base0, l, stack_panel[waiting][0]);
                 set(base1, l, stack_panel[waiting][1]);
                 set(scale0, l, stack_panel[waiting][2]);
@@ -121,10 +121,7 @@ _BODY = """
         const mask fine = ((change0 <= limit3) & (change1 <= limit3)) | (scale0 < 1e-15) | (scale1 < 1e-15);
         const mask ready = inside & fine;
         if (any(ready)) {
-            const int order0 = any(ready & (change0 > limit2)) ? 3 : any(ready & (change0 > limit1)) ? 2
-                               : any(ready & (change0 > limit0)) ? 1 : 0;
-            const int order1 = any(ready & (change1 > limit2)) ? 3 : any(ready & (change1 > limit1)) ? 2
-                               : any(ready & (change1 > limit0)) ? 1 : 0;
+            ORDERS
             vec sum = (vec)(0.0);
             for (int p = 0; p <= order0; ++p)
                 for (int q = 0; q <= order1; ++q) {
@@ -152,25 +149,7 @@ _BODY = """
                 GMM_ADD(hits + flat, value);
             }
         }
-        const mask coarse = inside & !fine;
-        if (!any(coarse)) continue;
-        const vec cut = coarse ? (vec)(1.0) : (vec)(0.0);
-        for (int l = 0; l < LANES; ++l) {
-            if (get(cut, l) == 0.0) continue;
-            const double ratio0 = ceil(get(change0, l) / limit3), ratio1 = ceil(get(change1, l) / limit3);
-            const int parts0 = (int)GMM_MIN(GMM_MAX(ratio0, 1.0), 4.0);
-            const int parts1 = (int)GMM_MIN(GMM_MAX(ratio1, 1.0), 4.0);
-            for (int p = 0; p < parts0; ++p)
-                for (int q = 0; q < parts1; ++q) {
-                    if (waiting >= STACK) break;  // not reached: panels end at 1e-15
-                    stack_cell[waiting] = cell[l];
-                    stack_panel[waiting][0] = get(base0, l) + get(scale0, l) * ((p + 0.5) / parts0 - 0.5);
-                    stack_panel[waiting][1] = get(base1, l) + get(scale1, l) * ((q + 0.5) / parts1 - 0.5);
-                    stack_panel[waiting][2] = get(scale0, l) / parts0;
-                    stack_panel[waiting][3] = get(scale1, l) / parts1;
-                    ++waiting;
-                }
-        }
+        SPLIT
     }
 """
 _KERNEL = FusedKernel(
@@ -178,7 +157,7 @@ _KERNEL = FusedKernel(
     "const double* cones, const double* counts, const int64* cone, const int64* first, const int64* number,"
     " int64 dim, double place0, double place1, double place2, double side, int64 stride0, int64 stride1,"
     " int64 stride2, double cutoff, double limit0, double limit1, double limit2, double limit3, double* hits",
-    SIMD + _BODY.replace("RULES", RULES),
+    SIMD + with_panels(_BODY, "cell"),
     shares=True,
 )
 

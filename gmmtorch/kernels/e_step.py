@@ -22,6 +22,16 @@ SKIPPED = 37.0
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
 
+PRODUCTS = """
+        vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
+        for (int f = 1; f < WIDTH; ++f) {
+            a = fused(x[f], (vec)(w[f]), a);
+            b = fused(x[f], (vec)(w[WIDTH + f]), b);
+            c = fused(x[f], (vec)(w[2 * WIDTH + f]), c);
+            d = fused(x[f], (vec)(w[3 * WIDTH + f]), d);
+        }
+"""
+"""Logits a, b, c, d of four components from features x and natural parameters w."""
 _LOGITS = """
     // Component by component for LANES rows: what four components share is loaded once.
     const int64_t lane_rows = GMM_MIN((int64_t)LANES, stop - row);
@@ -33,13 +43,7 @@ _LOGITS = """
     LIKELIEST_BEGIN
     for (int64_t k = 0; k < n_components; k += 4) {
         const double* w = natural + k * WIDTH;
-        vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
-        for (int f = 1; f < WIDTH; ++f) {
-            a = fused(x[f], (vec)(w[f]), a);
-            b = fused(x[f], (vec)(w[WIDTH + f]), b);
-            c = fused(x[f], (vec)(w[2 * WIDTH + f]), c);
-            d = fused(x[f], (vec)(w[3 * WIDTH + f]), d);
-        }
+        PRODUCTS
         LOGITS
     }
 """
@@ -97,7 +101,11 @@ _BEST = "".join(
 def _kernel(name: str, body: str, parameters: str, dim: int) -> FusedKernel:
     width = 1 + dim + dim * (dim + 1) // 2
     keeps = "vec first = (vec)(0.0);" if name == "most_likely" else ""
-    logits = _LOGITS.replace("LOGITS", _BEST if keeps else _STORED).replace("LIKELIEST_BEGIN", keeps)
+    logits = (
+        _LOGITS.replace("PRODUCTS", PRODUCTS)
+        .replace("LOGITS", _BEST if keeps else _STORED)
+        .replace("LIKELIEST_BEGIN", keeps)
+    )
     body = body.replace("LOGITS_OF_ROWS", logits)
     body = body.replace("WIDTH", str(width)).replace("SKIPPED", str(SKIPPED))
     rows = "const double* features, int64 n_rows, const double* natural, int64 n_components, int64 n_parts, "

@@ -16,7 +16,7 @@ from torch import Tensor
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.simd import SIMD
 
-RULES = """
+_RULES = """
     const double GAUSS[4][4] = {
         {0.0, 0.0, 0.0, 0.0},
         {-0.28867513459481287, 0.28867513459481287, 0.0, 0.0},
@@ -29,6 +29,46 @@ RULES = """
         {0.17392742256872693, 0.32607257743127307, 0.32607257743127307, 0.17392742256872693}};
 """
 """C++ of the nodes and weights of the Gauss-Legendre rules with 1 to 4 nodes on [−½, ½]."""
+
+_ORDERS = """
+            const int order0 = any(ready & (change0 > limit2)) ? 3 : any(ready & (change0 > limit1)) ? 2
+                               : any(ready & (change0 > limit0)) ? 1 : 0;
+            const int order1 = any(ready & (change1 > limit2)) ? 3 : any(ready & (change1 > limit1)) ? 2
+                               : any(ready & (change1 > limit0)) ? 1 : 0;
+"""
+_SPLIT = """
+        const mask coarse = inside & !fine;
+        if (!any(coarse)) continue;
+        const vec cut = coarse ? (vec)(1.0) : (vec)(0.0);
+        for (int l = 0; l < LANES; ++l) {
+            if (get(cut, l) == 0.0) continue;
+            const double ratio0 = ceil(get(change0, l) / limit3), ratio1 = ceil(get(change1, l) / limit3);
+            const int parts0 = (int)GMM_MIN(GMM_MAX(ratio0, 1.0), 4.0);
+            const int parts1 = (int)GMM_MIN(GMM_MAX(ratio1, 1.0), 4.0);
+            for (int p = 0; p < parts0; ++p)
+                for (int q = 0; q < parts1; ++q) {
+                    if (waiting >= STACK) break;  // not reached: panels end at 1e-15
+                    stack_index[waiting] = INDEX[l];
+                    stack_panel[waiting][0] = get(base0, l) + get(scale0, l) * ((p + 0.5) / parts0 - 0.5);
+                    stack_panel[waiting][1] = get(base1, l) + get(scale1, l) * ((q + 0.5) / parts1 - 0.5);
+                    stack_panel[waiting][2] = get(scale0, l) / parts0;
+                    stack_panel[waiting][3] = get(scale1, l) / parts1;
+                    ++waiting;
+                }
+        }
+"""
+
+
+def with_panels(body: str, index: str) -> str:
+    """The body of a kernel with the rules, their orders and the division of panels that are too large.
+
+    `index` is the variable that holds the face or cell of each lane.
+    """
+    parts = {"RULES": _RULES, "ORDERS": _ORDERS, "SPLIT": _SPLIT.replace("INDEX", index)}
+    for name, text in parts.items():
+        body = body.replace(name, text)
+    return body
+
 
 _BODY = """
     const double* c = cones + cone[item] * 16;  // W (9), origin (3), m = W(mean - origin) (3), scale
@@ -51,7 +91,7 @@ _BODY = """
     }
     constexpr int STACK = LANES * 15 * 27;  // panels that wait: 27 levels down to the smallest
     int64_t waiting = 0, next = 0;
-    int64_t stack_face[STACK];
+    int64_t stack_index[STACK];
     double stack_panel[STACK][4];
     while (waiting > 0 || next < n_faces) {
         vec base0 = (vec)(0.0), base1 = (vec)(0.0), scale0 = (vec)(1.0), scale1 = (vec)(1.0);
@@ -60,7 +100,7 @@ _BODY = """
         for (int l = 0; l < LANES; ++l) {
             if (waiting > 0) {
                 --waiting;
-                face[l] = stack_face[waiting];
+                face[l] = stack_index[waiting];
                 set(base0, l, stack_panel[waiting][0]);
                 set(base1, l, stack_panel[waiting][1]);
                 set(scale0, l, stack_panel[waiting][2]);
@@ -110,10 +150,7 @@ _BODY = """
         const mask fine = ((change0 <= limit3) & (change1 <= limit3)) | (scale0 < 1e-15) | (scale1 < 1e-15);
         const mask ready = inside & fine;
         if (any(ready)) {
-            const int order0 = any(ready & (change0 > limit2)) ? 3 : any(ready & (change0 > limit1)) ? 2
-                               : any(ready & (change0 > limit0)) ? 1 : 0;
-            const int order1 = any(ready & (change1 > limit2)) ? 3 : any(ready & (change1 > limit1)) ? 2
-                               : any(ready & (change1 > limit0)) ? 1 : 0;
+            ORDERS
             const bool all_simple = !any(ready & !simple);
             vec sum = (vec)(0.0);
             for (int p = 0; p <= order0; ++p)
@@ -154,25 +191,7 @@ _BODY = """
                 }
             }
         }
-        const mask coarse = inside & !fine;
-        if (!any(coarse)) continue;
-        const vec chosen = coarse ? (vec)(1.0) : (vec)(0.0);
-        for (int l = 0; l < LANES; ++l) {
-            if (get(chosen, l) == 0.0) continue;
-            const double ratio0 = ceil(get(change0, l) / limit3), ratio1 = ceil(get(change1, l) / limit3);
-            const int parts0 = (int)GMM_MIN(GMM_MAX(ratio0, 1.0), 4.0);
-            const int parts1 = (int)GMM_MIN(GMM_MAX(ratio1, 1.0), 4.0);
-            for (int p = 0; p < parts0; ++p)
-                for (int q = 0; q < parts1; ++q) {
-                    if (waiting >= STACK) break;  // not reached: panels end at 1e-15
-                    stack_face[waiting] = face[l];
-                    stack_panel[waiting][0] = get(base0, l) + get(scale0, l) * ((p + 0.5) / parts0 - 0.5);
-                    stack_panel[waiting][1] = get(base1, l) + get(scale1, l) * ((q + 0.5) / parts1 - 0.5);
-                    stack_panel[waiting][2] = get(scale0, l) / parts0;
-                    stack_panel[waiting][3] = get(scale1, l) / parts1;
-                    ++waiting;
-                }
-        }
+        SPLIT
     }
 """
 _KERNEL = FusedKernel(
@@ -182,7 +201,7 @@ _KERNEL = FusedKernel(
     " double place0, double place1, double place2, double side, double area, int64 stride0, int64 stride1,"
     " int64 stride2, double cutoff, double limit0, double limit1, double limit2, double limit3,"
     " double* misses",
-    SIMD + _BODY.replace("RULES", RULES),
+    SIMD + with_panels(_BODY, "face"),
     shares=True,
 )
 

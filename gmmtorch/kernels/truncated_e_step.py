@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.e_step import SKIPPED
+from gmmtorch.kernels.e_step import PRODUCTS, SKIPPED
 from gmmtorch.kernels.simd import CPU_LANES, SIMD
 
 DIMENSIONS = (1, 2, 3)
@@ -39,13 +39,7 @@ _LOAD = """
 _LOGITS = """
     for (int64_t k = 0; k < PADDED; k += 4) {
         const double* w = NATURAL + k * WIDTH;
-        vec a = x[0] * w[0], b = x[0] * w[WIDTH], c = x[0] * w[2 * WIDTH], d = x[0] * w[3 * WIDTH];
-        for (int f = 1; f < WIDTH; ++f) {
-            a = fused(x[f], (vec)(w[f]), a);
-            b = fused(x[f], (vec)(w[WIDTH + f]), b);
-            c = fused(x[f], (vec)(w[2 * WIDTH + f]), c);
-            d = fused(x[f], (vec)(w[3 * WIDTH + f]), d);
-        }
+        PRODUCTS
         logits[k] = a, logits[k + 1] = b, logits[k + 2] = c, logits[k + 3] = d;
         a = a > b ? a : b;
         c = c > d ? c : d;
@@ -185,7 +179,9 @@ _CHOICE = """
 def _kernel(name: str, body: str, parameters: str, dim: int, kind: str) -> FusedKernel:
     slot = "row + l" if name == "truncated" else "slots[g * n_samples + GMM_MIN(sample + l, n_samples - 1)]"
     natural = "(natural + item * n_padded * WIDTH)" if name == "truncated" else "natural"
-    body = body.replace("LOAD", _LOAD.replace("SLOT", slot)).replace("LOGITS", _LOGITS)
+    body = body.replace("LOAD", _LOAD.replace("SLOT", slot)).replace(
+        "LOGITS", _LOGITS.replace("PRODUCTS", PRODUCTS)
+    )
     body = body.replace("PADDED", "n_padded").replace("NATURAL", natural)
     body = body.replace("WIDTH", str(1 + dim + dim * (dim + 1) // 2)).replace("DIM", str(dim))
     rows = f"const {kind}* features, const {kind}* weight, const int64* begin, const double* centers,"
