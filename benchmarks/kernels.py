@@ -27,8 +27,8 @@ from torch import Tensor
 from gmmtorch import GaussianMap, datasets
 from gmmtorch.evaluation.queries import hit_and_free, test_beams
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.e_step import expectation
-from gmmtorch.kernels.ray_traversal import traverse
+from gmmtorch.kernels.mixtures.e_step import expectation
+from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.occupancy.cones import Cones

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from gmmtorch import GaussianMap, datasets
-from gmmtorch.kernels.ray_traversal import traverse
+from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mixture.em import exact as em

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.distinct_keys import distinct_keys
+from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
 
 _MANY_KEYS = 1 << 12  # from here on a hash table is faster than sorting
 _JITTERS = (1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean of the diagonal

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.baselines.baseline_map import TensorFileMap, check_length, check_max_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, check_whole
 from gmmtorch.files import require
-from gmmtorch.kernels.ray_traversal import traverse
+from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.linalg import pack_symmetric, unpack_symmetric
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, check_resolution
 from gmmtorch.occupancy.voxels.cell_table import CellTable

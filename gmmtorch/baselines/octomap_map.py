@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap, check_max_range
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
-from gmmtorch.kernels.ray_traversal import traverse
+from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.scan import Scan

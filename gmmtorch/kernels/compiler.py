@@ -221,8 +221,8 @@ def _compile(device: torch.device) -> None:
     """Compile all kernels for a device, or load them from the cache."""
     wp = _warp()
     package = importlib.import_module("gmmtorch.kernels")
-    for found in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"gmmtorch.kernels.{found.name}")
+    for found in pkgutil.walk_packages(package.__path__, "gmmtorch.kernels."):
+        importlib.import_module(found.name)
     for kernel in _sources.values():
         if kernel._kernel is None:
             kernel.define(wp)

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.near_pairs import MOST_TESTED, near_pairs
-from gmmtorch.kernels.pair_overlap import overlap_sums
+from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
+from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
 from gmmtorch.mapping.surfaces import touching
 from gmmtorch.mixture.em.exact import Parameters
 
@@ -111,7 +111,7 @@ def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pai
 def _batched_sums(
     source: Parameters, target: Parameters, motions: Motions, pairs: Pairs
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The twin of `kernels.pair_overlap`."""
+    """The twin of `kernels.mixtures.pair_overlap`."""
     n, dim = motions.translations.shape
     n_free = dim + dim * (dim - 1) // 2
     lever = torch.einsum("bij,kj->ibk", motions.rotations, source.means).flatten(1)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.kernels import chunks, e_step, kernels
+from gmmtorch.kernels import chunks, kernels
+from gmmtorch.kernels.mixtures import e_step
 from gmmtorch.mixture.em.exact import quadratic_features
 
 FULL = "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 4.00 GiB of which ..."

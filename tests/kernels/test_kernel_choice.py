@@ -83,7 +83,7 @@ def test_kernels_are_cached_in_the_first_folder_that_can_be_written(tmp_path, mo
 
 @pytest.mark.parametrize("n_threads", [1, 2])
 def test_items_split_over_threads_are_each_run_once(n_threads):
-    from gmmtorch.kernels.ray_traversal import traverse
+    from gmmtorch.kernels.rays.ray_traversal import traverse
 
     starts = torch.rand(5000, 3, dtype=torch.float64) * 20
     with kernels("torch"):

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.kernels.point_evidence import pair_evidence
+from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import PointEvidence, PointForm, point_evidence

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.beam_information import banded_csqmi, first_block, shannon, sharpened
+from gmmtorch.kernels.rays.beam_information import banded_csqmi, first_block, shannon, sharpened
 
 _NEGLIGIBLE = 1e-5
 """Kernel values below this count as zero."""

@@ -25,7 +25,7 @@ from gmmtorch.exploration.information.mutual_information import (
     needed_band,
 )
 from gmmtorch.exploration.robot.mapper import LocalMap
-from gmmtorch.kernels.beam_information import Beams, Cells, information_by_block
+from gmmtorch.kernels.rays.beam_information import Beams, Cells, information_by_block
 from gmmtorch.occupancy.grid import check_resolution
 
 BLOCK = 4

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event, ignore
-from gmmtorch.kernels.ray_traversal import row_major_strides
+from gmmtorch.kernels.rays.ray_traversal import row_major_strides
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.voxelize import occupied_cells
 from gmmtorch.simulation.worlds.mesh_world import MeshWorld

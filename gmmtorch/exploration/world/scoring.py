@@ -10,7 +10,7 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.cell_entropy import entropy_removed
+from gmmtorch.kernels.rays.cell_entropy import entropy_removed
 from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence

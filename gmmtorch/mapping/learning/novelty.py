@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.cell_entropy import cell_entropy, reduction_along_rays
-from gmmtorch.kernels.ray_traversal import traverse
+from gmmtorch.kernels.rays.cell_entropy import cell_entropy, reduction_along_rays
+from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import NoveltyRule

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.component_casting import (
+from gmmtorch.kernels.rays.component_casting import (
     THINNING,
     Seen,
     cast_components,

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.cell_moments import KEY_BITS, cell_moments
 from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.mixtures.cell_moments import KEY_BITS, cell_moments
 from gmmtorch.linalg import count_distinct, dense_ranks
 from gmmtorch.mixture.em.exact import quadratic_features
 
@@ -79,7 +79,7 @@ def _coarsest_allowed(
 def _sums_by_key(
     points: Tensor, weight: Tensor, keys: Tensor, max_cells: int
 ) -> tuple[Tensor, Tensor] | None:
-    """The twin of `kernels.cell_moments`: sums (C, F) over points of one key, and the cell of each point."""
+    """The twin of `kernels.mixtures.cell_moments`: sums (C, F) over equal keys, and each point's cell."""
     if count_distinct(keys) > max_cells:
         return None
     member, n_cells = dense_ranks(keys)

@@ -18,10 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import e_step
 from gmmtorch.kernels.chunks import chunk_elements
-from gmmtorch.kernels.e_step import expectation as expectation
-from gmmtorch.kernels.e_step import exponent_floor as exponent_floor
+from gmmtorch.kernels.mixtures import e_step
+from gmmtorch.kernels.mixtures.e_step import expectation as expectation
+from gmmtorch.kernels.mixtures.e_step import exponent_floor as exponent_floor
 from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
 
 SOFTMAX_DTYPES = {"float32": torch.float32, "float64": torch.float64}

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.kernels.chunks import chunk_elements
-from gmmtorch.kernels.truncated_e_step import (
+from gmmtorch.kernels.mixtures.truncated_e_step import (
     GroupedRows,
     fused_candidates,
     fused_expectation,

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.e_step import in_spatial_order
+from gmmtorch.kernels.mixtures.e_step import in_spatial_order
 from gmmtorch.mixture.em import exact
 from gmmtorch.mixture.em.covariance_types import constrain
 from gmmtorch.mixture.em.exact import Parameters

@@ -12,7 +12,12 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.point_evidence import PointTable, compiled_pair_evidence, listed_evidence, pair_evidence
+from gmmtorch.kernels.evidence.point_evidence import (
+    PointTable,
+    compiled_pair_evidence,
+    listed_evidence,
+    pair_evidence,
+)
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.ray_traversal import row_major_strides
+from gmmtorch.kernels.rays.ray_traversal import row_major_strides
 
 
 class CellEvidence(NamedTuple):

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import MemoryLimitError
-from gmmtorch.kernels.ray_counting import count_in_grid
-from gmmtorch.kernels.ray_traversal import Visits, traverse
+from gmmtorch.kernels.rays.ray_counting import count_in_grid
+from gmmtorch.kernels.rays.ray_traversal import Visits, traverse
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.boxes import Box, flat_index, to_lattice
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels.cell_index import BlockKeys, cell_index
-from gmmtorch.kernels.ray_traversal import CHUNK_VISITS
+from gmmtorch.kernels.rays.cell_index import BlockKeys, cell_index
+from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.block_table import count_misses

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.kernels.ray_traversal import row_major_strides
+from gmmtorch.kernels.rays.ray_traversal import row_major_strides
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
 

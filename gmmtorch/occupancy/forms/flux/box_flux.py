@@ -15,9 +15,9 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.cell_mass import add_cell_mass
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.face_flux import add_row_flux, whitened_rows
+from gmmtorch.kernels.evidence.cell_mass import add_cell_mass
+from gmmtorch.kernels.evidence.face_flux import add_row_flux, whitened_rows
 from gmmtorch.occupancy.cones import CUTOFF, Cones, WhitenedCones, cross, dot, length, outside_cone
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.adaptive_quadrature import (
@@ -199,7 +199,7 @@ def _add_faces(
     tolerance: float,
     dtype: torch.dtype,
 ) -> Tensor:
-    """misses (cells,) and the flux through rows of faces; the twin of `kernels.face_flux`."""
+    """misses (cells,) and the flux through rows of faces; the twin of `kernels.evidence.face_flux`."""
     for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
         cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
         patches = _grid_faces(white, grid, axis, cone, plane, forward, cells, cutoff, dtype)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.ray_walk import walk
+from gmmtorch.kernels.rays.ray_walk import walk
 
 THINNING = 4
 """Of the first halves of rays, one in this many is followed, with as much more weight."""

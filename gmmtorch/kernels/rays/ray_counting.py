@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.ray_traversal import CHUNK_VISITS, grid_arguments, row_major_strides, traverse
-from gmmtorch.kernels.ray_walk import PARAMETERS, walk
+from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS, grid_arguments, row_major_strides, traverse
+from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk
 
 
 def _counting(place: str) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.point_evidence import sum_of
+from gmmtorch.kernels.evidence.point_evidence import sum_of
 
 _BODY = """
     const double* row = rows + cone[item] * WIDTH;

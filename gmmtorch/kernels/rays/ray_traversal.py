@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.ray_walk import PARAMETERS, TIE, walk
+from gmmtorch.kernels.rays.ray_walk import PARAMETERS, TIE, walk
 
 CHUNK_VISITS = 1 << 18
 """Voxel visits in one pass: they fit a core's cache."""

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import entropy
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.cell_entropy import cell_entropy, entropy_removed, reduction_along_rays
+from gmmtorch.kernels.rays.cell_entropy import cell_entropy, entropy_removed, reduction_along_rays
 
 
 def counts(n: int, seed: int) -> torch.Tensor:

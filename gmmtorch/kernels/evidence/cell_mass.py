@@ -12,7 +12,7 @@ import math
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.face_flux import with_panels
+from gmmtorch.kernels.evidence.face_flux import with_panels
 from gmmtorch.kernels.simd import SIMD
 
 _BODY = """

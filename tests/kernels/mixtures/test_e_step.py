@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gmmtorch.kernels import e_step, kernels
+from gmmtorch.kernels import kernels
+from gmmtorch.kernels.mixtures import e_step
 from gmmtorch.mixture.em.exact import Parameters, natural_parameters, quadratic_features
 
 

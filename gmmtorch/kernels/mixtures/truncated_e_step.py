@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.e_step import PRODUCTS, SKIPPED
+from gmmtorch.kernels.mixtures.e_step import PRODUCTS, SKIPPED
 from gmmtorch.kernels.simd import CPU_LANES, SIMD
 
 DIMENSIONS = (1, 2, 3)

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.ray_traversal import row_major_strides, traverse
+from gmmtorch.kernels.rays.ray_traversal import row_major_strides, traverse
 
 
 @pytest.fixture(autouse=True, params=["fused", "torch"])

@@ -12,8 +12,8 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import check_prior
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
-from gmmtorch.kernels.ray_traversal import grid_arguments, row_major_strides, traverse
-from gmmtorch.kernels.ray_walk import PARAMETERS, walk
+from gmmtorch.kernels.rays.ray_traversal import grid_arguments, row_major_strides, traverse
+from gmmtorch.kernels.rays.ray_walk import PARAMETERS, walk
 
 _CHUNK_VISITS = 1 << 16  # of the twin: fastest when cores share a cache
 _RUN = 256  # cells whose sums an item adds up

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from kernels.test_e_step import mixture
+from kernels.mixtures.test_e_step import mixture
 
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture.em.exact import Parameters, quadratic_features

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gmmtorch.kernels import kernels
-from gmmtorch.kernels.distinct_keys import distinct_keys
+from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
 from gmmtorch.linalg import count_distinct, dense_ranks
 
 

@@ -1,0 +1,1 @@
+"""Evidence of components: at points, as flux and mass in cells, and the test of which cones are near."""

@@ -1,0 +1,1 @@
+"""E-steps, moments of cells, and pairs of components of two mixtures."""

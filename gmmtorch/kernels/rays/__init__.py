@@ -1,0 +1,1 @@
+"""Rays and voxels: traversal, counting, entropies, information of beams, casting, lookup of cells."""
