@@ -1,8 +1,8 @@
-"""Text logs of OctoMap, the format of the Freiburg campus scans.
+"""Scan graphs of OctoMap: text logs, the format of the Freiburg campus scans, and binary `.graph` files.
 
-A line `NODE x y z roll pitch yaw` (metres, radians; R = Rz(yaw) Ry(pitch) Rx(roll), world ← sensor) starts
-a scan. The lines up to the next NODE are its points in the sensor frame, three numbers each. Blank lines and
-comments (#) are skipped.
+In a text log, a line `NODE x y z roll pitch yaw` (metres, radians; R = Rz(yaw) Ry(pitch) Rx(roll), world ←
+sensor) starts a scan. The lines up to the next NODE are its points in the sensor frame, three numbers each.
+Blank lines and comments (#) are skipped. The binary format is in `scan_graph`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gmmtorch.datasets import scan_graph
 from gmmtorch.datasets.base import Dataset, Ranges, gunzip, require_path
 from gmmtorch.errors import DataError
 from gmmtorch.scan import Scan
@@ -21,7 +22,8 @@ _LINE_BYTES = 1 << 12
 
 
 class OctomapLog(Dataset):
-    """Scans of an OctoMap log in the order of the file. Only their positions in the file are kept in memory.
+    """Scans of a log, text or binary, in the order of the file. Only their positions in the file are kept in
+    memory.
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
     invalid and dropped. A gzip file is decompressed into memory once.
@@ -31,15 +33,21 @@ class OctomapLog(Dataset):
         self._path = require_path(
             path,
             "file",
-            "an OctoMap scan log (NODE x y z roll pitch yaw, then points)",
+            "an OctoMap scan log (NODE x y z roll pitch yaw, then points) or binary scan graph",
             "The OctoMap 3D scan dataset of the University of Freiburg is published in this format.",
         )
         super().__init__(self._path.name.split(".")[0], ranges, stride)
         self._unzipped = gunzip(self._path)
         with self._open() as file:
-            self._nodes = _node_positions(file)
+            self._is_binary = scan_graph.is_scan_graph(file)
+            file.seek(0)
+            if self._is_binary:
+                self._nodes = scan_graph.node_positions(file, str(self._path))
+            else:
+                self._nodes = _node_positions(file)
         if not self._nodes:
-            raise DataError(f"{self._path} has no NODE line, so it is not an OctoMap scan log.")
+            missing = "scan" if self._is_binary else "NODE line, so it is not an OctoMap scan log"
+            raise DataError(f"{self._path} has no {missing}.")
 
     def _open(self) -> io.BufferedIOBase:
         return self._path.open("rb") if self._unzipped is None else io.BytesIO(self._unzipped)
@@ -48,21 +56,31 @@ class OctomapLog(Dataset):
         return len(self._nodes)
 
     def _read(self, index: int) -> Scan:
+        pose, points = self._known_pose(index), self._points(index)
+        return self.ranges.scan(points @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+
+    def _points(self, index: int) -> torch.Tensor:
+        """Points (N, 3) of a scan, sensor frame."""
+        where = f"{self._path}, scan {index}"
+        if self._is_binary:
+            with self._open() as file:
+                return torch.from_numpy(scan_graph.read_points(file, self._nodes[index], where))
         stop = self._nodes[index + 1] if index + 1 < len(self._nodes) else None
         with self._open() as file:
             file.seek(self._nodes[index])
             text = file.read() if stop is None else file.read(stop - self._nodes[index])
-        where = f"{self._path}, scan {index}"
-        head, *lines = text.decode("ascii", errors="replace").splitlines()
-        pose = _node_pose(head, where)
-        points = _numbers([line for line in lines if line.strip() and not line.startswith("#")], 3, where)
-        return self.ranges.scan(torch.from_numpy(points) @ pose[:3, :3].T + pose[:3, 3], pose[:3, 3])
+        _, *lines = text.decode("ascii", errors="replace").splitlines()
+        lines = [line for line in lines if line.strip() and not line.startswith("#")]
+        return torch.from_numpy(_numbers(lines, 3, where))
 
     def _known_pose(self, index: int) -> torch.Tensor:
+        where = f"{self._path}, scan {index}"
         with self._open() as file:
+            if self._is_binary:
+                return scan_graph.read_pose(file, self._nodes[index], where)
             file.seek(self._nodes[index])
             head = file.readline(_LINE_BYTES).decode("ascii", errors="replace")
-        return _node_pose(head, f"{self._path}, scan {index}")
+        return _node_pose(head, where)
 
 
 def _node_pose(line: str, where: str) -> torch.Tensor:

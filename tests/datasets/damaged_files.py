@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import test_point_chunks
 import test_readers
+import test_scan_graph
 import torch
 
 from gmmtorch.datasets import load
@@ -44,6 +45,11 @@ def carmen(folder: Path, name: str = "a.log") -> None:
 
 def octomap(folder: Path) -> None:
     (folder / "a.log").write_text("NODE 1 2 3 0 0 0.5\n1 2 3\n4 5 6\n" * 4)
+
+
+def octomap_graph(folder: Path) -> None:
+    pose = test_scan_graph.MOVED
+    (folder / "a.graph").write_bytes(test_scan_graph.graph([(pose, POINTS)] * 3, n_edges=2))
 
 
 def frames(folder: Path) -> None:
@@ -131,6 +137,7 @@ FORMATS: dict[str, tuple[Callable[[Path], object], Callable[[Path], list[torch.T
     "carmen": (carmen, all_scans("carmen", "a.log")),
     "carmen_gzip": (lambda folder: carmen(folder, "a.gz"), all_scans("carmen", "a.gz")),
     "octomap_log": (octomap, all_scans("octomap_log", "a.log")),
+    "octomap_graph": (octomap_graph, all_scans("octomap_log", "a.graph")),
     "depth_frames": (frames, all_scans("depth_frames", "")),
     **{
         name: (lambda folder, name=name: test_point_chunks.written(folder, name), all_points(name))
