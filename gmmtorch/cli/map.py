@@ -59,7 +59,7 @@ def run(config: DictConfig) -> None:
         row = map_outputs.result_row(dataset.name, builder, config)
         exported, errors = map_outputs.write_exports(config, target, folder, bars)
         common.write_results("map", config, [row], folder)
-        map_outputs.draw(config, builder, trajectory, row, folder)
+        map_outputs.draw(config, target, [trajectory], row, folder)
     (folder / _CHECKPOINT).unlink(missing_ok=True)
     common.print_table([row], TABLE.split(), f"{dataset.name}: {row['n_scans']} scans")
     for reason, count in builder.skipped.items():

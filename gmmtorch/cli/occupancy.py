@@ -97,7 +97,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
         panels = [MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
         # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
         figures[f"map_{resolution:g}m"] = map_figure(
-            panels, trajectory, occupied_above=0.4, **_image_limits(shown)
+            panels, [trajectory], occupied_above=0.4, **_image_limits(shown)
         )
         regions = busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.reporting import map_outputs
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 # Flags of Hydra whose values are words of their own.
 _FLAGS_WITH_A_VALUE = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp"}
 _FLAGS_WITH_A_VALUE |= {"--config-name", "-cn", "--config-dir", "-cd"}
-_TRAJECTORY = "trajectory.tum"
 
 
 def main() -> None:
@@ -65,13 +65,13 @@ def run(config: DictConfig) -> None:
     common.use_runtime(config.runtime)
     path = Path(config.path).expanduser()
     shown = maps.open_map(path, config.runtime, config.bounds)
-    trajectory = _trajectory(config, path, shown.dim)
+    trajectories = _trajectories(config, path, shown.dim or 3)
     look = {"shape": config.shape, "colour": config.colour}
     if config.html:
-        written = write_page(config.html, shown, trajectory, **look)
+        written = write_page(config.html, shown, trajectories, **look)
         print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
         return
-    viewer = MapViewer(shown, trajectory, **look, host=config.host, port=config.port)
+    viewer = MapViewer(shown, trajectories, **look, host=config.host, port=config.port)
     try:
         serve(viewer)
     finally:
@@ -84,30 +84,16 @@ def serve(viewer: MapViewer) -> None:
     threading.Event().wait()
 
 
-def _trajectory(config: DictConfig, path: Path, dim: int | None) -> Tensor | None:
-    """The sensor positions (S, D) of `trajectory`, or of the file beside the map if there is one."""
-    import numpy as np
-    import torch
+def _trajectories(config: DictConfig, path: Path, dim: int) -> list[Tensor]:
+    """The sensor positions (S, D) in `trajectory`, or in the files beside the map: one of each recording."""
+    from gmmtorch.errors import MissingDataError
 
-    from gmmtorch.errors import DataError, MissingDataError
-
-    given = config.trajectory is not None
-    file = (
-        Path(config.trajectory).expanduser()
-        if given
-        else (path if path.is_dir() else path.parent) / _TRAJECTORY
-    )
-    if not file.is_file():
-        if given:
-            raise MissingDataError(f"trajectory={file} does not exist; give a TUM file, or null.")
-        return None
-    try:
-        rows = np.loadtxt(file, ndmin=2)
-        if rows.shape[1] != 8 or not np.isfinite(rows).all():
-            raise ValueError("its rows are not eight finite numbers")
-    except ValueError as error:
-        raise DataError(f"trajectory={file} is not a TUM file: {error}.") from error
-    return torch.from_numpy(rows[:, 1 : 1 + (dim or 3)])
+    if config.trajectory is not None:
+        file = Path(config.trajectory).expanduser()
+        if not file.is_file():
+            raise MissingDataError(f"trajectory={file} does not exist; give a TUM or KITTI file, or null.")
+        return [map_outputs.positions(file, dim)]
+    return map_outputs.trajectories(path if path.is_dir() else path.parent, dim)
 
 
 if __name__ == "__main__":

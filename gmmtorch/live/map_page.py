@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ _N_SHADES = 9  # of the legend
 def write_page(
     path: str | Path,
     shown: GaussianMap,
-    trajectory: Tensor | None = None,
+    trajectories: Sequence[Tensor] = (),
     *,
     shape: str = "ellipsoids",
     colour: str = "height",
@@ -38,12 +39,12 @@ def write_page(
     """Writes a map as one HTML file, atomically.
 
     The page has controls for the shape, the colour and the size of components, the height above which they
-    are hidden, the path and a slice of occupancy at the sensor's height.
+    are hidden, the paths and a slice of occupancy at the sensor's height.
 
     Args:
         path: FILE.html.
         shown: the map.
-        trajectory: (S, 2) or (S, 3) sensor positions, world metres; None draws no path.
+        trajectories: (S, 2) or (S, 3) sensor positions of each recording, world metres.
         shape: one of `viewer_scene.SHAPES`, shown first. The mesh of the surfaces, which is large, is in the
             file only with "surfaces".
         colour: one of `viewer_scene.COLOURS`, shown first.
@@ -59,9 +60,8 @@ def write_page(
     solid = viewer_scene.surfaces(components)
     if len(solid.rows) == 0:
         raise InvalidArgumentError(f"html={path}: the map has no surface to show; insert scans with returns.")
-    positions = torch.zeros(0, 3) if trajectory is None else trajectory.detach().cpu()
-    positions = torch.nn.functional.pad(positions.double(), (0, 3 - positions.shape[1]))
-    frame = viewer_scene.frame(components, positions)
+    paths = viewer_scene.in_space(trajectories)
+    frame = viewer_scene.frame(components, paths)
     scene = {
         "about": f"{len(components):,} components, {byte_text(shown.nbytes)}",
         "flat": components.dim == 2,
@@ -71,7 +71,7 @@ def write_page(
         "scale": viewer_scene.colour_scale(_N_SHADES),
         **_view(frame),
         **_ellipsoids(components, solid, frame),
-        "path": _encoded(positions - frame.shift, "<f4"),
+        "paths": _encoded(viewer_scene.segments(paths) - frame.shift, "<f4"),
         "slice": _slice(shown, frame),
         "mesh": _mesh(components, shown.resolution, frame) if shape == "surfaces" else None,
     }

@@ -21,7 +21,6 @@ from gmmtorch.live.map_page import write_page
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.optional_packages import load_viser
-from gmmtorch.report.maps.map_regions import robust_bounds
 from gmmtorch.report.scenes.ellipsoids import unit_sphere
 
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
@@ -32,18 +31,18 @@ _WELCOME = "Click a place to see what the map knows about it."
 
 
 class MapViewer:
-    """Shows a map in the browser: components, the sensor's path and slices of occupancy.
+    """Shows a map in the browser: components, the sensor's paths and slices of occupancy.
 
         viewer = MapViewer(GaussianMap.load("map.safetensors"))
         print(viewer.url)
 
     Args:
         shown: the map; an empty map is shown once `update` gives another one.
-        trajectory: (S, D) sensor positions, world metres; None draws no path.
+        trajectories: (S, D) sensor positions of each recording, world metres.
         shape: one of `viewer_scene.SHAPES`. colour: one of `viewer_scene.COLOURS`.
         host, port: where the page is served; another port is taken if this one is in use.
 
-    The page has controls for the shape, the colour, the height above which components are hidden, the path,
+    The page has controls for the shape, the colour, the height above which components are hidden, the paths,
     and the height and resolution of the slice. A click shows occupancy, hits and misses at a place.
 
     Raises `GmmTorchError` if viser is not installed, and `OutputError` if no port is free.
@@ -52,7 +51,7 @@ class MapViewer:
     def __init__(
         self,
         shown: GaussianMap,
-        trajectory: Tensor | None = None,
+        trajectories: Sequence[Tensor] = (),
         *,
         shape: str = "ellipsoids",
         colour: str = "height",
@@ -72,9 +71,9 @@ class MapViewer:
         self._shift = torch.zeros(3, dtype=torch.float64)
         self._box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._map, self._components = shown, Components.empty(3)
-        self._path = torch.zeros(0, 3, dtype=torch.float64)
+        self._paths: list[Tensor] = []
         self._add_controls(shape, colour)
-        self.update(shown, trajectory)
+        self.update(shown, trajectories)
 
     @property
     def url(self) -> str:
@@ -86,33 +85,33 @@ class MapViewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def update(self, shown: GaussianMap, trajectory: Tensor | None = None) -> None:
-        """Shows another map and path. The map must not change afterwards."""
+    def update(self, shown: GaussianMap, trajectories: Sequence[Tensor] = ()) -> None:
+        """Shows another map and other paths. The map must not change afterwards."""
         with self._lock:
             if shown.dim is None:
                 return
             first = self._box is None
             self._map, self._components = shown, shown.components()
-            surface = viewer_scene.surfaces(self._components)
-            path = torch.zeros(0, shown.dim) if trajectory is None else trajectory.detach().cpu()
-            self._path = torch.nn.functional.pad(path.double(), (0, 3 - shown.dim))
-            self._box = robust_bounds(surface.means, self._path if len(self._path) else None, margin=0.5)
+            self._paths = viewer_scene.in_space(trajectories)
+            view = viewer_scene.frame(self._components, self._paths)
+            self._box = tuple(view.low.tolist()), tuple(view.high.tolist())
             if first:
-                self._begin()
+                self._begin(view)
             self._draw_components()
-            self._draw_path()
+            self._draw_paths()
             self._draw_slice()
 
     def save_html(self, path: str | Path) -> Path:
-        """Writes the map and the path as one HTML file; see `map_page.write_page`."""
+        """Writes the map and the paths as one HTML file; see `map_page.write_page`."""
         with self._lock:
-            return write_page(path, self._map, self._path, shape=self._shape.value, colour=self._colour.value)
+            return write_page(
+                path, self._map, self._paths, shape=self._shape.value, colour=self._colour.value
+            )
 
     # -- the scene ------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
+    def _begin(self, begin: viewer_scene.Frame) -> None:
         """Limits of the controls, the camera and the lights, from the first map."""
-        begin = viewer_scene.frame(self._components, self._path)
         self._shift, away = begin.shift, begin.distance
         middle = ((begin.low + begin.high) / 2 - begin.shift).numpy()
         self._server.initial_camera.look_at = tuple(middle)
@@ -194,14 +193,14 @@ class MapViewer:
             receive_shadow=False,
         )
 
-    def _draw_path(self) -> None:
-        self._remove("path")
-        if len(self._path) < 2 or not self._with_path.value:
+    def _draw_paths(self) -> None:
+        self._remove("paths")
+        lines = viewer_scene.segments(self._paths) - self._shift
+        if len(lines) == 0 or not self._with_paths.value:
             return
-        moved = (self._path - self._shift).float().numpy()
-        self._nodes["path"] = self._server.scene.add_line_segments(
-            "/path",
-            np.stack([moved[:-1], moved[1:]], 1),
+        self._nodes["paths"] = self._server.scene.add_line_segments(
+            "/paths",
+            lines.float().numpy(),
             _PATH_COLOUR,
             thickness=_PATH_WIDTH,
             thickness_units="screen",
@@ -241,7 +240,7 @@ class MapViewer:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
             self._colour = gui.add_dropdown("colour", viewer_scene.COLOURS, initial_value=colour)
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
-            self._with_path = gui.add_checkbox("trajectory", True)
+            self._with_paths = gui.add_checkbox("trajectory", True)
         with gui.add_folder("Occupancy"):
             self._visible = gui.add_checkbox("slice", True)
             self._height = gui.add_slider("height [m]", 0.0, 1.0, 0.05, 0.5)
@@ -250,7 +249,7 @@ class MapViewer:
             self._place = gui.add_markdown(_WELCOME)
         for control in (self._shape, self._colour, self._cut):
             control.on_update(lambda _: self._redraw(self._draw_components))
-        self._with_path.on_update(lambda _: self._redraw(self._draw_path))
+        self._with_paths.on_update(lambda _: self._redraw(self._draw_paths))
         for control in (self._visible, self._height, self._resolution):
             control.on_update(lambda _: self._redraw(self._draw_slice))
         self._server.scene.on_click()(lambda event: self._show_place(event.ray_origin, event.ray_direction))
@@ -283,7 +282,7 @@ class MapViewer:
             resolution = self._resolution.value
             position = (start + nearest * along)[:dim]
             known = viewer_scene.place_at(self._map, position, resolution)
-            self._place.content = _said(known, resolution)
+            self._place.content = viewer_scene.place_text(known, resolution)
             spot = torch.nn.functional.pad(position, (0, 3 - dim)) - self._shift
             self._remove("place")
             self._nodes["place"] = self._server.scene.add_icosphere(
@@ -298,14 +297,3 @@ class MapViewer:
             yield
         finally:
             self._is_quiet = False
-
-
-def _said(known: viewer_scene.Place, resolution: float) -> str:
-    """A table of what the map knows about a place, in Markdown."""
-    where = ", ".join(f"{value:.2f}" for value in known.position.tolist())
-    kind = "unknown" if known.hits + known.misses < 0.01 else "free" if known.occupancy < 0.5 else "occupied"
-    return (
-        f"**{kind}** at ({where}) m\n\n"
-        f"| | |\n|---|---|\n| occupancy θ | {known.occupancy:.3f} |\n| hits | {known.hits:.3g} |\n"
-        f"| misses | {known.misses:.3g} |\n| cell | {resolution:g} m |"
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -151,10 +152,23 @@ class Frame(NamedTuple):
     open_height: float
 
 
-def frame(components: Components, path: Tensor) -> Frame:
-    """The first view of components and the sensor's path (S, 3)."""
+def in_space(trajectories: Sequence[Tensor]) -> list[Tensor]:
+    """Sensor positions (S, 3), float64, of paths (S, 2 or 3); those in 2D lie at z = 0."""
+    paths = [path.detach().cpu().double() for path in trajectories]
+    return [torch.nn.functional.pad(path, (0, 3 - path.shape[1])) for path in paths]
+
+
+def segments(paths: Sequence[Tensor]) -> Tensor:
+    """The lines (N, 2, 3) between consecutive positions of each path (S, 3)."""
+    pieces = [torch.stack([path[:-1], path[1:]], 1) for path in paths if len(path)]
+    return torch.cat(pieces) if pieces else torch.zeros(0, 2, 3, dtype=torch.float64)
+
+
+def frame(components: Components, paths: Sequence[Tensor]) -> Frame:
+    """The first view of components and the sensor's paths (S, 3)."""
     solid = surfaces(components)
-    corners = robust_bounds(solid.means, path if len(path) else None, margin=0.5)
+    path = torch.cat([solid.means[:0], *paths])
+    corners = robust_bounds(solid.means, path, margin=0.5)
     low, high = torch.tensor(corners, dtype=torch.float64)
     far = max(float(low.abs().max()), float(high.abs().max())) > _FAR
     shift = ((low + high) / 2).round() if far else torch.zeros(3, dtype=torch.float64)
@@ -216,3 +230,14 @@ def place_at(shown: GaussianMap, position: Tensor, resolution: float) -> Place:
     evidence = shown.evidence(cell)
     theta = torch.as_tensor(shown.occupancy(position[None], resolution))
     return Place(position, float(theta[0]), float(evidence.hits.sum()), float(evidence.misses.sum()))
+
+
+def place_text(known: Place, resolution: float) -> str:
+    """A table of what the map knows about a cell of a side (m), in Markdown."""
+    where = ", ".join(f"{value:.2f}" for value in known.position.tolist())
+    kind = "unknown" if known.hits + known.misses < 0.01 else "free" if known.occupancy < 0.5 else "occupied"
+    return (
+        f"**{kind}** at ({where}) m\n\n"
+        f"| | |\n|---|---|\n| occupancy θ | {known.occupancy:.3f} |\n| hits | {known.hits:.3g} |\n"
+        f"| misses | {known.misses:.3g} |\n| cell | {resolution:g} m |"
+    )

@@ -17,6 +17,7 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 from gmmtorch.cli.recordings import map_recordings
 from gmmtorch.cli.recordings.inputs import find_recordings
 from gmmtorch.cli.recordings.tasks import run_tasks
+from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
 from gmmtorch.mapping.components import Components
@@ -94,6 +95,27 @@ def test_recordings_are_mapped_and_merged_into_the_map_of_all(run, logs, generat
     torch.testing.assert_close(tiled.occupancy(points), whole.occupancy(points), rtol=0, atol=1e-9)
     assert {"navigation.pgm", "navigation.yaml"} <= done.files()
     assert sum(name.endswith("trajectory.tum") for name in done.files()) == 3
+
+
+def test_a_run_has_the_pictures_of_its_map_and_the_paths_of_its_recordings(run, logs):
+    done = succeeded(run(logs / "*.log", "report.figures=true", "report.tensorboard=true"))
+    assert {"above.png", "components.png"} <= done.files()
+    assert any(name.startswith("tensorboard/events") for name in done.files())
+    merged = done.results()["rows"][-1]
+    assert merged["metres"] == pytest.approx(3 * 0.3 * (N_SCANS - 1), rel=0.01)
+    paths = map_outputs.trajectories(done.folder, 2)
+    assert [tuple(path.shape) for path in paths] == [(N_SCANS, 2)] * 3
+    (first, last) = paths[0][0], paths[2][-1]
+    torch.testing.assert_close(first, torch.tensor([1.0, 2.0], dtype=torch.float64))
+    torch.testing.assert_close(last, torch.tensor([8.5, 2.05], dtype=torch.float64))
+
+
+def test_a_map_larger_than_the_memory_limit_is_written_without_pictures(run, logs):
+    done = succeeded(run(logs / "*.log", "report.figures=true", "runtime.memory_limit=100000"))
+    assert "pictures  none: " in done.stdout
+    assert "give the bounds of a smaller box" in done.stdout
+    assert "above.png" not in done.files()
+    assert len(TiledMap(done.folder / "tiles").index) > 1
 
 
 def test_exports_open_only_the_tiles_in_the_bounds(run, logs, monkeypatch, tmp_path):

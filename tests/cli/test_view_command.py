@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,9 @@ def test_html_of_a_run_directory_and_errors(monkeypatch, tmp_path):
     assert "open it in a browser" in done.stdout
     assert "path is not set" in refused(run_here(monkeypatch, "view", tmp_path))
     (tmp_path / "trajectory.tum").write_text("no numbers\n")
-    assert "is not a TUM file" in refused(run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html))
+    assert "is not a table of numbers" in refused(
+        run_here(monkeypatch, "view", tmp_path, f"path={tmp_path}", html)
+    )
 
 
 def test_html_of_a_part_of_a_map_in_tiles(monkeypatch, tmp_path):
@@ -62,8 +65,8 @@ def test_a_map_is_shown_while_it_is_built(monkeypatch, tmp_path):
     shown: list[int] = []
     update = MapViewer.update
 
-    def count(self: MapViewer, built: GaussianMap, trajectory: torch.Tensor | None = None) -> None:
-        update(self, built, trajectory)
+    def count(self: MapViewer, built: GaussianMap, trajectories: Sequence[torch.Tensor] = ()) -> None:
+        update(self, built, trajectories)
         shown.append(built.n_components)
 
     monkeypatch.setattr(MapViewer, "update", count)

@@ -19,8 +19,8 @@ pytest.importorskip("viser")
 
 
 @pytest.fixture(scope="module")
-def maps() -> dict[int, tuple[GaussianMap, torch.Tensor]]:
-    """A map and its sensor path by dimension."""
+def maps() -> dict[int, tuple[GaussianMap, list[torch.Tensor]]]:
+    """A map and its sensor paths by dimension."""
     torch.set_num_threads(1)
     found = {}
     for dim, name in ((2, "synthetic_building_2d"), (3, "synthetic_building")):
@@ -28,7 +28,7 @@ def maps() -> dict[int, tuple[GaussianMap, torch.Tensor]]:
         built = GaussianMap()
         for scan in scans:
             built.insert(scan.select(torch.arange(scan.n_beams) % (1 if dim == 2 else 8) == 0))
-        found[dim] = built, torch.stack([scan.origin for scan in scans])
+        found[dim] = built, [torch.stack([scan.origin for scan in scans])]
     return found
 
 
@@ -136,7 +136,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
 
 
 def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, maps):
-    assert {"components", "path", "slice"} <= viewer._nodes.keys()
+    assert {"components", "paths", "slice"} <= viewer._nodes.keys()
     viewer._height.value = 0.8
     viewer._redraw(viewer._draw_slice)
     assert viewer._nodes["slice"].position[2] == pytest.approx(0.8)
@@ -174,7 +174,7 @@ def test_a_growing_map_is_shown_from_its_first_components(maps):
     try:
         assert not made._nodes
         made.update(*maps[2])
-        assert {"components", "path", "slice"} <= made._nodes.keys()
+        assert {"components", "paths", "slice"} <= made._nodes.keys()
         assert not made._height.visible
     finally:
         made.stop()

@@ -39,7 +39,7 @@ def test_map_figure_draws_one_panel_per_map(dim, n_panels):
     low, high = box(dim)
     panels = [MapPanel(f"map {i}", wall_map(dim).lookup, 0.5, low, high) for i in range(n_panels)]
     path = torch.tensor([[0.0] * dim, [1.0] * dim])
-    figure = map_figure(panels, path, title="wall")
+    figure = map_figure(panels, [path], title="wall")
     shown = [axes for axes in figure.axes if axes.get_visible() and axes.get_images()]
     assert len(shown) == n_panels * (dim - 1)
     assert all(axes.get_aspect() == 1 for axes in shown)
@@ -52,7 +52,7 @@ def test_map_figure_draws_one_panel_per_map(dim, n_panels):
 def test_map_figure_draws_an_unknown_map(dim, path):
     panel = MapPanel("nothing", unknown, 0.5, *box(dim))
     trajectory = torch.zeros(1, dim) if path == "one" else torch.empty(0, dim)
-    map_figure([panel], trajectory).canvas.draw()
+    map_figure([panel], [trajectory]).canvas.draw()
     assert slice_image(panel).image.isnan().all()
 
 
@@ -121,9 +121,9 @@ def test_map_figure_leaves_out_a_roof(roof):
     panel = MapPanel("room", occupancy, 0.5, (0.0, 0.0, -1.0), (4.0, 4.0, 3.0))
     path = torch.tensor([[1.0, 1.0, 1.0], [3.0, 3.0, 1.0]], dtype=torch.float64)
     assert roof_above(panel, path.numpy(), 0.5) == (roof == 2.0)
-    titles = [axes.get_title() for axes in map_figure([panel], path).axes]
+    titles = [axes.get_title() for axes in map_figure([panel], [path]).axes]
     assert any("below z = 1.5 m" in title for title in titles) == (roof == 2.0)
-    assert not any("below" in axes.get_title() for axes in map_figure([panel], path, ceiling=50.0).axes)
+    assert not any("below" in axes.get_title() for axes in map_figure([panel], [path], ceiling=50.0).axes)
 
 
 def test_robust_bounds_ignore_stray_points():
@@ -153,7 +153,7 @@ def test_map_figure_errors_name_the_argument():
     with pytest.raises(InvalidArgumentError, match="all 3D"):
         map_figure([flat, solid])
     with pytest.raises(InvalidArgumentError, match="all 3D"):
-        map_figure([flat], torch.zeros(4, 3))
+        map_figure([flat], [torch.zeros(4, 3)])
     with pytest.raises(InvalidArgumentError, match="one probability for each point"):
         slice_image(MapPanel("short", lambda points: torch.zeros(1), 0.5, *box(2)))
 

@@ -115,7 +115,7 @@ class View:
     """Options of gmmtorch-view.
 
     path: map file, run directory of gmmtorch-map, or folder of tiles.
-    trajectory: TUM file; null: trajectory.tum beside the map, if it exists.
+    trajectory: TUM or KITTI file; null: trajectory.tum beside the map and of each recording.
     bounds: of a map in tiles, the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened.
     html: file to write, .html, instead of serving a page.
     shape: ellipsoids, splats, surfaces or none.

@@ -57,16 +57,15 @@ def run(config: DictConfig) -> None:
     found = find_recordings(config.inputs)
     facts = {name: _facts(config, address) for name, address in found.items()}
     with ProgressBars(enabled=config.report.progress) as bars:
-        rows = _map_all(config, facts, folder / "recordings", bars)
+        rows = _map_all(config, facts, folder / map_outputs.RECORDINGS, bars)
         failed = [row for row in rows if row["error"]]
-        finished = [name for name in found if (folder / "recordings" / name / _DONE).exists()]
+        places = [folder / map_outputs.RECORDINGS / name for name in found]
+        finished = [place for place in places if (place / _DONE).exists()]
         if finished:
             rows.append(_merge(config, finished, rows, folder, bars))
             rows[-1]["seconds_of_run"] = time.monotonic() - begin
-            exported, errors = _export(config, folder, bars)
-        else:
-            exported, errors = [], []
-    common.write_results("map", config, rows, folder)
+        common.write_results("map", config, rows, folder)
+        exported, errors = _show(config, finished, rows[-1], folder, bars) if finished else ([], [])
     if finished:
         common.print_table(rows[-1:], TABLE.split(), f"{len(found)} recordings")
         print(f"\nmap       {folder / 'tiles'}")
@@ -190,15 +189,14 @@ def _mapped(config: DictConfig, path: Path) -> Mapped:
 
 
 def _merge(
-    config: DictConfig, names: Sequence[str], rows: Sequence[Row], folder: Path, bars: ProgressBars
+    config: DictConfig, places: Sequence[Path], rows: Sequence[Row], folder: Path, bars: ProgressBars
 ) -> Row:
     """Merges the finished recordings into tiles/; returns the row of the merged map."""
     from gmmtorch.mapping.tile_merging import merge
     from gmmtorch.mapping.tiles import TiledMap
 
     begin = time.process_time()
-    parts = [TiledMap(folder / "recordings" / name) for name in names]
-    tiled = merge(folder / "tiles", parts, config.tile_bytes, bars)
+    tiled = merge(folder / "tiles", [TiledMap(place) for place in places], config.tile_bytes, bars)
     mapped = [row for row in rows if not row["error"]]
     metres = sum(row["metres"] for row in mapped)
     return {
@@ -212,20 +210,27 @@ def _merge(
         "n_tiles": len(tiled.index),
         "n_components": tiled.n_components,
         "nbytes": tiled.nbytes,
-        "bytes_per_metre": tiled.nbytes / metres if metres else None,
+        "bytes_per_metre": map_outputs.bytes_per_metre(tiled.nbytes, metres),
         "merge_cpu_seconds": time.process_time() - begin,
     }
 
 
-def _export(config: DictConfig, folder: Path, bars: ProgressBars) -> tuple[list[str], list[str]]:
-    """Writes the exports of the whole map; returns messages, and the errors of those that failed."""
-    from gmmtorch.errors import GmmTorchError
+def _show(
+    config: DictConfig, places: Sequence[Path], row: Row, folder: Path, bars: ProgressBars
+) -> tuple[list[str], list[str]]:
+    """Writes the exports and pictures of the merged map; returns messages, and errors of exports.
+
+    A map that does not fit into `runtime.memory_limit` has no pictures.
+    """
+    from gmmtorch.errors import MemoryLimitError
     from gmmtorch.mapping.tiles import TiledMap
 
-    if not config.export:
-        return [], []
     tiled = TiledMap(folder / "tiles", config.runtime.device, memory_limit=config.runtime.memory_limit)
     try:
-        return map_outputs.write_exports(config, tiled.open(), folder, bars)
-    except GmmTorchError as error:
-        return [], [str(error)]
+        built = tiled.open()
+    except MemoryLimitError as error:
+        return [f"pictures  none: {error}"], [str(error)] if config.export else []
+    exported, errors = map_outputs.write_exports(config, built, folder, bars)
+    paths = [map_outputs.positions(place / map_outputs.TRAJECTORY, tiled.dim) for place in places]
+    map_outputs.draw(config, built, paths, row, folder)
+    return exported, errors

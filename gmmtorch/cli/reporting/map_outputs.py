@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ EXPORTS = {
 
 _MESH_CELLS = 0.5  # sides of a mesh's cells, relative to the resolution of the map
 _MOST_CELLS = 1600  # along a side of a picture
+_STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
 def check_exports(config: DictConfig) -> None:
@@ -42,22 +44,42 @@ def check_exports(config: DictConfig) -> None:
             )
 
 
+TRAJECTORY = "trajectory.tum"
+RECORDINGS = "recordings"
+"""Folder of a run with `inputs`: one folder for each recording."""
+
+
 def write_trajectory(builder: MapBuilder, folder: Path) -> Tensor:
-    """Write trajectory.tum; returns the sensor positions (S, D)."""
+    """Write the trajectory as TUM; returns the sensor positions (S, D)."""
     from gmmtorch.export.trajectory_files import write_tum
 
-    write_tum(folder / "trajectory.tum", builder.times, builder.poses)
+    write_tum(folder / TRAJECTORY, builder.times, builder.poses)
     return builder.poses[:, :-1, -1]
 
 
-def snapshot(builder: MapBuilder) -> tuple[GaussianMap, Tensor]:
+def trajectories(folder: Path, dim: int) -> list[Tensor]:
+    """The sensor positions (S, D) of each recording in a run directory."""
+    files = [folder / TRAJECTORY, *sorted(folder.glob(f"{RECORDINGS}/*/{TRAJECTORY}"))]
+    return [positions(file, dim) for file in files if file.is_file()]
+
+
+def positions(trajectory: Path, dim: int) -> Tensor:
+    """The sensor positions (S, D) of a trajectory file. Raises `DataError` if it is damaged."""
+    import torch
+
+    from gmmtorch.datasets.recordings.trajectory import read_trajectory
+
+    return torch.from_numpy(read_trajectory(trajectory).matrices[:, :dim, 3])
+
+
+def snapshot(builder: MapBuilder) -> tuple[GaussianMap, list[Tensor]]:
     """A copy of the map for the viewer, and the sensor positions (S, D)."""
     from dataclasses import asdict
 
     from gmmtorch.mapping.gaussian_map import GaussianMap
 
     options = {**asdict(builder.map.query_options), "resolution": builder.map.resolution}
-    return GaussianMap.of(builder.map.components(), **options), builder.poses[:, :-1, -1]
+    return GaussianMap.of(builder.map.components(), **options), [builder.poses[:, :-1, -1]]
 
 
 def write_exports(
@@ -100,7 +122,7 @@ def result_row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
         "metres": now.metres,
         "n_components": built.n_components,
         "nbytes": nbytes,
-        "bytes_per_metre": nbytes / now.metres if now.metres else None,
+        "bytes_per_metre": bytes_per_metre(nbytes, now.metres),
         "resolution": config.resolution,
         "seconds": now.seconds,
         "scans_per_second": now.n_read / seconds,
@@ -110,32 +132,44 @@ def result_row(name: str, builder: MapBuilder, config: DictConfig) -> Row:
     }
 
 
-def draw(config: DictConfig, builder: MapBuilder, trajectory: Tensor, row: Row, folder: Path) -> None:
-    """Write the figures as PNG, and figures and numbers to TensorBoard."""
+def bytes_per_metre(nbytes: int, metres: float) -> float | None:
+    """Bytes of a map for each metre of the sensor's path; None if the sensor stood."""
+    return nbytes / metres if metres >= _STANDING else None
+
+
+def draw(
+    config: DictConfig, built: GaussianMap, trajectories: Sequence[Tensor], row: Row, folder: Path
+) -> None:
+    """Write the figures as PNG, and figures and numbers to TensorBoard.
+
+    trajectories: sensor positions (S, D) of each recording. row: of results.json.
+    """
     if not (config.report.figures or config.report.tensorboard):
         return
-    figures = _figures(builder.map, trajectory, row)
+    figures = _figures(built, trajectories, row)
     common.save_figures(config, figures, folder)
     if not config.report.tensorboard:
         return
     from gmmtorch.report.tensorboard_writer import Board
 
-    components = builder.map.components()
+    components = built.components()
     with Board(folder / "tensorboard") as board:
-        for entry in builder.record.history:
+        for entry in row.get("history", ()):
             board.scalars(entry, "map", step=entry["n_read"])
         for name, figure in figures.items():
             board.figure(name, figure)
         surface = ~components.max_range
         board.ellipsoids("components", components.means[surface], components.covariances[surface])
-        board.paths("trajectory", [trajectory])
+        board.paths("trajectory", trajectories)
         board.hparams(
             common.chosen_options(config), {f"{key}": row[key] for key in ("n_components", "nbytes")}
         )
 
 
-def _figures(built: GaussianMap, trajectory: Tensor, row: Row) -> dict[str, Any]:
+def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
     """The map from above, and its components: in 3D in space."""
+    import torch
+
     from gmmtorch.report.maps.map_figures import map_figure
     from gmmtorch.report.maps.map_images import MapPanel
     from gmmtorch.report.maps.map_regions import robust_bounds
@@ -147,25 +181,23 @@ def _figures(built: GaussianMap, trajectory: Tensor, row: Row) -> dict[str, Any]
     components = built.components()
     surfaces = components.selected((~components.max_range).nonzero().squeeze(1))
     surfaces = surfaces if len(surfaces) else components
-    low, high = robust_bounds(surfaces.means.cpu(), trajectory)
+    low, high = robust_bounds(surfaces.means.cpu(), torch.cat(list(trajectories)))
     side = max(b - a for a, b in zip(low[:2], high[:2], strict=True))
     resolution = built.resolution * max(1, math.ceil(side / (_MOST_CELLS * built.resolution)))
 
     def answer(points: Tensor) -> Tensor:
         return built.occupancy(points, resolution)  # type: ignore[return-value]
 
-    title = (
-        f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}, "
-        f"{row['metres']:,.0f} m travelled"
-    )
+    title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
+    title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
     panel = MapPanel("occupancy", answer, resolution, low, high)
     # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
-    figures = {"above": map_figure([panel], trajectory, title=title, occupied_above=0.4)}
+    figures = {"above": map_figure([panel], trajectories, title=title, occupied_above=0.4)}
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
         seen_from = first_viewpoints(surfaces).cpu()
         figures["components"] = mixture_scene_figure(
-            *shown, seen_from=seen_from, trajectories=[trajectory], title=title
+            *shown, seen_from=seen_from, trajectories=trajectories, traveller="recording", title=title
         )
     else:
         figures["components"] = mixture_figure(

@@ -38,7 +38,7 @@ _PATH, _START, _END = style.PALETTE[1], style.PALETTE[2], style.PALETTE[0]
 
 def map_figure(
     panels: Sequence[MapPanel],
-    trajectory: ArrayLike | None = None,
+    trajectories: Sequence[ArrayLike] = (),
     *,
     title: str | None = None,
     ceiling: float | None = None,
@@ -49,44 +49,45 @@ def map_figure(
     """Draws one panel per map: occupied dark, free light, unknown (θ within 0.02 of ½) blue-grey.
 
     In 3D, draws a horizontal slice of each map, and below it the height of the highest occupied cells. The
-    slice is at the median height of the trajectory, or without one in the middle of the region.
+    slice is at the median height of the trajectories, or without one in the middle of the region.
 
     Args:
         panels: one or more maps, all 2D or all 3D.
-        trajectory: sensor positions (S, D) in order, world metres; if None, no path is drawn.
+        trajectories: sensor positions (S, D) of each drive in order, world metres.
         title: title of the figure.
         ceiling: height (m) above which cells are left out of the view from above; if None, half a metre above
-            the trajectory if most of it lies under a roof, else no limit.
+            the trajectories if most of them lies under a roof, else no limit.
         occupied_above: probability above which a cell counts as occupied in the view from above.
         max_pixels: pixels along each side of a picture; larger regions are sampled more coarsely.
         max_queries: largest number of queries for one view from above.
 
     Raises:
-        InvalidArgumentError: no panel, or panels and trajectory of different dimensions.
+        InvalidArgumentError: no panel, or panels and trajectories of different dimensions.
     """
     if not panels:
         raise InvalidArgumentError("panels is empty; give at least one map to show.")
     dim = panels[0].dim
-    path = None if trajectory is None else style.as_array(trajectory)
-    if any(panel.dim != dim for panel in panels) or (path is not None and path.shape[1:] != (dim,)):
+    paths = [style.as_array(path) for path in trajectories]
+    if any(panel.dim != dim for panel in panels) or any(path.shape[1:] != (dim,) for path in paths):
         raise InvalidArgumentError(
-            f"panels are of dimensions {[panel.dim for panel in panels]} and trajectory has shape "
-            f"{None if path is None else path.shape}; all must be 2D, or all 3D."
+            f"panels are of dimensions {[panel.dim for panel in panels]} and trajectories have shapes "
+            f"{[path.shape for path in paths]}; all must be 2D, or all 3D."
         )
-    path = path if path is not None and len(path) else None
+    paths = [path for path in paths if len(path)]
+    flown = np.concatenate(paths) if paths else None
     n_bands = math.ceil(len(panels) / _MAX_COLUMNS)
     n_columns = math.ceil(len(panels) / n_bands)
     n_views = dim - 1  # rows of pictures in a band of panels
     figure, grid, shown_pixels = _sheet(panels, n_columns, n_bands * n_views)
     bands = [grid[i * n_views : (i + 1) * n_views] for i in range(n_bands)]
     slices = np.concatenate([band[0] for band in bands])
-    height = _slice_height(panels[0], path)
+    height = _slice_height(panels[0], flown)
     for axes, panel in zip(slices, panels, strict=False):
         cells = f"cells of {style.metres(panel.resolution)}"
         image = slice_image(panel, height, max_pixels, shown_pixels)
         # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
         image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
-        _draw_path(axes, panel, path)
+        _draw_paths(axes, panel, paths)
         caption = f"slice at z = {style.metres(height)}, {cells}" if dim == 3 else cells
         style.label_axes(axes, f"{panel.title}\n{caption}")
     greys = ScalarMappable(Normalize(0, 1), occupancy_colours())
@@ -95,7 +96,7 @@ def map_figure(
     if dim == 3:
         views = np.concatenate([band[1] for band in bands])
         # One ceiling for all: panels that are cut at different heights cannot be compared.
-        top = min(_ceiling(panel, path, ceiling, occupied_above) for panel in panels)
+        top = min(_ceiling(panel, flown, ceiling, occupied_above) for panel in panels)
         cut = [_below(panel, top) for panel in panels]
         images = [height_image(panel, occupied_above, shown_pixels, max_queries) for panel in cut]
         known = torch.cat([image.image[image.image.isfinite()] for image in images])
@@ -103,7 +104,7 @@ def map_figure(
         heights = ScalarMappable(style.height_scale(known), colours)
         for axes, whole, panel, image in zip(views, panels, cut, images, strict=False):
             image.draw(axes, heights.to_rgba(np.ma.masked_invalid(image.image.numpy())))
-            _draw_path(axes, panel, path)
+            _draw_paths(axes, panel, paths)
             below = f" below z = {style.metres(panel.high[2])}" if panel.high[2] < whole.high[2] else ""
             style.label_axes(axes, f"highest cell with θ > {occupied_above:g}{below}")
         for band in bands:
@@ -114,7 +115,7 @@ def map_figure(
         axes.set_xlabel("x [m]", fontsize=style.LABEL_SIZE)
     for axes in grid[:, 0]:
         axes.set_ylabel("y [m]", fontsize=style.LABEL_SIZE)
-    style.legend_below(figure, _legend(path, dim))
+    style.legend_below(figure, _legend(bool(paths), dim))
     style.figure_title(figure, title)
     return figure
 
@@ -142,14 +143,14 @@ def occupancy_colours() -> Colormap:
     return greys.with_extremes(bad=style.UNKNOWN)
 
 
-def _draw_path(axes: Axes, panel: MapPanel, path: np.ndarray | None) -> None:
-    """Draws the sensor path, and limits the axes to the region of the panel."""
+def _draw_paths(axes: Axes, panel: MapPanel, paths: Sequence[np.ndarray]) -> None:
+    """Draws the sensor paths, and limits the axes to the region of the panel."""
     axes.set(xlim=(panel.low[0], panel.high[0]), ylim=(panel.low[1], panel.high[1]))
-    if path is None:
-        return
-    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.2, path_effects=style.halo(2.6), zorder=3)
-    for (x, y), shape, hue in ((path[0, :2], "o", _START), (path[-1, :2], "s", _END)):
-        axes.plot(x, y, shape, color=hue, markersize=8, markeredgecolor="white", zorder=4)
+    size = 8 if len(paths) == 1 else 5
+    for path in paths:
+        axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.2, path_effects=style.halo(2.6), zorder=3)
+        for (x, y), shape, hue in ((path[0, :2], "o", _START), (path[-1, :2], "s", _END)):
+            axes.plot(x, y, shape, color=hue, markersize=size, markeredgecolor="white", zorder=4)
 
 
 def _ceiling(panel: MapPanel, path: np.ndarray | None, given: float | None, occupied_above: float) -> float:
@@ -168,11 +169,11 @@ def _below(panel: MapPanel, ceiling: float) -> MapPanel:
     return replace(panel, high=(*panel.high[:2], top))
 
 
-def _legend(path: np.ndarray | None, dim: int) -> list[Artist]:
+def _legend(has_paths: bool, dim: int) -> list[Artist]:
     handles: list[Artist] = [Patch(facecolor=style.UNKNOWN, edgecolor=style.EDGE, label="unknown (θ ≈ ½)")]
     if dim == 3:
         handles.append(Patch(facecolor=_NONE, edgecolor=style.EDGE, label="no such cell"))
-    if path is not None:
+    if has_paths:
         handles += [
             Line2D([], [], color=_PATH, linewidth=2, label="sensor path"),
             Line2D([], [], color=_START, marker="o", linestyle="", markersize=8, label="start"),

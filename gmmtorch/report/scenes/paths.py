@@ -94,15 +94,18 @@ def draw_paths(
         axes.plot(*poses[-1, :2], marker=last, markersize=12, linestyle="", **mark)
 
 
-def path_handles(trajectories: Sequence[ArrayLike], band: tuple[float, float], ends: bool) -> list[Line2D]:
-    """Returns legend entries for `draw_paths`: robots, first and last poses, and heights outside the band."""
+def path_handles(
+    trajectories: Sequence[ArrayLike], band: tuple[float, float], ends: bool, traveller: str = "robot"
+) -> list[Line2D]:
+    """Returns legend entries for `draw_paths`: robots or other travellers, first and last poses, and heights
+    outside the band."""
     handles = [
         Line2D(
             [],
             [],
             color=style.colour(i),
             linewidth=2.4,
-            label=f"robot {i}" if len(trajectories) > 1 else "path",
+            label=f"{traveller} {i}" if len(trajectories) > 1 else "path",
         )
         for i in range(min(len(trajectories), _MAX_NAMED))
     ]

@@ -122,6 +122,7 @@ def mixture_scene_figure(
     *,
     seen_from: ArrayLike | None = None,
     trajectories: Sequence[ArrayLike] = (),
+    traveller: str = "robot",
     ceiling: float | None = None,
     camera: Camera = SOUTH_WEST,
     title: str | None = None,
@@ -137,6 +138,7 @@ def mixture_scene_figure(
         covariances: (K, 3, 3), m².
         seen_from: (K, 3), a sensor origin that observed each component.
         trajectories: poses (T, ≥ 3) of each robot, world metres.
+        traveller: what each path is of, for the legend.
         ceiling: height (m) above which nothing is drawn; if None, below the top if `seen_from` is None or
             most surfaces overhead are near the top, else none.
         camera: the viewer; by default in the south-west, 45° up.
@@ -173,7 +175,7 @@ def mixture_scene_figure(
         for (x, y), shape in ((flat[0], "o"), (flat[-1], "^")):
             axes.plot(x, y, shape, markersize=9, markeredgecolor="#111111", zorder=4, **look)
     height_bar(figure, axes, scale)
-    style.legend_below(figure, path_handles(trajectories, (-np.inf, np.inf), ends=True), max_columns=9)
+    style.legend_below(figure, path_handles(trajectories, (-np.inf, np.inf), True, traveller), max_columns=9)
     style.figure_title(figure, _scene_title(kept) if title is None else title)
     return figure
 
