@@ -80,7 +80,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, nn.Module):
         return cast(Tensor, self.score_samples(X))
 
     def score(self, X: Array, y: Any = None) -> float:
-        """Mean log-likelihood of the points, nats."""
+        """Mean log-likelihood of the points (2.2), nats."""
         return float(self.score_samples(X).mean())
 
     def predict_proba(self, X: Array) -> Array:

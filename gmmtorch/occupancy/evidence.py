@@ -1,4 +1,7 @@
-"""Evidence: hits and misses of the cells of a grid, and the occupancy that follows from them."""
+"""Evidence: hits and misses of the cells of a grid, and the occupancy that follows from them, thesis (3.9).
+
+`occupancy_probability` has the formula. It is in `kernels`, whose fused loops use it too.
+"""
 
 from __future__ import annotations
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
 from torch import Tensor
+from torch.distributions import MultivariateNormal, kl_divergence
 
 from gmmtorch.baselines.hilbert.bayesian_hilbert_map import BayesianHilbertMap
 from gmmtorch.baselines.hilbert.lattice_features import LatticeDesign, LatticeFeatures
 from gmmtorch.baselines.hilbert.logistic_regression import (
     Posterior,
-    evidence_bound,
     fit_posterior,
     jaakkola_lambda,
     moderated,
@@ -98,6 +98,18 @@ def exact_posterior(
     mean = weight @ w
     covariance = ((w - mean) * weight[:, None]).T @ (w - mean)
     return float(total + cell.log()), mean, covariance, weight @ torch.sigmoid(w @ phi.T)
+
+
+def evidence_bound(design: LatticeDesign, is_hit: Tensor, prior: Posterior, posterior: Posterior) -> float:
+    """Lower bound of ln p(y) with the optimal ξ for this posterior (Jaakkola & Jordan 2000).
+
+    Σ ln σ(ξ) − ξ/2 + (y − ½) E[wᵀφ] − KL(posterior ‖ prior), with ξ² = E[(wᵀφ)²].
+    """
+    mean, variance = moments(design, posterior)
+    xi = (mean.square() + variance).sqrt()
+    fit = torch.nn.functional.logsigmoid(xi) - 0.5 * xi + (is_hit.double() - 0.5) * mean
+    one, other = (MultivariateNormal(x.mean, precision_matrix=x.precision) for x in (posterior, prior))
+    return float(fit.sum() - kl_divergence(one, other))
 
 
 def test_jaakkola_lambda_equals_its_formula():

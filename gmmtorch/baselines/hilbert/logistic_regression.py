@@ -117,28 +117,6 @@ def moderated(mean: Tensor, variance: Tensor) -> Tensor:
     return torch.sigmoid(mean / (1 + math.pi / 8 * variance).sqrt())
 
 
-def evidence_bound(design: LatticeDesign, is_hit: Tensor, prior: Posterior, posterior: Posterior) -> float:
-    """Lower bound of ln p(y) with the optimal ξ for this posterior (Jaakkola & Jordan 2000).
-
-    Σ ln σ(ξ) − ξ/2 + (y − ½) E[wᵀφ] − KL(posterior ‖ prior), with ξ² = E[(wᵀφ)²].
-    """
-    mean, variance = moments(design, posterior)
-    xi = (mean.square() + variance).sqrt()
-    fit = torch.nn.functional.logsigmoid(xi) - 0.5 * xi + (is_hit.double() - 0.5) * mean
-    return float(fit.sum() - _divergence(posterior, prior))
-
-
-def _divergence(one: Posterior, other: Posterior) -> Tensor:
-    """KL(one ‖ other) of two normal distributions, both with full or both with diagonal precision."""
-    shift = one.mean - other.mean
-    if not one.is_full:
-        ratio = other.precision / one.precision
-        return 0.5 * (ratio - 1 - ratio.log() + other.precision * shift.square()).sum()
-    trace = torch.linalg.solve(one.precision, other.precision).diagonal().sum()
-    determinants = 2 * (one.factor.diagonal().log().sum() - other.factor.diagonal().log().sum())
-    return 0.5 * (trace - shift.shape[0] + determinants + shift @ other.precision @ shift)
-
-
 def variational_step(
     design: LatticeDesign,
     is_hit: Tensor,

@@ -128,7 +128,7 @@ _DIMENSIONS = {1 + dim + dim * (dim + 1) // 2: dim for dim in _EXPECTATION}
 def expectation(
     features: Tensor, sample_weight: Tensor, natural: Tensor, softmax_dtype: torch.dtype = torch.float32
 ) -> tuple[Tensor, Tensor]:
-    """One E-step: sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar), L = φWᵀ.
+    """One E-step (2.3): sufficient statistics S (K, F) and Σ_n p_n logsumexp_k L_nk (a scalar), L = φWᵀ.
 
     Products are computed in the dtype of the features (float64, because the quadratic form cancels many
     digits). The twin computes exponentials in `softmax_dtype`, after subtraction of the row's maximum.

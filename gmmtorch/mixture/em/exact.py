@@ -1,8 +1,9 @@
-"""Exact expectation–maximisation of a Gaussian mixture, as two matrix products.
+"""Exact expectation–maximisation of a Gaussian mixture, thesis (2.1)-(2.6), as two matrix products.
 
 With the features φ(x) = [1, x, x_i x_j (i ≤ j)], the log-density plus log-weight of every component
-is linear in φ: L = φ Wᵀ, with natural parameters W. One iteration is Γ = softmax(L), S = Γᵀ diag(p) φ.
-S (K × F) contains all sufficient statistics: N_k, Σ γ x and Σ γ xxᵀ.
+is linear in φ: L = φ Wᵀ, with natural parameters W. One iteration is Γ = softmax(L) (2.3), S = Γᵀ diag(p) φ.
+S (K × F) contains all sufficient statistics: N_k, Σ γ x and Σ γ xxᵀ. `maximization` turns them into
+weights (2.4), means (2.5) and covariances (2.6).
 
 A row of features may also stand for a cell of points. The mean feature of the cell, weighted by its
 number of points, gives the cell's expected log-density exactly. All points of a cell then share one
@@ -82,7 +83,7 @@ def most_likely(features: Tensor, parameters: Parameters) -> Tensor:
 
 
 def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | None = None) -> Parameters:
-    """M-step: parameters from sufficient statistics. `reg_covar` (m²) is added to each variance.
+    """M-step (2.4)-(2.6): parameters from sufficient statistics. `reg_covar` (m²) is added to each variance.
 
     A component that lost all its points keeps its `previous` mean and covariance, with weight 0.
     """
@@ -152,7 +153,7 @@ def log_joint(points: Tensor, parameters: Parameters) -> Tensor:
 def _responsibilities(
     points: Tensor, sample_weight: Tensor, parameters: Parameters
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Points (n, D), their weighted responsibilities (n, K) and Σ_n p_n log p(x_n), in chunks."""
+    """Points (n, D), their weighted responsibilities (n, K) (2.3) and Σ_n p_n log p(x_n), in chunks."""
     rows = max(1, chunk_elements(points.device) // parameters.weights.shape[0])
     for part, p in zip(points.split(rows), sample_weight.split(rows), strict=True):
         joint = log_joint(part, parameters)
@@ -183,9 +184,7 @@ def direct_scatter(points: Tensor, sample_weight: Tensor, parameters: Parameters
 def direct_maximization(
     sums: Tensor, scatter: Callable[[Tensor], Tensor], reg_covar: float, previous: Parameters
 ) -> Parameters:
-    """M-step from the sums (K, 1 + D) of the first pass; `scatter` computes the second pass for means (K,
-    D).
-    """
+    """M-step (2.4)-(2.6) from the sums (K, 1 + D) of the first pass; `scatter` of means is the second."""
     eps = 10 * torch.finfo(sums.dtype).eps
     count = sums[:, 0] + eps
     means = sums[:, 1:] / count[:, None]

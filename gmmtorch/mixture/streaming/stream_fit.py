@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -104,11 +104,51 @@ def fit_stream(
         LostProcessError: another process ended; names the iteration, and how to continue.
         NumericalError: a component collapsed, which happens with reg_covar = 0.
     """
+    _check_options(mixture, checkpoint)
+    source = _in_chunks(source)
+    done: list[float] = []
+    with _add_iteration_to_errors(done, checkpoint):
+        generator = as_generator(mixture.random_state)
+        if survey is None:
+            at_least = None if sample_points is None else max(sample_points, int(mixture.n_components or 0))
+            survey = survey_all(source, at_least, draw_seed(generator), processes)
+        if survey.n_points == 0:
+            raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
+        mixture.check_parameters(survey.n_points)
+        e_step = ExactEStep(mixture.dtype) if e_step is None else e_step
+        facts = run_facts(mixture, survey, repr(e_step))
+        first = first_state(mixture, survey, facts, generator, checkpoint, processes)
+        done += first.lower_bounds
+        run = _Run(
+            mixture,
+            source,
+            processes,
+            first.center.to(device),
+            Parameters(*(value.to(device) for value in first.parameters)),
+            mixture.lower_bound_ if mixture._continues() else -math.inf,
+            on_iteration,
+        )
+        if mixture.algorithm == "truncated":
+            result = _truncated(run)
+        else:
+            writer = None
+            if checkpoint is not None and processes.rank == 0:
+                writer = CheckpointWriter(checkpoint, facts, first.center)
+            result = _exact(run, e_step, survey.n_points, done, writer)
+    mixture._tensors, mixture.n_features_in_ = True, source.dim
+    seen = {"n_samples_seen": run.center.new_tensor(survey.n_points)}
+    mixture._store_fit(result.parameters, run.center, result.lower_bounds, result.converged, seen)
+    if processes.rank == 0:
+        mixture._warn_unless_converged()
+    return mixture
+
+
+def _check_options(mixture: GaussianMixture, checkpoint: Checkpoint | None) -> None:
+    """Raise `InvalidArgumentError` for an estimator, or options of it, that `fit_stream` does not support."""
     if not isinstance(mixture, GaussianMixture):
         raise InvalidArgumentError(
             f"mixture is a {type(mixture).__name__}; give a GaussianMixture, then the points."
         )
-    source = _in_chunks(source)
     mixture.check_parameters()
     if mixture.n_components is None:
         raise InvalidArgumentError(
@@ -120,54 +160,6 @@ def fit_stream(
         raise InvalidArgumentError(
             f"checkpoint={checkpoint.path}: algorithm='truncated' has no checkpoints; use algorithm='exact'."
         )
-    done: list[float] = []
-    with _add_iteration_to_errors(done, checkpoint):
-        generator = as_generator(mixture.random_state)
-        if survey is None:
-            at_least = None if sample_points is None else max(sample_points, int(mixture.n_components))
-            survey = survey_all(source, at_least, draw_seed(generator), processes)
-        if survey.n_points == 0:
-            raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
-        mixture.check_parameters(survey.n_points)
-        e_step = ExactEStep(mixture.dtype) if e_step is None else e_step
-        run = run_facts(mixture, survey, repr(e_step))
-        first = first_state(mixture, survey, run, generator, checkpoint, processes)
-        done += first.lower_bounds
-        previous_bound = mixture.lower_bound_ if mixture._continues() else -math.inf
-        center = first.center.to(device)
-        start = Parameters(*(value.to(device) for value in first.parameters))
-        writer = None
-        if checkpoint is not None and processes.rank == 0:
-            writer = CheckpointWriter(checkpoint, run, first.center)
-        step = _stream_step(source, center, e_step, mixture, survey.n_points, processes)
-
-        def checkpointed_step(parameters: Parameters) -> tuple[Parameters, float]:
-            new, bound = step(parameters)
-            done.append(bound)
-            if writer is not None:
-                writer.write_if_due(new, done)
-            return new, bound
-
-        if mixture.algorithm == "truncated":
-            result = _truncated(mixture, source, center, start, processes, on_iteration, previous_bound)
-        else:
-            result = loop.run_em(
-                checkpointed_step,
-                start,
-                tol=mixture.tol,
-                max_iter=mixture.max_iter,
-                on_iteration=on_iteration,
-                lower_bounds=first.lower_bounds,
-                previous_bound=previous_bound,
-            )
-    if writer is not None:
-        writer.write_if_due(result.parameters, result.lower_bounds, final=True)
-    mixture._tensors, mixture.n_features_in_ = True, source.dim
-    seen = {"n_samples_seen": center.new_tensor(survey.n_points)}
-    mixture._store_fit(result.parameters, center, result.lower_bounds, result.converged, seen)
-    if processes.rank == 0:
-        mixture._warn_unless_converged()
-    return mixture
 
 
 @contextmanager
@@ -196,54 +188,79 @@ def _in_chunks(source: PointChunks | ArrayLike) -> PointChunks:
     return source if isinstance(source, PointChunks) else in_memory(source, "source")
 
 
-def _truncated(
-    mixture: GaussianMixture,
-    source: PointChunks,
-    center: Tensor,
-    first: Parameters,
-    processes: Processes,
-    on_iteration: Callable[[int, float], None] | None,
-    previous_bound: float,
+# -- all iterations -------------------------------------------------------------------------------
+
+
+class _Run(NamedTuple):
+    """One process's part of a fit. `first` is relative to `center` (D,), on the device of the computation."""
+
+    mixture: GaussianMixture
+    source: PointChunks
+    processes: Processes
+    center: Tensor
+    first: Parameters
+    previous_bound: float
+    on_iteration: Callable[[int, float], None] | None
+
+
+def _exact(
+    run: _Run, e_step: EStep, n_points: int, done: list[float], writer: CheckpointWriter | None
 ) -> loop.EMResult[Parameters]:
-    """Truncated EM on the points of all processes. Each process keeps its own points."""
-    held = [chunk.points.to(center.device) - center for chunk in source]
-    points = torch.cat(held) if held else center.new_empty(0, source.dim)
+    """Exact EM. `done` has the lower bounds of earlier iterations, and gets those of the new ones."""
+    one_step, earlier = _stream_step(run, e_step, n_points), tuple(done)
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        new, bound = one_step(parameters)
+        done.append(bound)
+        if writer is not None:
+            writer.write_if_due(new, done)
+        return new, bound
+
+    result = loop.run_em(
+        step,
+        run.first,
+        tol=run.mixture.tol,
+        max_iter=run.mixture.max_iter,
+        on_iteration=run.on_iteration,
+        lower_bounds=earlier,
+        previous_bound=run.previous_bound,
+    )
+    if writer is not None:
+        writer.write_if_due(result.parameters, result.lower_bounds, final=True)
+    return result
+
+
+def _truncated(run: _Run) -> loop.EMResult[Parameters]:
+    """Truncated EM. The points of this process stay in memory."""
+    center, mixture = run.center, run.mixture
+    held = [chunk.points.to(center.device) - center for chunk in run.source]
+    points = torch.cat(held) if held else center.new_empty(0, run.source.dim)
     del held
-    owner = nearest(points, first.means)
-    dtype = em.SOFTMAX_DTYPES[mixture.dtype]
+    owner = nearest(points, run.first.means)
     settings = Settings(
         float(mixture.reg_covar),
         mixture.tol,
         mixture.max_iter,
-        dtype,
-        on_iteration=on_iteration,
-        processes=processes,
+        em.SOFTMAX_DTYPES[mixture.dtype],
+        on_iteration=run.on_iteration,
+        processes=run.processes,
         compiled=bool(mixture.compiled),
-        previous_bound=previous_bound,
+        previous_bound=run.previous_bound,
     )
-    return fit_truncated(Rows(points, points.new_ones(points.shape[0])), owner, first, settings)
+    return fit_truncated(Rows(points, points.new_ones(points.shape[0])), owner, run.first, settings)
 
 
 # -- one iteration --------------------------------------------------------------------------------
 
 
-def _stream_step(
-    source: PointChunks,
-    center: Tensor,
-    e_step: EStep,
-    mixture: GaussianMixture,
-    n_points: int,
-    processes: Processes,
-) -> loop.Step[Parameters]:
+def _stream_step(run: _Run, e_step: EStep, n_points: int) -> loop.Step[Parameters]:
     """EM steps on the points of all processes. Each process sums over its chunks, then all sum once."""
-    reg_covar = float(mixture.reg_covar)
+    center, reg_covar = run.center, float(run.mixture.reg_covar)
 
     def centered() -> Iterator[tuple[Tensor, Tensor]]:
-        yield (
-            center.new_empty(0, source.dim),
-            center.new_empty(0),
-        )  # so that a process without points contributes zeros
-        for chunk in source:
+        # Zeros first, for a process without points.
+        yield center.new_empty(0, run.source.dim), center.new_empty(0)
+        for chunk in run.source:
             points = chunk.points.to(center.device) - center
             yield points, points.new_ones(points.shape[0])
 
@@ -252,7 +269,7 @@ def _stream_step(
         sums = next(terms)
         for term in terms:
             sums = tuple(a + b for a, b in zip(sums, term, strict=True))
-        packed = processes.sum(torch.cat([part.flatten() for part in sums]))
+        packed = run.processes.sum(torch.cat([part.flatten() for part in sums]))
         parts = packed.split([part.numel() for part in sums])
         return [part.view(like.shape) for part, like in zip(parts, sums, strict=True)]
 
@@ -270,4 +287,4 @@ def _stream_step(
 
         return em.direct_maximization(sums, scatter, reg_covar, parameters), total
 
-    return loop.guarded_step(gather, direct, reg_covar, float(n_points), mixture.covariance_type)
+    return loop.guarded_step(gather, direct, reg_covar, float(n_points), run.mixture.covariance_type)
