@@ -14,7 +14,7 @@ from gmmtorch.evaluation.events import ignore
 from gmmtorch.evaluation.fit_comparison import FitData, Row, compare, split
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies import initialization_study as initialization
-from gmmtorch.evaluation.studies.initialization_study import fit_timed, run
+from gmmtorch.evaluation.studies.initialization_study import box_covariances, fit_timed, run
 from gmmtorch.evaluation.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
@@ -45,6 +45,28 @@ def test_a_row_for_each_initialization_number_and_seed(data):
         assert row["seconds"] == pytest.approx(row["init_seconds"] + row["em_seconds"])
         assert min(row["init_seconds"], row["em_seconds"]) > 0
     json.dumps(rows, allow_nan=False)
+
+
+def test_starts_of_means_run_with_each_initial_covariance(data):
+    study = replace(SMALL, initial_covariance=("tiles", "box"), n_components=(3,), n_seeds=1)
+    rows = rows_of(data, study)
+    found = [(row["start"], row["init_params"], row["initial_covariance"]) for row in rows]
+    assert found == [
+        ("random_points", "random_points", "tiles"),
+        ("random_points_box", "random_points", "box"),
+        ("kmeans", "kmeans", None),
+    ]
+    alone = rows_of(data, replace(study, initial_covariance=("tiles",)))
+    assert timeless(alone) == timeless([rows[0], rows[2]])
+
+
+def test_box_covariances_are_the_square_of_the_longest_side(data):
+    points = data.train.double()
+    side = max(float(points[:, i].max() - points[:, i].min()) for i in range(3))
+    expected = torch.eye(3, dtype=torch.float64) * side**2
+    found = box_covariances(points, 4)
+    assert found.shape == (4, 3, 3)
+    torch.testing.assert_close(found[2], expected)
 
 
 @pytest.mark.parametrize("init_params", INITIALIZATIONS)
@@ -78,6 +100,7 @@ def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
         ({"n_seeds": 0}, "n_seeds=0"),
         ({"n_components": ()}, r"n_components=\[\] is empty"),
         ({"init_params": []}, r"init_params=\[\] is empty"),
+        ({"initial_covariance": ("sphere",)}, "initial_covariance='sphere'"),
         ({"n_components": (2, 400)}, "n_components=400 is more than the n_samples=300"),
         ({"n_components": (0,)}, "n_components=0"),
         ({"init_params": ("kmeans", "sorted")}, "init_params='sorted'"),

@@ -17,7 +17,7 @@ def study_row(init: str, k: int, seed: int, **more: object) -> dict[str, object]
     return {
         "dataset": "bunny",
         "n_points": 5000,
-        "init_params": init,
+        "start": init,
         "n_components": k,
         "seed": seed,
         "init_seconds": 0.01 * k + seed,

@@ -31,7 +31,7 @@ def _initialization(config: DictConfig, device: str, on_event: Event, on_rows: O
     return _found(
         rows,
         initialization_figures,
-        "init_params",
+        "start",
         "init_seconds n_iterations seconds psnr2_db held_out_psnr2_db log_likelihood held_out_log_likelihood",
     )
 

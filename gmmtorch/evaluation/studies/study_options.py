@@ -168,20 +168,26 @@ class InitializationStudy:
     Attributes:
         n_components: numbers of components.
         init_params: initializations; each is run with each number of components and each seed.
+        initial_covariance: covariances of the initializations that choose only means (random_points,
+            bounding_box). "tiles": the mean variance of the cloud, divided by K^(2/D). "box": the square of
+            the bounding box's longest side (thesis 2.1.3).
         n_seeds: number of seeds; the first is the seed of the run.
     """
 
     n_components: Sequence[int] = (4, 8, 32, 64, 128, 256, 512)
     init_params: Sequence[str] = ("random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces")
+    initial_covariance: Sequence[str] = ("tiles",)
     n_seeds: int = 3
 
     def __post_init__(self) -> None:
         from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 
         check_whole("n_seeds", self.n_seeds, 1)
-        check_not_empty(self, "n_components", "init_params")
+        check_not_empty(self, "n_components", "init_params", "initial_covariance")
         for name in self.init_params:
             check_choice("init_params", name, INITIALIZATIONS)
+        for name in self.initial_covariance:
+            check_choice("initial_covariance", name, ("tiles", "box"))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,12 @@ from gmmtorch.report.labels import Label, place_labels
 from gmmtorch.report.style import Rows
 
 _AXES = {"n_components": "components", "nbytes": "map size [bytes]"}
-_LABELS = {"kmeans": "k-means", "kmeans_restarts": "k-means, best of ten"}
+_LABELS = {
+    "kmeans": "k-means",
+    "kmeans_restarts": "k-means, best of ten",
+    "random_points_box": "random points, covariance of the box",
+    "bounding_box_box": "bounding box, covariance of the box",
+}
 
 
 class Panel(NamedTuple):
@@ -126,11 +131,11 @@ def initialization_figures(rows: Rows) -> dict[str, Figure]:
     log-likelihood of held-out points.
 
     Args:
-        rows: of the initialization study: `init_params`, `n_components`, and the quantities drawn.
+        rows: of the initialization study: `start`, `n_components`, and the quantities drawn.
     """
-    first, about = line_label(str(rows[0]["init_params"])), subject(rows)
-    costs = panels_figure(rows, _COST, "init_params", f"EM after different initializations: {about}")
-    gains = panels_figure(rows, _QUALITY, "init_params", f"Gain over {first}: {about}")
+    first, about = line_label(str(rows[0]["start"])), subject(rows)
+    costs = panels_figure(rows, _COST, "start", f"EM after different initializations: {about}")
+    gains = panels_figure(rows, _QUALITY, "start", f"Gain over {first}: {about}")
     return {"initialization": costs, "initialization_quality": gains}
 
 
