@@ -23,7 +23,7 @@ from gmmtorch.mapping.learning.incremental import depth_scan
 from gmmtorch.mapping.learning.learner import Learner
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.query import Query
-from gmmtorch.mapping.query_options import MapOptions, QueryOptions, Sampling, check_method
+from gmmtorch.mapping.query_options import HitLength, MapOptions, QueryOptions, Sampling, check_method
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
@@ -68,7 +68,8 @@ class GaussianMap(nn.Module):
         cutoff: Mahalanobis distance at which a component ends. None: 3 if components have many points (a
             median of at least 50 for each viewpoint), otherwise 5.
         hit_length: ℓ (m). Occupancy multiplies hits by ℓ/resolution, so that thin walls count as occupied;
-            cells above ℓ lose hits. None: the factor is 1. `evidence` is not affected.
+            cells above ℓ lose hits. "auto": half the mean range of the map's beams. None: the factor is 1.
+            `evidence` is not affected.
         n_samples: number of rays of method "monte_carlo", drawn from the whole map.
         sampling: sequence of these rays, "sobol", "stratified" or "plain".
         memory_limit: largest number of bytes of the evidence of a grid, and of Monte Carlo evidence.
@@ -105,7 +106,7 @@ class GaussianMap(nn.Module):
         codec: str = "quantized",
         prior: float = 1.0,
         cutoff: float | None = None,
-        hit_length: float | None = 1.0,
+        hit_length: HitLength = 1.0,
         n_samples: int = 1_000_000,
         sampling: Sampling = "sobol",
         memory_limit: int = 4 << 30,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from gmmtorch.mapping.query_options import QueryOptions, check_method
+from gmmtorch.mapping.query_options import AUTO, QueryOptions, check_method
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.evidence import Evidence, occupancy_probability
 from gmmtorch.occupancy.forms.cone.cone_evidence import cone_evidence
@@ -36,10 +38,22 @@ def cutoff_of(n_seen: int, n_many: int) -> float:
     return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
 
 
+def range_sums(cones: Cones) -> Tensor:
+    """Sum (m) of the ranges of all beams with a return, to the means of their components; their number."""
+    weight = cones.counts * ~cones.max_range
+    return torch.stack([(weight * (cones.means - cones.origins).norm(dim=1)).sum(), weight.sum()])
+
+
+def with_hit_length(options: QueryOptions, sums: Tensor) -> QueryOptions:
+    """The options with ℓ in metres: for "auto" half the mean range of beams with these `range_sums`."""
+    total, count = sums.tolist()
+    return replace(options, hit_length=0.5 * total / count if total > 0 else None)
+
+
 def probability(evidence: PointEvidence, resolution: float, options: QueryOptions) -> Tensor:
-    """θ (M,) of cubes of side `resolution` (m) with hits (M,) and misses (M,)."""
+    """θ (M,) of cubes of side `resolution` (m) with hits (M,) and misses (M,); ℓ of the options in metres."""
     length = options.hit_length
-    hits = evidence.hits if length is None else evidence.hits * (length / resolution)
+    hits = evidence.hits if length is None else evidence.hits * (float(length) / resolution)
     return occupancy_probability(hits, evidence.misses, options.prior)
 
 
@@ -48,7 +62,7 @@ class Query:
 
     def __init__(self, cones: Cones, options: QueryOptions) -> None:
         self.cones = cones
-        self.options = options
+        self.options = with_hit_length(options, range_sums(cones)) if options.hit_length == AUTO else options
         self.cutoff = cutoff_by_support(cones) if options.cutoff is None else options.cutoff
         self._lattices: dict[float, SparseEvidence] = {}
         self._forms: dict[float, PointForm] = {}

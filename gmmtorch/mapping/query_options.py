@@ -16,6 +16,9 @@ Sampling = Literal["sobol", "stratified", "plain"]
 SAMPLINGS: tuple[str, ...] = get_args(Sampling)
 """Sequences from which Monte Carlo rays are drawn, see `occupancy.forms.monte_carlo`."""
 
+HitLength = int | float | str | None
+AUTO = "auto"
+
 
 @dataclass(frozen=True)
 class QueryOptions:
@@ -27,7 +30,8 @@ class QueryOptions:
         points do not show where a surface ends.
     hit_length: ℓ (m); the occupancy of a cell of side h multiplies hits by ℓ/h. A ray ends in one of the
         many cells of a thin surface that it could have crossed; the factor puts θ on the right side of ½
-        and hardly changes the order of cells. None: the factor is 1.
+        and hardly changes the order of cells. "auto": half the mean range of the map's beams, which
+        calibrates θ in any scene (docs/occupancy.md). None: the factor is 1.
     n_samples: number of Monte Carlo rays, drawn from the whole map.
     sampling: "sobol", "stratified" or "plain".
     random_state: seed of the rays.
@@ -37,7 +41,7 @@ class QueryOptions:
 
     prior: float = 1.0
     cutoff: float | None = None
-    hit_length: float | None = 1.0
+    hit_length: HitLength = 1.0
     n_samples: int = 1_000_000
     sampling: Sampling = "sobol"
     random_state: int = 0
@@ -51,8 +55,13 @@ class QueryOptions:
         check_whole("random_state", self.random_state, 0)
         if self.cutoff is not None and not 0 < self.cutoff < float("inf"):
             raise InvalidArgumentError(f"cutoff={self.cutoff} must be a number of deviations above zero.")
-        if self.hit_length is not None and not 0 < self.hit_length < float("inf"):
-            raise InvalidArgumentError(f"hit_length={self.hit_length} must be metres above zero, or null.")
+        length = self.hit_length
+        if (
+            length is not None
+            and length != AUTO
+            and (isinstance(length, str) or not 0 < length < float("inf"))
+        ):
+            raise InvalidArgumentError(f"hit_length={length} must be metres above zero, auto, or null.")
         if self.sampling not in SAMPLINGS:
             raise InvalidArgumentError(f"sampling={self.sampling!r} is not one of {', '.join(SAMPLINGS)}.")
 
@@ -75,7 +84,7 @@ class MapOptions(TypedDict, total=False):
     codec: str
     prior: float
     cutoff: float | None
-    hit_length: float | None
+    hit_length: HitLength
     n_samples: int
     sampling: Sampling
     memory_limit: int

@@ -23,8 +23,8 @@ from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, M
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, probability
-from gmmtorch.mapping.query_options import check_method
+from gmmtorch.mapping.query import Query, probability, range_sums, with_hit_length
+from gmmtorch.mapping.query_options import AUTO, QueryOptions, check_method
 from gmmtorch.mapping.tile_index import INDEX, read_index, tile_name
 from gmmtorch.occupancy.forms.point import PointEvidence
 from gmmtorch.occupancy.grid import check_resolution
@@ -51,7 +51,8 @@ class TiledMap:
 
     Attributes:
         index: see `TileIndex`. dim: 2 or 3. side: of the tiles (m).
-        resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map.
+        resolution, method, query_options: as of a `GaussianMap`; the cutoff is that of the whole map. With
+            hit_length="auto" the first query reads all tiles once, for their mean range.
         settings: of the tiles' files.
         n_read: number of tile files read so far.
 
@@ -73,7 +74,7 @@ class TiledMap:
         self.resolution, self.method = self.settings.resolution, self.settings.method
         query = self.settings.query
         self._cutoff = self.index.cutoff if query.cutoff is None else query.cutoff
-        self.query_options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
+        self._options = replace(query, cutoff=self._cutoff, memory_limit=memory_limit)
         self.n_read = 0
         self._open: OrderedDict[int, Query] = OrderedDict()
 
@@ -82,6 +83,13 @@ class TiledMap:
             f"TiledMap({self.n_components} components in {self.dim}D, {len(self.index)} tiles of "
             f"{self.side:g} m, {self.nbytes} bytes, {self.folder})"
         )
+
+    @property
+    def query_options(self) -> QueryOptions:
+        if self._options.hit_length == AUTO:
+            sums = [range_sums(self.components(row).cones()) for row in range(len(self.index))]
+            self._options = with_hit_length(self._options, sum(sums, torch.zeros(2, dtype=torch.float64)))
+        return self._options
 
     @property
     def n_components(self) -> int:
@@ -154,7 +162,7 @@ class TiledMap:
         """
         far = torch.full((self.dim,), math.inf)
         rows = self.near(-far if low is None else low, far if high is None else high, resolution)
-        n, limit = int(self.index.n_components[rows].sum()), self.query_options.memory_limit
+        n, limit = int(self.index.n_components[rows].sum()), self._options.memory_limit
         if n * _BYTES_EACH > limit:
             raise MemoryLimitError(
                 f"{len(rows)} tiles with {n:,} components need about {n * _BYTES_EACH:,} bytes, more than "

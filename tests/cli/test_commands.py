@@ -235,7 +235,7 @@ def test_a_carmen_log_can_be_mapped(monkeypatch, tmp_path):
 )
 def test_the_map_has_the_options_of_its_group(name, more, expected, run, tmp_path):
     options = ["map.noise=0.02", "map.prior=0.5", "map.sampling=plain", "runtime.dtype=float64", "seed=7"]
-    options += ["map.cutoff=4", "map.hit_length=null", "map.codec=float", *more.split()]
+    options += ["map.cutoff=4", "map.hit_length=2", "map.codec=float", *more.split()]
     succeeded(
         run(
             "occupancy",
@@ -250,7 +250,7 @@ def test_the_map_has_the_options_of_its_group(name, more, expected, run, tmp_pat
     assert {option: getattr(made.learning, option) for option in expected} == expected
     how = made.query_options
     assert (how.n_samples, how.sampling, how.prior, how.random_state) == (20_000, "plain", 0.5, 7)
-    assert (how.cutoff, how.hit_length, made.codec) == (4, None, "float")
+    assert (how.cutoff, how.hit_length, made.codec) == (4, 2, "float")
 
 
 def test_a_sweep_writes_a_folder_for_each_job(run, tmp_path):

@@ -240,6 +240,7 @@ def test_queries_use_quantized_components_and_learning_uses_exact_ones(dim):
         ("codec", "zip"),
         ("cutoff", 0.0),
         ("hit_length", -1.0),
+        ("hit_length", "long"),
     ],
 )
 def test_invalid_settings_are_refused_at_construction(name, value):

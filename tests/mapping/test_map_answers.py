@@ -85,6 +85,25 @@ def test_grid_evidence_equals_the_occupancy_at_cell_centres(dim, method):
 
 
 @dims
+def test_hit_length_auto_is_half_the_mean_range(dim):
+    means, origins = points([1.0, 4.0, 9.0], dim), points([0.0, 0.0, 1.0], dim)
+    given = {
+        "means": means,
+        "covariances": 0.01 * torch.eye(dim, dtype=torch.float64).expand(3, dim, dim),
+        "support": [30.0, 10.0, 50.0],
+        "origins": origins,
+        "max_range": [False, False, True],  # beams without a return do not count
+    }
+    mean_range = (30 * 1.0 + 10 * 4.0) / 40
+    found = GaussianMap.from_components(**given, hit_length="auto").occupancy(lattice(dim), 0.25)
+    expected = GaussianMap.from_components(**given, hit_length=mean_range / 2).occupancy(lattice(dim), 0.25)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    assert not torch.equal(found, GaussianMap.from_components(**given).occupancy(lattice(dim), 0.25))
+    free = {**given, "max_range": [True] * 3}
+    assert bool((GaussianMap.from_components(**free, hit_length="auto").occupancy(means) < 0.5).all())
+
+
+@dims
 def test_all_methods_approximate_monte_carlo_occupancy(dim):
     made = built(drive(2, dim), n_samples=1 << 17)
     exact = made.occupancy(lattice(dim), method="monte_carlo")

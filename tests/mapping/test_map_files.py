@@ -54,6 +54,12 @@ def test_settings_and_components_are_restored(dim, codec, learning, tmp_path):
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "m.safetensors").read_bytes()
 
 
+def test_hit_length_auto_is_restored(tmp_path):
+    made = built(open_drive(2, 2), FINE, hit_length="auto")
+    made.save(tmp_path / "m.safetensors")
+    assert GaussianMap.load(tmp_path / "m.safetensors").query_options.hit_length == "auto"
+
+
 def test_only_settings_that_differ_from_the_defaults_are_written(tmp_path):
     made = built([wall_scan(2)], FINE, n_samples=1_000_000, compiled=True)
     made.save(tmp_path / "m.safetensors")

@@ -63,6 +63,16 @@ ERRORS = {"point": 1e-9, "flux": 1e-6, "cone": 0.05}
 outside the hull of a cone, where it depends on the index whether the cone is asked."""
 
 
+def test_hit_length_auto_is_that_of_the_whole_map(tmp_path, generator):
+    set_to = replace(SETTINGS, query=replace(SETTINGS.query, hit_length="auto"))
+    parts = [recording(3, seed) for seed in range(2)]
+    tiled = merge(tmp_path / "all", [written(tmp_path / str(i), c, set_to) for i, c in enumerate(parts)])
+    points = 3 + 40 * (torch.rand(100, 3, generator=generator, dtype=torch.float64) - 0.5)
+    expected = whole(parts, set_to).occupancy(points)
+    torch.testing.assert_close(tiled.occupancy(points), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(tiled.open().occupancy(points), expected, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("method", "cutoff"), [("point", None), ("point", 4.0), ("flux", None), ("cone", 4.0)]
 )
