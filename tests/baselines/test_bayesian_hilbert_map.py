@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
-from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
+from baselines.tensor_file_contract import TensorFileContract, check_damaged_files_are_refused
+from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_scan
 from torch import Tensor
 from torch.distributions import MultivariateNormal, kl_divergence
 
@@ -24,17 +26,17 @@ from gmmtorch.baselines.hilbert.logistic_regression import (
 )
 from gmmtorch.baselines.samples import beam_samples
 from gmmtorch.datasets import load
-from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.evaluation import metrics, queries
-from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan
 
 
-class TestMeanField(OccupancyMapContract):
+class TestMeanField(TensorFileContract):
     shift_tolerance = 1e-4
     turn_tolerance = 0.1
     overshoot = 0.1
     thins_scans = True
+    damage: ClassVar = {"means": [lambda v: v * math.inf], "precisions": [lambda v: -v - 1]}
 
     def make(self) -> BayesianHilbertMap:
         return BayesianHilbertMap(
@@ -42,12 +44,13 @@ class TestMeanField(OccupancyMapContract):
         )
 
 
-class TestDiagonal(OccupancyMapContract):
+class TestDiagonal(TensorFileContract):
     """Narrow kernels: with overlapping kernels the authors' fast form counts evidence several times."""
 
     shift_tolerance = 1e-4
     turn_tolerance = 0.15
     thins_scans = True
+    damage: ClassVar = {"means": [lambda v: v * math.inf], "precisions": [lambda v: -v - 1]}
 
     def make(self) -> BayesianHilbertMap:
         return BayesianHilbertMap(
@@ -273,23 +276,11 @@ def test_bayesian_hilbert_map_rejects_hinges_with_gaps():
         BayesianHilbertMap(100.0, spacing=1.0).insert(wall_scan(2))
 
 
-@pytest.mark.parametrize("covariance", ["mean_field", "full"])
-def test_bayesian_hilbert_map_load_rejects_damaged_tensors_and_settings(tmp_path, covariance):
-    made = BayesianHilbertMap(5.0, spacing=0.5, covariance=covariance)
+def test_damaged_files_of_a_full_covariance_are_refused(tmp_path):
+    made = BayesianHilbertMap(5.0, spacing=0.5, covariance="full")
     made.insert(open_scan(2))
-    path = tmp_path / "map.safetensors"
-    made.save(path)
-    tensors, facts = read_tensors(path, "gmmtorch.bayesian_hilbert_map", 1)
-    last = "factor" if covariance == "full" else "precisions"
-    changes = [{name: tensors[name][:-1]} for name in tensors]
-    changes += [{"means": tensors["means"] * math.inf}, {last: -tensors[last] - 1}]
-    for change in changes:
-        path.write_bytes(pack_tensors({**tensors, **change}, "gmmtorch.bayesian_hilbert_map", 1, **facts))
-        with pytest.raises(DataError, match=r"map\.safetensors"):
-            BayesianHilbertMap.load(path)
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.bayesian_hilbert_map", 1, **{**facts, "dim": 1}))
-    with pytest.raises(DataError, match="settings"):
-        BayesianHilbertMap.load(path)
+    damage = {"means": [lambda v: v * math.inf], "factor": [lambda v: -v - 1]}
+    check_damaged_files_are_refused(made, tmp_path, damage, [])
 
 
 @pytest.mark.real_data

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
+from baselines.tensor_file_contract import TensorFileContract
 from occupancy.protocol_contract import (
     RESOLUTION,
-    OccupancyMapContract,
     lattice,
     move,
     shifted,
@@ -21,15 +22,15 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gmmtorch.baselines.gp_map import GPMap, gp_regression
 from gmmtorch.baselines.samples import thinned_samples
-from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.scan import Scan
 
 
-class TestGPMap(OccupancyMapContract):
+class TestGPMap(TensorFileContract):
     shift_tolerance = 1e-3
     turn_tolerance = 0.1
     thins_scans = True
+    damage: ClassVar = {"fused": [lambda v: -v.abs() - 1, lambda v: v.repeat(1, 2)]}
 
     def make(self) -> GPMap:
         return GPMap(RESOLUTION)
@@ -139,21 +140,3 @@ def test_gp_map_rejects_too_many_samples_per_block():
     scan = Scan(torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(2))
     with pytest.raises(InvalidArgumentError, match="ds_resolution"):
         GPMap(1.0, ds_resolution=1e-6).insert(scan)
-
-
-@pytest.mark.parametrize(
-    "change", [{"fused": torch.tensor([[0.0, -1.0]])}, {"fused": torch.zeros(1, 3)}, {"fused": None}]
-)
-def test_gp_map_load_rejects_damaged_tensors(tmp_path, change):
-    path = tmp_path / "map.safetensors"
-    made = GPMap(0.125)
-    made.insert(wall_scan(2))
-    made.save(path)
-    tensors, facts = read_tensors(path, "gmmtorch.gp_map", 1)
-    value = change["fused"]
-    n_cells = len(tensors.pop("fused"))
-    if value is not None:
-        tensors["fused"] = value.expand(n_cells, -1)
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.gp_map", 1, **facts))
-    with pytest.raises(DataError, match=r"map\.safetensors"):
-        GPMap.load(path)

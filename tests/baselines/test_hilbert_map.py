@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
-from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, open_scan, wall_scan
+from baselines.tensor_file_contract import TensorFileContract
+from occupancy.protocol_contract import RESOLUTION, wall_scan
 from sklearn.gaussian_process.kernels import RBF
 from sklearn.kernel_approximation import Nystroem
 from sklearn.linear_model import LogisticRegression
@@ -19,18 +21,18 @@ from gmmtorch.baselines.hilbert.hilbert_map import HilbertMap
 from gmmtorch.baselines.hilbert.lattice_features import LatticeFeatures
 from gmmtorch.baselines.hilbert.logistic_regression import logistic_regression, penalised_loss
 from gmmtorch.datasets import load
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries
-from gmmtorch.files import pack_tensors, read_tensors
 from gmmtorch.scan import Scan
 
 LEARNING = {"gap": RESOLUTION, "alpha": 0.05, "batch_size": 512, "learning_rate": 1.0}
 
 
-class TestSparse(OccupancyMapContract):
+class TestSparse(TensorFileContract):
     shift_tolerance = 1e-4
     turn_tolerance = 0.1
     thins_scans = True
+    damage: ClassVar = {"weights": [lambda v: v * math.nan]}
 
     def make(self) -> HilbertMap:
         return HilbertMap(
@@ -38,12 +40,13 @@ class TestSparse(OccupancyMapContract):
         )
 
 
-class TestNystroem(OccupancyMapContract):
+class TestNystroem(TensorFileContract):
     """Centres are drawn from the points, in another order if the scene is rotated."""
 
     shift_tolerance = 1e-4
     turn_tolerance = 0.25
     thins_scans = True
+    damage: ClassVar = {"weights": [lambda v: v * math.nan]}
     extrapolates = True  # up to five lengths, here 1.25 m
 
     def make(self) -> HilbertMap:
@@ -59,12 +62,13 @@ class TestNystroem(OccupancyMapContract):
         assert made.occupancy([[300.0, -2.0]]).tolist() == [0.5]
 
 
-class TestFourier(OccupancyMapContract):
+class TestFourier(TensorFileContract):
     """Features are waves, so values in unobserved space are arbitrary and change under rotation."""
 
     shift_tolerance = 1e-4
     turn_tolerance = 0.5
     thins_scans = True
+    damage: ClassVar = {"weights": [lambda v: v * math.nan]}
     extrapolates = True
 
     def make(self) -> HilbertMap:
@@ -286,27 +290,6 @@ def test_a_loaded_lattice_grows_and_keeps_its_occupancy(tmp_path):
     assert theta[0] > 0.6
     assert theta[1] > 0.5 > theta[2]
     assert theta[3] == 0.5
-
-
-@pytest.mark.parametrize("kind", ["sparse", "nystroem", "fourier"])
-def test_hilbert_map_load_rejects_damaged_tensors_and_settings(tmp_path, kind):
-    made = HilbertMap(kind, length=0.5, n_features=20, epochs=1)
-    made.insert(open_scan(2))
-    path = tmp_path / "map.safetensors"
-    made.save(path)
-    tensors, facts = read_tensors(path, "gmmtorch.hilbert_map", 1)
-    for name in tensors:
-        broken = {**tensors, name: tensors[name][:-1]}
-        path.write_bytes(pack_tensors(broken, "gmmtorch.hilbert_map", 1, **facts))
-        with pytest.raises(DataError, match=r"map\.safetensors"):
-            HilbertMap.load(path)
-    nan = {**tensors, "weights": tensors["weights"] * math.nan}
-    path.write_bytes(pack_tensors(nan, "gmmtorch.hilbert_map", 1, **facts))
-    with pytest.raises(DataError, match="weights"):
-        HilbertMap.load(path)
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.hilbert_map", 1, **{**facts, "dim": 4}))
-    with pytest.raises(DataError, match="settings"):
-        HilbertMap.load(path)
 
 
 @pytest.mark.real_data

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import pytest
 import torch
-from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
-from torch import Tensor
+from baselines.tensor_file_contract import TensorFileContract
+from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_scan
 
 from gmmtorch.baselines.occupancy_grid import LogOdds, OccupancyGrid
-from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.files import pack_tensors
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
 
-class GridContract(OccupancyMapContract):
+class GridContract(TensorFileContract):
     """Counts are additive, so the order of scans and the chunk size do not matter."""
+
+    damage: ClassVar = {
+        "hits": [
+            *(lambda v, x=x: v.double() * 0 + x for x in (math.nan, math.inf, -1.0)),
+            lambda v: v.repeat(2),
+        ],
+        "misses": [lambda v: v.double() * math.nan, lambda v: -v.short() - 1, lambda v: v[:, None]],
+        "observed": [lambda v: v[:, :-1], lambda v: v.repeat(2, 1)],
+        "keys": [torch.zeros_like, lambda v: v.int()],
+        "anchor": [lambda v: v.new_zeros(3)],
+    }
+    damaged_settings: ClassVar = [
+        *({"resolution": value} for value in (0, "wide", None)),
+        *({"prior": value} for value in (-1.0, "much", None)),
+        *({"log_odds": value} for value in ({"hit": "x"}, {"unheard": 1}, 3, {"hit": None})),
+    ]
 
     @pytest.mark.parametrize("dim", [2, 3])
     def test_the_order_of_the_scans_does_not_matter(self, dim):
@@ -80,79 +94,3 @@ def test_occupancy_grid_rejects_an_invalid_prior(prior):
 def test_log_odds_rejects_values_that_are_not_finite(rule):
     with pytest.raises(InvalidArgumentError, match=next(iter(rule))):
         OccupancyGrid(0.1, log_odds=LogOdds(**rule))
-
-
-def valid_file() -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Content of a file: one block of 16² cells at the origin; one cell has two hits and one miss."""
-    observed = torch.zeros(1, 32, dtype=torch.uint8)
-    observed[0, 0] = 0b1000_0000
-    tensors = {
-        "anchor": torch.zeros(2, dtype=torch.int64),
-        "keys": torch.tensor([(1 << 30) * ((1 << 31) + 1)]),
-        "observed": observed,
-        "hits": torch.tensor([2], dtype=torch.uint8),
-        "misses": torch.tensor([1], dtype=torch.uint8),
-    }
-    return tensors, {"resolution": 0.5, "dim": 2, "prior": 1.0}
-
-
-def load_file(folder: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> OccupancyGrid:
-    path = folder / "grid.safetensors"
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.occupancy_grid", 1, **facts))
-    return OccupancyGrid.load(path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"hits": torch.tensor([math.nan])},
-        {"hits": torch.tensor([math.inf])},
-        {"hits": torch.tensor([-1.0])},
-        {"hits": torch.tensor([2, 2], dtype=torch.uint8)},
-        {"misses": torch.tensor([math.nan], dtype=torch.float64)},
-        {"misses": torch.tensor([-1], dtype=torch.int16)},
-        {"misses": torch.tensor([[1]], dtype=torch.uint8)},
-        {"observed": torch.zeros(1, 31, dtype=torch.uint8)},
-        {"observed": torch.zeros(2, 32, dtype=torch.uint8)},
-        {"keys": torch.tensor([5, 5])},
-        {"keys": torch.tensor([5], dtype=torch.int32)},
-        {"anchor": torch.zeros(3, dtype=torch.int64)},
-    ],
-    ids=lambda c: next(iter(c)),
-)
-def test_occupancy_grid_load_rejects_damaged_tensors(tmp_path, change):
-    tensors, facts = valid_file()
-    with pytest.raises(DataError, match=r"grid\.safetensors"):
-        load_file(tmp_path, {**tensors, **change}, facts)
-
-
-@pytest.mark.parametrize("name", ["anchor", "keys", "observed", "hits", "misses"])
-def test_occupancy_grid_load_rejects_missing_tensors(tmp_path, name):
-    tensors, facts = valid_file()
-    tensors.pop(name)
-    with pytest.raises(DataError, match=r"grid\.safetensors"):
-        load_file(tmp_path, tensors, facts)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"resolution": 0},
-        {"resolution": "wide"},
-        {"resolution": None},
-        {"dim": 4},
-        {"dim": [2]},
-        {"prior": -1.0},
-        {"prior": "much"},
-        {"prior": None},
-        {"log_odds": {"hit": "x"}},
-        {"log_odds": {"unheard": 1}},
-        {"log_odds": 3},
-        {"log_odds": {"hit": None}},
-    ],
-    ids=str,
-)
-def test_occupancy_grid_load_rejects_damaged_settings(tmp_path, change):
-    tensors, facts = valid_file()
-    with pytest.raises(DataError, match=r"grid\.safetensors"):
-        load_file(tmp_path, tensors, {**facts, **change})
