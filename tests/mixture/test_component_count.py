@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mixture.estimator_contract import check_mixture, degenerate_clouds, move, rigid_motion
+from mixture.fit_contract import check_mixture, degenerate_clouds, move, rigid_motion
 from sklearn.base import clone
 from torch import Tensor
 

@@ -8,6 +8,7 @@ import sys
 from typing import Any, ClassVar
 
 from mixture.estimator_contract import MixtureContract
+from mixture.fit_contract import FitContract
 
 from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
 
@@ -23,7 +24,11 @@ BAD_LOOP_PARAMETERS: list[dict[str, Any]] = [
 
 
 class TestGaussianMixture(MixtureContract):
-    bad_parameters: ClassVar[list[dict[str, Any]]] = BAD_LOOP_PARAMETERS
+    bad_parameters: ClassVar[list[dict[str, Any]]] = [
+        *BAD_LOOP_PARAMETERS,
+        {"algorithm": "fast"},
+        *({"max_cells": value} for value in (0, 2.5, "many")),
+    ]
 
     def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
         return GaussianMixture(n_components, **{"random_state": 0, **options})
@@ -48,7 +53,7 @@ class TestVariationalGaussianMixture(MixtureContract):
         return VariationalGaussianMixture(n_components, **{"random_state": 0, **options})
 
 
-class TestVariationalGaussianMixtureWithDirichletWeights(MixtureContract):
+class TestVariationalGaussianMixtureWithDirichletWeights(FitContract):
     score_tolerance = 1.2
 
     def make(self, n_components: int = 3, **options: Any) -> VariationalGaussianMixture:

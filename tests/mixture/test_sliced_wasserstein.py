@@ -10,7 +10,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mixture.estimator_contract import MixtureContract, blobs
+from mixture.estimator_contract import MixtureContract
+from mixture.fit_contract import blobs
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.stats import norm, wasserstein_distance

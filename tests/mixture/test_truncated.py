@@ -6,14 +6,14 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mixture.estimator_contract import MixtureContract, check_mixture
+from mixture.fit_contract import FitContract, check_mixture
 from mixture.test_gaussian_mixture import DtypeRecorder
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
@@ -701,13 +701,9 @@ def test_fewer_cells_than_components_give_copies(algorithm, init):
 # -- the contract ----------------------------------------------------------------------------------
 
 
-class TestTruncatedGaussianMixture(MixtureContract):
+class TestTruncatedGaussianMixture(FitContract):
     # The E-step is in float32.
     order_tolerance = motion_tolerance = repetition_tolerance = far_tolerance = 2e-3
-    bad_parameters: ClassVar[list[dict[str, Any]]] = [
-        {"algorithm": "fast"},
-        *({"max_cells": value} for value in (0, 2.5, "many")),
-    ]
 
     def make(self, n_components: int = 3, **options: Any) -> GaussianMixture:
         return GaussianMixture(n_components, **{"random_state": 0, "algorithm": "truncated", **options})
@@ -720,7 +716,7 @@ class TestTruncatedGaussianMixtureInFloat64(TestTruncatedGaussianMixture):
         return super().make(n_components, **{"init_params": "flat_pieces", "dtype": "float64", **options})
 
 
-class TestGaussianMixtureOnCells(MixtureContract):
+class TestGaussianMixtureOnCells(FitContract):
     motion_tolerance = None  # cells are aligned with the axes
 
     @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mixture.estimator_contract import blobs, check_mixture, move, rigid_motion
+from mixture.fit_contract import blobs, check_mixture, move, rigid_motion
 from scipy import integrate, special, stats
 from sklearn.mixture import BayesianGaussianMixture
 from torch import Tensor
