@@ -27,7 +27,7 @@ from gmmtorch.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.evaluation import methods
 from gmmtorch.evaluation.fit_comparison import ESTIMATORS
-from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.exploration.mission.trials import WorldOptions
 from gmmtorch.exploration.planning.planners import PLANNERS
 from gmmtorch.mapping.gaussian_map import GaussianMap
@@ -127,7 +127,7 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
     trials = [missions.trial_of(config, tmp_path, variant, 7) for variant in variants]
     assert len({trial.folder for trial in trials}) == len(trials) > 1
     for trial, variant in zip(trials, variants, strict=True):
-        named = {"team": trial.team.framework, "seed": trial.team.seed, **vars(trial.team)}
+        named = {"team": trial.team.framework, **vars(trial.team), **trial.team.learning}
         cuts = [cut._asdict() for cut in trial.team.partitions]
         named["partitions"] = [{**cut, "groups": list(map(list, cut["groups"]))} for cut in cuts]
         assert named["seed"] == 7
@@ -142,6 +142,7 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
         ("warehouse", "gmm_shared", "mcts"),
         ("tunnels", "grid_shared", "frontier"),
         ("mesh", "grid_isolated", "random"),
+        ("warehouse", "gmm_thesis", "mcts"),
     ],
 )
 def test_worlds_teams_and_planners_compose(world, team, planner, tmp_path):
@@ -150,6 +151,20 @@ def test_worlds_teams_and_planners_compose(world, team, planner, tmp_path):
     trial = missions.trial_of(config, tmp_path)
     assert (trial.world.name, trial.team.framework, trial.team.planner) == (world, team, planner)
     assert trial.world.path == ("mine.ply" if path else None)
+
+
+def test_the_file_of_the_thesis_team_has_its_options():
+    config = composed("explore", "team=gmm_thesis")
+    assert {name: config.map.get(name, config.codec) for name in THESIS} == THESIS
+    plain = missions.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
+    assert missions.team_options(config, 0, {}) == plain
+
+
+def test_options_that_are_not_of_the_thesis_team_are_refused():
+    with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with shell=0.5.* has 0.0"):
+        missions.team_options(composed("explore", "team=gmm_thesis", "map.shell=0.5"), 0, {})
+    with pytest.raises(InvalidArgumentError, match="team=gmm_thesis sets options of all teams"):
+        missions.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 
 
 @pytest.mark.parametrize("world", ["warehouse", "tunnels"])

@@ -355,6 +355,30 @@ def test_a_study_of_networks_compares_them_with_the_lossless_one(run):
     assert [any(line.startswith(f"{name} ") for line in lines) for name in names] == [True] * 4
 
 
+def test_a_study_of_deviations_compares_each_with_ours(run):
+    variants = (
+        "{team:gmm_shared},{team:gmm_shared,shell:0},{team:gmm_shared,update_stride:null},{team:gmm_thesis}"
+    )
+    options = ["experiment=deviations", "study.seeds=[0]", f"study.variants=[{variants}]"]
+    done = succeeded(run(*options, "report.figures=true", "report.tensorboard=true"))
+    pictures = {name for name in done.files() if name.endswith(".png")}
+    assert pictures == {"deviations.png", "entropy.png", "bandwidth.png", "summary.png", "profile.png"}
+    rows = done.results()["rows"]
+    assert [(row["framework"], row["shell"], row["update_stride"], row["codec"]) for row in rows] == [
+        ("gmm_shared", 0.5, 11, "quantized"),
+        ("gmm_shared", 0.0, 11, "quantized"),
+        ("gmm_shared", 0.5, None, "quantized"),
+        ("gmm_thesis", 0.0, None, "thesis"),
+    ]
+    head = (done.folder / "summary.md").read_text().splitlines()[0]
+    assert head == "| 1 seeds: mean (range) | E0 | E0, shell=0 | E0, update_stride=null | thesis |"
+    (alone,) = timeless(succeeded(run("team=gmm_thesis", name="alone")).results())["rows"]
+    (same,) = timeless({"rows": rows[3:]})["rows"]
+    assert {name: same[name] for name in alone if name not in ("t50", "t90", "reference_bits")} == {
+        name: value for name, value in alone.items() if name not in ("t50", "t90", "reference_bits")
+    }
+
+
 def test_a_trial_of_a_study_equals_the_single_mission(run):
     (alone,) = timeless(succeeded(run("team=grid_shared", "seed=1")).results())["rows"]
     options = ["experiment=fig4_5_bandwidth", "study.seeds=[1]", "study.variants=[{team:grid_shared}]"]

@@ -38,14 +38,20 @@ def frame(place: tuple[float, ...], yaw: float, seed: int = 0, max_range: float 
     return DepthFrame(origin, origin + depth[:, None] * turned, depth < max_range, torch.arange(len(d)))
 
 
-def mapper(robot: int = 0, codec: str = "replica", memo: Memo | None = None, **options: Any) -> GmmMapper:
+def mapper(
+    robot: int = 0,
+    codec: str = "replica",
+    memo: Memo | None = None,
+    novelty: NoveltyRule = NOVELTY,
+    **options: Any,
+) -> GmmMapper:
     """One with a `Replica`, or with a `Broadcast` in a codec."""
     local = RollingWindow(0.2, (64, 64, 32))
     local.center_on(torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
-    return GmmMapper(robot, local, belief, CAMERA.width, NOVELTY, rule, memo, shared)
+    return GmmMapper(robot, local, belief, CAMERA.width, novelty, rule, memo, shared)
 
 
 def heard(*datagrams: bytes, sender: int = 0) -> list[ReceivedMessage]:

@@ -8,14 +8,17 @@ from dataclasses import replace
 import pytest
 import torch
 from exploration.mapped_room import BOX, HIGH, LOW, NOVELTY, PLACES, frame, heard, mapper
+from scipy.stats import chi2
 from sharing.replica_model import Model, rows
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.exploration.mission.options import THESIS
 from gmmtorch.exploration.robot.gmm_mapper import FrameRule, GmmMapper
 from gmmtorch.exploration.robot.mapper import FrameUpdate, Memo
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
+from gmmtorch.mapping.learning.novelty import beam_novelty
 from gmmtorch.occupancy.voxels.boxes import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.sharing.messages.message_registry import (
@@ -322,6 +325,76 @@ def test_a_stride_weights_the_beams_it_uses() -> None:
     assert gains[1] == pytest.approx(gains[0], rel=0.1)
 
 
+# -- E0 of the thesis ---------------------------------------------------------------------------------
+
+
+def thesis_mapper(robot: int = 0) -> GmmMapper:
+    """One with the options of the thesis, which explains surfaces from anywhere and free space from near."""
+    options = {name: value for name, value in THESIS.items() if name in vars(FrameRule())}
+    near = replace(NOVELTY, distance=0.5, distance_for="free_space")
+    return mapper(robot, "thesis", novelty=near, **options)
+
+
+def explained_by_a_loop(one: GmmMapper, seen: DepthFrame) -> tuple[Tensor, dict[tuple[int, int], float]]:
+    """Which novel beams of a frame components explain, and what these gain (thesis 4.1.3)."""
+    known, limit = one.components(), float(chi2.ppf(0.95, 3))
+    near = (known.origins[known.seen_from] - seen.origin).norm(dim=1) <= one._novelty.distance
+    novel, ends_here = (
+        (unobserved | (bits >= NOVELTY.threshold))
+        for bits, unobserved in (
+            beam_novelty(one.local, seen.origin, seen.ends, hits, NOVELTY, within=BOX)
+            for hits in (seen.is_hit, torch.zeros_like(seen.is_hit))
+        )
+    )
+    gains: dict[tuple[int, int], float] = {}
+    explained = torch.zeros_like(novel)
+    for n in novel.nonzero().squeeze(1).tolist():
+        offset = seen.ends[n] - known.means
+        squared = (offset[:, None] @ torch.linalg.inv(known.covariances) @ offset[..., None]).flatten()
+        valid = (squared < limit) & (known.max_range != seen.is_hit[n])
+        if ends_here[n] or not seen.is_hit[n]:
+            valid &= near
+        rows = valid.nonzero().squeeze(1).tolist()
+        explained[n] = bool(rows)
+        for row in rows:
+            key = tuple(known.ids[row].tolist())
+            gains[key] = gains.get(key, 0.0) + float(squared[row] ** -1 / (squared[rows] ** -1).sum())
+    return explained, gains
+
+
+def test_in_the_thesis_novel_points_update_the_components_that_explain_them() -> None:
+    one = thesis_mapper()
+    sizes, n_explained = [], 0
+    for seed, place in enumerate([*PLACES, *PLACES]):
+        seen = frame(*place, seed=seed)
+        explained, gains = explained_by_a_loop(one, seen)
+        novel = one.sense(seen).novel
+        assert bool(novel[explained].all())
+        components, counts = by_kind(one.shared.datagrams())
+        learned = sum(counts_in(components, []).values())
+        assert learned == pytest.approx(int((novel & ~explained).sum()), rel=1e-5)  # others are discarded
+        told: dict[tuple[int, int], float] = {}
+        for message in map(decode, counts):
+            assert isinstance(message, CountsMessage)
+            told |= message.counts
+        assert told == pytest.approx(gains, rel=1e-5)
+        sizes += [(len(data) - 5, 57) for data in components] + [(len(data) - 6, 8) for data in counts]
+        n_explained += int(explained.sum())
+    assert n_explained > 300
+    assert all(size % of_a_record == 0 for size, of_a_record in sizes)  # beside kind, sender and checksum
+    assert {record for _, record in sizes} == {57, 8}
+
+
+def test_in_the_thesis_robots_that_exchange_messages_hold_the_same_map() -> None:
+    pair = [thesis_mapper(robot) for robot in range(2)]
+    for turn, place in enumerate(PLACES * 2):
+        speaker, listener = pair[turn % 2], pair[1 - turn % 2]
+        speaker.sense(frame(*place, seed=turn))
+        listener.receive(heard(*speaker.shared.datagrams(), sender=turn % 2))
+    assert_same_components(pair[0].components(), pair[1].components(), exact=False)
+    assert_same_evidence(*pair)
+
+
 # -- counts -------------------------------------------------------------------------------------------
 
 
@@ -513,7 +586,10 @@ def test_invalid_frame_rules_are_rejected() -> None:
         ({"shell": -1.0}, "shell=-1"),
         ({"components": 0}, "components=0"),
         ({"update_stride": 0}, "update_stride=0"),
-        ({"update_at": 1.0}, "update_at=1"),
+        ({"update_at": 0.9}, "update_at=0.9"),
+        ({"update_every": 0}, "update_every=0"),
+        ({"novelty_block": 0}, "novelty_block=0"),
+        ({"hits_per_ray": 0}, "hits_per_ray=0"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):
             FrameRule(**options)

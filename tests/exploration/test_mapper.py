@@ -40,14 +40,16 @@ def frame(width: int, height: int, seed: int, missing: float) -> DepthFrame:
     return DepthFrame(origin, ends, is_hit, pixel)
 
 
-def novel_by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: float) -> list[bool]:
-    """Each beam gets the answer of the beam with the lowest pixel in its 3 × 3 block."""
+def novel_by_a_loop(
+    local: RollingWindow, seen: DepthFrame, width: int, short: float, side: int
+) -> list[bool]:
+    """Each beam gets the answer of the beam with the lowest pixel in its block."""
     speaker: dict[tuple[int, int], int] = {}
     for beam, pixel in enumerate(seen.pixel.tolist()):
-        speaker.setdefault((pixel // width // 3, pixel % width // 3), beam)
+        speaker.setdefault((pixel // width // side, pixel % width // side), beam)
     answers = []
     for pixel in seen.pixel.tolist():
-        beam = speaker[(pixel // width // 3, pixel % width // 3)]
+        beam = speaker[(pixel // width // side, pixel % width // side)]
         bits, unobserved = beam_novelty(
             local, seen.origin, seen.ends[[beam]], seen.is_hit[[beam]], RULE, short=short, within=WITHIN
         )
@@ -55,16 +57,16 @@ def novel_by_a_loop(local: RollingWindow, seen: DepthFrame, width: int, short: f
     return answers
 
 
-@pytest.mark.parametrize("short", [0.0, 0.5])
+@pytest.mark.parametrize(("short", "side"), [(0.0, 3), (0.5, 3), (0.5, 1)])
 @pytest.mark.parametrize("missing", [0.0, 0.3, 0.9])
 @pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (7, 1), (1, 9), (2, 2), (10, 11)])
 def test_the_first_beam_of_a_block_decides_for_the_block(
-    width: int, height: int, missing: float, short: float
+    width: int, height: int, missing: float, short: float, side: int
 ) -> None:
     local, seen = random_window(width), frame(width, height, height, missing)
-    found = novel_beams(local, seen, width, RULE, WITHIN, short)
+    found = novel_beams(local, seen, width, RULE, WITHIN, short, side)
     assert found.dtype == torch.bool
-    assert found.tolist() == novel_by_a_loop(local, seen, width, short)
+    assert found.tolist() == novel_by_a_loop(local, seen, width, short, side)
 
 
 def test_a_random_map_has_novel_and_known_beams() -> None:

@@ -14,7 +14,7 @@ from exploration.furnished_room import SHELF, SMALL, room, without_seconds
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.mission.driver import SimulatedClock, drive
 from gmmtorch.exploration.mission.mission import Mission
-from gmmtorch.exploration.mission.options import FRAMEWORKS, TeamOptions
+from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.exploration.mission.results import mission_row, with_times
 from gmmtorch.exploration.mission.team_setup import assemble
 from gmmtorch.exploration.robot.robot_state import StoppingRule
@@ -85,9 +85,25 @@ def test_each_framework_sends_what_it_shares(mission: Mission) -> None:
         assert row["bytes_sent"] == row["datagrams"] == 0
     elif mission.options.framework == "grid_shared":
         assert row["bytes_by_kind"]["points"] > row["bytes_raw_points"]
+    elif mission.options.framework == "gmm_thesis":
+        sent = row["bytes_by_kind"]
+        assert 0 < sent["counts"] < sent["components"] < row["bytes_raw_points"] / 10
+        assert set(sent) == {"components", "counts", "plans", "views"}  # no record is announced or repaired
     else:
         assert 0 < row["bytes_by_kind"]["components"] < row["bytes_raw_points"] / 30
         assert row["map_disagreement"] <= 0.02
+
+
+def test_the_team_of_the_thesis_has_its_options() -> None:
+    team = replace(SMALL, framework="gmm_thesis")
+    assert team.learning == THESIS
+    assert team == replace(team)
+    assert team.novelty.distance == SMALL.novelty.distance  # the thesis gives no number
+    assert replace(SMALL).learning == TeamOptions().learning
+    assert not {name for name, value in TeamOptions().learning.items() if value == THESIS[name]}
+    for part in ({"frame": replace(SMALL.frame, shell=0.3)}, {"codec": "float"}):
+        with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with (shell=0.3|codec=float)"):
+            replace(SMALL, framework="gmm_thesis", **part)
 
 
 @pytest.mark.parametrize("framework", FRAMEWORKS)

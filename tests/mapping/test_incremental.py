@@ -21,6 +21,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.incremental import absorb, depth_scan
 from gmmtorch.mapping.learning.merging import UNNUMBERED, estimated_bytes
+from gmmtorch.mapping.learning.novelty import entropy_reduction
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.forms.point import point_evidence
@@ -128,6 +129,27 @@ def test_explained_novel_points_are_counted_instead_of_learned():
     assert torch.equal(twice.means, once.means)
     gained = float(twice.support.sum() - once.support.sum())
     assert 0.5 * len(scan.points) < gained <= len(scan.points) + 1e-6
+
+
+@dims
+def test_only_beams_that_contribute_free_space_ask_where_components_were_seen_from(dim):
+    once = grown([wall_scan(dim, seed) for seed in range(3)], NOVEL)
+    away = wall_scan(dim, 9, (0.3125, 1.0, 0.0))  # further than `distance` from the first place
+    known = replace(NOVEL.novelty, observed=0.0, explained=1e9)
+    bits, _ = entropy_reduction(once, away, known)
+    way, _ = entropy_reduction(once, Scan(away.points[:0], away.origin, away.points), known)
+    rule = replace(known, threshold=float(bits.median()))
+    by_their_end = int(((bits >= rule.threshold) & (way < rule.threshold)).sum())
+    gained = {
+        asked: absorb(once, [away], replace(NOVEL, novelty=replace(rule, distance_for=asked)))
+        .support[: len(once)]
+        .sum()
+        - once.support.sum()
+        for asked in ("all", "free_space")
+    }
+    assert 0 < by_their_end < int((bits >= rule.threshold).sum())
+    assert float(gained["all"]) == 0
+    assert float(gained["free_space"]) == pytest.approx(by_their_end)
 
 
 # -- depth images ---------------------------------------------------------------------------------

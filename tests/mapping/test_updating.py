@@ -15,20 +15,21 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 
 
-def counts_by_a_loop(components, points, origin, distance, limit, max_range):
+def counts_by_a_loop(components, points, origin, distance, limit, max_range, frees=None):
     """Support (K,), which points are explained, and counts (K, S) by origin."""
     support = components.support.clone()
     counts = torch.zeros(len(components), components.origins.shape[0], dtype=torch.float64)
     counts[components.seen_by, components.seen_from] = components.seen_count
     explained = []
-    for point in points:
+    for n, point in enumerate(points):
         shares = {}
+        within = distance if frees is None or frees[n] else math.inf
         for k in range(len(components)):
             offset = point - components.means[k]
             squared = float(offset @ torch.linalg.inv(components.covariances[k]) @ offset)
             places = components.seen_from[components.seen_by == k]
             apart = float((components.origins[places] - origin).norm(dim=1).min())
-            if squared < limit and apart <= distance and bool(components.max_range[k]) == max_range:
+            if squared < limit and apart <= within and bool(components.max_range[k]) == max_range:
                 shares[k] = 1 / max(squared, 1e-6)
         for k, share in shares.items():
             places = components.seen_from[components.seen_by == k]
@@ -45,15 +46,20 @@ def counts_by_a_loop(components, points, origin, distance, limit, max_range):
     distance=st.sampled_from([0.0, 1.0, 3.0, 100.0]),
     limit=st.sampled_from([None, 2.0]),
     max_range=st.booleans(),
+    asks=st.sampled_from(["all", "some", "none"]),
 )
-def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range):
+def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range, asks):
     components = random_components(7, dim, seed, spread=0.5, empty=0.3)
     generator = torch.Generator().manual_seed(seed + 1)
     points = torch.randn(15, dim, generator=generator, dtype=torch.float64)
     origin = torch.randn(dim, generator=generator, dtype=torch.float64)
-    found = count_explained(components, points, origin, distance, limit, max_range)
+    some = torch.rand(15, generator=generator) < 0.5
+    frees = {"all": None, "some": some, "none": torch.zeros_like(some)}[asks]
+    found = count_explained(components, points, origin, distance, limit, max_range, frees=frees)
     bound = float(chi2.ppf(0.95, dim)) if limit is None else limit
-    support, explained, counts = counts_by_a_loop(components, points, origin, distance, bound, max_range)
+    support, explained, counts = counts_by_a_loop(
+        components, points, origin, distance, bound, max_range, frees
+    )
     assert found.explained.tolist() == explained
     torch.testing.assert_close(found.components.support, support)
     got = torch.zeros_like(counts)
@@ -76,6 +82,15 @@ def test_association_keeps_moments_and_adds_beam_weights():
     assert torch.equal(found.components.ids, components.ids)
 
 
+def test_only_points_that_free_space_ask_where_a_component_was_seen_from():
+    surface = random_components(1, 3, 0)  # the issue's case: seen from one place, explained from another
+    point, away = surface.means, surface.origins[surface.seen_from[0]] + torch.tensor([0.0, 3.0, 0.0])
+    for frees, explained in ((None, False), (torch.tensor([True]), False), (torch.tensor([False]), True)):
+        found = count_explained(surface, point, away, 2.0, max_range=bool(surface.max_range[0]), frees=frees)
+        assert found.explained.tolist() == [explained], frees
+        assert float(found.components.support - surface.support) == pytest.approx(float(explained))
+
+
 def test_without_components_or_points_nothing_is_explained():
     nothing = Components.empty(2)
     points = torch.zeros(3, 2, dtype=torch.float64)
@@ -93,5 +108,10 @@ def test_association_counts_do_not_depend_on_the_portion_size(k, monkeypatch):
     whole = count_explained(components, points, components.origins[0], 100.0)
     monkeypatch.setattr("gmmtorch.mapping.learning.association._PAIRS_AT_ONCE", 7 * k)
     parts = count_explained(components, points, components.origins[0], 100.0)
+    by_place = count_explained(
+        components, points, components.origins[0], 100.0, frees=torch.ones(200, dtype=torch.bool)
+    )
     assert torch.equal(whole.explained, parts.explained)
     torch.testing.assert_close(whole.components.support, parts.components.support)
+    assert torch.equal(whole.explained, by_place.explained)
+    torch.testing.assert_close(whole.components.support, by_place.components.support)

@@ -9,13 +9,19 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.paired_statistics import mean_band
-from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
+from gmmtorch.evaluation.paired_statistics import mean_band, paired_interval
+from gmmtorch.report.exploration.mission_bars import (
+    deviations_figure,
+    profile_figure,
+    stage_means,
+    summary_bars,
+)
 from gmmtorch.report.exploration.mission_curves import (
     bandwidth_figure,
     entropy_figure,
     planner_comparison_figure,
 )
+from gmmtorch.report.exploration.mission_summary import study_summary
 from gmmtorch.report.exploration.trial_groups import (
     FRAMEWORKS,
     framework_colour,
@@ -147,16 +153,67 @@ def test_summary_draws_seeds_and_paired_differences():
     ]
     auc, difference = figure.axes[2], figure.axes[6]
     dots = [line for line in auc.lines if line.get_marker() == "o"]
-    assert [len(line.get_ydata()) for line in dots] == [3, 3, 3]
+    assert [len(line.get_ydata()) for line in dots] == [3, 3, 3, 3]
     by = {f: np.array([r["auc"] for r in rows if r["framework"] == f]) for f in FRAMEWORKS}
     means = [float(line.get_ydata()[0]) for line in difference.lines if len(line.get_ydata()) == 2][1:]
-    expected = [by["gmm_shared"] - by["grid_shared"], by["gmm_shared"] - by["grid_isolated"]]
+    expected = [by["gmm_shared"] - by[name] for name in FRAMEWORKS if name != "gmm_shared"]
+    assert len(means) == len(expected)  # four frameworks: the first beside the others
     for value in expected:
         assert any(np.isclose(mean, value.mean()) for mean in means)
     ratio = [float(line.get_ydata()[0]) for line in figure.axes[4].lines if len(line.get_ydata()) == 2][1]
     sent = {f: np.array([r["bytes_sent"] for r in rows if r["framework"] == f]) for f in FRAMEWORKS}
     assert ratio == pytest.approx(np.exp(np.log(sent["gmm_shared"] / sent["grid_shared"]).mean()))
     summary_bars([trial("grid_isolated", 0)]).canvas.draw()
+
+
+def deviations(n_seeds: int = 3) -> list[dict]:
+    """Trials of E0, of E0 without shell and of E0 of the thesis."""
+    ours = {"codec": "quantized", "shell": 0.5, "update_stride": 11, "update_novel": False}
+    thesis = {"codec": "thesis", "shell": 0.0, "update_stride": None, "update_novel": True}
+    return [
+        row
+        for seed in range(n_seeds)
+        for row in (
+            trial("gmm_shared", seed, **ours),
+            trial("gmm_shared", seed, pace=400 + 10 * seed, **{**ours, "shell": 0.0}),
+            trial("gmm_shared", seed, pace=400, **{**ours, "update_stride": None}),
+            trial("gmm_thesis", seed, **thesis),
+        )
+    ]
+
+
+def test_deviations_are_drawn_as_paired_differences():
+    rows = deviations()
+    figure = deviations_figure(rows)
+    entropy, t90, _, sent = figure.axes
+    names = [text.get_text() for text in entropy.get_yticklabels()]
+    assert names == ["E0, shell=0.0", "E0, update_stride=null", "thesis"]
+    groups = [[row for row in rows if row["shell"] == 0.0 and row["framework"] == "gmm_shared"]]
+    groups += [[row for row in rows if row["framework"] == "gmm_thesis"]]
+    usual = rows[::4]
+    for place, group in ((0, groups[0]), (2, groups[1])):
+        change = np.array([row["t90"] for row in group]) - np.array([row["t90"] for row in usual])
+        mean, low, high = paired_interval(change, np.zeros(3))
+        (dot,) = (
+            x
+            for line in t90.lines
+            if line.get_marker() == "o"
+            for x, y in [line.get_xydata()[0]]
+            if y == place
+        )
+        assert dot == pytest.approx(mean)
+        (ends,) = (line.get_xdata() for line in t90.lines if list(line.get_ydata()) == [place, place])
+        np.testing.assert_allclose(ends, [low, high])
+    ratio = np.exp(
+        np.mean([np.log(a["bytes_sent"] / b["bytes_sent"]) for a, b in zip(groups[1], usual, strict=True)])
+    )
+    assert any(
+        line.get_marker() == "o" and line.get_xdata()[0] == pytest.approx(ratio) for line in sent.lines
+    )
+    with pytest.raises(InvalidArgumentError, match="rows contain one variant, E0;"):
+        deviations_figure(usual)
+    assert "E0, shell=0.0 − E0" in study_summary(rows)
+    deviations_figure(rows[:4]).canvas.draw()  # one seed has no intervals
 
 
 def test_summary_draws_no_mean_if_a_seed_has_no_value():
@@ -199,7 +256,7 @@ def test_line_end_labels_keep_order_and_do_not_overlap():
 
 
 def test_frameworks_have_fixed_names_and_colours():
-    assert [framework_colour(name) for name in FRAMEWORKS] == list(PALETTE[:3])
+    assert [framework_colour(name) for name in FRAMEWORKS] == [*PALETTE[:3], PALETTE[5]]
     assert framework_name("gmm_shared") == "E0 shared mixtures"
     assert framework_name("another_one") == "another one"
     rows = [trial("gmm_shared", 0), {**trial("gmm_shared", 0), "framework": "another_one"}]

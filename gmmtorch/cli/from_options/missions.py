@@ -40,11 +40,13 @@ NAMES = {
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
     """The variants of a study. Raises `InvalidArgumentError` for options that a variant cannot set."""
     from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.exploration.mission.options import THESIS
+    from gmmtorch.exploration.mission.results import PLANNING
 
     if config.study.name != "trials":
         raise InvalidArgumentError(f"study.name={config.study.name!r} is not one of trials.")
     variants: list[dict[str, Any]] = list(common.as_options(config.study)["variants"])
-    known = {"team", "planner", "information", "coordination", "planning_prior", "codec", *config.network}
+    known = {"team", *PLANNING, *THESIS, *config.network}
     for variant in variants:
         if not set(variant) <= known:
             raise InvalidArgumentError(
@@ -55,6 +57,10 @@ def variants_of(config: DictConfig) -> list[dict[str, Any]]:
             value = variant.get(key, 0.0)
             if not (isinstance(value, int | float) or (key == "budget" and value is None)):
                 raise InvalidArgumentError(f"study.variants has {key}={value!r}, which is not a number.")
+    if config.team.name == "gmm_thesis" and any("team" in variant for variant in variants):
+        raise InvalidArgumentError(
+            "team=gmm_thesis sets options of all teams of the study; use its variants: {team: gmm_thesis}."
+        )
     if not variants or not config.study.seeds:
         raise InvalidArgumentError("study.variants and study.seeds must each have at least one entry.")
     return variants
@@ -106,7 +112,7 @@ def open_world(world: WorldOptions, team: TeamOptions, on_event: Event | None = 
 
 def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> TeamOptions:
     """The team that the options describe, with the changes of a variant."""
-    from gmmtorch.exploration.mission.options import TeamOptions
+    from gmmtorch.exploration.mission.options import THESIS, TeamOptions
     from gmmtorch.exploration.planning.primitives import Dynamics
     from gmmtorch.exploration.robot.gmm_mapper import FrameRule
     from gmmtorch.exploration.robot.robot_state import StoppingRule
@@ -115,13 +121,15 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     from gmmtorch.simulation.sensors.depth_camera import DepthCamera
 
     sensor, mapping = common.as_options(config.sensor), common.as_options(config.map)
+    mapping |= {name: variant[name] for name in mapping if name in variant and name in THESIS}
     rate, window = sensor.pop("rate"), mapping.pop("window")
-    novelty = {name: mapping.pop(name) for name in ("threshold", "observed", "distance")}
+    novelty = {name: mapping.pop(name) for name in ("threshold", "observed", "distance", "distance_for")}
+    learning = {**mapping, **novelty, "codec": config.codec}
     start: Any = config.team.start
     start = OmegaConf.to_container(start) if OmegaConf.is_config(start) else start
     names = {name: f"study.variants: {option}" for option, name in OF_ROBOTS.items() if option in variant}
     with common.naming({**NAMES, **names}):
-        return TeamOptions(
+        options = TeamOptions(
             framework=variant.get("team", config.team.name),
             size=config.team.size,
             duration=config.duration,
@@ -150,6 +158,21 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
             start=None if start is None else _poses(start),
             device=config.runtime.device,
         )
+    if "team" not in variant and options.framework == "gmm_thesis":
+        _check_thesis(learning, options)
+    return options
+
+
+def _check_thesis(given: dict[str, Any], options: TeamOptions) -> None:
+    """Raises `InvalidArgumentError` if the options `given` of team=gmm_thesis are not those of the thesis."""
+    from gmmtorch.errors import InvalidArgumentError
+
+    for name, value in options.learning.items():
+        if given[name] != value:
+            raise InvalidArgumentError(
+                f"team=gmm_thesis with {name}={given[name]}: E0 of the thesis has {value}. Use "
+                "team=gmm_shared, which takes any value."
+            )
 
 
 def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: Any) -> T:

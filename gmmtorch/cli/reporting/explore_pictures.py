@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -174,11 +175,18 @@ class MissionRecorder:
 def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path) -> None:
     """Writes a study's summary and pictures: curves with bands over seeds, and bars.
 
-    If teams ran on several networks, one picture compares these, and all others show the first network.
+    If teams ran on several networks, one picture compares these, and all others show the first network. If
+    they learned in several ways, one picture compares these, and all others show the first way.
     """
+    from gmmtorch.exploration.mission.options import THESIS
     from gmmtorch.exploration.mission.results import NETWORK, differing
     from gmmtorch.files import write_bytes
-    from gmmtorch.report.exploration.mission_bars import profile_figure, stage_means, summary_bars
+    from gmmtorch.report.exploration.mission_bars import (
+        deviations_figure,
+        profile_figure,
+        stage_means,
+        summary_bars,
+    )
     from gmmtorch.report.exploration.mission_curves import (
         bandwidth_figure,
         entropy_figure,
@@ -189,17 +197,20 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
     from gmmtorch.report.tensorboard_writer import Board
 
     write_bytes(folder / "summary.md", study_summary(rows).encode())
-    on_first, on_several = _by_networks(rows)
-    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(on_first))}
+    on_first, on_several = _by_first(rows, NETWORK)
+    shown, _ = _by_first(on_first, THESIS)
+    figures: dict[str, Any] = {"profile": profile_figure(*stage_means(shown))}
     if on_several:
         figures["loss"] = loss_figure(on_several)
+    if len(shown) < len(on_first):
+        figures["deviations"] = deviations_figure(on_first)
     if len({row["framework"] for row in rows}) > 1:
         figures |= {
-            "entropy": entropy_figure(on_first),
-            "bandwidth": bandwidth_figure(on_first),
-            "summary": summary_bars(on_first),
+            "entropy": entropy_figure(shown),
+            "bandwidth": bandwidth_figure(shown),
+            "summary": summary_bars(shown),
         }
-    elif not on_several or differing(on_first, without=NETWORK):
+    elif len(shown) == len(rows) or differing(on_first, without=[*NETWORK, *THESIS]):
         figures["planners"] = planner_comparison_figure(on_first)
     common.save_figures(config, figures, folder)
     if config.report.tensorboard:
@@ -207,15 +218,18 @@ def save_comparison(config: DictConfig, rows: list[dict[str, Any]], folder: Path
             write_exploration_board(board, rows, figures)
 
 
-def _by_networks(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The rows of each framework on its first network; and all rows of the frameworks that ran on several."""
-    from gmmtorch.exploration.mission.results import NETWORK, variant_of
+def _by_first(
+    rows: list[dict[str, Any]], fields: Collection[str]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The rows of each framework with the first values of `fields`; and all rows of the frameworks that have
+    several."""
+    from gmmtorch.exploration.mission.results import variant_of
 
-    networks: dict[str, dict[Any, None]] = {}  # as an ordered set
+    values: dict[str, dict[Any, None]] = {}  # as an ordered set
     for row in rows:
-        networks.setdefault(row["framework"], {})[variant_of(row, NETWORK)] = None
-    on_first = [row for row in rows if variant_of(row, NETWORK) == next(iter(networks[row["framework"]]))]
-    return on_first, [row for row in rows if len(networks[row["framework"]]) > 1]
+        values.setdefault(row["framework"], {})[variant_of(row, tuple(fields))] = None
+    first = [row for row in rows if variant_of(row, tuple(fields)) == next(iter(values[row["framework"]]))]
+    return first, [row for row in rows if len(values[row["framework"]]) > 1]
 
 
 def _surfaces(components: Components | None) -> Components | None:

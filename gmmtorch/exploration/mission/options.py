@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.evaluation.codecs.point_codecs import POINT_CODECS
@@ -25,15 +26,32 @@ _MOST_ROBOTS = 31
 _LATE_JITTERS = 5
 """Mean jitters. Less than 1 % of the datagrams arrive later."""
 
-FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2"}
-"""Name in the thesis, by framework."""
+FRAMEWORKS = {"gmm_shared": "E0", "grid_shared": "E1", "grid_isolated": "E2", "gmm_thesis": "E0"}
+"""Name in the thesis, by framework. `gmm_thesis` is `gmm_shared` with the options of `THESIS`."""
+_MIXTURES = ("gmm_shared", "gmm_thesis")
+
+THESIS: dict[str, Any] = {
+    "codec": "thesis",
+    "update_novel": True,
+    "update_stride": None,
+    "update_at": 1.0,
+    "update_every": 1,
+    "distance_for": "free_space",
+    "novelty_block": 1,
+    "shell": 0.0,
+    "hits_per_ray": 1,
+}
+"""What chapter 4 of the thesis has where our E0 differs: the codec, and fields of `NoveltyRule` and of
+`FrameRule`. docs/exploration.md has what each of them changes."""
+_CODEC = "quantized"
 
 
 @dataclass(frozen=True)
 class TeamOptions:
     """How a team explores; the world is separate.
 
-    framework: one of `FRAMEWORKS`. size: number of robots. duration: simulated seconds.
+    framework: one of `FRAMEWORKS`; "gmm_thesis" sets the options of `THESIS`. size: number of robots.
+    duration: simulated seconds.
     seed: of sensor noise, network and planners. rate: frames per second (Hz).
     camera, dynamics, belief, novelty, frame: see their classes. A robot plans once every `dynamics.duration`.
     window: cells along x, y, z, around the robot, in which it plans.
@@ -71,7 +89,7 @@ class TeamOptions:
     n_rounds: int = 3
     planning_prior: float = 0.125
     rest: StoppingRule = field(default_factory=StoppingRule)
-    codec: str = "quantized"
+    codec: str = _CODEC
     latency: float = 0.05
     jitter: float = 0.0
     bandwidth: float | None = None
@@ -92,6 +110,8 @@ class TeamOptions:
             raise InvalidArgumentError(f"team={self.framework!r} is not one of {', '.join(FRAMEWORKS)}.")
         if self.planner not in PLANNERS:
             raise InvalidArgumentError(f"planner={self.planner!r} is not one of {', '.join(PLANNERS)}.")
+        if self.framework == "gmm_thesis":
+            self._set_thesis()
         check_whole("team.size", self.size, 1)
         if self.size > _MOST_ROBOTS:
             raise InvalidArgumentError(f"team.size={self.size} must be at most {_MOST_ROBOTS}.")
@@ -140,6 +160,27 @@ class TeamOptions:
                 f"take {near}."
             )
 
+    def _set_thesis(self) -> None:
+        """Gives the options of `THESIS` that have our defaults their values in the thesis."""
+        ours = {"codec": _CODEC, **vars(NoveltyRule()), **vars(FrameRule())}
+        for name, value in self.learning.items():
+            if value not in (ours[name], THESIS[name]):
+                raise InvalidArgumentError(
+                    f"team=gmm_thesis with {name}={value}: E0 of the thesis has {THESIS[name]}. Use "
+                    "team=gmm_shared, which takes any value."
+                )
+        for rule in ("novelty", "frame"):
+            given = getattr(self, rule)
+            changed = {name: value for name, value in THESIS.items() if name in vars(given)}
+            object.__setattr__(self, rule, replace(given, **changed))
+        object.__setattr__(self, "codec", THESIS["codec"])
+
+    @property
+    def learning(self) -> dict[str, Any]:
+        """The values of the options of `THESIS`, by name."""
+        known = {"codec": self.codec, **vars(self.novelty), **vars(self.frame)}
+        return {name: known[name] for name in THESIS}
+
     @property
     def tick_seconds(self) -> float:
         return 1 / self.rate
@@ -180,6 +221,11 @@ class TeamOptions:
     def separation(self) -> float:
         """Least distance (m) between the centres of two robots."""
         return 2 * self.dynamics.radius + self.margin
+
+    @property
+    def has_mixtures(self) -> bool:
+        """Whether the maps are mixtures; otherwise they are voxels."""
+        return self.framework in _MIXTURES
 
     @property
     def shares(self) -> bool:

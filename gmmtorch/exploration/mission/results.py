@@ -10,6 +10,7 @@ import torch
 
 from gmmtorch.evaluation.paired_statistics import time_to_share
 from gmmtorch.exploration.mission.mission import Mission
+from gmmtorch.exploration.mission.options import THESIS
 from gmmtorch.exploration.world.scoring import accuracy, disagreement, overlap
 
 PLANNING = ("planner", "information", "coordination", "planning_prior")
@@ -17,7 +18,7 @@ NETWORK = (
     *("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions"),
     *("announce", "budget"),
 )
-VARIANT = ("framework", *PLANNING, "codec", *NETWORK)
+VARIANT = ("framework", *PLANNING, *THESIS, *NETWORK)
 """Fields of a row that say which variant of a study it belongs to."""
 _LOSSES = ("loss", "partitions")
 
@@ -43,7 +44,7 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "planner": options.planner,
         "information": options.information,
         "coordination": mission.coordination.name,
-        "codec": options.codec,
+        **options.learning,
         "planning_prior": options.planning_prior,
         "delay": options.latency,
         "jitter": options.jitter,
@@ -93,11 +94,13 @@ def variant_of(
 
 
 def differing(rows: Sequence[Mapping[str, Any]], without: Collection[str] = ()) -> list[str]:
-    """The fields of `VARIANT` in which rows differ."""
+    """The fields of `VARIANT` in which rows differ. The name `gmm_thesis` stands for the options `THESIS`."""
+    free = [row for row in rows if row.get("framework") != "gmm_thesis"]
     return [
         field
         for field in VARIANT
-        if field not in without and len({_hashable(row.get(field)) for row in rows}) > 1
+        if field not in without
+        and len({_hashable(row.get(field)) for row in (free if field in THESIS else rows)}) > 1
     ]
 
 

@@ -149,7 +149,7 @@ def _mapper(
     local = RollingWindow(world.resolution, (x, y, z), _SLACK, options.device)
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
     width = options.camera.width
-    if options.framework != "gmm_shared":
+    if not options.has_mixtures:
         team = options.shares, options.size
         return GridMapper(number, local, belief, width, options.novelty, evidence, *team, memo.decoded)
     shared: Replica | Broadcast

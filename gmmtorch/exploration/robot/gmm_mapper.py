@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_whole
@@ -19,7 +21,7 @@ from gmmtorch.exploration.robot.mapper import FrameUpdate, Mapper, Memo, novel_b
 from gmmtorch.exploration.robot.radio import ReceivedMessage
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.association import count_explained, summed
+from gmmtorch.mapping.learning.association import box_around, count_explained, explained_within, summed
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
 from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
@@ -34,10 +36,7 @@ from gmmtorch.sharing.broadcast import Broadcast
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
-_HITS_PER_RAY = 8
 _LEEWAY = 0.5  # cells
-_FRAMES_PER_COUNT = 10
-"""Frames between two messages of counts: they are then few and large, and seldom change the mixture."""
 _EMPTY_LENGTH = 0.75  # of the length of components of surfaces
 _EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
 _EMPTY_CUTOFF = 2.0
@@ -50,8 +49,14 @@ class FrameRule:
 
     rays: for each cell that a component covers; see `component_evidence`.
     shell: cells in front of a component's surface that its rays do not count as free.
-    update_at: counts of a component are sent once they have grown by this factor.
-    update_stride: of the explained beams, every `update_stride`-th is counted, with that weight.
+    hits_per_ray: points drawn from a component of a surface for each of its rays.
+    novelty_block: pixels along the side of the blocks of the image whose novelty one beam decides.
+    update_novel: novel beams that components explain are counted to these, and only the others are learned.
+    update_stride: of the beams that are not novel, every `update_stride`-th is counted, with that weight, to
+        the components that explain it; null: none, they are discarded.
+    update_at: counts of a component are sent once they have grown by this factor; 1: always.
+    update_every: frames between two messages of counts: they are then few and large, and seldom change the
+        mixture.
     """
 
     noise: float = 0.03
@@ -61,8 +66,12 @@ class FrameRule:
     iterations: int = 4
     rays: float = 4.0
     shell: float = 0.5
+    hits_per_ray: int = 8
+    novelty_block: int = 3
+    update_novel: bool = False
+    update_stride: int | None = 11
     update_at: float = 3.0
-    update_stride: int = 11
+    update_every: int = 10
 
     def __post_init__(self) -> None:
         for name in ("noise", "length", "cell"):
@@ -72,10 +81,12 @@ class FrameRule:
             raise InvalidArgumentError(
                 f"rays={self.rays} must be above zero, shell={self.shell} at least zero."
             )
-        for name in ("components", "iterations", "update_stride"):
+        for name in ("components", "iterations", "hits_per_ray", "novelty_block", "update_every"):
             check_whole(name, getattr(self, name), 1)
-        if not self.update_at > 1:
-            raise InvalidArgumentError(f"update_at={self.update_at} must be above 1.")
+        if self.update_stride is not None:
+            check_whole("update_stride", self.update_stride, 1)
+        if not 1 <= self.update_at < math.inf:
+            raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
 
     def surface_fit(self) -> SurfaceFit:
         """How the returns of a frame become components."""
@@ -114,6 +125,7 @@ class GmmMapper(Mapper):
         self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
         self._n_frames = 0
         self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
+        self._by_place: list[tuple[Tensor, Components]] = []  # batches with the box (2, 3) that they explain
 
     # -- sensing ----------------------------------------------------------------------------------
 
@@ -123,36 +135,62 @@ class GmmMapper(Mapper):
         regenerate(self.local, boxes, self.tiles, self._evidence)
 
     def sense(self, frame: DepthFrame) -> FrameUpdate:
-        # Components do not count cells close to surfaces as free: this must not make beams novel.
-        short = (self._rule.shell + _LEEWAY) * self.local.resolution if self._rule.shell else 0.0
-        novel = novel_beams(self.local, frame, self._width, self._novelty, self.belief.grid.box, short)
-        self._count(frame, ~novel)
-        self.shared.add(self._learned(frame, novel).to("cpu"))  # where messages are encoded
+        rule = self._rule
+        novel = learned = self._novel(frame)
+        if rule.update_novel:
+            learned = novel & ~self._count(frame, novel.nonzero().squeeze(1), 1)
+        if rule.update_stride is not None:
+            self._count(frame, (~novel).nonzero().squeeze(1)[:: rule.update_stride], rule.update_stride)
+        components = self._learned(frame, learned)
+        self.shared.add(components.to("cpu"))  # where messages are encoded
         self._n_frames += 1
-        if self._n_frames % _FRAMES_PER_COUNT == 0:
+        if self._n_frames % rule.update_every == 0:
             self.shared.count(self._due)
             self._due = {}
         return FrameUpdate(self._follow(), novel)
+
+    def _novel(self, frame: DepthFrame) -> Tensor:
+        """Which beams (N,) of a frame are novel."""
+        rule = self._rule
+        # Components do not count cells close to surfaces as free: this must not make beams novel.
+        short = (rule.shell + _LEEWAY) * self.local.resolution if rule.shell else 0.0
+        within, side = self.belief.grid.box, rule.novelty_block
+        return novel_beams(self.local, frame, self._width, self._novelty, within, short, side)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams."""
         scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
         return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
 
-    def _count(self, frame: DepthFrame, known: Tensor) -> None:
-        """Adds the beams (N,) that were not novel to the counts of the components that explain them."""
-        nearby = self._seen_from_near(frame.origin)
-        chosen = known.nonzero().squeeze(1)[:: self._rule.update_stride]
+    def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
+        """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;
+        returns which of all beams (N,) are explained."""
+        rule, found = self._novelty, torch.zeros_like(frame.is_hit)
+        is_near = rule.distance_for == "all"
+        nearby = self._seen_from_near(frame.origin) if is_near else self._around(frame.ends[chosen])
         if nearby is None or len(chosen) == 0:
-            return
-        weight = float(self._rule.update_stride)
+            return found
+        # A beam whose way alone makes it novel contributes free space, and so does one without return.
+        way = replace(frame, is_hit=torch.zeros_like(frame.is_hit))
+        frees = None if is_near else self._novel(way) | ~frame.is_hit
         counted = nearby
         for max_range in (False, True):
-            ends = frame.ends[chosen[frame.is_hit[chosen] != max_range]]
-            counted = count_explained(
-                counted, ends, frame.origin, self._novelty.distance, None, max_range, weight
-            ).components
-        gain = counted.support - nearby.support
+            beams = chosen[frame.is_hit[chosen] != max_range]
+            counted, found[beams] = count_explained(
+                counted,
+                frame.ends[beams],
+                frame.origin,
+                rule.distance,
+                rule.explained,
+                max_range,
+                weight,
+                None if frees is None else frees[beams],
+            )
+        self._gain(nearby, counted.support - nearby.support)
+        return found
+
+    def _gain(self, nearby: Components, gain: Tensor) -> None:
+        """Adds points (K,) to the counts of components; counts that have grown enough become due."""
         rows = (gain > 0).nonzero().squeeze(1)
         columns = (nearby.ids[rows], gain[rows], nearby.support[rows])
         for (robot, sequence), gained, support in zip(*(c.tolist() for c in columns), strict=True):
@@ -162,6 +200,15 @@ class GmmMapper(Mapper):
                 self._due[key] = self._due.get(key, 0.0) + total
             else:
                 self._gained[key] = total
+
+    def _around(self, points: Tensor) -> Components | None:
+        """Components with all their counts, of batches that may explain points (M, 3); None: none may."""
+        if not self._by_place or len(points) == 0:
+            return None
+        first, last = points.aminmax(dim=0)
+        low, high = torch.stack([box for box, _ in self._by_place], 1)
+        near = ((low <= last) & (high >= first)).all(1).nonzero().squeeze(1).tolist()
+        return summed(Components.concatenate([self._by_place[n][1] for n in near])) if near else None
 
     def _seen_from_near(self, origin: Tensor) -> Components | None:
         """Components with all their counts, of batches seen from near a place (3,); None: there are none."""
@@ -202,7 +249,7 @@ class GmmMapper(Mapper):
         evidence."""
         self.local.clear()
         self.belief.clear()
-        self.tiles, self._by_origin = MixtureTiles(), {}
+        self.tiles, self._by_origin, self._by_place = MixtureTiles(), {}, []
         everything = self.shared.components()
         if len(everything):
             self._enter(everything)
@@ -214,6 +261,8 @@ class GmmMapper(Mapper):
         self.tiles.add(len(self.tiles), there)
         for cell in {self._origin_cell(origin) for origin in batch.origins}:
             self._by_origin.setdefault(cell, []).append(there)
+        low, high = box_around(there, explained_within(3, self._novelty.explained))
+        self._by_place.append((torch.stack([low.amin(0), high.amax(0)]), there))
         evidence = self._memo(_key(batch), lambda: self._evidence(there, grid.resolution, grid.box))
         self._add(evidence)
         return evidence
@@ -233,7 +282,7 @@ class GmmMapper(Mapper):
                     box,
                     rays_per_cell=rule.rays,
                     shell=rule.shell,
-                    hits_per_ray=_HITS_PER_RAY,
+                    hits_per_ray=rule.hits_per_ray,
                     thinned=True,
                 )
             )

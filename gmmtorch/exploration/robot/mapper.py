@@ -80,8 +80,8 @@ class LocalMap:
 
 
 T = TypeVar("T")
-_BLOCK = 3
-"""Pixels along the side of the blocks that one beam represents."""
+NOVELTY_BLOCK = 3
+"""Pixels along the side of the blocks whose novelty one beam decides."""
 
 
 class FrameUpdate(NamedTuple):
@@ -214,17 +214,18 @@ def novel_beams(
     rule: NoveltyRule,
     within: Box,
     short: float = 0.0,
+    side: int = NOVELTY_BLOCK,
 ) -> Tensor:
     """Which beams (N,) of a frame are novel to a map.
 
-    The first beam of each block of 3 × 3 pixels decides for the block: neighbouring pixels are much closer to
-    one another than the cells are wide.
+    The first beam of each block of `side` × `side` pixels decides for the block: neighbouring pixels are much
+    closer to one another than the cells are wide.
 
     Args:
         width: of the image, pixels. within, short: see `beam_novelty`.
     """
-    n, across = len(frame.pixel), -(-width // _BLOCK)
-    block = frame.pixel // (_BLOCK * width) * across + frame.pixel % width // _BLOCK
+    n, across = len(frame.pixel), -(-width // side)
+    block = frame.pixel // (side * width) * across + frame.pixel % width // side
     first = block.new_full((int(block.max()) + 1 if n else 0,), n)
     first.scatter_reduce_(0, block, torch.arange(n, device=block.device), "amin")
     present = first < n

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from gmmtorch.occupancy.cones import whitening
 
 _LEAST_DISTANCE = 1e-6  # squared Mahalanobis: the thesis's shares are undefined at a mean
 _PAIRS_AT_ONCE = 1 << 20
+_POINTS_AT_ONCE = 512  # neighbouring points that few components can explain
 
 
 class Explained(NamedTuple):
@@ -31,6 +33,7 @@ def count_explained(
     explained: float | None = None,
     max_range: bool = False,
     weight: float = 1.0,
+    frees: Tensor | None = None,
 ) -> Explained:
     """Counts points (N, D), observed from `origin` (D,), to the components that explain them.
 
@@ -43,30 +46,49 @@ def count_explained(
         explained: squared Mahalanobis distance; None: the 95 % quantile of χ² with D degrees of freedom.
         max_range: the points are ends of no-return beams, which only `max_range` components explain.
         weight: number of measured points for which each point stands.
+        frees: (N,) bool, points whose beams contribute free space. Only these ask for an origin within
+            `distance`, as in the thesis. None: all points ask for it.
     """
     n, k = points.shape[0], len(components)
     found = torch.zeros(n, dtype=torch.bool, device=points.device)
     near, nearest = _nearest_viewpoints(components, origin, distance)
-    rows = (near & (components.max_range == max_range)).nonzero().squeeze(1)
+    is_candidate = components.max_range == max_range
+    rows = (is_candidate & near if frees is None else is_candidate).nonzero().squeeze(1)
     if n == 0 or len(rows) == 0:
         return Explained(components, found)
-    if explained is None:
-        from scipy.stats import chi2
-
-        explained = float(chi2.ppf(0.95, components.dim))
+    limit = explained_within(components.dim, explained)
     inverse, _ = whitening(components.covariances[rows])
+    means = components.means[rows].double()
     gained = components.support.new_zeros(len(rows))
-    step = max(1, _PAIRS_AT_ONCE // len(rows))
-    for begin in range(0, n, step):
-        offset = points[begin : begin + step, None].double() - components.means[rows].double()
-        squared = torch.einsum("kij,nkj->nki", inverse, offset).square().sum(-1)
-        share = torch.where(squared < explained, squared.clamp_min(_LEAST_DISTANCE).reciprocal(), 0.0)
+    reach = None if frees is None else box_around(components.selected(rows), limit)
+    for part, some in _portions(points, len(rows), reach):
+        offset = points[part, None].double() - means[some]
+        squared = torch.einsum("kij,nkj->nki", inverse[some], offset).square().sum(-1)
+        explains = squared < limit
+        if frees is not None:
+            explains &= near[rows[some]] | ~frees[part, None]
+        share = torch.where(explains, squared.clamp_min(_LEAST_DISTANCE).reciprocal(), 0.0)
         total = share.sum(1)
-        found[begin : begin + step] = total > 0
-        gained += (share / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]).sum(0)
+        found[part] = total > 0
+        gained[some] += (share / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]).sum(0)
     gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
     counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
     return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
+
+
+def explained_within(dim: int, explained: float | None) -> float:
+    """The squared Mahalanobis distance within which components explain points; see `count_explained`."""
+    if explained is not None:
+        return explained
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(0.95, dim))
+
+
+def box_around(components: Components, squared: float) -> tuple[Tensor, Tensor]:
+    """Lowest and highest corners (K, D) of boxes around the points within a squared Mahalanobis distance."""
+    half = (components.covariances.diagonal(dim1=1, dim2=2).double() * (squared * (1 + 1e-9))).sqrt()
+    return components.means.double() - half, components.means.double() + half
 
 
 def summed(components: Components) -> Components:
@@ -81,6 +103,26 @@ def summed(components: Components) -> Components:
     support = components.support.new_zeros(n_ids).index_add_(0, row, components.support)
     kept = components.selected(first)
     return replace(kept, support=support, seen_count=support[kept.seen_by])
+
+
+def _portions(points: Tensor, k: int, boxes: tuple[Tensor, Tensor] | None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Portions of points (N, D), as indices, and the indices of the components that may explain them.
+
+    boxes: lowest and highest corners (K, D) of what the components explain. Portions are then neighbouring
+        points, with the few of the K components whose boxes meet them. None: all components.
+    """
+    n, device = len(points), points.device
+    if boxes is None:
+        for part in torch.arange(n, device=device).split(max(1, _PAIRS_AT_ONCE // k)):
+            yield part, torch.arange(k, device=device)
+        return
+    low, high = boxes
+    order = torch.arange(n, device=device)
+    for axis in range(points.shape[1]):  # the last axis, in rising order within cells of a metre
+        order = order[points[order, axis].floor().argsort(stable=True)]
+    for part in order.split(min(_POINTS_AT_ONCE, max(1, _PAIRS_AT_ONCE // k))):
+        first, last = points[part].double().aminmax(dim=0)
+        yield part, ((low <= last) & (high >= first)).all(1).nonzero().squeeze(1)
 
 
 def _nearest_viewpoints(components: Components, origin: Tensor, distance: float) -> tuple[Tensor, Tensor]:

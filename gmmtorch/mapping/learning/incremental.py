@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 
 import torch
+from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
@@ -129,14 +130,25 @@ def _explain(
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
+        frees = _contribute_free_space(components, novel, rule)
         keep = []
-        for points, max_range in ((novel.points, False), (novel.no_return, True)):
+        for points, max_range, free in (
+            (novel.points, False, frees),
+            (novel.no_return, True, None),
+        ):
             components, explained = count_explained(
-                components, points, scan.origin, rule.distance, rule.explained, max_range, weight
+                components, points, scan.origin, rule.distance, rule.explained, max_range, weight, free
             )
             keep.append(~explained)
         remaining.append(novel.select(torch.cat(keep)))
     return components, remaining
+
+
+def _contribute_free_space(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor | None:
+    """Which returns (N,) of a scan are novel by their way alone; None if all count as such."""
+    if rule.distance_for == "all":
+        return None
+    return novel_beams(components, Scan(scan.points[:0], scan.origin, scan.points), rule)
 
 
 def _within_budget(components: Components, rule: IncrementalRule, size: Size) -> Components:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 SOFTMAX_DTYPES = ("float32", "float64")
 """Names of the types in which EM can compute exponentials."""
 
+DISTANCE_FOR = ("all", "free_space")
+
 
 @dataclass(frozen=True)
 class NoveltyRule:
@@ -35,6 +37,8 @@ class NoveltyRule:
         None: the 95 % quantile of χ² with D degrees of freedom.
     distance: a component explains the free space of a beam only if one of its sensor origins is within
         this distance (m) of the sensor (d_s of the thesis).
+    distance_for: beams that ask for `distance`: all, or free_space: only those whose way before the end is
+        novel, and no-return beams, as in the thesis.
     """
 
     resolution: float = 0.1
@@ -44,10 +48,15 @@ class NoveltyRule:
     cutoff: float = 5.0
     explained: float | None = None
     distance: float = 0.5
+    distance_for: str = "all"
 
     def __post_init__(self) -> None:
         check_resolution(self.resolution)
         check_prior(self.prior)
+        if self.distance_for not in DISTANCE_FOR:
+            raise InvalidArgumentError(
+                f"distance_for={self.distance_for!r} is not one of {', '.join(DISTANCE_FOR)}."
+            )
         for name in ("threshold", "observed", "distance"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be finite, at least zero.")

@@ -19,6 +19,7 @@ from gmmtorch.report import style
 from gmmtorch.report.exploration.trial_groups import (
     about,
     by_framework,
+    by_variant,
     framework_colour,
     framework_name,
     paired_difference,
@@ -38,6 +39,8 @@ class _Measure(NamedTuple):
     by_ratio: bool = False
 
 
+_MOST_ALL_PAIRS = 3
+"""Frameworks that are all compared with each other; more are compared with the first only."""
 _MEASURES = (
     _Measure("bytes_sent", "bytes sent", by_ratio=True),
     _Measure("t90", "t90", "s"),
@@ -52,7 +55,8 @@ def summary_bars(rows: Rows) -> Figure:
     Above: a dot per seed, and the mean with its 95 % interval. If a seed has no value (it never reached t90),
     text says how many have one, because a mean of these would be biased. Below: the mean difference of two
     frameworks over their common seeds with its paired 95 % interval, and a line at zero; for bytes, the
-    geometric mean of the ratio, and a line at one. Empty if a seed has no value.
+    geometric mean of the ratio, and a line at one. Empty if a seed has no value. With more than three
+    frameworks, only the first is compared with the others.
 
     Args:
         rows: explore rows of `results.json`.
@@ -62,6 +66,8 @@ def summary_bars(rows: Rows) -> Figure:
     """
     groups = by_framework(rows)
     pairs = list(itertools.combinations(groups, 2))
+    if len(groups) > _MOST_ALL_PAIRS:
+        pairs = [pair for pair in pairs if pair[0] == next(iter(groups))]
     figure = style.new_figure(3.2 * len(_MEASURES) + 1.0, 5.9 if pairs else 3.9)
     grid = figure.subplots(
         2 if pairs else 1, len(_MEASURES), squeeze=False, height_ratios=[1.25, 1] if pairs else [1]
@@ -80,6 +86,54 @@ def summary_bars(rows: Rows) -> Figure:
         style.draw_grid(axes, "y")
     names = ", ".join(framework_name(name) for name in groups)
     style.figure_title(figure, f"{about(rows)}: {names}\n{seeds_note(rows, '95 % interval')}")
+    return figure
+
+
+_DEVIATION_MEASURES = (
+    _Measure("entropy_reduction_bits", "entropy removed", by_ratio=True),
+    _Measure("t90", "t90", "s"),
+    _Measure("auc", "AUC"),
+    _Measure("bytes_sent", "bytes sent", by_ratio=True),
+)
+
+
+def deviations_figure(rows: Rows) -> Figure:
+    """Draws, for each variant, its mean difference to the first one, over common seeds with the paired 95 %
+    interval: entropy removed (ratio), t90, AUC, and bytes sent (ratio).
+
+    An interval that does not contain the line of no difference has the variant's colour, others are grey. A
+    variant without a value for some seed has none.
+
+    Raises:
+        InvalidArgumentError: no row, or only one variant.
+    """
+    (usual, first), *others = by_variant(rows, otherwise="framework").items()
+    if not others:
+        raise InvalidArgumentError(f"rows contain one variant, {usual}; give another one to compare.")
+    figure = style.new_figure(2.9 * len(_DEVIATION_MEASURES) + 2.4, 1.9 + 0.36 * len(others))
+    columns = figure.subplots(1, len(_DEVIATION_MEASURES), sharey=True)
+    for axes, measure in zip(columns, _DEVIATION_MEASURES, strict=True):
+        none = 1.0 if measure.by_ratio else 0.0
+        axes.axvline(none, color="#777777", linewidth=1)
+        values = _by_seed(first, measure)
+        for place, (_, trials) in enumerate(others):
+            interval = paired_difference(_by_seed(trials, measure), values, by_ratio=measure.by_ratio)
+            if interval is None:
+                continue
+            mean, low, high = interval
+            hue = "#888888" if low <= none <= high else framework_colour(str(trials[0]["framework"]))
+            if math.isfinite(low) and math.isfinite(high):
+                axes.plot([low, high], [place, place], color=hue, linewidth=2)
+            axes.plot(mean, place, "o", color=hue, markersize=6)
+        if measure.field == "bytes_sent":
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}×"))
+        kind = "ratio" if measure.by_ratio else f"difference{f' [{measure.unit}]' if measure.unit else ''}"
+        style.label_axes(axes, measure.title, kind, "")
+        style.draw_grid(axes, "x")
+    columns[0].set_yticks(range(len(others)), [name for name, _ in others], fontsize=style.LABEL_SIZE)
+    columns[0].set_ylim(len(others) - 0.5, -0.5)
+    style.figure_title(figure, f"{about(rows)}: variants beside {usual}\n{seeds_note(rows, '95 % interval')}")
     return figure
 
 

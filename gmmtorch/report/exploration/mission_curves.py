@@ -40,6 +40,7 @@ _SIZE = (9.6, 5.4)  # inches
 _BYTE_LINES = (
     ("gmm_shared", "bytes_over_time", "E0, as sent", framework_colour("gmm_shared"), "-"),
     ("grid_shared", "bytes_over_time", "E1, as sent", framework_colour("grid_shared"), "-"),
+    ("gmm_thesis", "bytes_over_time", "E0 of the thesis, as sent", framework_colour("gmm_thesis"), "-"),
     ("gmm_shared", "raw_points_bytes_over_time", "E0's novel points, raw", style.PALETTE[6], "--"),
     ("gmm_shared", "draco_bytes_over_time", "same points, Draco", style.PALETTE[3], "-."),
     ("gmm_shared", "octree_bytes_over_time", "same points, zstd octree", style.PALETTE[4], ":"),
@@ -101,8 +102,8 @@ def planner_comparison_figure(rows: Rows) -> Figure:
 def bandwidth_figure(rows: Rows, draco_error: float = 0.03) -> Figure:
     """Draws the cumulative bytes that the team shared over time, on a logarithmic axis (Fig 4.5).
 
-    Lines are what E0 and E1 sent, and the novel points of the frames that E0 learned from in other codecs:
-    means over seeds in 95 % bands. Labels give the mean total, and its ratio to that of E0.
+    Lines are what E0, E1 and the thesis's E0 sent, and the novel points of the frames that E0 learned from in
+    other codecs: means over seeds in 95 % bands. Labels give the mean total, and its ratio to that of E0.
 
     Args:
         rows: explore rows; E2 sends nothing and has no line. Series that are null are left out.

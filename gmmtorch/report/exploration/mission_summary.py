@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gmmtorch.exploration.mission.results import NETWORK, differing
-from gmmtorch.report.exploration.trial_groups import by_variant, check_rows, paired_difference
+from gmmtorch.report.exploration.trial_groups import by_variant, check_rows, named_fields, paired_difference
 from gmmtorch.report.style import Rows
 from gmmtorch.report.tensorboard_writer import Board
 
@@ -152,7 +152,7 @@ def write_exploration_board(board: Board, rows: Rows, figures: Mapping[str, Figu
     """
     fields = differing(rows, without=["framework"])
     for row in rows:
-        tag = f"{row['framework']}/{_variant(row, fields)}seed_{row['seed']}"
+        tag = f"{row['framework']}/{_variant(row, named_fields(row, rows[0], fields))}seed_{row['seed']}"
         _write_series(board, row, tag)
         board.scalars(row, tag, step=int(row["times"][-1]))
     for name, figure in figures.items():

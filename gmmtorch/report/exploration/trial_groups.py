@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Band, Interval, mean_band, on_common_times, paired_interval
+from gmmtorch.exploration.mission.options import THESIS
 from gmmtorch.exploration.mission.results import NETWORK, differing, variant_of
 from gmmtorch.report import style
 from gmmtorch.report.style import Rows
@@ -20,8 +21,10 @@ FRAMEWORKS = {
     "gmm_shared": "E0 shared mixtures",
     "grid_shared": "E1 shared grids",
     "grid_isolated": "E2 isolated grids",
+    "gmm_thesis": "E0 of the thesis",
 }
 """Names of the thesis's frameworks, in the order of figures."""
+_COLOURS = dict(zip(FRAMEWORKS, (*style.PALETTE[:3], style.PALETTE[5]), strict=True))
 
 TIME = "simulated time [s]"
 REMAINING = "remaining entropy [% of observable]"
@@ -36,18 +39,20 @@ def framework_name(framework: str) -> str:
 
 
 def short_name(framework: str) -> str:
-    """Returns E0, E1 or E2 for the thesis's frameworks, else the name."""
+    """Returns E0, E1, E2 or thesis for the thesis's frameworks, else the name."""
+    if framework == "gmm_thesis":
+        return "thesis"
     name = framework_name(framework)
     return name.split()[0] if framework in FRAMEWORKS else name
 
 
 def framework_colour(framework: str) -> str:
     """Returns the colour of a framework; the same in every figure."""
-    return style.colour(list(FRAMEWORKS).index(framework)) if framework in FRAMEWORKS else style.PALETTE[-1]
+    return _COLOURS.get(framework, style.PALETTE[-1])
 
 
 def by_framework(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    """Groups rows by framework: E0, E1, E2, then others in order of occurrence.
+    """Groups rows by framework: E0, E1, E2, E0 of the thesis, then others in order of occurrence.
 
     Raises `InvalidArgumentError` if there is no row.
     """
@@ -68,13 +73,23 @@ def by_variant(rows: Rows, otherwise: str = "planner") -> dict[str, list[Mapping
     """Groups rows by the options in which they differ, in order of occurrence; the names list these options.
 
     If rows differ in none, the name is the value of the field `otherwise`. A variant whose name would be
-    empty, because its network has no faults, is called lossless.
+    empty, because its network has no faults, is called lossless. Options of `THESIS` are named where they
+    differ from those of the first row.
     """
     fields = differing(rows) or [otherwise]
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(_variant_name(row, fields), []).append(row)
+        named = named_fields(row, rows[0], fields) or fields
+        groups.setdefault(_variant_name(row, named), []).append(row)
     return groups
+
+
+def named_fields(row: Mapping[str, Any], first: Mapping[str, Any], fields: Sequence[str]) -> list[str]:
+    """Returns the `fields` that name the variant of a row: without options of `THESIS` that are as in the
+    first row, or that the framework implies."""
+    is_thesis = row.get("framework") == "gmm_thesis"
+    implied = {field for field in THESIS if is_thesis or row.get(field) == first.get(field)}
+    return [field for field in fields if field not in implied]
 
 
 def _variant_name(row: Mapping[str, Any], fields: Sequence[str]) -> str:
@@ -108,6 +123,8 @@ def _option_text(field: str, value: Any) -> str:
             return f"reach {value:g} m"
         case (("delay" | "jitter" | "announce"), (int() | float())):
             return f"{field} {value:g} s"
+        case _ if field in THESIS and field != "codec":
+            return f"{field}={'null' if value is None else str(value).lower()}"
         case _:
             return _NAMES.get(str(value), style.label_of(str(value)))
 
