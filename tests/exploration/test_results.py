@@ -118,9 +118,11 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
     mask[: len(seen_by)] = torch.tensor(seen_by, dtype=torch.int16)
     mask[20:] = 7  # not observable: not counted
     names = ["framework", "seed", "planner", "information", "planning_prior", "loss", "duration"]
-    names += ["coordination", "codec", "latency", "jitter", "bandwidth", "duplication", "reach"]
+    names += ["coordination", "latency", "jitter", "bandwidth", "duplication", "reach"]
     names += ["announce_every", "budget"]
-    options = SimpleNamespace(size=3, codecs=("zip",), partitions=(), **dict.fromkeys(names, "x"))
+    options = SimpleNamespace(
+        size=3, codecs=("zip",), partitions=(), learning={"shell": 0.5}, **dict.fromkeys(names, "x")
+    )
     robots = [
         SimpleNamespace(
             path_length=length,

@@ -129,6 +129,7 @@ def test_novelty_is_the_same_far_from_the_world_origin():
         {"cutoff": 0.0},
         {"explained": 0.0},
         {"distance": -0.1},
+        {"distance_for": "some"},
     ],
 )
 def test_invalid_novelty_rules_are_refused(bad):
