@@ -13,6 +13,8 @@ from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.studies import occupancy_studies, study
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from gmmtorch.evaluation.events import Event, Row
     from gmmtorch.evaluation.held_out import Built, Outcome
     from gmmtorch.mapping.components import Components
@@ -91,6 +93,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
     low, high = robust_bounds(points[:: max(1, len(points) // 200_000)], trajectory)
+    surfaces = _surfaces(outcome)
     figures: dict[str, Any] = {"auc_against_kept": auc_against_kept_figure(outcome.rows)}
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
@@ -103,11 +106,12 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
         for number, (corner, other) in enumerate(regions, 1):
             close = [MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
             figures[f"map_{resolution:g}m_region_{number}"] = map_figure(close)
+        if config.report.scene and len(low) == 3:
+            figures[f"scene_{resolution:g}m"] = _scene(shown, points, trajectory, surfaces)
         curves = {_label(built): built.roc for built in shown}
         about = f"{shown[0].row['dataset']}, {resolution:g} m"
         figures[f"roc_{resolution:g}m"] = roc_figure(curves, about)
         figures[f"reliability_{resolution:g}m"] = _reliability(shown, about)
-    surfaces = _surfaces(outcome)
     if surfaces is not None:
         figures["mixture"] = mixture_figure(
             points,
@@ -131,6 +135,25 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
         known = built.asked.labels <= OCCUPIED
         curves[_label(built)] = reliability(built.theta[known], built.asked.labels[known])
     return reliability_figure(curves, f"Reliability: {about}")
+
+
+def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces: Components | None) -> Any:
+    """The maps of one resolution in space, beside the points and the surfaces of the `GaussianMap`."""
+    from gmmtorch.report.scenes.map_scenes import OccupancyPanel, map_scene_figure
+    from gmmtorch.report.style import label_of
+    from gmmtorch.report.table import byte_text
+
+    maps = []
+    for built in shown:
+        row = built.row
+        n = "" if row["n_components"] is None else f"{row['n_components']:,} components, "
+        title = f"{_label(built)}: {n}{byte_text(row['nbytes'])}, AUC {row['auc']:.3f}"
+        maps.append(OccupancyPanel(title, built.answer))
+    resolution = shown[0].row["resolution"]
+    title = (
+        f"{label_of(shown[0].row['dataset'])}: cells of {100 * resolution:g} cm that each map calls occupied"
+    )
+    return map_scene_figure(points, trajectory, maps, resolution, surfaces, title=title)
 
 
 def _image_limits(shown: Sequence[Built]) -> dict[str, Any]:

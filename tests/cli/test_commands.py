@@ -83,7 +83,7 @@ def test_results_have_the_documented_fields(whole_run):
     assert results["command"] == command
     assert results["version"] == gmmtorch.__version__
     assert results["seed"] == results["config"]["seed"] == 0
-    extra = {"magnify": 0} if command == "occupancy" else {}
+    extra = {"magnify": 0, "scene": False} if command == "occupancy" else {}
     assert results["config"]["report"] == {"progress": True, "figures": True, "tensorboard": True, **extra}
     fields = OCCUPANCY_FIELDS if command == "occupancy" else FIT_FIELDS
     assert len(results["rows"]) == 2

@@ -10,7 +10,14 @@ from command_runs import QUIET, Finished, refused, run_here, succeeded
 
 Run = Callable[..., Finished]
 SHOWN = ["report.figures=true", "report.tensorboard=true"]
+SMALL_2D = "dataset.n_scans=8 evaluation.test_every=4 evaluation.resolution=[0.5] map.n_samples=20000"
 TINY = {
+    "fig3_4_auc_sparsity_2d": f"{SMALL_2D} evaluation.kept=[1.0,0.5]",
+    "fig3_5_maps_2d": f"{SMALL_2D} method=[occupancy_grid,monte_carlo]",
+    "fig3_6_auc_sparsity_3d": "dataset.n_scans=4 evaluation.test_every=2 evaluation.kept=[1.0,0.1] "
+    "map.n_samples=20000",
+    "fig3_7_maps_3d": "dataset.n_scans=3 evaluation.test_every=2 map.n_components=40 map.n_samples=20000 "
+    "method_options.bgk_points.max_points=300 evaluation.resolution=[0.5]",
     "fig3_3_approximation_error": (
         "study.n_pixels=2 study.n_components=2 study.n_cells=2 study.n_rays=[64] study.tolerance=[0.1] "
         "study.n_large_samples=256 study.n_samples=64 study.resolution=3"
@@ -57,6 +64,35 @@ def assert_shown(done: Finished, pictures: set[str], *tags: str) -> None:
         single = {f"{prefix}/{line[0]}" for line in lines for prefix in prefixes}
     assert set(found["images"]) == {f"figures/{name}" for name in pictures}
     assert set(tags) <= {*found["scalars"], *single}
+
+
+def test_auc_against_sparsity_in_2d(run):
+    done = succeeded(run("fig3_4_auc_sparsity_2d"))
+    rows = done.results()["rows"]
+    methods = ["occupancy_grid", "hilbert", "cone", "flux", "monte_carlo", "point"]
+    assert [(row["kept"], row["method"]) for row in rows] == [(k, m) for k in (1.0, 0.5) for m in methods]
+    assert all(0 < row["auc_low"] <= row["auc"] <= row["auc_high"] <= 1 for row in rows)
+
+
+def test_maps_in_2d_with_magnified_regions(run):
+    done = succeeded(run("fig3_5_maps_2d", "report.figures=true"))
+    assert {"map_0.5m.png", "map_0.5m_region_1.png", "map_0.5m_region_2.png"} <= set(done.files())
+
+
+def test_auc_against_sparsity_in_3d(run):
+    rows = succeeded(run("fig3_6_auc_sparsity_3d")).results()["rows"]
+    methods = ["occupancy_grid", "monte_carlo", "point"]
+    assert [(row["kept"], row["method"]) for row in rows] == [(k, m) for k in (1.0, 0.1) for m in methods]
+    assert {row["resolution"] for row in rows} == {0.25}
+
+
+@pytest.mark.slow
+def test_maps_in_3d_are_drawn_in_space(run):
+    done = succeeded(run("fig3_7_maps_3d", "report.figures=true"))
+    rows = done.results()["rows"]
+    assert [row["method"] for row in rows] == ["monte_carlo", "bgk_points"]
+    assert rows[0]["n_components"] <= 40
+    assert "scene_0.5m.png" in done.files()
 
 
 @pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])

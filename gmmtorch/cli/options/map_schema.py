@@ -55,9 +55,14 @@ class Map:
 
 @dataclass
 class OccupancyReport(Report):
-    """magnify: number of regions of a 2D map with a magnified figure."""
+    """Figures of gmmtorch-occupancy.
+
+    magnify: number of regions of a 2D map with a magnified figure.
+    scene: draw 3D maps in space, beside the points and the components.
+    """
 
     magnify: int = 0
+    scene: bool = False
 
 
 @dataclass

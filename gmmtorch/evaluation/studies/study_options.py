@@ -92,9 +92,9 @@ class AucMemoryStudy:
         others: methods that have one size.
     """
 
-    forms: Sequence[str] = ("point",)
-    n_components: Sequence[int] = (100, 200, 300, 500, 1000)
-    bgk_points: Sequence[int] = (500, 1000, 2000, 5000, 10000)
+    forms: Sequence[str] = ("monte_carlo", "point")
+    n_components: Sequence[int] = (100, 250, 500, 1000)
+    bgk_points: Sequence[int] = (1555, 3095, 5010, 9472, 17011)
     others: Sequence[str] = ("occupancy_grid",)
 
     def __post_init__(self) -> None:

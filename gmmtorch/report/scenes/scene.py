@@ -58,6 +58,18 @@ def balls(centres: Tensor, radius: float, colours: Tensor) -> Ellipsoids:
     return Ellipsoids(centres, covariance.expand(k, 3, 3), colours.expand(k, 3))
 
 
+def path_balls(path: Tensor, radius: float, hue: str) -> Ellipsoids:
+    """Returns a path (M, 3), metres, as a string of small balls, so that surfaces can hide it.
+
+    `radius` is in metres; `hue` is a colour of matplotlib.
+    """
+    steps = (path[1:] - path[:-1]).norm(dim=1).cumsum(0)
+    along = np.concatenate([[0.0], steps.numpy()])
+    s = np.arange(0.0, along[-1] + radius, radius)
+    centres = np.stack([np.interp(s, along, path[:, axis].numpy()) for axis in range(3)], 1)
+    return balls(torch.from_numpy(centres), radius, torch.tensor(to_rgb(hue), dtype=torch.float64))
+
+
 def canvas_around(low: Sequence[float], high: Sequence[float], camera: Camera, pixels: int) -> Canvas:
     """Returns the picture plane, `pixels` wide, that shows the box between two corners (3,), world metres."""
     corners = torch.cartesian_prod(*(torch.tensor(pair).double() for pair in zip(low, high, strict=True)))
@@ -111,7 +123,7 @@ def draw_scene(
     axes.set_axis_off()
 
 
-def height_bar(figure: Figure, axes: Axes, scale: Normalize) -> None:
+def height_bar(figure: Figure, axes: Axes | Sequence[Axes], scale: Normalize) -> None:
     """Draws the colour bar of heights on shaded surfaces."""
     style.colour_bar(figure, ScalarMappable(scale, height_colour_map()), axes, "height z [m]", shrink=0.7)
 
@@ -166,7 +178,7 @@ def mixture_scene_figure(
     scale = style.height_scale(mean[kept, 2])
     components = Ellipsoids(mean[kept], covariance[kept], height_colours(mean[kept, 2], scale), top)
     radius = _PATH_PIXELS / canvas.scale
-    strings = [_string(path, radius, style.colour(robot)) for robot, path in enumerate(paths)]
+    strings = [path_balls(path, radius, style.colour(robot)) for robot, path in enumerate(paths)]
     draw_scene(axes, [components, *strings], low, high, camera, canvas)
     for robot, path in enumerate(paths):
         flat = camera.project(path).numpy()[:, :2]
@@ -185,15 +197,6 @@ def _scene_title(kept: Tensor) -> str:
     if bool(kept.all()):
         return f"Gaussian mixture: {count}"
     return f"Gaussian mixture: {int(kept.sum()):,} of {count} (ceilings and near walls left out)"
-
-
-def _string(path: Tensor, radius: float, hue: str) -> Ellipsoids:
-    """Returns a path (M, 3) as a string of small balls, so that surfaces can hide it."""
-    steps = (path[1:] - path[:-1]).norm(dim=1).cumsum(0)
-    along = np.concatenate([[0.0], steps.numpy()])
-    s = np.arange(0.0, along[-1] + radius, radius)
-    centres = np.stack([np.interp(s, along, path[:, axis].numpy()) for axis in range(3)], 1)
-    return balls(torch.from_numpy(centres), radius, torch.tensor(to_rgb(hue), dtype=torch.float64))
 
 
 def _draw_floor(axes: Axes, low: np.ndarray, high: np.ndarray, camera: Camera, n_ticks: int) -> None:

@@ -1,0 +1,173 @@
+"""Maps in space: the measured points, the components of a map, and the cells that each map calls occupied."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from gmmtorch.mapping.components import Components
+from gmmtorch.occupancy.evidence import Thresholds
+from gmmtorch.report import style
+from gmmtorch.report.maps.map_regions import Corners, robust_bounds
+from gmmtorch.report.scenes.ellipsoids import cut_away, first_viewpoints, height_colours
+from gmmtorch.report.scenes.scene import (
+    SOUTH_WEST,
+    Ellipsoids,
+    balls,
+    canvas_around,
+    draw_scene,
+    height_bar,
+    path_balls,
+)
+from gmmtorch.report.scenes.scene_renderer import Camera
+from gmmtorch.report.table import byte_text, count_text
+
+_SIDE = 6.6  # inches, width of a panel
+_TALLEST = 1.1  # of a panel, relative to its width
+_MAX_POINTS = 300_000
+_MAX_CELLS = 2_000_000
+_REACH = 2  # cells around a measured point that are asked
+_POINT_PIXELS = 1.3  # radius of a point
+_PATH_PIXELS = 2.5  # radius of the sensor's path
+_PATH = style.PALETTE[1]
+_POINT_BYTES = 12  # three float32
+_N_NEAR = 16  # components near a place, of which one explains it
+_BLUR = 0.1  # metres, added to the components to find the one that explains a place
+_FILL = 0.62  # radius of a cell's ball, in cells: balls of neighbouring cells touch
+
+
+class OccupancyPanel(NamedTuple):
+    """One map: the title of its panel, and its occupancy (M,) at points (M, 3), world metres."""
+
+    title: str
+    occupancy: Callable[[Tensor], Tensor]
+
+
+def map_scene_figure(
+    points: Tensor,
+    trajectory: Tensor,
+    maps: Sequence[OccupancyPanel],
+    resolution: float,
+    components: Components | None = None,
+    *,
+    title: str = "",
+    camera: Camera = SOUTH_WEST,
+) -> Figure:
+    """Draws 3D maps side by side in space, coloured by height (thesis Fig 3.6b and Fig 3.7).
+
+    The first panel shows the points, the second the components as 2σ ellipsoids, and each further one the
+    cells with θ > 0.65 of a map, the threshold of the thesis. Only cells within two cells of a point are
+    asked. Surfaces that hide the inside are left out of all panels: see `cut_away`.
+
+    Args:
+        points: (N, 3) measured points, world metres.
+        trajectory: (S, 3) sensor origins, world metres.
+        maps: the maps.
+        resolution: side (m) of the cells; a multiple if more than two million cells would be asked.
+        components: surfaces of the map; None: the panel of the components is left out.
+        title: of the figure.
+        camera: the viewer.
+    """
+    box = low, high = robust_bounds(
+        points[:: max(1, len(points) // _MAX_POINTS)], trajectory, 0.996, margin=0.3
+    )
+    hidden = _Hidden(components, camera)
+    scale = style.height_scale(points[:, 2])
+    canvas = canvas_around(low, high, camera, int(_SIDE * style.SAVED_DPI))
+    cloud = points[style.even_sample(len(points), _MAX_POINTS)]
+    size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
+    shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
+    if components is not None:
+        kept = hidden.kept & _inside(components.means, box)
+        ellipsoids = Ellipsoids(
+            components.means[kept].double(),
+            components.covariances[kept].double(),
+            height_colours(components.means[kept, 2], scale),
+            hidden.top,
+        )
+        shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", ellipsoids))
+    centres, side = cells_near(points[_inside(points, box)], resolution)
+    for one in maps:
+        occupied = centres[one.occupancy(centres).cpu() > Thresholds().occupied]
+        shown.append((one.title, _spots(occupied, _FILL * side, scale, hidden, box)))
+    path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
+    n_columns = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
+    n_rows = math.ceil(len(shown) / n_columns)
+    tall = min((canvas.top - canvas.bottom) / (canvas.right - canvas.left), _TALLEST)
+    figure = style.new_figure(_SIDE * n_columns + 0.9, (_SIDE * tall + 0.5) * n_rows + 0.5)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    for axes, (name, part) in zip(panels, shown, strict=False):
+        draw_scene(axes, [part, *path], low, high, camera, canvas)
+        axes.set_title(name, fontsize=style.TITLE_SIZE)
+    height_bar(figure, panels.tolist(), scale)
+    style.figure_title(figure, title)
+    return figure
+
+
+def cells_near(points: Tensor, resolution: float, reach: int = _REACH) -> tuple[Tensor, float]:
+    """Returns the centres (M, 3) of the cells at most `reach` cells from a point along each axis, and their
+    side (m): `resolution`, doubled until there are no more than two million cells."""
+    while True:
+        cells = torch.unique((points.double() / resolution).floor(), dim=0)
+        for axis in range(3):
+            step = torch.zeros(2 * reach + 1, 3, dtype=torch.float64)
+            step[:, axis] = torch.arange(-reach, reach + 1)
+            cells = torch.unique((cells[:, None] + step).flatten(0, 1), dim=0)
+            if len(cells) > _MAX_CELLS:
+                break
+        else:
+            return (cells + 0.5) * resolution, resolution
+        resolution *= 2
+
+
+class _Hidden:
+    """What is left out because it hides the inside: what lies above `top` (m), and what belongs to components
+    that `cut_away` leaves out; `kept` (K,) marks the others."""
+
+    def __init__(self, components: Components | None, camera: Camera) -> None:
+        self.kept, self.top = torch.ones(0, dtype=torch.bool), math.inf
+        if components is None or len(components) == 0:
+            return
+        self._means, self._covariances = (
+            components.means.double().cpu(),
+            components.covariances.double().cpu(),
+        )
+        seen_from = first_viewpoints(components).double().cpu()
+        self.kept, self.top = cut_away(self._means, self._covariances, seen_from, None, camera)
+
+    def __call__(self, places: Tensor) -> Tensor:
+        """Whether each place (M, 3) is left out."""
+        from scipy.spatial import cKDTree
+
+        if not len(self.kept) or not len(places):
+            return torch.zeros(len(places), dtype=torch.bool)
+        n = min(_N_NEAR, len(self.kept))
+        _, near = cKDTree(self._means.numpy()).query(places.numpy(), k=range(1, n + 1))
+        chosen = torch.from_numpy(near)
+        spread = self._covariances + _BLUR**2 * torch.eye(3, dtype=torch.float64)
+        inverse = torch.linalg.inv(spread)[chosen]
+        offset = places[:, None] - self._means[chosen]
+        distance = (offset[..., None, :] @ inverse @ offset[..., None]).flatten(1)
+        owner = chosen.gather(1, distance.argmin(1, keepdim=True)).squeeze(1)
+        return ~self.kept[owner] | (places[:, 2] > self.top)
+
+
+def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:
+    """Balls at the places (M, 3) in the box that are not hidden, coloured by height."""
+    places = places.double().cpu()
+    places = places[_inside(places, box)]
+    places = places[~hidden(places)]
+    return balls(places, radius, height_colours(places[:, 2], scale))
+
+
+def _inside(places: Tensor, box: Corners) -> Tensor:
+    low, high = (places.new_tensor(corner) for corner in box)
+    return ((places >= low) & (places <= high)).all(1)
