@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import BaselineMap, check_max_range
+from gmmtorch.baselines.octree_files import read_octree
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.kernels.rays.ray_traversal import traverse
 from gmmtorch.occupancy.grid import check_resolution
@@ -187,6 +188,20 @@ class OctoMapMap(BaselineMap):
         made._anchor = anchor
         made._tree = _read_tree(data)
         made._tree.setResolution(made.resolution)  # the file has only six digits of it
+        made._set_sensor_model()
+        return made
+
+    @classmethod
+    def from_octree(cls, path: str | Path) -> Self:
+        """A 3D map with the octree of another program's `.bt` or `.ot` file; further scans can be inserted.
+
+        A `.bt` file has two classes: its cells get the probabilities `clamp_low` and `clamp_high`. Raises
+        `MissingDataError` for a missing and `DataError` for a damaged or another file.
+        """
+        tree, resolution = read_octree(path)
+        made = cls(resolution)
+        made._start(3, made.device)
+        made.dim, made._tree, made._anchor = 3, tree, torch.zeros(3, dtype=torch.int64)
         made._set_sensor_model()
         return made
 
