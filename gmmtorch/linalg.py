@@ -98,20 +98,21 @@ def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
             f"transform has shape {tuple(transform.shape)}; a rigid motion in {dim}D is {shape}."
         )
     matrix = transform.double()
-    rotation, translation = matrix[:dim, :dim], matrix[:dim, dim]
-    identity = torch.eye(dim + 1, dtype=torch.float64, device=matrix.device)
+    values = matrix.detach().cpu().numpy()
+    turn, last = values[:dim, :dim], values[dim]
     rigid = (
-        bool(torch.isfinite(matrix).all())
-        and torch.allclose(rotation @ rotation.T, identity[:dim, :dim], atol=1e-6)
-        and float(torch.linalg.det(rotation)) > 0
-        and torch.equal(matrix[dim], identity[dim])
+        np.isfinite(values).all()
+        and np.allclose(turn @ turn.T, np.eye(dim), atol=1e-6)
+        and np.linalg.det(turn) > 0
+        and last[dim] == 1
+        and not last[:dim].any()
     )
     if not rigid:
         raise InvalidArgumentError(
             f"transform={matrix.tolist()} is not rigid; its rotation must be orthonormal with determinant 1, "
             "its translation in metres, and its last row 0 … 0 1."
         )
-    return rotation, translation
+    return matrix[:dim, :dim], matrix[:dim, dim]
 
 
 # -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------

@@ -19,7 +19,7 @@ from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components, viewpoints_of
-from gmmtorch.mapping.learning.incremental import depth_scan
+from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.learning.learner import Learner
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
 from gmmtorch.mapping.query import Query
@@ -227,7 +227,7 @@ class GaussianMap(nn.Module):
                 world ← camera.
             intrinsics: (3, 3) pinhole matrix of images of this size, in pixels.
             pixel_stride: uses every `pixel_stride`-th pixel of every `pixel_stride`-th row; each counts for
-                `pixel_stride`² points.
+                `pixel_stride`² points. With 1, every pixel is used.
             max_range: pixels at or beyond it (m) are left out, as are pixels that are zero or not finite.
             depth_scale: metres per unit of the images, such as 0.001 for millimetres. Images of integers need
                 it; None: metres, in a floating type.
@@ -240,16 +240,17 @@ class GaussianMap(nn.Module):
         if len(frames) == 0:
             return
 
-        def scan_of(index: int) -> Scan:
-            return depth_scan(*_frame(frames, index), intrinsics, pixel_stride, max_range, depth_scale)
+        def frame_of(index: int) -> DepthFrame:
+            given = _frame(frames, index)
+            return DepthFrame.of(*given, intrinsics, pixel_stride, max_range, depth_scale)
 
-        first = scan_of(0)
-        self._prepare(3, first.points.device, "depth images are")
+        first = frame_of(0)
+        self._prepare(3, first.depth.device, "depth images are")
         if self.n_pending:
             self._commit(self._with_pending())
         self._learner.rule = self.learning.fitted([first])
-        scans = (scan_of(index).to(self._device) for index in range(len(frames)))
-        self._set(self._learner.absorb(self._final(), scans, self.settings, float(pixel_stride**2)))
+        taken = (frame_of(index).to(self._device) for index in range(len(frames)))
+        self._set(self._learner.absorb(self._final(), taken, self.settings, float(pixel_stride**2)))
 
     def _prepare(self, dim: int, device: torch.device, what: str) -> None:
         """Gives an empty map its dimension. Raises if the map has another one."""

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.mapping.components import UNNUMBERED, Components
-from gmmtorch.mapping.learning.viewpoints import AssignViewpoints
+from gmmtorch.mapping.learning.depth_frame import DepthFrame, pool_frames
+from gmmtorch.mapping.learning.viewpoints import AssignedViewpoints, AssignViewpoints
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.cells import pool_into_cells
@@ -87,11 +88,38 @@ def fit_points(
     n_found, n_scans = found.weights.shape[0], len(clouds)
     pair = owner[cells.member] * n_scans + torch.repeat_interleave(sizes)
     counts = torch.bincount(pair, minlength=n_found * n_scans).view(-1, n_scans).double()
-    kept, support, seen_by, seen_from, seen_count = viewpoints(counts, found.weights, n_points)
+    found = found._replace(means=found.means + center)
+    return _components(found, viewpoints(counts, found.weights, n_points), origins, max_range)
+
+
+def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
+    """Components of the points of depth images, each observed from its camera; see `fit_points`.
+
+    The images are summed into cells at once, without a list of their points. Components are not numbered.
+    """
+    origins = torch.stack([frame.origin for frame in frames])
+    if sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
+        return fit_points([frame.scan().points for frame in frames], origins, fit, viewpoints)
+    cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
+    if cells.weight.shape[0] == 0:
+        return Components.empty(3, origins.device)
+    found = _mixture_of(cells.features, cells.weight, 3, fit)
+    owner = em.most_likely(cells.features, found)
+    counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
+    found = found._replace(means=found.means + cells.center)
+    assigned = viewpoints(counts, found.weights, int(cells.weight.sum()))
+    return _components(found, assigned, origins, max_range=False)
+
+
+def _components(
+    found: em.Parameters, assigned: AssignedViewpoints, origins: Tensor, max_range: bool
+) -> Components:
+    """The components that keep a viewpoint; not numbered."""
+    kept, support, seen_by, seen_from, seen_count = assigned
     ids = torch.zeros(support.shape[0], 2, dtype=torch.int64, device=origins.device)
     ids[:, 1] = UNNUMBERED
     return Components(
-        means=found.means[kept] + center,
+        means=found.means[kept],
         covariances=found.covariances[kept],
         support=support,
         max_range=torch.full_like(ids[:, 0], max_range, dtype=torch.bool),

@@ -8,24 +8,22 @@ from itertools import islice
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
-from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
+from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
+from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_frames, fit_window
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
 from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins, limit_origins
 from gmmtorch.mixture.em.partition import FlatnessRule
-from gmmtorch.pinhole import back_project, check_intrinsics, metric_depth
 from gmmtorch.scan import Scan
 
 
 def absorb(
     components: Components,
-    scans: Iterable[Scan],
+    scans: Iterable[Scan | DepthFrame],
     rule: IncrementalRule,
     size: Size = estimated_bytes,
     weight: float = 1.0,
@@ -38,7 +36,7 @@ def absorb(
 
     Args:
         components: of the map so far.
-        scans: of the dimension of the components.
+        scans: of the dimension of the components; or frames, whose pixels are then summed into cells at once.
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
@@ -46,39 +44,12 @@ def absorb(
     Raises `InvalidArgumentError` for scans of another dimension.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
-        scans = list(scans)
+        scans = as_scans(scans)
         rule = rule.fitted(scans)
     left = iter(scans)
     while window := list(islice(left, rule.window)):
         components = _absorb_window(components, window, rule, size, weight)
     return components
-
-
-def depth_scan(
-    depth: ArrayLike,
-    pose: ArrayLike,
-    intrinsics: ArrayLike,
-    pixel_stride: int = 1,
-    max_range: float = torch.inf,
-    depth_scale: float | None = None,
-) -> Scan:
-    """The scan of every `pixel_stride`-th pixel of every `pixel_stride`-th row of a depth image.
-
-    Args:
-        depth: (H, W), metres along the optical axis. Pixels at or beyond `max_range`, not above zero or
-            not finite are left out.
-        pose: (4, 4), world ← camera.
-        intrinsics: (3, 3).
-        depth_scale: metres per unit of the image; None: metres, in a floating type.
-    """
-    image = metric_depth(depth, depth_scale).detach()
-    rotation, translation = check_rigid(as_tensor(pose, "pose", torch.float64, image.device).detach(), 3)
-    scaled = check_intrinsics(intrinsics, tuple(image.shape)).to(image.device, copy=True)
-    scaled[:2] /= pixel_stride
-    taken = image[::pixel_stride, ::pixel_stride]
-    valid = torch.isfinite(taken) & (taken < max_range)
-    points = back_project(torch.where(valid, taken, 0.0).double(), scaled)
-    return Scan(points @ rotation.T + translation, translation)
 
 
 def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
@@ -103,22 +74,33 @@ def cell_fit(
 
 
 def _absorb_window(
-    components: Components, scans: Sequence[Scan], rule: IncrementalRule, size: Size, weight: float
+    components: Components,
+    window: Sequence[Scan | DepthFrame],
+    rule: IncrementalRule,
+    size: Size,
+    weight: float,
 ) -> Components:
-    for scan in scans:
+    for scan in window:
         if scan.dim != components.dim:
             raise InvalidArgumentError(
                 f"The scan is {scan.dim}-dimensional and the map {components.dim}-dimensional; give the "
                 "scans of one sensor to one map."
             )
-    if rule.novelty is not None:
-        components, scans = _explain(components, scans, rule.novelty, weight)
-    if not any(scan.n_beams for scan in scans):
+    frames = [frame for frame in window if isinstance(frame, DepthFrame)]
+    if rule.novelty is None and len(frames) == len(window):
+        learned = fit_frames(frames, surface_fit(rule, components.dim), all_origins(weight))
+    else:
+        scans = as_scans(window)
+        if rule.novelty is not None:
+            components, scans = _explain(components, scans, rule.novelty, weight)
+        if not any(scan.n_beams for scan in scans):
+            return components
+        if rule.noise is None or rule.length is None or rule.cell is None:
+            # Scans without a return still show the scale of the sensor by the ends of their beams.
+            rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
+        learned = fit_window(scans, surface_fit(rule, components.dim), all_origins(weight))
+    if len(learned) == 0:
         return components
-    if rule.noise is None or rule.length is None or rule.cell is None:
-        # Scans without a return still show the scale of the sensor by the ends of their beams.
-        rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
-    learned = fit_window(scans, surface_fit(rule, components.dim), all_origins(weight))
     return _within_budget(Components.concatenate([components, learned]), rule, size)
 
 

@@ -11,6 +11,7 @@ from gmmtorch.errors import GmmTorchError, check_whole
 from gmmtorch.mapping.codec.component_batch import numbered
 from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
 from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.depth_frame import DepthFrame
 from gmmtorch.mapping.learning.rules import LearningRule, read_rule, rule_facts
 from gmmtorch.scan import Scan
 
@@ -55,9 +56,9 @@ class Learner:
         return self._absorb(known, self.pending, self.rule.fitted(self.pending), settings, 1.0)
 
     def absorb(
-        self, known: Components, scans: Iterable[Scan], settings: MapSettings, weight: float
+        self, known: Components, scans: Iterable[DepthFrame], settings: MapSettings, weight: float
     ) -> Components:
-        """All components, with those of scans of which each point stands for `weight` points.
+        """All components, with those of frames of which each point stands for `weight` points.
 
         There must be no unfinished window, and the rule must be fitted.
         """
@@ -75,7 +76,7 @@ class Learner:
     def _absorb(
         self,
         known: Components,
-        scans: Iterable[Scan],
+        scans: Iterable[Scan | DepthFrame],
         rule: LearningRule,
         settings: MapSettings,
         weight: float,

@@ -18,6 +18,9 @@ from gmmtorch.mixture.reduction.moments import merge_components
 Size = Callable[[Components], int]
 """Number of bytes of the file of given components."""
 
+_GROWTH = 1.08
+"""Exponent of the number of components that fit in a share of the bytes; merged components take more each."""
+
 
 def estimated_bytes(components: Components) -> int:
     """Estimate of the file size: 16 bytes a component, 2 a viewpoint beyond the first, 7 an origin, 300 in
@@ -136,7 +139,7 @@ def compact_to_bytes(
     """
     check_whole("max_bytes", max_bytes, 1)
     components = limit_origins(components, max_origins, mean_origins)
-    fixed = size(Components.empty(components.dim, components.means.device))
+    fixed = None
     while len(components) and (taken := size(components)) > max_bytes:
         if len(components) == 1:
             if components.seen_by.shape[0] == 1:
@@ -145,7 +148,9 @@ def compact_to_bytes(
                 )
             components = limit_origins(components, 1)
             continue
+        if fixed is None:
+            fixed = size(Components.empty(components.dim, components.means.device))
         room = max(0, max_bytes - fixed) / max(1, taken - fixed)
-        wanted = max(1, min(len(components) - 1, int(len(components) * room)))
+        wanted = max(1, min(len(components) - 1, int(len(components) * room**_GROWTH)))
         components = limit_origins(compact(components, wanted), max_origins, mean_origins)
     return components

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from gmmtorch.mapping.components import Components
+    from gmmtorch.mapping.learning.depth_frame import DepthFrame
     from gmmtorch.mapping.learning.merging import Size
     from gmmtorch.scan import Scan
 
@@ -108,18 +109,24 @@ class WindowedRule:
         if self.dtype not in SOFTMAX_DTYPES:
             raise InvalidArgumentError(f"dtype={self.dtype!r} is not one of {', '.join(SOFTMAX_DTYPES)}.")
 
-    def fitted(self, scans: Sequence[Scan]) -> WindowedRule:
+    def fitted(self, scans: Sequence[Scan | DepthFrame]) -> WindowedRule:
         """The rule itself: none of its options is derived from scans."""
         return self
 
     def absorb(
-        self, known: Components, scans: Iterable[Scan], generator: torch.Generator, size: Size, weight: float
+        self,
+        known: Components,
+        scans: Iterable[Scan | DepthFrame],
+        generator: torch.Generator,
+        size: Size,
+        weight: float,
     ) -> Components:
         """The components of a map with those of one window added. `size` and `weight` are not used."""
         from gmmtorch.mapping.components import Components
+        from gmmtorch.mapping.learning.depth_frame import as_scans
         from gmmtorch.mapping.learning.windowed import learn_window
 
-        return Components.concatenate([known, learn_window(list(scans), self, generator)])
+        return Components.concatenate([known, learn_window(as_scans(scans), self, generator)])
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,7 @@ class IncrementalRule:
                 f"max_cost={self.max_cost} must be at least 0 (equal) and below 1 (no overlap)."
             )
 
-    def fitted(self, scans: Sequence[Scan]) -> IncrementalRule:
+    def fitted(self, scans: Sequence[Scan | DepthFrame]) -> IncrementalRule:
         """The rule with every None among noise, length, cell and window derived from scans.
 
         Sensors differ in scale. Lengths are fixed fractions of the median range r of the scans, measured on
@@ -184,8 +191,11 @@ class IncrementalRule:
         """
         import torch
 
-        ranges = [(scan.points - scan.origin).norm(dim=1) for scan in scans if len(scan.points)]
-        if not ranges or None not in (self.noise, self.length, self.cell, self.window):
+        if None not in (self.noise, self.length, self.cell, self.window):
+            return self
+        clouds = [(scan.points, scan.origin) for scan in scans]
+        ranges = [(points - origin).norm(dim=1) for points, origin in clouds if len(points)]
+        if not ranges:
             return self
         scale = _SCALES[scans[0].dim]
         r = max(float(torch.cat(ranges).median()), _LEAST_RANGE)
@@ -200,7 +210,12 @@ class IncrementalRule:
         )
 
     def absorb(
-        self, known: Components, scans: Iterable[Scan], generator: torch.Generator, size: Size, weight: float
+        self,
+        known: Components,
+        scans: Iterable[Scan | DepthFrame],
+        generator: torch.Generator,
+        size: Size,
+        weight: float,
     ) -> Components:
         """The components of a map with scans added and merged, see `incremental.absorb`."""
         from gmmtorch.mapping.learning.incremental import absorb

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_CELLS_ALONG = (1 << KEY_BITS) - 2  # along the longest side
 _CHUNK_POINTS = 1 << 17
+T = TypeVar("T")
 
 
 class Cells(NamedTuple):
@@ -55,14 +56,15 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
         return _sums_by_key(points, weight, _pack(((points - low) / side * factor).long()), max_cells)
 
     last = 3 * math.ceil(math.log2(extent / side + 2))  # gives one cell
-    sums, member = pooled(0) or _coarsest_allowed(pooled, last)
+    sums, member = pooled(0) or coarsest_allowed(pooled, last)[1]
     return Cells(sums / sums[:, :1], sums[:, 0].clone(), member)
 
 
-def _coarsest_allowed(
-    pooled: Callable[[int], tuple[Tensor, Tensor] | None], enough: int
-) -> tuple[Tensor, Tensor]:
-    """The first result between 0, which has too many cells, and `enough`, by bisection."""
+def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[int, T]:
+    """The least step after 0, which has too many cells, that has a result; at most `enough`. And that result.
+
+    By bisection.
+    """
     too_fine, best = 0, None
     while enough - too_fine > 1:
         middle = (too_fine + enough) // 2
@@ -73,7 +75,7 @@ def _coarsest_allowed(
             enough, best = middle, found
     best = best or pooled(enough)
     assert best is not None
-    return best
+    return enough, best
 
 
 def _sums_by_key(
