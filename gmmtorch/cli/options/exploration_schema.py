@@ -8,8 +8,11 @@ from typing import Any
 from omegaconf import MISSING
 
 from gmmtorch.cli.options.runtime_schema import Report
-from gmmtorch.cli.options.structured import read_dataclass, schema_of
+from gmmtorch.cli.options.structured import read_dataclass, read_defaults, schema_of
 from gmmtorch.mapping.learning.rules import NoveltyRule
+
+_TEAM = read_defaults("exploration.mission.options", "TeamOptions")
+"""Default values of a team. Its options have their own names and descriptions, because they are in groups."""
 
 
 @dataclass
@@ -45,7 +48,7 @@ class Team:
     """
 
     name: str = MISSING
-    size: int = 3
+    size: int = _TEAM["size"]
     start: Any = None  # a list of poses
 
 
@@ -56,22 +59,22 @@ class PlannerOptions:
     """
 
     name: str = MISSING
-    prior: float = 0.125
-    rest: float = 0.01
+    prior: float = _TEAM["planning_prior"]
+    rest: float = read_defaults("exploration.robot.robot_state", "StoppingRule")["share"]
 
 
 @dataclass
 class TreePlannerOptions(PlannerOptions):
     """beams: beams of a view."""
 
-    beams: int = 160
+    beams: int = _TEAM["n_beams"]
 
 
 @dataclass
 class SensorRate:
     """rate: frames per second."""
 
-    rate: float = 1.0
+    rate: float = _TEAM["rate"]
 
 
 @dataclass
@@ -86,7 +89,7 @@ class PlanningWindow:
     iterations: EM iterations.
     """
 
-    window: list[int] = field(default_factory=lambda: [80, 80, 40])
+    window: list[int] = field(default_factory=lambda: list(_TEAM["window"]))
 
 
 @dataclass
@@ -94,7 +97,7 @@ class NetworkDelay:
     """delay: seconds from the end of transmission to arrival, at least.
     partitions: as in [{begin: 60, end: 120, groups: [[0], [1, 2]]}]; simulated seconds, robots by id."""
 
-    delay: float = 0.05
+    delay: float = _TEAM["latency"]
 
 
 @dataclass
@@ -104,16 +107,16 @@ class RobotNetwork:
     budget: bytes per second that each robot sends of its map and views; null: no limit.
     """
 
-    loss: float = 0.0
-    announce: float = 5.0
-    budget: float | None = None
+    loss: float = _TEAM["loss"]
+    announce: float = _TEAM["announce_every"]
+    budget: float | None = _TEAM["budget"]
 
 
 @dataclass
 class RobotEvaluation:
     """every: seconds between the rows of a mission's curves."""
 
-    every: float = 10.0
+    every: float = _TEAM["sample_every"]
 
 
 @dataclass
@@ -172,12 +175,12 @@ class Exploration:
     world: Any = MISSING
     team: Any = MISSING
     planner: Any = MISSING
-    duration: float = 1600.0
-    seed: int = 0
-    information: str = "csqmi"
-    coordination: str = "greedy"
-    rounds: int = 3
-    codec: str = "quantized"
+    duration: float = _TEAM["duration"]
+    seed: int = _TEAM["seed"]
+    information: str = _TEAM["information"]
+    coordination: str = _TEAM["coordination"]
+    rounds: int = _TEAM["n_rounds"]
+    codec: str = _TEAM["codec"]
     sensor: _SENSOR = field(default_factory=_SENSOR)  # type: ignore[valid-type]
     robot: _BODY = field(default_factory=_BODY)  # type: ignore[valid-type]
     belief: _BELIEF = field(default_factory=_BELIEF)  # type: ignore[valid-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import operator
 from collections.abc import Collection, Mapping, Sequence
@@ -61,9 +62,7 @@ def read_dataclass(module: str, name: str, **hints: Any) -> type:
         module: dotted name in gmmtorch.
         hints: types of fields whose own types are not built in.
     """
-    path = Path(gmmtorch.__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    (source,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    source = _source_of(module, name)
     found: list[Any] = []
     for item in source.body:
         if isinstance(item, ast.AnnAssign) and not ast.unparse(item.annotation).startswith("InitVar"):
@@ -80,6 +79,23 @@ def read_dataclass(module: str, name: str, **hints: Any) -> type:
         [ast.unparse(item.target) for item in source.body if isinstance(item, ast.AnnAssign)],
     )
     return made
+
+
+def read_defaults(module: str, name: str) -> dict[str, Any]:
+    """The literal defaults of the fields of a dataclass, read from its source as by `read_dataclass`."""
+    found = {}
+    for item in _source_of(module, name).body:
+        if isinstance(item, ast.AnnAssign) and item.value is not None:
+            with contextlib.suppress(ValueError):  # a computed default
+                found[ast.unparse(item.target)] = ast.literal_eval(item.value)
+    return found
+
+
+def _source_of(module: str, name: str) -> ast.ClassDef:
+    path = Path(gmmtorch.__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    (source,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    return source
 
 
 def _accepted(hint: Any) -> Any:
