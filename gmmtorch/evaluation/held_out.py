@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -89,37 +89,45 @@ def evaluate(
     largest = max(protocol.kept)
     for kept in protocol.kept:
         shown = queries.keep_share(train, kept, protocol.removal, seed)
-        # A map that serves several resolutions or forms of evidence is built once.
-        cache: dict[Any, tuple[OccupancyMap, float]] = {}
-        for method, factory in factories.items():
-            label = (
-                f"{'mixture' if isinstance(factory, Form) else method}, {kept:.0%} of the {protocol.removal}"
+        for method, resolution, built, seconds, answer in _built_maps(
+            factories, shown, kept, protocol, on_event
+        ):
+            made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
+            made.row.update(
+                dataset=name,
+                method=method,
+                removal=protocol.removal,
+                kept=float(kept),
+                n_train_points=sum(scan.points.shape[0] for scan in shown),
+                build_seconds=seconds,
             )
-            shared = factory.new_map if isinstance(factory, Form) else method
-            for resolution in protocol.resolution:
-                if shared not in cache:
-                    cache[shared] = _build(factory(resolution), shown, label, on_event)
-                built, seconds = cache[shared]
-                if not built.any_resolution:
-                    del cache[shared]
-                _set_defaults(built, factory, resolution)
-                answer = _answerer(built, factory, resolution)
-                made = _score(built, answer, asked[resolution], resolution, seed, protocol.unknown)
-                made.row.update(
-                    dataset=name,
-                    method=method,
-                    removal=protocol.removal,
-                    kept=float(kept),
-                    n_train_points=sum(scan.points.shape[0] for scan in shown),
-                    build_seconds=seconds,
-                )
-                if protocol.save_map:
-                    built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
-                outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
-                on_row(outcome.rows)
-                if kept == largest:
-                    outcome.shown.append(made)
+            if protocol.save_map:
+                built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
+            outcome.rows.append({key: made.row[key] for key in sorted(made.row, key=_column)})
+            on_row(outcome.rows)
+            if kept == largest:
+                outcome.shown.append(made)
     return outcome
+
+
+def _built_maps(
+    factories: dict[str, MapFactory], shown: Sequence[Scan], kept: float, protocol: Protocol, on_event: Event
+) -> Iterator[tuple[str, float, OccupancyMap, float, Answer]]:
+    """Method, resolution, map, seconds of its building, and its answers, for each method and resolution."""
+    # A map that serves several resolutions or forms of evidence is built once.
+    cache: dict[Any, tuple[OccupancyMap, float]] = {}
+    for method, factory in factories.items():
+        made_as = "mixture" if isinstance(factory, Form) else method
+        shared = factory.new_map if isinstance(factory, Form) else method
+        for resolution in protocol.resolution:
+            if shared not in cache:
+                label = f"{made_as}, {kept:.0%} of the {protocol.removal}"
+                cache[shared] = _build(factory(resolution), shown, label, on_event)
+            built, seconds = cache[shared]
+            if not built.any_resolution:
+                del cache[shared]
+            _set_defaults(built, factory, resolution)
+            yield method, resolution, built, seconds, _answerer(built, factory, resolution)
 
 
 def _answerer(built: OccupancyMap, factory: MapFactory, resolution: float) -> Answer:

@@ -94,21 +94,10 @@ def map_figure(
     for band in bands:
         style.colour_bar(figure, greys, band[0].tolist(), "occupancy probability θ")
     if dim == 3:
-        views = np.concatenate([band[1] for band in bands])
+        views = [band[1] for band in bands]
         # One ceiling for all: panels that are cut at different heights cannot be compared.
         top = min(_ceiling(panel, flown, ceiling, occupied_above) for panel in panels)
-        cut = [_below(panel, top) for panel in panels]
-        images = [height_image(panel, occupied_above, shown_pixels, max_queries) for panel in cut]
-        known = torch.cat([image.image[image.image.isfinite()] for image in images])
-        colours = matplotlib.colormaps[style.HEIGHTS].with_extremes(bad=_NONE)
-        heights = ScalarMappable(style.height_scale(known), colours)
-        for axes, whole, panel, image in zip(views, panels, cut, images, strict=False):
-            image.draw(axes, heights.to_rgba(np.ma.masked_invalid(image.image.numpy())))
-            _draw_paths(axes, panel, paths)
-            below = f" below z = {style.metres(panel.high[2])}" if panel.high[2] < whole.high[2] else ""
-            style.label_axes(axes, f"highest cell with θ > {occupied_above:g}{below}")
-        for band in bands:
-            style.colour_bar(figure, heights, band[1].tolist(), "height z [m]", extend="both")
+        _draw_heights(figure, views, panels, paths, top, occupied_above, shown_pixels, max_queries)
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
     for axes in np.concatenate([band[-1] for band in bands]):
@@ -118,6 +107,31 @@ def map_figure(
     style.legend_below(figure, _legend(bool(paths), dim))
     style.figure_title(figure, title)
     return figure
+
+
+def _draw_heights(
+    figure: Figure,
+    bands: list[np.ndarray],
+    panels: Sequence[MapPanel],
+    paths: list[np.ndarray],
+    top: float,
+    occupied_above: float,
+    shown_pixels: int,
+    max_queries: int,
+) -> None:
+    """Draws the views from above, of the cells below z = `top` (m), with a colour bar for each band."""
+    cut = [_below(panel, top) for panel in panels]
+    images = [height_image(panel, occupied_above, shown_pixels, max_queries) for panel in cut]
+    known = torch.cat([image.image[image.image.isfinite()] for image in images])
+    colours = matplotlib.colormaps[style.HEIGHTS].with_extremes(bad=_NONE)
+    heights = ScalarMappable(style.height_scale(known), colours)
+    for axes, whole, panel, image in zip(np.concatenate(bands), panels, cut, images, strict=False):
+        image.draw(axes, heights.to_rgba(np.ma.masked_invalid(image.image.numpy())))
+        _draw_paths(axes, panel, paths)
+        below = f" below z = {style.metres(panel.high[2])}" if panel.high[2] < whole.high[2] else ""
+        style.label_axes(axes, f"highest cell with θ > {occupied_above:g}{below}")
+    for band in bands:
+        style.colour_bar(figure, heights, band.tolist(), "height z [m]", extend="both")
 
 
 def _sheet(panels: Sequence[MapPanel], n_columns: int, n_rows: int) -> tuple[Figure, np.ndarray, int]:
