@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from gmmtorch.errors import GmmTorchError
@@ -19,37 +21,38 @@ def load_open3d(failure: str) -> Any:
     return open3d
 
 
-def load_pyoctomap() -> Any:
-    """The module pyoctomap. Raises `GmmTorchError` if it does not load."""
+@contextmanager
+def needs_extra(purpose: str, package: str, extra: str) -> Iterator[None]:
+    """For imports: raises `GmmTorchError` if they fail, which names the extra of gmmtorch to install.
+
+    Args:
+        purpose: beginning of the message, as in "OctoMap needs".
+    """
     try:
-        import pyoctomap
+        yield
     except ImportError as error:
         raise GmmTorchError(
-            f"OctoMap needs the package pyoctomap, which does not load ({error}); install it: "
-            "pip install 'gmmtorch[baselines]'."
+            f"{purpose} the package {package}, which does not load ({error}); install it: "
+            f"pip install 'gmmtorch[{extra}]'."
         ) from error
+
+
+def load_pyoctomap() -> Any:
+    """The module pyoctomap. Raises `GmmTorchError` if it does not load."""
+    with needs_extra("OctoMap needs", "pyoctomap", "baselines"):
+        import pyoctomap
     return pyoctomap
 
 
 def load_viser() -> Any:
     """The module viser. Raises `GmmTorchError` if it does not load."""
-    try:
+    with needs_extra("The browser viewer needs", "viser", "viewer"):
         import viser
-    except ImportError as error:
-        raise GmmTorchError(
-            f"The browser viewer needs the package viser, which does not load ({error}); install it: "
-            "pip install 'gmmtorch[viewer]'."
-        ) from error
     return viser
 
 
 def load_ray() -> Any:
     """The module ray. Raises `GmmTorchError` if it does not load."""
-    try:
+    with needs_extra("Several workers and clusters need", "ray", "cluster"):
         import ray
-    except ImportError as error:
-        raise GmmTorchError(
-            f"Several workers and clusters need the package ray, which does not load ({error}); install it: "
-            "pip install 'gmmtorch[cluster]'."
-        ) from error
     return ray

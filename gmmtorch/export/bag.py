@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, to_nanoseconds
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, OutputError
+from gmmtorch.errors import InvalidArgumentError, OutputError
+from gmmtorch.optional_packages import needs_extra
 from gmmtorch.scan import ArrayLike, Scan
 
 _BASE, _NAME, _ARRAY = 1, 2, 3
@@ -71,13 +72,8 @@ class BagWriter:
         self.path = Path(path)
         if self.path.suffix not in (".mcap", ".db3", ".bag"):
             raise InvalidArgumentError(f"path={path} must end in .mcap, .db3 (ROS 2) or .bag (ROS 1).")
-        try:
+        with needs_extra("ROS bags need", "rosbags", "bags"):
             from rosbags import rosbag1, rosbag2, typesys
-        except ImportError as error:
-            raise GmmTorchError(
-                f"ROS bags need the package rosbags, which does not load ({error}); install it: "
-                "pip install 'gmmtorch[bags]'."
-            ) from error
         self._is_ros1 = self.path.suffix == ".bag"
         self._typesys: Any = typesys
         self.types: Any = typesys.get_typestore(

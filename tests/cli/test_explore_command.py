@@ -549,7 +549,7 @@ def test_bad_values_are_found_before_the_first_tick(run, steps):
 
 def test_a_recording_without_rerun_is_found_before_the_first_tick(run, steps, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert "pip install 'rerun-sdk" in refused(run("report.recording=true"))
+    assert "pip install 'gmmtorch[viewer]'" in refused(run("report.recording=true"))
     assert steps == []
 
 

@@ -64,8 +64,8 @@ def test_recording_errors_name_the_argument(tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match="period=0"):
         record_rerun(tmp_path / "mission.rrd", [], period=0.0)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(GmmTorchError, match="pip install 'rerun-sdk"):
+    with pytest.raises(GmmTorchError, match=r"gmmtorch\[viewer\]"):
         record_rerun(tmp_path / "mission.rrd", [])
-    with pytest.raises(GmmTorchError, match="pip install 'rerun-sdk"):
+    with pytest.raises(GmmTorchError, match=r"gmmtorch\[viewer\]"):
         load_rerun()
     assert list(tmp_path.iterdir()) == []

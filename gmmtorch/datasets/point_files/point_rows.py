@@ -25,6 +25,7 @@ from gmmtorch.datasets.point_files.cloud_files import (
 )
 from gmmtorch.datasets.point_files.las_header import read_las_header
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.optional_packages import needs_extra
 
 _LAS_BLOCK_BYTES = 1 << 25
 """Limit of one read: a point may announce 64 kB of extra bytes."""
@@ -89,13 +90,9 @@ class LasRows:
     dim = 3
 
     def __init__(self, path: Path) -> None:
-        try:
+        with needs_extra(f"{path}: LAS and LAZ files need", "laspy", "formats"):
             import laspy
             import lazrs  # noqa: F401  used by laspy
-        except ImportError as error:
-            raise GmmTorchError(
-                f"{path} cannot be read, because {error.name} is not installed: pip install gmmtorch[formats]"
-            ) from error
         self._laspy: Any = laspy
         self._path = path
         self.name = path.stem

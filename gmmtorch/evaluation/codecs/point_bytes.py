@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Ints
+from gmmtorch.optional_packages import needs_extra
 
 MOST_BITS = 21
 """Bits of a cell index along an axis; three axes fit into 63 bits."""
@@ -160,10 +161,5 @@ def decompressed(data: bytes) -> bytes:
 
 def library(name: str) -> Any:
     """The module zstandard or DracoPy, which only the point codecs need."""
-    try:
+    with needs_extra("The point codecs need", name, "baselines"):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise GmmTorchError(
-            f"The point codecs need {name}, which cannot be imported ({error}); "
-            "pip install 'gmmtorch[baselines]'."
-        ) from error

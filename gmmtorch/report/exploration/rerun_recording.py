@@ -15,6 +15,7 @@ from matplotlib.colors import to_rgb
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.files import write_atomically
 from gmmtorch.occupancy.grid import check_resolution
+from gmmtorch.optional_packages import needs_extra
 from gmmtorch.report.scenes.ellipsoids import N_SIGMA, checked_components, height_colours, principal_axes
 from gmmtorch.report.style import as_array, colour
 from gmmtorch.scan import ArrayLike
@@ -86,13 +87,8 @@ def record_rerun(
 
 def load_rerun() -> Any:
     """Imports rerun. Raises `GmmTorchError` if it is not installed or too old."""
-    try:
+    with needs_extra("The recording for the rerun viewer needs", "rerun-sdk", "viewer"):
         rerun = importlib.import_module("rerun")
-    except ImportError as error:
-        raise GmmTorchError(
-            f"The recording for the rerun viewer needs rerun-sdk, which cannot be imported ({error}); "
-            "pip install 'rerun-sdk>=0.23'."
-        ) from error
     if not hasattr(rerun, "Scalars"):  # was introduced together with set_time(duration=…)
         version = getattr(rerun, "__version__", "unknown")
         raise GmmTorchError(

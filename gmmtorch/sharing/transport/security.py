@@ -14,7 +14,8 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.optional_packages import needs_extra
 from gmmtorch.sharing.messages.envelope import MAX_BYTES
 from gmmtorch.sharing.transport.sessions import OwnIdWatch, Sessions
 from gmmtorch.sharing.transport.team_key import TeamKey
@@ -55,14 +56,9 @@ class _Cipher:
     """ChaCha20-Poly1305 with a team's key."""
 
     def __init__(self, key: TeamKey) -> None:
-        try:
+        with needs_extra("A team key needs", "cryptography", "network"):
             from cryptography.exceptions import InvalidTag
             from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-        except ImportError as error:
-            raise GmmTorchError(
-                f"A team key needs the package cryptography, which does not load ({error}); "
-                "pip install 'gmmtorch[network]'."
-            ) from error
         self._aead, self._invalid = ChaCha20Poly1305(key._data), InvalidTag
 
     def encrypt(self, header: bytes, datagram: bytes) -> bytes:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
+from gmmtorch.optional_packages import needs_extra
 from gmmtorch.sharing.transport.frames import MAX_WAITING, FramedTransport
 from gmmtorch.sharing.transport.security import TeamKey
 from gmmtorch.sharing.transport.simulated_network import Traffic
@@ -35,13 +36,8 @@ _REMEDIES = {
 
 def load_zenoh() -> Any:
     """The package zenoh; raises `GmmTorchError` if it is not installed."""
-    try:
+    with needs_extra("transport=zenoh needs", "eclipse-zenoh", "zenoh"):
         import zenoh
-    except ImportError as error:
-        raise GmmTorchError(
-            f"transport=zenoh needs the package eclipse-zenoh, which does not load ({error}); "
-            "pip install 'gmmtorch[zenoh]'."
-        ) from error
     return zenoh
 
 
