@@ -180,7 +180,7 @@ class Exploration:
     information: str = _TEAM["information"]
     coordination: str = _TEAM["coordination"]
     rounds: int = _TEAM["n_rounds"]
-    codec: str = _TEAM["codec"]
+    codec: str = "quantized"
     sensor: _SENSOR = field(default_factory=_SENSOR)  # type: ignore[valid-type]
     robot: _BODY = field(default_factory=_BODY)  # type: ignore[valid-type]
     belief: _BELIEF = field(default_factory=_BELIEF)  # type: ignore[valid-type]
