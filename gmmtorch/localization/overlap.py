@@ -23,6 +23,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
 from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
+from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping.surfaces import touching
 from gmmtorch.mixture.em.exact import Parameters
 
@@ -32,7 +33,9 @@ CUTOFF = 4.0
 """Deviations beyond which a pair is left out: its term is below 4e-4 of its maximum."""
 
 _SLACK = 0.5  # of the thickness: components may move this far before pairs are listed again
-_SADDLE = 0.05  # of the information: with less curvature Newton's step is too long
+_LEAST_CURVATURE = 0.05  # of the information
+_LONGEST = 1.0  # step, as the root mean square of the Mahalanobis distances that pairs move by,
+_THICKNESSES = 4  # and in thicknesses of the components
 
 
 class Motions(NamedTuple):
@@ -111,7 +114,7 @@ def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pai
 def _batched_sums(
     source: Parameters, target: Parameters, motions: Motions, pairs: Pairs
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The twin of `kernels.mixtures.pair_overlap`."""
+    """The twin of `kernels.pair_overlap`."""
     n, dim = motions.translations.shape
     n_free = dim + dim * (dim - 1) // 2
     lever = torch.einsum("bij,kj->ibk", motions.rotations, source.means).flatten(1)
@@ -193,9 +196,9 @@ def _times(a: Tensor, b: Tensor) -> Tensor:
 class Ascent:
     """Climbs log S from B motions in parallel, with one evaluation of the score for each step.
 
-    A step is Newton's if −∇² log S is positive definite, otherwise Fisher's, and is cut until the score
-    rises. Over the listed pairs the score never falls. Pairs are listed again after components have moved
-    by a fraction of their thickness.
+    Steps are Newton's with the absolute values of the curvatures, cut until the score rises. Except for pairs
+    near the cutoff the score never falls. Pairs are listed again after components have moved by a fraction of
+    their thickness.
 
     Args:
         source, target: mixtures near the origin.
@@ -221,17 +224,18 @@ class Ascent:
         for _ in range(max_iterations):
             if not bool(active.any()):
                 break
-            steps = self._steps(state) * share[:, None]
+            steps = torch.where(active[:, None], self._steps(state) * share[:, None], 0.0)
             trial = motions.moved(steps)
+            if self._strayed(trial, listed):
+                rows = active.nonzero().squeeze(1)
+                listed, pairs = trial, self.pairs(trial.at(rows))
+                pairs = pairs._replace(motion=rows[pairs.motion])
             tried = self.evaluate(trial, pairs.of(active[pairs.motion]))
             better = active & (tried.log_score > state.log_score)
             active &= (steps / self.scale).norm(dim=1) > tolerance
             motions = Motions(*(_where(better, n, o) for n, o in zip(trial, motions, strict=True)))
             state = Overlap(*(_where(better, n, o) for n, o in zip(tried, state, strict=True)))
             share = torch.where(better, (2 * share).clamp_max(1), share / 4)
-            if self._strayed(motions, listed):
-                listed, pairs = motions, self.pairs(motions)
-                state = self.evaluate(motions, pairs)
         return motions, state, ~active & torch.isfinite(state.log_score)
 
     def evaluate(self, motions: Motions, pairs: Pairs) -> Overlap:
@@ -239,17 +243,26 @@ class Ascent:
         return overlap(self.source, self.target, motions, pairs)
 
     def _steps(self, state: Overlap) -> Tensor:
-        """Ascent steps (B, F), Newton's or Fisher's, at most as long as components are thick."""
+        """Ascent steps (B, F).
+
+        In coordinates in which the information is the identity, lengths are the Mahalanobis distances that
+        pairs move by, so their limit lets a wall slide far along itself. There each axis of the Hessian takes
+        Newton's step with the curvature's absolute value, which climbs where the score is convex, too.
+        """
         outer = self.scale[:, None] * self.scale
         fisher = state.information * outer
         ridge = 1e-9 * fisher.diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-12)
-        fisher = fisher + ridge[:, None, None] * torch.eye(len(outer)).to(fisher)
-        newton = fisher - state.scatter * outer
-        _, flawed = torch.linalg.cholesky_ex(newton - _SADDLE * fisher)
-        curvature = torch.where((flawed == 0)[:, None, None], newton, fisher)
-        steps = torch.linalg.solve(curvature, state.gradient * self.scale)
+        root = safe_cholesky(fisher + ridge[:, None, None] * torch.eye(len(outer)).to(fisher))
+        scatter = torch.linalg.solve_triangular(root, state.scatter * outer, upper=False)
+        scatter = torch.linalg.solve_triangular(root, scatter.mT, upper=False)
+        missing, axes = torch.linalg.eigh((scatter + scatter.mT) / 2)
+        slope = torch.linalg.solve_triangular(root, (state.gradient * self.scale)[:, :, None], upper=False)
+        parts = (axes.mT @ slope)[:, :, 0] / (1 - missing).abs().clamp_min(_LEAST_CURVATURE)
+        parts = parts * (_LONGEST / parts.norm(dim=1, keepdim=True).clamp_min(_LONGEST))
+        steps = torch.linalg.solve_triangular(root.mT, axes @ parts[:, :, None], upper=True)[:, :, 0]
+        longest = _THICKNESSES * self.thickness
         length = steps.norm(dim=1, keepdim=True)
-        return steps * (self.thickness / length.clamp_min(self.thickness)) * self.scale
+        return steps * (longest / length.clamp_min(longest)) * self.scale
 
     def pairs(self, motions: Motions) -> Pairs:
         """Pairs within the cutoff now, or after components have moved by the slack."""

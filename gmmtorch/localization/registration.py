@@ -14,9 +14,8 @@ from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.overlap import Ascent, Motions, deviations, log_self_overlap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
 from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.merge import simplify
+from gmmtorch.mixture.reduction.moments import merge_components
 
-_ALIKE = 0.2  # squared Hellinger distance up to which blurred components are one
 _BEST_KEPT = 4  # poses that go on from one level to the next,
 _LEAST_SHARE = 0.7  # of the best one's score at least
 _SECOND_CHANCE = 2  # levels below the first: a single initial pose is tried there once more
@@ -73,10 +72,10 @@ def register(
 
         S(T) = Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j + s² I)
 
-    Coarse to fine: s is halved from `coarsest` to `finest`. On each level, components that are similar under
-    the blur are merged first, so coarse levels are small. A level climbs log S by Newton's steps on SE(3) or
-    SE(2), by Fisher's steps if the Hessian is indefinite; each is cut until the score rises. Pairs beyond
-    four deviations are left out.
+    Coarse to fine: s is halved from `coarsest` to `finest`. While s exceeds the components' size, those in
+    one cell of side s are merged first, so coarse levels are small. A level climbs log S by Newton's steps
+    on SE(3) or SE(2), with the absolute values of the curvatures; each is cut until the score rises. Pairs
+    beyond four deviations are left out. Of several peaks, the best one that the surfaces hold is the result.
 
     Args:
         source, target: maps, components, or (means, covariances, weights). `max_range` components are left
@@ -113,30 +112,33 @@ def register(
     radius = min(_radius(f), _radius(g))
     blurs = _blurs(f, g, radius, coarsest, finest)
 
+    f_levels, g_levels = _levels(f, blurs), _levels(g, blurs)
     n_evaluated, climbed = 0, motions
     for number, blur in enumerate(blurs):
         if len(start) == 1 and number == _SECOND_CHANCE:
             climbed = climbed.joined(motions)  # in case a coarser level climbed a wrong peak
         last = number == len(blurs) - 1
-        ascent = Ascent(_level(f, blur), _level(g, blur), radius)
+        ascent = Ascent(f_levels[number], g_levels[number], radius)
         accuracy = tolerance if last else max(tolerance, _COARSELY * blur)
         climbed, found, converged = ascent.run(climbed, max_iterations, accuracy)
         n_evaluated += ascent.n_evaluated
         best = _promising(climbed, found.log_score, radius, 0.5 * ascent.thickness)
         climbed, found, converged = climbed.at(best), found.at(best), converged[best]
+    hessian = found.information - found.scatter
+    width = _widths(hessian, ascent.scale)
+    held = (width > _WIDEST * radius).argsort(stable=True)  # first the poses that the surfaces hold
     own = log_self_overlap(ascent.source) + log_self_overlap(ascent.target)
-    share = torch.exp((found.log_score - own / 2).clamp_max(0))
-    hessian = (found.information - found.scatter)[0]
-    width = _width(hessian, ascent.scale)
+    share = torch.exp((found.log_score[held] - own / 2).clamp_max(0))
+    first = int(held[0])
     return Registration(
-        transform=_world(climbed, here, there)[0],
-        score=float(found.log_score[0].exp()),
+        transform=_world(climbed.at(held[:1]), here, there)[0],
+        score=float(found.log_score[first].exp()),
         overlap=float(share[0]),
-        hessian=hessian,
-        width=width,
+        hessian=hessian[first],
+        width=float(width[first]),
         n_iterations=n_evaluated,
-        converged=bool(converged[0]),
-        doubts=_doubts(share, width, radius, bool(converged[0])),
+        converged=bool(converged[first]),
+        doubts=_doubts(share, float(width[first]), radius, bool(converged[first])),
     )
 
 
@@ -207,11 +209,23 @@ def _blurs(
     return [*blurs, last]
 
 
-def _level(mixture: Parameters, blur: float) -> Parameters:
-    """The mixture with ½ s² I added to every covariance, and similar components merged."""
+def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
+    """For each blur s, the mixture with ½ s² I added to every covariance.
+
+    Once s exceeds the components' size, those in a cell of side s are merged first.
+    """
+    size = float(deviations(mixture)[:, -1].median())
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
-    blurred = mixture._replace(covariances=mixture.covariances + 0.5 * blur**2 * eye)
-    return simplify(blurred, max_cost=_ALIKE, cost="hellinger", most_exact=0).parameters
+    levels = []
+    for blur in blurs:
+        merged = _merged_in_cells(mixture, blur) if blur > size else mixture
+        levels.append(merged._replace(covariances=merged.covariances + 0.5 * blur**2 * eye))
+    return levels
+
+
+def _merged_in_cells(mixture: Parameters, side: float) -> Parameters:
+    cells, labels = torch.unique((mixture.means / side).floor(), dim=0, return_inverse=True)
+    return merge_components(*mixture, labels, len(cells))
 
 
 # -- motions --------------------------------------------------------------------------------------
@@ -266,9 +280,10 @@ def _promising(motions: Motions, log_score: Tensor, radius: float, apart: float)
 # -- trust ----------------------------------------------------------------------------------------
 
 
-def _width(hessian: Tensor, scale: Tensor) -> float:
-    least = float(torch.linalg.eigvalsh(hessian * scale[:, None] * scale)[0])
-    return 1 / math.sqrt(least) if least > 0 else math.inf
+def _widths(hessian: Tensor, scale: Tensor) -> Tensor:
+    """Metres (B,) that the source can slide or turn; infinite where the Hessian (B, F, F) is not definite."""
+    least = torch.linalg.eigvalsh(hessian * scale[:, None] * scale)[:, 0]
+    return torch.where(least > 0, least.clamp_min(1e-300).rsqrt(), torch.inf)
 
 
 def _doubts(share: Tensor, width: float, radius: float, converged: bool) -> tuple[str, ...]:
@@ -280,6 +295,7 @@ def _doubts(share: Tensor, width: float, radius: float, converged: bool) -> tupl
         doubts.append(f"the overlap {float(share[0]):.3f} is below {_LEAST_OVERLAP}: hardly a common surface")
     if not width <= _WIDEST * radius:
         doubts.append(f"the source can slide or turn by {width:.3g} m: the surfaces do not hold it")
-    if len(share) > 1 and float(share[1]) > _AMBIGUOUS * float(share[0]):
-        doubts.append(f"another pose has an overlap of {float(share[1]):.3f}, against {float(share[0]):.3f}")
+    others = share[1:].max() if len(share) > 1 else 0.0
+    if float(others) > _AMBIGUOUS * float(share[0]):
+        doubts.append(f"another pose has an overlap of {float(others):.3f}, against {float(share[0]):.3f}")
     return tuple(doubts)

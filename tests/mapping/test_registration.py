@@ -13,14 +13,11 @@ from mapping.component_cases import random_components
 from mapping.map_cases import some_motion
 from torch import Tensor
 
-import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.localization.overlap import Ascent, Motions, Pairs, generators, overlap
 from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windowed import learn_window
 from gmmtorch.mixture.em.exact import Parameters
 
 dims = pytest.mark.parametrize("dim", [2, 3])
@@ -322,17 +319,3 @@ def test_an_indefinite_covariance_is_refused():
     means, covariances, weights = given_as(scene(3, 0, 5))
     with pytest.raises(NumericalError):
         register((means, -covariances, weights), (means, covariances, weights))
-
-
-# -- real scans -----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.real_data
-def test_scans_of_a_hall_are_registered(real_data):
-    scans = gt.datasets.load("scan_folder", real_data / "hall")
-    rule = WindowedRule(noise=0.02, length=0.6)
-    source, target = (learn_window([scans[i]], rule, torch.Generator().manual_seed(0)) for i in (14, 10))
-    found = register(source, target, motion(3, 0.5, 10))
-    assert_close(found.transform, torch.eye(4).double(), 0.3, 0.01)  # in the world frame: poses agree
-    assert found.reliable

@@ -17,7 +17,7 @@ MOST_TESTED = 1 << 24
 _BODY = """
     const double *x = moved + item * DIM, *shape = shapes + item * DIM * DIM;
     const double reach = reaches[item % n_source];
-    int64_t found = stops ? (item ? stops[item - 1] : 0) : 0;
+    bool* row = near + item * n_target;
     for (int64_t j = 0; j < n_target; ++j) {
         const double* other = targets + j * (DIM + 1);  // mean, reach
         double d[DIM], square = 0.0;
@@ -26,7 +26,13 @@ _BODY = """
             square += d[i] * d[i];
         }
         const double sum = reach + other[DIM];
+        row[j] = false;
         if (square > sum * sum) continue;
+        double along = wide * square;  // d'Md: d'M⁻¹d is at least (d'd)² / d'Md
+        for (int r = 0; r < DIM; ++r)
+            for (int c = 0; c < DIM; ++c)
+                along += scale * d[r] * d[c] * (shape[r * DIM + c] + covariances[(j * DIM + r) * DIM + c]);
+        if (square * square > along) continue;
         double root_of[DIM][DIM], y[DIM], quadratic = 0.0;  // of scale (A + S) + wide I
         for (int c = 0; c < DIM; ++c) {
             for (int r = c; r < DIM; ++r) {
@@ -40,22 +46,15 @@ _BODY = """
             y[c] /= root_of[c][c];
             quadratic += y[c] * y[c];
         }
-        if (!(quadratic <= 1.0)) continue;
-        if (stops) {
-            pairs[found] = item / n_source;
-            pairs[n_pairs + found] = item % n_source;
-            pairs[2 * n_pairs + found] = j;
-        }
-        ++found;
+        row[j] = quadratic <= 1.0;
     }
-    if (!stops) counts[item] = found;
 """
 _KERNELS = {
     dim: FusedKernel(
         f"near_pairs_{dim}d",
         "const double* moved, const double* shapes, const double* reaches, int64 n_source,"
         " const double* targets, const double* covariances, int64 n_target, double scale, double wide,"
-        " const int64* stops, int64 n_pairs, int64* counts, int64* pairs",
+        " bool* near",
         _BODY.replace("DIM", str(dim)),
     )
     for dim in (2, 3)
@@ -85,10 +84,6 @@ def near_pairs(
     targets = torch.cat([means, reaches[1][:, None]], 1)
     given = [part.contiguous() for part in (moved, shapes, reaches[0])]
     table = targets.contiguous(), covariances.contiguous(), len(means), scale, wide
-    counts = torch.empty(n * k, dtype=torch.int64, device=device)
-    _KERNELS[dim](n * k, *given, k, *table, None, 0, counts, None, device=device)
-    stops = counts.cumsum(0)
-    n_pairs = int(stops[-1]) if n * k else 0
-    pairs = torch.empty(3, n_pairs, dtype=torch.int64, device=device)
-    _KERNELS[dim](n * k, *given, k, *table, stops, n_pairs, None, pairs, device=device)
-    return pairs
+    near = torch.empty(n, k, len(means), dtype=torch.bool, device=device)
+    _KERNELS[dim](n * k, *given, k, *table, near, device=device)
+    return near.nonzero().T.contiguous()
