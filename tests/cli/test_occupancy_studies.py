@@ -29,8 +29,8 @@ TINY = {
     "pose_correction": "dataset.n_scans=10 evaluation.pose_noise=[0.3,0.1] study.methods=[point,monte_carlo] "
     "map.n_samples=20000",
     "fig3_8_variance_threshold": (
-        "dataset.n_scans=6 study.max_beams=300 study.n_components=[20,40] "
-        "study.variance_threshold=[0.06,0.24] study.test_every=3"
+        "study.railing_scans=4 study.max_beams=300 study.n_components=[20,40] study.method=[counts,point] "
+        "study.resolution=[0.25] study.hit_length=[null,auto] study.test_every=3"
     ),
 }
 
@@ -143,15 +143,22 @@ def test_pose_correction(run):
 def test_variance_threshold(run):
     done = succeeded(run("fig3_8_variance_threshold", *SHOWN))
     rows = done.results()["rows"]
-    assert len(rows) == 2 * 2
-    assert [row["variance_threshold"] for row in rows] == [0.06, 0.24] * 2
-    assert all(row["n_components"] <= limit for row, limit in zip(rows, (20, 20, 40, 40), strict=True))
-    for strict, lenient in (rows[:2], rows[2:]):
+    assert len(rows) == 3 * 2 * 2 * 2  # sources, priors, hit lengths, thresholds
+    assert [row["variance_threshold"] for row in rows] == [0.06, 0.24] * 12
+    assert {row["method"] for row in rows[:8]} == {"counts"}
+    assert all(row["n_components"] is None for row in rows[:8])
+    for strict, lenient in zip(rows[::2], rows[1::2], strict=True):
         assert strict["auc"] == lenient["auc"]
-        assert strict["nbytes"] == lenient["nbytes"] > 0
         assert strict["share_decided"] <= lenient["share_decided"]  # with v = ¼ only ½ is unknown
-    assert rows[0]["nbytes"] < rows[2]["nbytes"]
+        assert strict["thin_recall"] <= strict["thin_kept"]
+    assert rows[8]["nbytes"] < rows[16]["nbytes"]
     assert_shown(done, {"variance_threshold", "variance_threshold_cells"}, "point/free_recall", "point/auc")
+
+
+def test_variance_threshold_of_a_data_set_in_2d(run):
+    data = "dataset=synthetic_building_2d dataset.n_scans=12 study.railing=null study.max_beams=200"
+    done = succeeded(run("fig3_8_variance_threshold", *data.split()))
+    assert {row["dataset"] for row in done.results()["rows"]} == {"synthetic_building_2d"}
 
 
 @pytest.mark.parametrize("name", ["pose_correction"])
@@ -183,10 +190,11 @@ def test_no_figures_are_written_without_report_figures(name, run):
         ("pose_correction", "map=incremental", "map=per_scan"),
         ("pose_correction", "study.methods=[]", "study.methods=[] point flux"),
         ("pose_correction", "study.methods=[occupancy_grid]", "method='occupancy_grid' point"),
-        ("fig3_8_variance_threshold", "study.method=bgk", "method='bgk' point"),
+        ("fig3_8_variance_threshold", "study.method=[bgk]", "method='bgk' point"),
+        ("fig3_8_variance_threshold", "study.hit_length=[-1]", "hit_length=-1"),
         ("fig3_8_variance_threshold", "study.n_components=[]", "study.n_components=[] empty"),
         ("fig3_8_variance_threshold", "study.variance_threshold=[-1]", "threshold=-1"),
-        ("fig3_8_variance_threshold", "study.thin_radius=0", "study.thin_radius=0"),
+        ("fig3_8_variance_threshold", "study.thin_width=0", "study.thin_width=0"),
     ],
 )
 def test_an_invalid_study_option_gives_a_one_line_error(name, options, words, run):

@@ -1,88 +1,125 @@
-"""Variance thresholds on thin structures: hand counts, and detection of thin structures."""
+"""Thin structures and variance thresholds: hand counts, a rail of known width, a simulated railing."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from evaluation.pillar_room import room_scans
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
-from gmmtorch.evaluation.studies.variance_threshold import decided, on_lines, run
+from gmmtorch.evaluation.studies.railing import Railing
+from gmmtorch.evaluation.studies.study_options import COUNTS, VarianceThresholdStudy
+from gmmtorch.evaluation.studies.variance_threshold import (
+    cells_by_setting,
+    decided,
+    run,
+    seen_past,
+    weighed,
+)
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import WindowedRule
+from gmmtorch.mapping.learning.rules import IncrementalRule
+from gmmtorch.occupancy.forms.point import PointEvidence
+from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.scan import Scan
 
 
 def test_decided_matches_a_hand_count():
     occupied = torch.tensor([0.99, 0.97, 0.6, 0.4, 0.01], dtype=torch.float64)
     free = torch.tensor([0.02, 0.3, 0.5, 0.98], dtype=torch.float64)
-    thin = torch.tensor([True, False, True, False, False])
+    thin = torch.tensor([0.96, 0.6, 0.3, 0.01], dtype=torch.float64)
     # v = 0.0475: free below 0.05, occupied above 0.95.
     assert decided(occupied, free, thin, 0.0475) == {
         "share_decided": 5 / 9,
         "accuracy_decided": 3 / 5,
         "occupied_recall": 2 / 5,
-        "thin_recall": 1 / 2,
+        "thin_recall": 1 / 4,
+        "thin_kept": 3 / 4,
         "free_recall": 1 / 4,
+        "free_occupied": 1 / 4,
     }
-    nothing = decided(torch.full((2,), 0.5), torch.full((2,), 0.5), torch.zeros(2, dtype=torch.bool), 0.06)
+    nothing = decided(torch.full((2,), 0.5), torch.full((2,), 0.5), torch.zeros(0), 0.06)
     assert nothing["accuracy_decided"] is None
     assert nothing["thin_recall"] is None
 
 
-def test_rails_are_thin_and_walls_are_not(generator):
-    def uniform(n: int, d: int) -> torch.Tensor:
-        return torch.rand(n, d, generator=generator, dtype=torch.float64)
-
-    wall = torch.cat([uniform(4000, 2) * 3, torch.zeros(4000, 1, dtype=torch.float64)], 1)
-    rail = torch.cat([uniform(300, 1) * 3, torch.full((300, 2), 2.0, dtype=torch.float64)], 1)
-    rail = rail + 0.01 * torch.randn(rail.shape, generator=generator, dtype=torch.float64)
-    lone = torch.tensor([[50.0, 50, 50]], dtype=torch.float64)
-    thin = on_lines(torch.cat([wall, rail, lone]), 0.4)
-    assert thin[4000:4300].double().mean() > 0.95
-    inner = ((wall[:, :2] > 0.4) & (wall[:, :2] < 2.6)).all(1)
-    assert not bool(thin[:4000][inner].any())
-    assert not bool(thin[-1])
+def test_beams_pass_rails_and_not_walls():
+    railing = Railing(0.04)
+    for scan in railing.scans(3, seed=1):
+        found, truth = seen_past(scan, 0.3), railing.holds(scan)
+        assert truth.sum() > 50
+        assert truth[found].double().mean() > 0.95
+        assert found[truth].double().mean() > 0.5  # not where posts, bars and floor meet
 
 
-def test_on_lines_does_not_depend_on_chunks_order_or_translation(generator, monkeypatch):
-    rail = torch.rand(150, 3, generator=generator, dtype=torch.float64) * torch.tensor([5.0, 0.08, 0.05])
-    blob = 9 + torch.rand(50, 3, generator=generator, dtype=torch.float64)
-    points = torch.cat([rail, blob])
-    whole = on_lines(points, 0.4)
-    assert bool(whole.any())
-    assert not bool(whole.all())
-    monkeypatch.setattr("gmmtorch.evaluation.studies.variance_threshold._CHUNK", 7)
-    assert torch.equal(on_lines(points, 0.4), whole)
-    order = torch.randperm(200, generator=generator)
-    assert torch.equal(on_lines(points[order] + 1000, 0.4), whole[order])
+def test_thin_structures_of_a_laser_are_passed_on_both_sides():
+    angle = torch.linspace(-0.5, 0.5, 201, dtype=torch.float64)
+    reading = torch.full_like(angle, 5.0)
+    reading[100:103] = 2.0  # a pole of about 3 cm
+    reading[170:] = 2.0  # the edge of a wall
+    points = reading[:, None] * torch.stack([angle.cos(), angle.sin()], 1)
+    thin = seen_past(Scan(points, torch.zeros(2)), 0.3)
+    assert thin.nonzero().flatten().tolist() == [100, 101, 102]
+    far = reading > 4
+    open_sky = Scan(points[~far], torch.zeros(2), points[far])
+    assert seen_past(open_sky, 0.3).nonzero().flatten().tolist() == [0, 1, 2]
+    assert not bool(seen_past(Scan(points[:0], torch.zeros(2), points), 0.3).any())
 
 
-def test_a_larger_threshold_decides_more_points():
+@pytest.mark.parametrize("width", [0.02, 0.04])
+def test_the_occupancy_of_a_rail_cell_follows_from_its_width(width):
+    """docs/occupancy.md: by counts θ = w/h; with the hit length ℓ the odds are (w ℓ/h²)/(1 − w/h)."""
+    side, depth, n = 0.1, 3.0, 100_000
+    height = (torch.arange(n, dtype=torch.float64) + 0.5) / n * side
+    on_rail = (height - 0.5 * side).abs() < 0.5 * width
+    ends = torch.stack([torch.where(on_rail, 1.05, depth), height], 1)
+    lattice = SparseEvidence(side, 2)
+    lattice.add_rays(torch.stack([torch.zeros(n), height], 1), ends)
+    evidence = PointEvidence(*lattice.at_points(torch.tensor([[1.05, 0.05]], dtype=torch.float64)))
+    sums = torch.tensor([0.0, 0.0])
+    by_counts = float(weighed(evidence, sums, side, 0.0, None))
+    assert by_counts == pytest.approx(width / side, abs=1e-3)
+    weight = float(weighed(evidence, sums, side, 0.0, 2.0))
+    odds = width * 2.0 / side**2 / (1 - width / side)
+    assert weight / (1 - weight) == pytest.approx(odds, rel=1e-2)
+
+
+def test_a_larger_threshold_decides_more_points_and_hit_length_keeps_the_rail():
+    railing = Railing(0.04)
     study = VarianceThresholdStudy(
-        n_components=(5, 20), variance_threshold=(0.06, 0.2), resolution=0.2, test_every=4
+        method=(COUNTS, "point"), n_components=(20, 80), resolution=(0.2,), prior=(1.0,), test_every=4
     )
 
     def new_map(n: int) -> GaussianMap:
-        return GaussianMap(window=20, learning=WindowedRule(n_components=n))
+        return GaussianMap(window=4, learning=IncrementalRule(n_components=n))
 
-    found = run("room", room_scans(12, dim=3, n_beams=400), new_map, study)
-    cases = [(row["n_components"], row["variance_threshold"]) for row in found.rows]
-    assert [v for _, v in cases] == [0.06, 0.2, 0.06, 0.2]
-    assert cases[0][0] < cases[2][0]
+    found = run("railing", railing.scans(5, seed=0), new_map, study, is_thin=railing.holds)
+    assert [row["n_components"] for row in found.rows[:6]] == [None] * 6
+    assert len(found.rows) == 3 * 3 * 2
     for strict, loose in zip(found.rows[::2], found.rows[1::2], strict=True):
         assert strict["share_decided"] < loose["share_decided"]
         assert strict["occupied_recall"] <= loose["occupied_recall"]
+    for rows in (found.rows[:6], found.rows[6:12], found.rows[12:]):
+        counts, auto = rows[0], rows[4]
+        assert (counts["hit_length"], auto["hit_length"]) == (None, "auto")
+        assert counts["thin_recall"] == 0
+        assert auto["thin_kept"] > counts["thin_kept"]
+        assert auto["brier"] < counts["brier"]
+    centers = torch.cartesian_prod(*[torch.arange(-1, 1, 0.2, dtype=torch.float64)] * 3)
+    drawn = cells_by_setting(found, study)
+    assert list(drawn) == [20, 80]
+    occupied, kept, *_ = drawn[80](centers).values()
+    assert bool((kept | ~occupied).all())
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"n_components": ()}, r"n_components=\[\] is empty"),
-        ({"method": "grid"}, "method='grid'"),
+        ({"method": ("grid",)}, "method='grid'"),
         ({"variance_threshold": (0.3,)}, "variance_threshold=0.3"),
-        ({"thin_radius": 0.0}, "thin_radius=0"),
-        ({"resolution": -1.0}, "resolution=-1"),
+        ({"thin_width": 0.0}, "thin_width=0"),
+        ({"railing": 0.0}, "railing=0"),
+        ({"hit_length": ("long",)}, "hit_length=long"),
+        ({"resolution": (-1.0,)}, "resolution=-1"),
         ({"test_every": 1}, "test_every=1"),
     ],
 )

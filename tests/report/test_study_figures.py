@@ -39,37 +39,49 @@ def test_auc_memory_draws_each_method_through_its_sizes():
     assert axes.get_xscale() == "log"
 
 
-def test_variance_threshold_draws_a_line_per_number_of_components():
+def test_variance_threshold_draws_bars_of_the_first_resolution_prior_and_threshold():
     rows = [
         {
             "dataset": "hall",
-            "method": "point",
+            "method": method,
             "n_components": n,
+            "resolution": h,
+            "prior": 1.0,
+            "hit_length": length,
             "variance_threshold": v,
             "occupied_recall": v,
             "thin_recall": None,
-            "free_recall": 2 * v,
-            "share_decided": 3 * v,
+            "thin_kept": 0.5,
+            "free_recall": 0.25 if length is None else 0.75,
         }
-        for n in (200, 850)
+        for method, n in (("counts", None), ("point", 200))
+        for h in (0.1, 0.2)
+        for length in (None, "auto")
         for v in (0.06, 0.2)
     ]
     (figure,) = map_study_figures.variance_threshold_figures(rows).values()
-    first, thin, free, _ = figure.axes
-    assert [list(line.get_ydata()) for line in first.lines] == [[0.06, 0.2]] * 2
-    assert [list(line.get_ydata()) for line in free.lines] == [[0.12, 0.4]] * 2
-    assert all(len(line.get_ydata()) == 0 for line in thin.lines)
+    thin, kept, hits, free = figure.axes
+    assert not thin.patches
+    assert [bar.get_height() for bar in kept.patches] == [0.5] * 4
+    assert [bar.get_height() for bar in hits.patches] == [0.06] * 4
+    assert [bar.get_height() for bar in free.patches] == [0.25, 0.25, 0.75, 0.75]
+    labels = [text.get_text() for text in free.get_xticklabels()]
+    assert labels == ["counted rays", "point,\n200 components"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "hits as counts",
+        "hit_length=auto",
+    ]
 
 
-def test_cells_figure_shows_cells_classified_occupied(generator):
-    def occupancy(points: torch.Tensor) -> torch.Tensor:
-        return torch.where(points[:, 2] < 0.5, 0.99, 0.8).double()  # variances 0.0099 and 0.16
+def test_cells_figure_draws_the_cells_of_each_mask(generator):
+    def masks(centers: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"low": centers[:, 2] < 0.5, "all": torch.ones(len(centers), dtype=torch.bool)}
 
     hits = torch.rand(100, 3, generator=generator, dtype=torch.float64)
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    figure = map_study_figures.cells_figure({20: occupancy}, (0.06, 0.2), hits, *box, 0.1)
+    figure = map_study_figures.cells_figure({20: masks}, hits, *box, 0.1)
     titles = [axes.get_title() for axes in figure.axes[:3]]
-    assert titles == ["20 components:\nheld-out points", "v = 0.06:\n500 cells", "v = 0.2:\n1,000 cells"]
+    assert titles == ["20 components:\nheld-out points", "low", "all"]
     assert figure.axes[3].get_ylabel() == "height z [m]"
     shares = [(axes.get_images()[0].get_array()[..., 3] > 0).mean() for axes in figure.axes[:3]]
     assert 0 < shares[1] < shares[2]  # more cells cover more of the picture

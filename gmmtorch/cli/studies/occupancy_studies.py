@@ -54,42 +54,44 @@ def _auc_memory(config: DictConfig, device: str, on_event: Event, on_rows: OnRow
 
 
 def _variance_threshold(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
-    """Maps of several sizes with several thresholds."""
-    import torch
-
+    """Thin structures with several forms, sizes, cells, priors, hit lengths and thresholds."""
     from gmmtorch.evaluation.studies import variance_threshold
+    from gmmtorch.evaluation.studies.railing import BOUNDS, Railing
     from gmmtorch.evaluation.studies.study_options import VarianceThresholdStudy
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.report.studies import map_study_figures as report
 
     study = build(VarianceThresholdStudy, common.as_options(config.study), "study")
-    name, scans = common.all_scans(config, device, on_event)
+    if study.railing is None:
+        (name, scans), is_thin = common.all_scans(config, device, on_event), None
+    else:
+        railing = Railing(study.railing)
+        name, scans, is_thin = "railing", railing.scans(study.railing_scans, config.seed), railing.holds
 
     def new_map(n: int) -> GaussianMap:
         return maps.map_factory(config, n_components=n)()
 
-    found = variance_threshold.run(name, scans, new_map, study, config.seed, on_event, on_rows)
+    found = variance_threshold.run(name, scans, new_map, study, config.seed, on_event, on_rows, is_thin)
 
     def figures() -> dict[str, object]:
         drawn: dict[str, object] = dict(report.variance_threshold_figures(found.rows))
-        if found.hits.shape[1] == 3:
-            low, high = report.closest_look(found.thin if len(found.thin) else found.hits, found.hits)
-            occupancies = {
-                n: lambda points, built=built: torch.as_tensor(
-                    built.occupancy(points, study.resolution, study.method)
-                )
-                for n, built in found.maps.items()
-            }
+        cells = variance_threshold.cells_by_setting(found, study)
+        if found.hits.shape[1] == 3 and cells:
+            thin = found.thin if len(found.thin) else found.hits
+            low, high = BOUNDS if study.railing else report.closest_look(thin, found.hits)
             drawn["variance_threshold_cells"] = report.cells_figure(
-                occupancies, study.variance_threshold, found.hits, low, high, study.resolution
+                cells, found.hits, low, high, study.resolution[0]
             )
         return drawn
 
     table = (
-        "n_components variance_threshold occupied_recall thin_recall free_recall share_decided "
-        "accuracy_decided auc auc_thin nbytes"
+        "method n_components resolution hit_length occupied_recall thin_recall thin_kept free_recall "
+        "free_occupied auc auc_thin brier"
     )
-    return Found(found.rows, figures, table, f"{name}: {len(scans)} scans")
+    prior, threshold = study.prior[0], study.variance_threshold[0]
+    shown = [r for r in found.rows if (r["prior"], r["variance_threshold"]) == (prior, threshold)]
+    about = f"{name}: {len(scans)} scans; prior {prior:g}, variance threshold {threshold:g}"
+    return Found(found.rows, figures, table, about, shown)
 
 
 def _approximation_error(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:

@@ -6,6 +6,7 @@ need torch are imported when an object is made.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +20,7 @@ from gmmtorch.errors import (
     check_whole,
 )
 from gmmtorch.evaluation.protocol_options import check_not_empty, check_test_every
-from gmmtorch.mapping.query_options import METHODS, check_method
+from gmmtorch.mapping.query_options import METHODS, QueryOptions, check_method
 
 
 def _check_whole_numbers(options: object, *names: str) -> None:
@@ -120,42 +121,63 @@ class PoseCorrectionStudy:
             check_method(method)
 
 
+COUNTS = "counts"
+"""Method of the study of thresholds: the training rays, counted in cells; no map."""
+
+
 @dataclass(frozen=True)
 class VarianceThresholdStudy:
-    """Options of `studies.variance_threshold`.
+    """Options of `studies.variance_threshold`: one row for each combination of the lists.
 
     Attributes:
-        method: form of evidence.
+        railing: width (m) of the bars of a simulated railing, which is scanned in place of the data set.
+            None: the data set.
+        railing_scans: number of scans of the railing.
+        method: forms of evidence, and "counts": the training rays counted in cells, without a map.
         n_components: sizes; a map is built for each.
-        variance_threshold: values v of (3.10); each is applied to every map.
-        resolution: side (m) of the cells of the test.
+        resolution: sides (m) of the cells.
+        prior, hit_length: of the queries, as in `QueryOptions`.
+        variance_threshold: values v of (3.10).
         test_every, max_beams: the test, as in `Protocol`.
-        thin_radius: radius (m) of the neighbourhoods in which the points of a thin structure form a line.
+        thin_width: width (m) of thin structures in a data set, see `variance_threshold.seen_past`.
     """
 
-    method: str = "point"
+    railing: float | None = 0.04
+    railing_scans: int = 20
+    method: Sequence[str] = (COUNTS, "point", "monte_carlo")
     n_components: Sequence[int] = (200, 850)
-    variance_threshold: Sequence[float] = (0.06, 0.12, 0.18, 0.24)
-    resolution: float = 0.1
+    resolution: Sequence[float] = (0.1, 0.25)
+    prior: Sequence[float] = (1.0, 0.1)
+    hit_length: Sequence[Any] = (None, 1.0, "auto")
+    variance_threshold: Sequence[float] = (0.06, 0.24)
     test_every: int = 5
-    max_beams: int = 40_000
-    thin_radius: float = 0.4
+    max_beams: int = 10_000
+    thin_width: float = 0.3
 
     def __post_init__(self) -> None:
         import torch
 
         from gmmtorch.occupancy.evidence import classify
 
-        check_method(self.method)
-        check_not_empty(self, "n_components", "variance_threshold")
+        check_not_empty(self, "method", "n_components", "resolution", "prior", "hit_length")
+        check_not_empty(self, "variance_threshold")
+        for method in self.method:
+            if method != COUNTS:
+                check_method(method)
         for n in self.n_components:
             check_whole("n_components", n, 1)
+        for prior, length in itertools.product(self.prior, self.hit_length):
+            QueryOptions(prior=prior, hit_length=length)
         for threshold in self.variance_threshold:
             classify(torch.zeros(1), threshold)
-        check_resolution(self.resolution)
+        for resolution in self.resolution:
+            check_resolution(resolution)
         check_whole("max_beams", self.max_beams, 1)
         check_test_every(self.test_every)
-        check_number("thin_radius", self.thin_radius, above=True)
+        check_number("thin_width", self.thin_width, above=True)
+        check_whole("railing_scans", self.railing_scans, 2)
+        if self.railing is not None:
+            check_number("railing", self.railing, above=True)
 
 
 # -- studies of gmmtorch-fit -----------------------------------------------------------------------

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 from torch import Tensor
 
-from gmmtorch.occupancy.evidence import CellClass, classify
 from gmmtorch.report import style
 from gmmtorch.report.labels import Label, place_labels
 from gmmtorch.report.maps.map_regions import Corners, busiest_regions
@@ -90,10 +89,10 @@ def pose_correction_figures(rows: style.Rows) -> dict[str, Figure]:
 
 
 _PANELS = {
-    "occupied_recall": "occupied points found",
-    "thin_recall": "occupied points found,\nthin structures",
-    "free_recall": "free points found",
-    "share_decided": "points not left unknown",
+    "thin_recall": "hits on thin structures:\ncalled occupied",
+    "thin_kept": "hits on thin structures:\nnot called free",
+    "occupied_recall": "all hits:\ncalled occupied",
+    "free_recall": "free points:\ncalled free",
 }
 _MAX_CELLS = 400_000
 _SIDE = 3.4  # inches of a panel in space
@@ -102,24 +101,44 @@ _CAMERA = Camera(-60.0, 24.0)
 
 
 def variance_threshold_figures(rows: style.Rows) -> dict[str, Figure]:
-    """Draws `variance_threshold`: the decisions at each threshold, one line per number of components."""
-    figure = style.new_figure(13.5, 4.6)
-    grid = figure.subplots(1, len(_PANELS), sharey=True)
-    sizes = list(dict.fromkeys(int(row["n_components"]) for row in rows))
-    for axes, (field, title) in zip(grid, _PANELS.items(), strict=True):
-        for index, size in enumerate(sizes):
-            own = [r for r in rows if r["n_components"] == size and r[field] is not None]
-            thresholds = [row["variance_threshold"] for row in own]
-            label = f"{size:,} components"
-            axes.plot(thresholds, [row[field] for row in own], label=label, **style.line_look(index))
-        style.label_axes(axes, title, "variance threshold v", "")
+    """Draws `variance_threshold`: the decisions with each hit length, a group of bars for each form and size.
+
+    Shown are the rows with the first resolution, prior and threshold.
+    """
+    fixed = {name: rows[0][name] for name in ("resolution", "prior", "variance_threshold")}
+    shown = [row for row in rows if all(row[name] == value for name, value in fixed.items())]
+    groups = list(dict.fromkeys((row["method"], row["n_components"]) for row in shown))
+    lengths = list(dict.fromkeys(row["hit_length"] for row in shown))
+    figure = style.new_figure(15.5, 4.8)
+    width = 0.8 / len(lengths)
+    for axes, (field, title) in zip(
+        figure.subplots(1, len(_PANELS), sharey=True), _PANELS.items(), strict=True
+    ):
+        for index, length in enumerate(lengths):
+            own = {(r["method"], r["n_components"]): r[field] for r in shown if r["hit_length"] == length}
+            bars = [(place, own[group]) for place, group in enumerate(groups) if own.get(group) is not None]
+            places = [place + width * (index - 0.5 * (len(lengths) - 1)) for place, _ in bars]
+            axes.bar(
+                places, [value for _, value in bars], width, label=_length(length), color=style.colour(index)
+            )
+        names = [
+            "counted rays" if n is None else f"{style.label_of(m)},\n{n:,} components" for m, n in groups
+        ]
+        axes.set_xticks(range(len(groups)), names, rotation=60, fontsize=style.TICK_SIZE - 1)
+        style.label_axes(axes, title, "", "")
         axes.set_ylim(0, 1.02)
         style.draw_grid(axes)
-    grid[0].set_ylabel("share of the points", fontsize=style.LABEL_SIZE)
+    figure.axes[0].set_ylabel("share of the points", fontsize=style.LABEL_SIZE)
     style.legend_below(figure)
-    subject = f"{rows[0]['dataset']}, {style.label_of(rows[0]['method'])}"
-    style.figure_title(figure, f"Decisions against the variance threshold: {subject}")
+    subject = f"{rows[0]['dataset']}, cells of {style.metres(fixed['resolution'])}"
+    style.figure_title(
+        figure, f"Decisions with the variance threshold {fixed['variance_threshold']:g}: {subject}"
+    )
     return {"variance_threshold": figure}
+
+
+def _length(length: object) -> str:
+    return "hits as counts" if length is None else f"hit_length={length}"
 
 
 def closest_look(thin: Tensor, hits: Tensor, side: float = 4.0) -> Corners:
@@ -132,21 +151,18 @@ def closest_look(thin: Tensor, hits: Tensor, side: float = 4.0) -> Corners:
 
 
 def cells_figure(
-    maps: Mapping[int, Callable[[Tensor], Tensor]],
-    thresholds: Sequence[float],
+    maps: Mapping[int, Callable[[Tensor], Mapping[str, Tensor]]],
     hits: Tensor,
     low: Sequence[float],
     high: Sequence[float],
     resolution: float,
 ) -> Figure:
-    """Draws the cells classified occupied in the box [low, high] (m): one row per map, one column per
-    threshold.
+    """Draws cells in the box [low, high] (m): one row per map, one column per title.
 
     The first column shows the held-out points. All panels have the same colours of height.
 
     Args:
-        maps: by number of components: occupancy (M,) of points (M, 3).
-        thresholds: variance thresholds.
+        maps: by number of components: centres (M, 3) of cells → masks (M,) of the cells to draw, by title.
         hits: (H, 3) measured points, world metres.
         low, high: (3,) corners of the box, world metres.
         resolution: side (m) of the cells; larger if the box has more than 400,000 of them.
@@ -154,23 +170,25 @@ def cells_figure(
     corners = torch.tensor([low, high], dtype=torch.float64)
     inside = hits[((hits >= corners[0]) & (hits <= corners[1])).all(1)]
     size = resolution * max(1.0, (math.prod((corners[1] - corners[0]) / resolution) / _MAX_CELLS) ** (1 / 3))
-    steps = [torch.arange(a, b, size, dtype=torch.float64) + size / 2 for a, b in zip(low, high, strict=True)]
+    steps = [
+        torch.arange(math.floor(a / size), math.ceil(b / size), dtype=torch.float64) * size + size / 2
+        for a, b in zip(low, high, strict=True)
+    ]
     centres = torch.cartesian_prod(*steps)
     scale = Normalize(low[2], high[2], clip=True)
-    figure = style.new_figure(_SIDE * (1 + len(thresholds)) + 1.0, _SIDE * len(maps) + 0.6)
-    grid = figure.subplots(len(maps), 1 + len(thresholds), squeeze=False)
+    drawn = {n: masks(centres) for n, masks in maps.items()}
+    n_columns = 1 + max(len(masks) for masks in drawn.values())
+    figure = style.new_figure(_SIDE * n_columns + 1.0, _SIDE * len(maps) + 0.6)
+    grid = figure.subplots(len(maps), n_columns, squeeze=False)
     canvas = canvas_around(low, high, _CAMERA, int(_SIDE * style.SAVED_DPI))
-    for row, (n_components, occupancy) in zip(grid, maps.items(), strict=True):
-        theta = occupancy(centres)
+    for row, (n_components, masks) in zip(grid, drawn.items(), strict=True):
         shown = [(inside, _POINT_PIXELS / canvas.scale, f"{n_components:,} components:\nheld-out points")]
-        for threshold in thresholds:
-            occupied = centres[classify(theta, threshold) == CellClass.OCCUPIED]
-            shown.append((occupied, size / 2, f"v = {threshold:g}:\n{len(occupied):,} cells"))
+        shown += [(centres[mask], size / 2, title) for title, mask in masks.items()]
         for axes, (places, radius, title) in zip(row, shown, strict=True):
             part = balls(places, radius, height_colours(places[:, 2], scale))
             draw_scene(axes, [part], low, high, _CAMERA, canvas, n_ticks=3)
             axes.set_title(title, fontsize=style.TITLE_SIZE)
     colours = ScalarMappable(scale, height_colour_map())
     style.colour_bar(figure, colours, grid.ravel().tolist(), "height z [m]", shrink=0.6)
-    style.figure_title(figure, f"Cells of {style.metres(size)} classified occupied, by variance threshold v")
+    style.figure_title(figure, f"Cells of {style.metres(size)} with the dead band of a variance threshold")
     return figure
