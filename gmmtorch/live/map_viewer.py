@@ -123,7 +123,7 @@ class MapViewer:
             control.visible = visible
         with self._quiet():
             for control in (self._cut, self._height):
-                control.min, control.max = float(begin.low[2]), float(begin.high[2]) + 0.1
+                control.min, control.max = round(float(begin.low[2]), 2), round(float(begin.high[2]) + 0.1, 2)
             self._height.value = begin.height
             self._cut.value = min(begin.open_height, self._cut.max)
             self._resolution.value = max(_FINEST, min(self._map.resolution, _COARSEST))

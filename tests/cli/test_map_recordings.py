@@ -203,7 +203,7 @@ def test_a_run_without_any_map_fails(run, logs):
     assert not (done.folder / "tiles").exists()
 
 
-def test_urls_are_read_by_fsspec(run, logs, tmp_path):
+def test_urls_are_read_by_fsspec(run, logs, monkeypatch):
     fsspec = pytest.importorskip("fsspec")
     memory = fsspec.filesystem("memory")
     for path in logs.iterdir():
@@ -216,6 +216,9 @@ def test_urls_are_read_by_fsspec(run, logs, tmp_path):
     finally:
         memory.rm("/drives", recursive=True)
     assert "nonsense://a cannot be read" in refused(run("nonsense://a", folder="none"))
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    error = refused(run("s3://fleet/*.log", folder="none"))
+    assert "s3://fleet/*.log cannot be read: Install s3fs to access S3" in error
 
 
 def test_wrong_inputs_are_refused_before_any_work(run, logs, monkeypatch):

@@ -136,6 +136,70 @@ def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypat
         load("rosbag", path)
 
 
+@pytest.mark.parametrize("is_announced", [False, True])
+def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatch, is_announced):
+    """`ros2 bag record --compression-mode file`."""
+    from rosbags import rosbag2
+
+    from gmmtorch.datasets.recordings import rosbags_access
+
+    bag, folder = BagWriter(tmp_path / "a.db3"), tmp_path / "bag"
+    bag.writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
+    bag.writer.set_compression(rosbag2.CompressionMode.FILE, rosbag2.CompressionFormat.ZSTD)
+    bag.writer.open()
+    drive(bag)
+    bag.cloud("/points", 0.0, "lidar", np.ones((100_000, 3)))
+    bag.writer.close()
+    (file,) = folder.glob("*.db3.zstd")
+    if is_announced:
+        zstd = rosbag2.storage_mcap.zstd
+        file.write_bytes(zstd.compress(zstd.decompress(file.read_bytes())))
+    assert file.stat().st_size < 20_000
+    assert load("rosbag", folder)[0].points.shape == (100_000, 2)
+    monkeypatch.setattr(rosbags_access, "MAX_BAG_BYTES", 1 << 20)
+    with pytest.raises(DataError, match="bag unpacks to more than 1,048,576 bytes.*zstd -d"):
+        load("rosbag", folder)
+    file.write_bytes(b"no zstd")
+    with pytest.raises(DataError, match="cannot be read as a ROS bag.*reindex"):
+        load("rosbag", folder)
+
+
+def test_clouds_with_rings_of_nan_keep_the_other_rings(tmp_path):
+    """An organized cloud has a row for each ring; rings without return are NaN."""
+    rings = np.zeros((4, 6), np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")]))
+    for row, axis in enumerate("xyz"):
+        rings[axis] = np.arange(1 + row, 25 + row, dtype=np.float32).reshape(4, 6)
+    for axis in "xyz":
+        rings[axis][1::2] = np.nan
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        drive(bag)
+        bag.cloud_table("/points", 0.0, "lidar", rings)
+    dataset = load("rosbag", tmp_path / "a.mcap")
+    kept = [np.ravel(rings[axis][::2]) for axis in "xyz"]
+    np.testing.assert_allclose(dataset[0].points, np.stack(kept, 1) + [0, 0, 0.5])
+    assert dataset.skipped == {}
+
+
+def test_a_topic_that_the_bag_does_not_have_lists_its_topics(tmp_path):
+    with pytest.raises(InvalidArgumentError, match=r"/velodyne.*/points .*3 messages"):
+        load("rosbag", clouds(tmp_path / "a.mcap"), topic="/velodyne")
+
+
+def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):
+    import pickle
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a bag was unpickled")
+
+    for name in ("load", "loads", "Unpickler"):
+        monkeypatch.setattr(pickle, name, refuse)
+    pickled, code = "cos\nabort\n(tR.", "__import__('os').abort()"
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.transforms(0.0, {("odom", pickled): np.eye(4), (pickled, code): np.eye(4)})
+        bag.cloud("/points", 0.0, code, POINTS)
+    assert len(load("rosbag", tmp_path / "a.mcap")[0].points) == 2
+
+
 def test_two_sensors_on_one_topic_are_told_apart_by_their_frame(tmp_path):
     with BagWriter(tmp_path / "a.mcap") as bag:
         drive(bag)

@@ -114,6 +114,23 @@ def test_a_tilted_laser_gives_3d_scans(tmp_path):
     np.testing.assert_allclose(load("rosbag", tmp_path / "a.mcap")[0].points.numpy(), [[0, 0, -1]], atol=1e-7)
 
 
+@pytest.mark.parametrize("increment", [0.1, -0.1])
+@pytest.mark.parametrize("is_upside_down", [False, True])
+def test_beams_follow_the_sign_of_the_increment_and_the_mount(tmp_path, increment, is_upside_down):
+    """A robot at 10 m/s; the beams are taken one after the other in the order of their index."""
+    ranges = np.array([1.0, 2.0, 3.0])
+    over = np.diag([1.0, -1.0, -1.0, 1.0]) if is_upside_down else np.eye(4)  # half a turn about x
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for time in (0.0, 1.0, 2.0):
+            bag.transforms(time, {("odom", "lidar"): moved(10 * time) @ over})
+        bag.laser("/scan", 1.0, "lidar", ranges, 0.5, increment, 8.0, time_increment=0.02)
+    scan = load("rosbag", tmp_path / "a.mcap")[0]
+    angles = 0.5 + increment * np.arange(3)
+    across = ranges * np.sin(angles) * (-1 if is_upside_down else 1)
+    expected = np.stack([10 + ranges * np.cos(angles) + 10 * 0.02 * np.arange(3), across], 1)
+    np.testing.assert_allclose(scan.points.numpy(), expected, atol=1e-6)
+
+
 def test_points_with_times_are_deskewed(tmp_path):
     """A robot at 10 m/s sees a fixed point twice during a sweep of 0.1 s."""
     with BagWriter(tmp_path / "a.mcap") as bag:

@@ -83,8 +83,14 @@ def _errors_of(url: str) -> Iterator[None]:
     """Errors of a file system become a `DataError` that names the URL."""
     try:
         yield
+    except ImportError as error:
+        protocol = url.partition("://")[0]
+        raise DataError(
+            f"inputs: {url} cannot be read: {error}. fsspec reads {protocol}:// with that package: install it "
+            "with pip."
+        ) from error
     except Exception as error:  # every file system has errors of its own
         raise DataError(
-            f"inputs: {url} cannot be read ({type(error).__name__}: {error}); check the address, your access "
-            "to it, and that fsspec's package for its protocol is installed, such as s3fs for s3://."
+            f"inputs: {url} cannot be read ({type(error).__name__}: {error}); check the address and your "
+            "access to it."
         ) from error

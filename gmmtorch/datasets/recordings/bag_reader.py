@@ -60,9 +60,6 @@ class BagReader:
             self._reader: Any = (rosbags.ros1 if self._is_ros1 else rosbags.ros2)(_bounded(self.path))
             self._reader.open()
             self._unpack = rosbags.unpack_zstd
-            if not self._is_ros1 and self._reader.compression_mode == "message":
-                storage = self._reader.storage  # messages are unpacked here, with a limit
-                storage.metadata = storage.metadata._replace(compression_mode=None)
             self._connections = [
                 c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
             ]  # columns of a damaged database can be empty

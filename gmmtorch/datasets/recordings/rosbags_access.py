@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import bz2
+import shutil
+import tempfile
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, BinaryIO
 
 from gmmtorch.errors import DataError, GmmTorchError
 
 MAX_CHUNK_BYTES = 1 << 28
 """Limit of an unpacked chunk or message; recorders write chunks of about a megabyte."""
+
+MAX_BAG_BYTES = 1 << 35
+"""Limit of a ROS 2 bag file that is compressed as a whole, unpacked. It also takes at most half of the free
+space of the temporary folder."""
+
+_ZSTD_HEADER_BYTES = 18
 
 
 def load_rosbags() -> Any:
@@ -23,6 +31,7 @@ def load_rosbags() -> Any:
         from rosbags.rosbag1 import ReaderError
         from rosbags.rosbag1 import reader as ros1_module
         from rosbags.rosbag2 import Reader as Ros2Reader
+        from rosbags.rosbag2 import reader as ros2_module
         from rosbags.rosbag2 import storage_mcap
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:
@@ -40,9 +49,28 @@ def load_rosbags() -> Any:
     def unpack_zstd(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
         return _within(storage_mcap.zstd.ZstdDecompressor().decompress(data, _more(limit)))
 
-    # rosbags chooses its codecs from these tables; its own unpack without a limit.
+    zstd = storage_mcap.zstd
+
+    class BoundedZstdFile(zstd.ZstdFile):  # type: ignore[misc]
+        """A compressed file that is not read further than `_most_bag_bytes`."""
+
+        def __init__(self, packed: BinaryIO, mode: str = "rb") -> None:
+            announced = zstd.get_frame_info(packed.read(_ZSTD_HEADER_BYTES)).decompressed_size
+            packed.seek(0)
+            self._left = _most_bag_bytes()
+            _check_bag(self._left - (announced or 0))
+            super().__init__(packed, mode)
+
+        def read(self, size: int | None = -1) -> bytes:
+            found: bytes = super().read(size)
+            self._left -= len(found)
+            _check_bag(self._left)
+            return found
+
+    # rosbags takes its codecs from these names; its own unpack without a limit.
     ros1_module.decompressors.update(bz2=unpack_bz2, lz4=unpack_lz4)
     storage_mcap.DECOMPRESSORS.update(lz4=unpack_lz4, zstd=unpack_zstd)
+    ros2_module.zstd = SimpleNamespace(open=BoundedZstdFile, decompress=unpack_zstd)
 
     class BoundedRos1Reader(Ros1Reader):
         """Reads each byte of the index once: chunks that share an index would multiply it."""
@@ -76,6 +104,19 @@ def load_rosbags() -> Any:
         definitions=definitions,
         parsed=parsed,
     )
+
+
+def _most_bag_bytes() -> int:
+    return min(MAX_BAG_BYTES, shutil.disk_usage(tempfile.gettempdir()).free // 2)
+
+
+def _check_bag(bytes_left: int) -> None:
+    if bytes_left < 0:
+        raise DataError(
+            f"The compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half of the free "
+            f"space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', and write "
+            "its metadata.yaml again with 'ros2 bag reindex'."
+        )
 
 
 def _more(limit: int) -> int:
