@@ -149,6 +149,7 @@ def measure(name: str, data: Path, work: Path) -> tuple[list[list[object]], list
             f"{row['n_components']:,}",
             f"{row['nbytes'] / 1e3:.0f}",
             f"{first:.0f} to {last:.0f}",
+            "",
         ]
     ]
     inputs = "inputs=[" + ",".join(f'"{part}"' for part in parts) + "]"
@@ -175,6 +176,7 @@ def measure(name: str, data: Path, work: Path) -> tuple[list[list[object]], list
                 f"{merged['n_components']:,}",
                 f"{merged['nbytes'] / 1e3:.0f}",
                 memory(rows),
+                f"{merged['memory_bytes'] / 1e6:.0f}",
             ]
         )
     if any(each != files[0] for each in files):
@@ -205,7 +207,17 @@ def main() -> None:
         rows += table
         cities.append(city)
         print(markdown([""] * len(table[0]), table), city, flush=True)
-    header = ["data", "how", "wall s", "CPU s", "AUC", "components", "kB", "memory of a worker, MB"]
+    header = [
+        "data",
+        "how",
+        "wall s",
+        "CPU s",
+        "AUC",
+        "components",
+        "kB",
+        "memory of a worker, MB",
+        "merging, MB",
+    ]
     text = f"{hardware()}\n\n{markdown(header, rows)}"
     per_metre = [
         "data",

@@ -192,11 +192,17 @@ def _merge(
     config: DictConfig, places: Sequence[Path], rows: Sequence[Row], folder: Path, bars: ProgressBars
 ) -> Row:
     """Merges the finished recordings into tiles/; returns the row of the merged map."""
+    from gmmtorch.mapping.map_builder import resident_bytes
     from gmmtorch.mapping.tile_merging import merge
     from gmmtorch.mapping.tiles import TiledMap
 
-    begin = time.process_time()
-    tiled = merge(folder / "tiles", [TiledMap(place) for place in places], config.tile_bytes, bars)
+    begin, memory = time.process_time(), [resident_bytes()]
+
+    def note(stage: str, n_done: int, n_total: int | None) -> None:
+        bars(stage, n_done, n_total)
+        memory.append(resident_bytes())
+
+    tiled = merge(folder / "tiles", [TiledMap(place) for place in places], config.tile_bytes, note)
     mapped = [row for row in rows if not row["error"]]
     metres = sum(row["metres"] for row in mapped)
     return {
@@ -212,6 +218,7 @@ def _merge(
         "nbytes": tiled.nbytes,
         "bytes_per_metre": map_outputs.bytes_per_metre(tiled.nbytes, metres),
         "merge_cpu_seconds": time.process_time() - begin,
+        "memory_bytes": max(memory),
     }
 
 
