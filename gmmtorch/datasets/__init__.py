@@ -67,9 +67,9 @@ def load(
         poses: a trajectory file whose poses replace those of the data set: TUM rows (time x y z qx qy qz qw)
             for scans with times, or KITTI rows (12 numbers), one for each scan. rosbag also takes "tf",
             "standing" and topics.
-        options: specific to the data set: `pixel_stride` and `depth_scale` for depth_frames; `n_points`,
-            `noise` and `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or "depth_camera")
-            for mesh_scans and the synthetic buildings.
+        options: specific to the data set: `pixel_stride`, `depth_scale` and `up` for depth_frames;
+            `n_points`, `noise` and `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or
+            "depth_camera") for mesh_scans and the synthetic buildings.
 
     Raises `InvalidArgumentError` for an unknown name or option or an invalid value, `MissingDataError` for a
     path that does not exist, and `DataError`, now or when a scan is read, for unreadable data.

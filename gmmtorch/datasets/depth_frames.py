@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges, check_pose, natural_key, require_path
-from gmmtorch.errors import DataError, InvalidArgumentError, check_number
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number
 from gmmtorch.pinhole import back_project, check_intrinsics
 from gmmtorch.scan import Scan
 
@@ -24,6 +24,16 @@ _INVALID = (0, 65535)
 MAX_PIXELS = 1 << 23
 """An image of 4K has 8.3 million; a damaged header may announce billions."""
 _LARGEST_OFFSET = 0.2  # of the principal point from the middle of the image, share of its width or height
+
+_UPRIGHT = {
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+}
+"""The rotation that turns an axis into z."""
 
 
 class DepthFrames(Dataset):
@@ -33,7 +43,8 @@ class DepthFrames(Dataset):
     and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `depth_scale` is the number of
     metres per unit of the images. `intrinsics` is the pinhole matrix (3, 3) in pixels. `image` returns the
     full depth image of a scan. An image whose middle is far from the principal point is refused: it has
-    another size than the intrinsics.
+    another size than the intrinsics. `up` is the axis of the world frame of the pose files that points up;
+    the frame is turned so that it becomes z.
     """
 
     def __init__(
@@ -43,6 +54,7 @@ class DepthFrames(Dataset):
         stride: int = 1,
         pixel_stride: int = 1,
         depth_scale: float = 0.001,
+        up: str = "z",
     ) -> None:
         path = require_path(
             path,
@@ -55,6 +67,8 @@ class DepthFrames(Dataset):
         super().__init__(path.name, ranges, stride)
         check_number("depth_scale", depth_scale, above=True)
         self.pixel_stride = pixel_stride
+        check_choice("dataset.up", up, _UPRIGHT)
+        self._upright = torch.tensor(_UPRIGHT[up], dtype=torch.float64)
         self.depth_scale = float(depth_scale)
         self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
         if not self._files:
@@ -107,7 +121,8 @@ class DepthFrames(Dataset):
     def _known_pose(self, index: int) -> Tensor:
         path = self._files[index]
         path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
-        return check_pose(_matrix(path, 4), str(path))
+        pose = check_pose(_matrix(path, 4), str(path))
+        return torch.cat([self._upright @ pose[:3], pose[3:]])
 
 
 def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:

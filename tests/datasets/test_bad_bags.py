@@ -157,10 +157,10 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
     assert file.stat().st_size < 20_000
     assert load("rosbag", folder)[0].points.shape == (100_000, 2)
     monkeypatch.setattr(rosbags_access, "MAX_BAG_BYTES", 1 << 20)
-    with pytest.raises(DataError, match="bag unpacks to more than 1,048,576 bytes.*zstd -d"):
+    with pytest.raises(DataError, match=r"bag unpacks to more than 1,048,576 bytes.*zstd -d"):
         load("rosbag", folder)
     file.write_bytes(b"no zstd")
-    with pytest.raises(DataError, match="cannot be read as a ROS bag.*reindex"):
+    with pytest.raises(DataError, match=r"cannot be read as a ROS bag.*reindex"):
         load("rosbag", folder)
 
 
@@ -175,8 +175,8 @@ def test_clouds_with_rings_of_nan_keep_the_other_rings(tmp_path):
         drive(bag)
         bag.cloud_table("/points", 0.0, "lidar", rings)
     dataset = load("rosbag", tmp_path / "a.mcap")
-    kept = [np.ravel(rings[axis][::2]) for axis in "xyz"]
-    np.testing.assert_allclose(dataset[0].points, np.stack(kept, 1) + [0, 0, 0.5])
+    kept = np.stack([np.ravel(rings[axis][::2]) for axis in "xyz"], 1)
+    np.testing.assert_allclose(dataset[0].points, np.add(kept, [0, 0, 0.5]))
     assert dataset.skipped == {}
 
 

@@ -311,6 +311,22 @@ def test_depth_frames_apply_max_range_and_pixel_stride(tmp_path):
         load("depth_frames", folder, pixel_stride=0)
 
 
+@pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
+def test_depth_frames_are_turned_so_that_up_is_z(tmp_path, up):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 2000, dtype=np.uint16), pose)])
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis["xyz".index(up[-1])] = -1.0 if up[0] == "-" else 1.0
+    given, turned = load("depth_frames", folder), load("depth_frames", folder, up=up)
+    torch.testing.assert_close(turned[0].points[:, 2], given[0].points @ axis)
+    motion = turned.image(0)[1] @ torch.linalg.inv(given.image(0)[1])
+    assert float(torch.linalg.det(motion[:3, :3])) == pytest.approx(1)
+    torch.testing.assert_close(given[0].transformed(motion).points, turned[0].points)
+    with pytest.raises(InvalidArgumentError, match=r"dataset\.up='w' is not one of z, -z"):
+        load("depth_frames", folder, up="w")
+
+
 def test_depth_frames_scale_their_units(tmp_path):
     folder = depth_folder(tmp_path, [(np.full((4, 6), 5000, dtype=np.uint16), np.eye(4))])
     assert load("depth_frames", folder).image(0)[0].unique().tolist() == [5.0]

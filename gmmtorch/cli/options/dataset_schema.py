@@ -32,10 +32,12 @@ class DepthFramesDataset(FileDataset):
 
     pixel_stride: every n-th pixel of every n-th row.
     depth_scale: metres per unit of the images.
+    up: axis of the poses' world frame that points up: x, -x, y, -y, z or -z; it becomes z.
     """
 
     pixel_stride: int = 1
     depth_scale: float = 0.001
+    up: str = "z"
 
 
 @dataclass
@@ -76,15 +78,18 @@ class KittiDataset(FileDataset):
 
 
 @dataclass
-class TumDataset(DepthFramesDataset):
+class TumDataset(FileDataset):
     """A sequence of the TUM RGB-D benchmark.
 
+    pixel_stride: every n-th pixel of every n-th row.
+    depth_scale: metres per unit of the images.
     intrinsics: [fx,fy,cx,cy] in pixels; null: [525,525,319.5,239.5].
     max_gap: longest time (s) between two poses that are interpolated.
     """
 
-    intrinsics: list[float] | None = None
+    pixel_stride: int = 1
     depth_scale: float = 0.0002
+    intrinsics: list[float] | None = None
     max_gap: float = 0.5
 
 

@@ -86,8 +86,8 @@ def _errors_of(url: str) -> Iterator[None]:
     except ImportError as error:
         protocol = url.partition("://")[0]
         raise DataError(
-            f"inputs: {url} cannot be read: {error}. fsspec reads {protocol}:// with that package: install it "
-            "with pip."
+            f"inputs: {url} cannot be read: {error}. fsspec reads {protocol}:// with that package: install "
+            "it with pip."
         ) from error
     except Exception as error:  # every file system has errors of its own
         raise DataError(

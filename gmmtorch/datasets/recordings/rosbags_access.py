@@ -49,9 +49,10 @@ def load_rosbags() -> Any:
     def unpack_zstd(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
         return _within(storage_mcap.zstd.ZstdDecompressor().decompress(data, _more(limit)))
 
-    zstd = storage_mcap.zstd
+    zstd: Any = storage_mcap.zstd
+    folders: Any = ros2_module
 
-    class BoundedZstdFile(zstd.ZstdFile):  # type: ignore[misc]
+    class BoundedZstdFile(zstd.ZstdFile):
         """A compressed file that is not read further than `_most_bag_bytes`."""
 
         def __init__(self, packed: BinaryIO, mode: str = "rb") -> None:
@@ -70,7 +71,7 @@ def load_rosbags() -> Any:
     # rosbags takes its codecs from these names; its own unpack without a limit.
     ros1_module.decompressors.update(bz2=unpack_bz2, lz4=unpack_lz4)
     storage_mcap.DECOMPRESSORS.update(lz4=unpack_lz4, zstd=unpack_zstd)
-    ros2_module.zstd = SimpleNamespace(open=BoundedZstdFile, decompress=unpack_zstd)
+    folders.zstd = SimpleNamespace(open=BoundedZstdFile, decompress=unpack_zstd)
 
     class BoundedRos1Reader(Ros1Reader):
         """Reads each byte of the index once: chunks that share an index would multiply it."""
@@ -113,9 +114,9 @@ def _most_bag_bytes() -> int:
 def _check_bag(bytes_left: int) -> None:
     if bytes_left < 0:
         raise DataError(
-            f"The compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half of the free "
-            f"space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', and write "
-            "its metadata.yaml again with 'ros2 bag reindex'."
+            f"The compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half of the "
+            f"free space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', "
+            "and write its metadata.yaml again with 'ros2 bag reindex'."
         )
 
 
