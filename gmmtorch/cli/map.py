@@ -96,6 +96,7 @@ def _build(
     """Inserts all scans. If the user stops the run, writes the checkpoint and ends the command."""
     import gmmtorch
     from gmmtorch.errors import check_number
+    from gmmtorch.report.table import byte_text
 
     check_number("checkpoint_seconds", config.checkpoint_seconds)
     run_facts = {
@@ -112,7 +113,8 @@ def _build(
     with _stop_requests() as is_stopped:
         for now in builder.insert_all():
             bars(_STAGE, now.n_read, now.n_total)
-            bars.note(_STAGE, f"{now.n_components:,} components, {now.metres:,.0f} m")
+            size = f"{now.n_components:,} components, {byte_text(now.nbytes)}"
+            bars.note(_STAGE, f"{size}, {now.metres:,.0f} m")
             if viewer is not None and builder.map.n_pending == 0:
                 viewer.update(*map_outputs.snapshot(builder))
             is_over = now.n_read == now.n_total

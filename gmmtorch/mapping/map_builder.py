@@ -30,7 +30,8 @@ class BuildProgress:
 
     n_read, n_total: scans that were read, of all. n_skipped: scans of these that could not be used.
     n_points: returns in the map. n_components: final components. metres: length of the sensor's path.
-    seconds: computing time of all runs so far.
+    seconds: computing time of all runs so far. nbytes: of the map at the last row of the history, because
+    every count encodes the map; 0 before.
     """
 
     n_read: int
@@ -40,6 +41,7 @@ class BuildProgress:
     n_components: int
     metres: float
     seconds: float
+    nbytes: int
 
 
 @dataclass
@@ -141,6 +143,7 @@ class MapBuilder:
             self.map.n_final,
             record.metres,
             record.seconds,
+            record.history[-1]["nbytes"] if record.history else 0,
         )
 
     def _insert(self, index: int) -> None:

@@ -74,6 +74,8 @@ def test_the_builder_inserts_its_scans_and_counts_them():
     assert one.record.history[-1]["nbytes"] == plain.nbytes
     assert one.record.history[-1]["n_components"] == plain.n_components
     assert all(row["memory_bytes"] > 1e6 for row in one.record.history)
+    rows = [row["nbytes"] for row in one.record.history]
+    assert {now.nbytes for now in progress} == {0, *rows[:-1]}
 
 
 def test_progress_learns_no_unfinished_window(monkeypatch):
