@@ -139,16 +139,20 @@ def _reliability(shown: Sequence[Built], about: str) -> Any:
 
 def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces: Components | None) -> Any:
     """The maps of one resolution in space, beside the points and the surfaces of the `GaussianMap`."""
+    from gmmtorch.evaluation.metrics import separating_threshold
+    from gmmtorch.evaluation.queries import FREE, OCCUPIED
     from gmmtorch.report.scenes.map_scenes import OccupancyPanel, map_scene_figure
     from gmmtorch.report.style import label_of
     from gmmtorch.report.table import byte_text
 
     maps = []
     for built in shown:
-        row = built.row
+        row, theta = built.row, built.theta
+        # Thresholds of their own, because maps differ in calibration.
+        least = separating_threshold(theta[built.asked.of(OCCUPIED)], theta[built.asked.of(FREE)])
         n = "" if row["n_components"] is None else f"{row['n_components']:,} components, "
-        title = f"{_label(built)}: {n}{byte_text(row['nbytes'])}, AUC {row['auc']:.3f}"
-        maps.append(OccupancyPanel(title, built.answer))
+        title = f"{_label(built)}: {n}{byte_text(row['nbytes'])}, AUC {row['auc']:.3f}, θ ≥ {least:.2f}"
+        maps.append(OccupancyPanel(title, built.answer, least))
     resolution = shown[0].row["resolution"]
     title = (
         f"{label_of(shown[0].row['dataset'])}: cells of {100 * resolution:g} cm that each map calls occupied"

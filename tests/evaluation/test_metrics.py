@@ -15,7 +15,15 @@ from sklearn.metrics import brier_score_loss, roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.metrics import auc_interval, brier, psnr2, psnr_terms, roc, unknown_scores
+from gmmtorch.evaluation.metrics import (
+    auc_interval,
+    brier,
+    psnr2,
+    psnr_terms,
+    roc,
+    separating_threshold,
+    unknown_scores,
+)
 
 eighths = st.lists(st.integers(0, 8).map(lambda n: n / 8), min_size=1, max_size=12)
 """Few values, so that many scores tie."""
@@ -54,6 +62,17 @@ def test_auc_of_perfect_reversed_and_constant_maps():
     assert roc(high, low).auc == 1
     assert roc(low, high).auc == 0
     assert roc(half, half).auc == 0.5
+
+
+@given(occupied=eighths, free=eighths)
+def test_the_separating_threshold_is_the_best_of_all(occupied, free):
+    hits, misses = (torch.tensor(values).double() for values in (occupied, free))
+
+    def gain(threshold: float) -> float:
+        return float((hits >= threshold).double().mean() - (misses >= threshold).double().mean())
+
+    best = max(gain(k / 8) for k in range(10))
+    assert gain(separating_threshold(hits, misses)) == pytest.approx(best)
 
 
 @pytest.mark.parametrize(("n_occupied", "n_free"), [(0, 3), (3, 0), (0, 0)])

@@ -66,6 +66,7 @@ def test_panels_show_points_components_and_the_occupied_cells_of_each_map():
     maps = [
         OccupancyPanel("north wall", lambda at: 0.66 * (at[:, 1] > 3.9)),
         OccupancyPanel("south wall", lambda at: 0.66 * ((at[:, 1].abs() < 0.2) & (at[:, 2] > 0.4))),
+        OccupancyPanel("unknown", lambda at: torch.full((len(at),), 0.5), 0.1),
         OccupancyPanel("not sure", lambda at: torch.full((len(at),), 0.64)),
     ]
     figure = map_scene_figure(points, components.origins, maps, 0.25, components, title="room")
@@ -74,6 +75,7 @@ def test_panels_show_points_components_and_the_occupied_cells_of_each_map():
     assert [axes.get_title() for axes in panels] == [*titles, *(one.title for one in maps)]
     pixels = [drawn(axes) for axes in panels]
     path = pixels[-1]  # cells with θ < 0.65 are not drawn
+    assert pixels[-2] == path
     assert pixels[0] > path > 0
     assert pixels[2] > 10 * path  # the far wall
     assert pixels[3] == path  # the near wall, which would hide the room, is left out

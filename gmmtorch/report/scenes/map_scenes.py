@@ -15,7 +15,13 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.evidence import Thresholds
 from gmmtorch.report import style
 from gmmtorch.report.maps.map_regions import Corners, robust_bounds
-from gmmtorch.report.scenes.ellipsoids import cut_away, first_viewpoints, height_colours
+from gmmtorch.report.scenes.ellipsoids import (
+    N_SIGMA,
+    cut_away,
+    first_viewpoints,
+    height_colours,
+    principal_axes,
+)
 from gmmtorch.report.scenes.scene import (
     SOUTH_WEST,
     Ellipsoids,
@@ -30,8 +36,11 @@ from gmmtorch.report.table import byte_text, count_text
 
 _SIDE = 6.6  # inches, width of a panel
 _TALLEST = 1.1  # of a panel, relative to its width
+_SHARE = 0.97  # of the points, along each axis, that are shown
+_OUTSIDE = 1.0  # metres by which an ellipsoid may exceed the box
 _MAX_POINTS = 300_000
 _MAX_CELLS = 2_000_000
+_UNKNOWN_BAND = 0.02  # around θ = ½
 _REACH = 2  # cells around a measured point that are asked
 _POINT_PIXELS = 1.3  # radius of a point
 _PATH_PIXELS = 2.5  # radius of the sensor's path
@@ -43,10 +52,12 @@ _FILL = 0.62  # radius of a cell's ball, in cells: balls of neighbouring cells t
 
 
 class OccupancyPanel(NamedTuple):
-    """One map: the title of its panel, and its occupancy (M,) at points (M, 3), world metres."""
+    """One map: the title of its panel, its occupancy (M,) at points (M, 3), world metres, and the θ from
+    which a cell is drawn."""
 
     title: str
     occupancy: Callable[[Tensor], Tensor]
+    occupied_from: float = Thresholds().occupied
 
 
 def map_scene_figure(
@@ -62,7 +73,7 @@ def map_scene_figure(
     """Draws 3D maps side by side in space, coloured by height (thesis Fig 3.6b and Fig 3.7).
 
     The first panel shows the points, the second the components as 2σ ellipsoids, and each further one the
-    cells with θ > 0.65 of a map, the threshold of the thesis. Only cells within two cells of a point are
+    known cells of a map with θ ≥ `occupied_from`. Only cells within two cells of a point are
     asked. Surfaces that hide the inside are left out of all panels: see `cut_away`.
 
     Args:
@@ -84,7 +95,7 @@ def map_scene_figure(
     size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
     shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
     if components is not None:
-        kept = hidden.kept & _inside(components.means, box)
+        kept = hidden.kept & _lie_inside(components, box)
         ellipsoids = Ellipsoids(
             components.means[kept].double(),
             components.covariances[kept].double(),
@@ -94,7 +105,9 @@ def map_scene_figure(
         shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", ellipsoids))
     centres, side = cells_near(points[_inside(points, box)], resolution)
     for one in maps:
-        occupied = centres[one.occupancy(centres).cpu() > Thresholds().occupied]
+        theta = one.occupancy(centres).cpu()
+        is_unknown = (theta - 0.5).abs() < _UNKNOWN_BAND
+        occupied = centres[(theta >= one.occupied_from) & ~is_unknown]
         shown.append((one.title, _spots(occupied, _FILL * side, scale, hidden, box)))
     path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
     n_columns = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
@@ -166,6 +179,14 @@ def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box
     places = places[_inside(places, box)]
     places = places[~hidden(places)]
     return balls(places, radius, height_colours(places[:, 2], scale))
+
+
+def _lie_inside(components: Components, box: Corners) -> Tensor:
+    """Mask (K,) of the components whose means are in the box, and whose ends are nearly."""
+    means, (deviations, directions) = components.means, principal_axes(components.covariances)
+    end = N_SIGMA * directions[:, :, 2] * deviations[:, 2:]
+    wide = tuple(x - _OUTSIDE for x in box[0]), tuple(x + _OUTSIDE for x in box[1])
+    return _inside(means, box) & _inside(means + end, wide) & _inside(means - end, wide)
 
 
 def _inside(places: Tensor, box: Corners) -> Tensor:
