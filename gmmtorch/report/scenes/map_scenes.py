@@ -85,13 +85,12 @@ def map_scene_figure(
         title: of the figure.
         camera: the viewer.
     """
-    box = low, high = robust_bounds(
-        points[:: max(1, len(points) // _MAX_POINTS)], trajectory, 0.996, margin=0.3
-    )
     hidden = _Hidden(components, camera)
-    scale = style.height_scale(points[:, 2])
+    cloud = points[style.even_sample(len(points), _MAX_POINTS)].double().cpu()
+    cloud = cloud[~hidden(cloud)]
+    box = low, high = robust_bounds(cloud, trajectory, _SHARE, margin=0.3)
+    scale = style.height_scale(cloud[:, 2])
     canvas = canvas_around(low, high, camera, int(_SIDE * style.SAVED_DPI))
-    cloud = points[style.even_sample(len(points), _MAX_POINTS)]
     size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
     shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
     if components is not None:
