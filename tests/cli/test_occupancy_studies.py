@@ -23,8 +23,8 @@ TINY = {
         "study.n_large_samples=256 study.n_samples=64 study.resolution=3"
     ),
     "tab3_1_auc_memory": (
-        "dataset=synthetic_building_2d dataset.n_scans=12 study.n_components=[5,10] study.bgk_points=[64] "
-        "study.others=[occupancy_grid]"
+        "dataset=synthetic_building_2d dataset.n_scans=12 study.forms=[point] study.n_components=[5,10] "
+        "study.bgk_points=[64] study.others=[occupancy_grid]"
     ),
     "pose_correction": "dataset.n_scans=10 evaluation.pose_noise=[0.3,0.1] study.methods=[point,monte_carlo] "
     "map.n_samples=20000",
