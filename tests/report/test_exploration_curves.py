@@ -187,7 +187,7 @@ def test_deviations_are_drawn_as_paired_differences():
     figure = deviations_figure(rows)
     entropy, t90, _, sent = figure.axes
     names = [text.get_text() for text in entropy.get_yticklabels()]
-    assert names == ["E0, shell=0.0", "E0, update_stride=null", "thesis"]
+    assert names == ["E0, shell=0", "E0, update_stride=null", "thesis"]
     groups = [[row for row in rows if row["shell"] == 0.0 and row["framework"] == "gmm_shared"]]
     groups += [[row for row in rows if row["framework"] == "gmm_thesis"]]
     usual = rows[::4]
@@ -212,7 +212,7 @@ def test_deviations_are_drawn_as_paired_differences():
     )
     with pytest.raises(InvalidArgumentError, match="rows contain one variant, E0;"):
         deviations_figure(usual)
-    assert "E0, shell=0.0 − E0" in study_summary(rows)
+    assert "E0, shell=0 − E0" in study_summary(rows)
     deviations_figure(rows[:4]).canvas.draw()  # one seed has no intervals
 
 

@@ -138,7 +138,7 @@ def test_loss_figure_accepts_a_mission_without_missing_records():
         ([{"bandwidth": None}, {"bandwidth": 2e4, "loss": 0.1}], ["no limit", "20.0 kB/s, 10 % lost"]),
         ([{"reach": 15.0}, {"duplication": 0.2}], ["reach 15 m", "20 % duplicated, any reach"]),
         ([{"jitter": 0.0}, {"jitter": 0.02}], ["jitter 0 s", "jitter 0.02 s"]),
-        ([{"codec": "float"}, {"codec": "thesis"}], ["float", "thesis"]),
+        ([{"codec": "float"}, {"codec": "thesis"}], ["codec=float", "codec=thesis"]),
         ([{"framework": "grid_shared"}, {"loss": 0.1}], ["E1, lossless", "E0, 10 % lost"]),
         ([{"planner": "mcts"}], ["MCTS"]),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.paired_statistics import Interval, mean_band
@@ -127,7 +127,9 @@ def deviations_figure(rows: Rows) -> Figure:
             axes.plot(mean, place, "o", color=hue, markersize=6)
         if measure.field == "bytes_sent":
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}×"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         kind = "ratio" if measure.by_ratio else f"difference{f' [{measure.unit}]' if measure.unit else ''}"
         style.label_axes(axes, measure.title, kind, "")
         style.draw_grid(axes, "x")

@@ -123,8 +123,9 @@ def _option_text(field: str, value: Any) -> str:
             return f"reach {value:g} m"
         case (("delay" | "jitter" | "announce"), (int() | float())):
             return f"{field} {value:g} s"
-        case _ if field in THESIS and field != "codec":
-            return f"{field}={'null' if value is None else str(value).lower()}"
+        case _ if field in THESIS:
+            text = f"{value:g}" if isinstance(value, float) else str(value).lower()
+            return f"{field}={'null' if value is None else text}"
         case _:
             return _NAMES.get(str(value), style.label_of(str(value)))
 
