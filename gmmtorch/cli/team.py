@@ -119,6 +119,7 @@ _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
 """Options that each robot gets from this command."""
 _STAGE = "seconds"
+_COMPARED = {True: "all hold the same map", False: "their maps differ", None: "their maps have no digest"}
 _PAUSE = 0.2
 """Seconds between checks of the processes."""
 _TURN = 2.0
@@ -147,8 +148,7 @@ def run(config: DictConfig) -> None:
     outputs = Outputs(folder)
     outputs.written("results.json", lambda _: common.write_results("team", config, [summary, *rows], folder))
     _show(config, rows, outputs)
-    same = "all hold the same map" if summary["same_map"] else "their maps differ"
-    common.print_table(rows, TABLE.split(), f"{len(rows)} robots: {same}")
+    common.print_table(rows, TABLE.split(), f"{len(rows)} robots: {_COMPARED[summary['same_map']]}")
     print_refusals(rows)
     outputs.check()
     common.print_files(folder, folder / "results.json")
@@ -237,10 +237,11 @@ def _status(robots: Sequence[RobotProcess]) -> str:
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The row of the whole team."""
+    """The row of the whole team. Maps without digest, which repair no losses, cannot be compared."""
+    digests = {row["digest"] for row in rows}
     return {
         "n_robots": len(rows),
-        "same_map": len({row["digest"] for row in rows}) == 1,
+        "same_map": None if digests == {""} else len(digests) == 1,
         "n_records": max(row["n_records"] for row in rows),
         **{name: sum(row[name] for row in rows) for name in _SUMS if all(name in row for row in rows)},
     }

@@ -138,6 +138,14 @@ def test_the_status_is_of_robots_that_run(monkeypatch):
     assert set(notes[2:]) == {"robot 1 works"}
 
 
+def test_maps_without_digest_are_not_called_equal():
+    row = {"n_records": 0, "bytes_sent": 3}
+    found = [
+        team._summary([{**row, "digest": one} for one in pair])["same_map"] for pair in ("aa", "ab", ["", ""])
+    ]
+    assert found == [True, False, None]
+
+
 def test_files_that_a_full_disk_rejects_are_named_below_the_table(run, monkeypatch):
     with Disk() as disk:
         monkeypatch.setattr(team, "_started", lambda *_: [Done(k, 0, disk) for k in range(2)])
