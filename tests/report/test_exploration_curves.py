@@ -214,6 +214,8 @@ def test_deviations_are_drawn_as_paired_differences():
         deviations_figure(usual)
     assert "E0, shell=0 − E0" in study_summary(rows)
     deviations_figure(rows[:4]).canvas.draw()  # one seed has no intervals
+    rows[0]["t90"] = None
+    assert [one.axes[1].get_title() for one in (figure, deviations_figure(rows))] == ["t90", "t50"]
 
 
 def test_summary_draws_no_mean_if_a_seed_has_no_value():

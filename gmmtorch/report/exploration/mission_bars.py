@@ -89,17 +89,9 @@ def summary_bars(rows: Rows) -> Figure:
     return figure
 
 
-_DEVIATION_MEASURES = (
-    _Measure("entropy_reduction_bits", "entropy removed", by_ratio=True),
-    _Measure("t90", "t90", "s"),
-    _Measure("auc", "AUC"),
-    _Measure("bytes_sent", "bytes sent", by_ratio=True),
-)
-
-
 def deviations_figure(rows: Rows) -> Figure:
     """Draws, for each variant, its mean difference to the first one, over common seeds with the paired 95 %
-    interval: entropy removed (ratio), t90, AUC, and bytes sent (ratio).
+    interval: entropy removed (ratio), t90 (t50 unless all missions reach t90), AUC, and bytes sent (ratio).
 
     An interval that does not contain the line of no difference has the variant's colour, others are grey. A
     variant without a value for some seed has none.
@@ -110,9 +102,16 @@ def deviations_figure(rows: Rows) -> Figure:
     (usual, first), *others = by_variant(rows, otherwise="framework").items()
     if not others:
         raise InvalidArgumentError(f"rows contain one variant, {usual}; give another one to compare.")
-    figure = style.new_figure(2.9 * len(_DEVIATION_MEASURES) + 2.4, 1.9 + 0.36 * len(others))
-    columns = figure.subplots(1, len(_DEVIATION_MEASURES), sharey=True)
-    for axes, measure in zip(columns, _DEVIATION_MEASURES, strict=True):
+    time = "t90" if all(row.get("t90") is not None for row in rows) else "t50"
+    measures = (
+        _Measure("entropy_reduction_bits", "entropy removed", by_ratio=True),
+        _Measure(time, time, "s"),
+        _Measure("auc", "AUC"),
+        _Measure("bytes_sent", "bytes sent", by_ratio=True),
+    )
+    figure = style.new_figure(2.9 * len(measures) + 2.4, 1.9 + 0.36 * len(others))
+    columns = figure.subplots(1, len(measures), sharey=True)
+    for axes, measure in zip(columns, measures, strict=True):
         none = 1.0 if measure.by_ratio else 0.0
         axes.axvline(none, color="#777777", linewidth=1)
         values = _by_seed(first, measure)
