@@ -21,6 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.mixtures.piece_cuts import CutRule, is_fused_on, piece_cuts
 from gmmtorch.linalg import unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
@@ -99,6 +100,8 @@ def partition(
     """
     n, dim = points.shape
     features = quadratic_features(points) if features is None else features
+    if is_fused_on(points, weight, features):
+        return Partition(*piece_cuts(points, weight, features, _cut_rule(rule)))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -111,9 +114,10 @@ def partition(
         wanted = (deviation[:, 0] > rule.thickness) | (deviation[:, -1] > rule.length)
         thick = (deviation[:, 0] > 2 * rule.thickness).to(count)
         least = rule.min_weight + thick * (rule.min_weight_thick - rule.min_weight)
-        along = torch.linalg.vecdot(
-            points - means.index_select(0, labels), directions[:, :, -1].index_select(0, labels)
-        )
+        longest = directions[:, :, -1]
+        largest = longest.gather(1, longest.abs().argmax(1, keepdim=True))
+        longest = torch.where(largest < 0, -longest, longest)  # its sign tells which half is the new piece
+        along = torch.linalg.vecdot(points - means.index_select(0, labels), longest.index_select(0, labels))
         beyond = along > 0
         supported = _is_supported(along, labels, weight, n_pieces, least, rule.outlier_gap)
         cut = wanted & supported & (count >= 2 * least) & (deviation[:, -1] > 0)
@@ -125,6 +129,19 @@ def partition(
         labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
         n_pieces += n_new
     return Partition(labels, n_pieces)
+
+
+def _cut_rule(rule: FlatnessRule) -> CutRule:
+    return CutRule(
+        n_levels=_MAX_LEVELS,
+        max_components=-1 if rule.max_components is None else rule.max_components,
+        thickness=rule.thickness,
+        length=rule.length,
+        min_weight=rule.min_weight,
+        min_weight_thick=rule.min_weight_thick,
+        outlier_gap=rule.outlier_gap,
+        thickness_priority=_THICKNESS_PRIORITY,
+    )
 
 
 def _split_priority(count: Tensor, variances: Tensor) -> Tensor:
