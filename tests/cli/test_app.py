@@ -158,7 +158,7 @@ def test_descriptions_are_read_from_docstrings():
         (
             "explore",
             "experiment=",
-            "experiment=fig4_4_entropy experiment=fig4_5_bandwidth experiment=planners",
+            "experiment=deviations experiment=fig4_4_entropy experiment=fig4_5_bandwidth experiment=planners",
         ),
         ("explore", "check", ""),
         ("export", "bounds", "bounds="),
