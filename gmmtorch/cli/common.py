@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,8 +63,10 @@ def fit_options(config: DictConfig) -> FitOptions:
     """The options of a fit from `mixture.*` and `runtime.*`."""
     from gmmtorch.evaluation.protocol_options import FitOptions
 
-    runtime = config.runtime
-    return FitOptions(**as_options(config.mixture), dtype=runtime.dtype, compiled=runtime.compile)
+    runtime, mixture = config.runtime, as_options(config.mixture)
+    known = {item.name for item in fields(FitOptions)}
+    chosen = {name: value for name, value in mixture.items() if name in known}
+    return FitOptions(**chosen, dtype=runtime.dtype, compiled=runtime.compile)
 
 
 def run_dir() -> Path:

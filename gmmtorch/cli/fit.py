@@ -9,7 +9,9 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common, fit_stream
 from gmmtorch.cli.from_options.fit_data import fit_data
+from gmmtorch.cli.options.structured import build
 from gmmtorch.cli.studies import fit_studies, study
+from gmmtorch.mixture.reduction.prune_options import PruneOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -74,6 +76,7 @@ def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> 
         on_event,
         lambda rows: common.write_results("fit", config, rows, folder),
         common.as_options(config.method_options),
+        build(PruneOptions, common.as_options(config.mixture), "mixture"),
     )
     for method, mixture in outcome.mixtures.items():
         mixture.save(folder / f"{method}.safetensors")

@@ -88,6 +88,11 @@ def _check(config: DictConfig) -> None:
         raise InvalidArgumentError(
             f"method_options={config.method_options}: a streamed fit has no method options; remove them."
         )
+    if config.mixture.prune != "none":
+        raise InvalidArgumentError(
+            f"mixture.prune={config.mixture.prune}: a streamed fit does not prune; use none, and "
+            "gmmtorch.mixture.prune."
+        )
     if config.study is not None:
         raise InvalidArgumentError(
             f"study={config.study.name} runs in one process on a data set; remove points, checkpoint, resume "

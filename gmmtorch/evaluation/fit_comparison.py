@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event, OnRows, Row
+from gmmtorch.evaluation.fit_pruning import Views, pruned, tree_options
 from gmmtorch.evaluation.metrics import psnr2, psnr_terms
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimator import MixtureEstimator
@@ -28,6 +29,7 @@ from gmmtorch.mixture.estimators.sliced_wasserstein import SlicedWassersteinGaus
 from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture
 from gmmtorch.mixture.estimators.variational import VariationalGaussianMixture
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
+from gmmtorch.mixture.reduction.prune_options import PruneOptions
 
 ESTIMATORS: dict[str, type] = {
     "em": GaussianMixture,
@@ -44,12 +46,19 @@ NO_LIKELIHOODS = frozenset({"variational", "sliced_wasserstein", "scikit_learn_b
 
 
 def fit(
-    method: str, points: Tensor, options: FitOptions, seed: int, on_event: Event, **own: Any
+    method: str,
+    points: Tensor,
+    options: FitOptions,
+    seed: int,
+    on_event: Event,
+    origins: Tensor | None = None,
+    **own: Any,
 ) -> MixtureEstimator:
     """Fit the estimator of that name to points (N, D).
 
     Args:
         options: an estimator takes the options that its constructor has.
+        origins: (S, D) sensor origins, for the estimators that take them.
         own: options of this estimator only.
 
     Raises `InvalidArgumentError` for an unknown method or option.
@@ -58,12 +67,19 @@ def fit(
         raise InvalidArgumentError(
             f"method={method!r} is not known; known are {', '.join(sorted(ESTIMATORS))}."
         )
-    work = _fit_ours if issubclass(ESTIMATORS[method], MixtureEstimator) else _fit_scikit_learn
-    return work(method, points, options, seed, on_event, own)
+    if issubclass(ESTIMATORS[method], MixtureEstimator):
+        return _fit_ours(method, points, options, seed, on_event, origins, own)
+    return _fit_scikit_learn(method, points, options, seed, on_event, own)
 
 
 def _fit_ours(
-    method: str, points: Tensor, options: FitOptions, seed: int, on_event: Event, own: dict[str, Any]
+    method: str,
+    points: Tensor,
+    options: FitOptions,
+    seed: int,
+    on_event: Event,
+    origins: Tensor | None,
+    own: dict[str, Any],
 ) -> MixtureEstimator:
     mixture: Any = ESTIMATORS[method](**_arguments(method, options, seed, own))
     on_event(method, 0, options.max_iter)
@@ -71,10 +87,11 @@ def _fit_ours(
     def on_iteration(iteration: int, lower_bound: float) -> None:
         on_event(method, min(iteration, options.max_iter), options.max_iter)
 
-    reports = "on_iteration" in inspect.signature(mixture.fit).parameters
+    known = inspect.signature(mixture.fit).parameters
+    given = {"on_iteration": on_iteration, "origins": origins}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row contains `converged`
-        mixture.fit(points, **({"on_iteration": on_iteration} if reports else {}))
+        mixture.fit(points, **{name: value for name, value in given.items() if name in known})
     on_event(method, options.max_iter, options.max_iter)
     fitted: MixtureEstimator = mixture
     return fitted
@@ -131,15 +148,19 @@ class FitOutcome:
 
 
 class FitData(NamedTuple):
-    """Points of a data set: train (N, D) for the fit and test (M, D) held out, M ≥ 0; metres."""
+    """Points of a data set: train (N, D) for the fit and test (M, D) held out, M ≥ 0; metres.
+
+    views: of the training points, if they are known.
+    """
 
     dataset: str
     train: Tensor
     test: Tensor
+    views: Views | None = None
 
 
-def split(dataset: str, points: Tensor, test_share: float, seed: int) -> FitData:
-    """Hold out a random share of points (N, D).
+def split(dataset: str, points: Tensor, test_share: float, seed: int, views: Views | None = None) -> FitData:
+    """Hold out a random share of points (N, D) with these views.
 
     Raises `InvalidArgumentError` for a share outside [0, 1) or a cloud without points.
     """
@@ -150,7 +171,9 @@ def split(dataset: str, points: Tensor, test_share: float, seed: int) -> FitData
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(points.shape[0], generator=generator).to(points.device)
     n_test = int(test_share * points.shape[0])
-    return FitData(dataset, points[order[n_test:].sort().values], points[order[:n_test]])
+    train = order[n_test:].sort().values
+    views = None if views is None else views._replace(scan=views.scan[train])
+    return FitData(dataset, points[train], points[order[:n_test]], views)
 
 
 def compare(
@@ -161,10 +184,12 @@ def compare(
     on_event: Event,
     on_rows: OnRows = lambda rows: None,
     own: Mapping[str, Mapping[str, Any]] | None = None,
+    pruning: PruneOptions | None = None,
 ) -> FitOutcome:
     """Fit the training points by each method, and score the mixtures on training and test points.
 
-    `own` contains, by method, options that only its estimator takes. Raises `InvalidArgumentError` for an
+    `own` contains, by method, options that only its estimator takes. `pruning` removes components; None
+    removes none. Raises `InvalidArgumentError` for an
     unknown method or an invalid option.
     """
     own = own or {}
@@ -178,13 +203,30 @@ def compare(
     outcome = FitOutcome()
     for method in methods:
         begin = time.perf_counter()
-        mixture = fit(method, data.train, options, seed, on_event, **own.get(method, {}))
+        mixture = _fit_and_prune(method, data, options, seed, on_event, own.get(method, {}), pruning)
         seconds = time.perf_counter() - begin
         outcome.mixtures[method] = mixture
         outcome.lower_bounds[method] = mixture.lower_bounds_
         outcome.rows.append(row_of(data, method, mixture, seconds, seed))
         on_rows(outcome.rows)
     return outcome
+
+
+def _fit_and_prune(
+    method: str,
+    data: FitData,
+    options: FitOptions,
+    seed: int,
+    on_event: Event,
+    own: Mapping[str, Any],
+    pruning: PruneOptions | None,
+) -> MixtureEstimator:
+    pruning, views = pruning or PruneOptions(), data.views
+    if method == "hierarchical":
+        own = {**tree_options(pruning, data.train, views), **own}
+    origins = None if views is None else views.origins
+    mixture = fit(method, data.train, options, seed, on_event, origins, **own)
+    return mixture if method == "hierarchical" else pruned(mixture, pruning, data.train, views)
 
 
 def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float, seed: int) -> Row:
@@ -194,7 +236,7 @@ def row_of(data: FitData, method: str, mixture: MixtureEstimator, seconds: float
     weights do not show this: a prior gives weight to components without points. PSNR2 compares the points
     with equally many samples, drawn with the seed.
     """
-    _, train, test = data
+    train, test = data.train, data.test
     forward, backward = psnr_terms(train, _drawn(mixture, len(train), seed))
     return {
         "dataset": data.dataset,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.evaluation.paired_statistics import Interval
 
 _BINS = 4096
 CALLED_FREE, CALLED_OCCUPIED = 0.2, 0.65
@@ -78,6 +80,31 @@ def auc_interval(
     tail = (1 - level) / 2
     low, high = np.quantile(replicates - replicates.mean(), [tail, 1 - tail]) + auc
     return max(0.0, float(low)), min(1.0, float(high))
+
+
+def auc_gain(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], level: float = 0.95) -> Interval:
+    """Difference of the AUCs of two classifiers of the same points, with its interval.
+
+    Each argument has the probabilities of occupied (P,) and free (Q,) points. The variance is that of
+    DeLong, DeLong & Clarke-Pearson (1988): of the differences of the points' shares of the AUC.
+    """
+    (occupied, free), (other_occupied, other_free) = _shares_of_auc(*before), _shares_of_auc(*after)
+    up, down = other_occupied - occupied, other_free - free
+    mean = float(up.mean())
+    variance = float(up.var() / len(up) + down.var() / len(down))
+    half = NormalDist().inv_cdf((1 + level) / 2) * math.sqrt(variance)
+    return Interval(mean, mean - half, mean + half)
+
+
+def _shares_of_auc(occupied: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """Share (P,) of free points below each occupied one, and (Q,) of occupied points above each free one."""
+
+    def below(values: Tensor, others: Tensor) -> Tensor:
+        ordered = others.double().sort().values
+        ends = [torch.searchsorted(ordered, values.double(), right=right) for right in (False, True)]
+        return (ends[0] + ends[1]).double() / (2 * len(ordered))
+
+    return below(occupied, free), 1 - below(free, occupied)
 
 
 def brier(occupied: Tensor, free: Tensor) -> float:

@@ -26,13 +26,14 @@ SILENT = {"study"}
 """Options that only `experiment=` sets."""
 WORDS = {"dataset.max_range", "dataset.no_return_range"}
 """Options whose defaults depend on other options; they are described in words and not compared."""
-FREE = {"method_options", "sensor_options"}
+FREE = {"method_options", "sensor_options", "variants"}
 """Groups with free names."""
 STUDIES = {
     "occupancy": [
         "fig3_3_approximation_error",
         "fig3_8_variance_threshold",
         "pose_correction",
+        "pruning",
         "tab3_1_auc_memory",
     ],
     "fit": ["automatic_components", "fig2_1_initialization", "sensor_model"],

@@ -28,6 +28,7 @@ TINY = {
     ),
     "pose_correction": "dataset.n_scans=10 evaluation.pose_noise=[0.3,0.1] study.methods=[point,monte_carlo] "
     "map.n_samples=20000",
+    "pruning": "dataset=synthetic_building_2d dataset.n_scans=8 evaluation.max_beams=500",
     "fig3_8_variance_threshold": (
         "study.railing_scans=4 study.max_beams=300 study.n_components=[20,40] study.method=[counts,point] "
         "study.resolution=[0.25] study.hit_length=[null,auto] study.test_every=3"
@@ -140,6 +141,22 @@ def test_pose_correction(run):
     assert_shown(done, {"pose_correction"}, "point/auc_corrected", "monte_carlo/auc")
 
 
+def test_pruning(run):
+    done = succeeded(run("pruning", *SHOWN))
+    rows = {row["variant"]: row for row in done.results()["rows"]}
+    assert list(rows)[:3] == ["flat_pieces", "support", "density"]
+    first = rows["flat_pieces"]
+    assert first["auc_gain"] == 0
+    for row in rows.values():
+        assert row["auc_gain_low"] <= row["auc_gain"] <= row["auc_gain_high"]
+        assert row["auc_gain"] == pytest.approx(row["auc"] - first["auc"], abs=1e-9)
+        assert row["nbytes"] > row["n_components"] > row["n_free_components"] >= 0
+    assert rows["support"]["n_components"] < first["n_components"]
+    assert rows["free_points"]["n_free_components"] > first["n_free_components"]
+    assert rows["tree_support"]["n_components"] < rows["tree"]["n_components"]
+    assert_shown(done, {"map_variants"}, "flat_pieces/auc", "tree/held_out_log_likelihood")
+
+
 def test_variance_threshold(run):
     done = succeeded(run("fig3_8_variance_threshold", *SHOWN))
     rows = done.results()["rows"]
@@ -192,6 +209,9 @@ def test_no_figures_are_written_without_report_figures(name, run):
         ("pose_correction", "study.methods=[occupancy_grid]", "method='occupancy_grid' point"),
         ("fig3_8_variance_threshold", "study.method=[bgk]", "method='bgk' point"),
         ("fig3_8_variance_threshold", "study.hit_length=[-1]", "hit_length=-1"),
+        ("pruning", "study.variants.support.prune=weight", "map.prune='weight' density"),
+        ("pruning", "+study.variants.support.novel=1", "study.variants.support.novel map=incremental"),
+        ("pruning", "study.variants.support=1", "study.variants={support: prune: support"),
         ("fig3_8_variance_threshold", "study.n_components=[]", "study.n_components=[] empty"),
         ("fig3_8_variance_threshold", "study.variance_threshold=[-1]", "threshold=-1"),
         ("fig3_8_variance_threshold", "study.thin_width=0", "study.thin_width=0"),

@@ -17,8 +17,12 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import ignore
 from gmmtorch.evaluation.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
+from gmmtorch.evaluation.fit_pruning import Views
 from gmmtorch.evaluation.metrics import psnr2
 from gmmtorch.evaluation.protocol_options import FitOptions
+from gmmtorch.mixture.estimators.sensor_model import measured_sensor
+from gmmtorch.mixture.reduction.prune_options import PruneOptions
+from gmmtorch.mixture.reduction.pruning import prune
 
 SMALL = FitOptions(n_components=6, max_iter=60)
 
@@ -140,7 +144,7 @@ def test_psnr2_uses_as_many_samples_as_points():
 
 def test_split_is_a_random_partition_of_the_points():
     points = blobs()
-    _, train, test = split("blobs", points, 0.25, 0)
+    _, train, test, _ = split("blobs", points, 0.25, 0)
     assert (len(train), len(test)) == (900, 300)
     assert sorted(torch.cat([train, test]).tolist()) == sorted(points.tolist())
     assert not torch.equal(test, split("blobs", points, 0.25, 1).test)
@@ -270,3 +274,61 @@ def test_unknown_own_options_raise():
         compare(data, ["em"], SMALL, 0, ignore, own={"em": {"branching": 3}})
     with pytest.raises(InvalidArgumentError, match="method='trees' is not known"):
         compare(data, ["em"], SMALL, 0, ignore, own={"trees": {"branching": 3}})
+
+
+# -- pruning ---------------------------------------------------------------------------------------
+
+
+def two_scans() -> tuple[Tensor, Views]:
+    """Two scans of a wall 4 m away, with a few stray points."""
+    generator = torch.Generator().manual_seed(0)
+    angle = torch.linspace(-0.7, 0.7, 500, dtype=torch.float64)
+    origins = torch.tensor([[0.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    wall = [torch.stack([torch.full_like(angle, 4), y + 4 * angle.tan()], 1) for y in origins[:, 1]]
+    stray = torch.rand(12, 2, generator=generator, dtype=torch.float64) * 3
+    points = torch.cat([*wall, stray]) + 0.01 * torch.randn(1012, 2, generator=generator).double()
+    return points, Views(torch.repeat_interleave(torch.tensor([500, 512])), origins)
+
+
+@pytest.mark.parametrize("kind", ["support", "density"])
+def test_fits_are_pruned_as_by_the_function(kind):
+    points, views = two_scans()
+    data = split("walls", points, 0.1, 0, views)
+    pruning = PruneOptions(prune=kind, min_support=30, min_density_share=0.3)
+    plain = compare(data, ["em"], SMALL, 0, ignore).mixtures["em"]
+    outcome = compare(data, ["em"], SMALL, 0, ignore, pruning=pruning)
+    known = data.views
+    assert known is not None
+    place = (data.train[:, None] == points).all(2).double().argmax(1)
+    assert torch.equal(known.scan, (place >= 500).long())
+    largest = int(known.scan.double().mean() > 0.5)
+    owner = torch.as_tensor(plain.predict(data.train))
+    counts = torch.zeros(len(plain.weights), 2)
+    for component, scan in zip(owner.tolist(), known.scan.tolist(), strict=True):
+        counts[component, scan] += 1
+    sensor = measured_sensor(data.train[known.scan == largest], views.origins[largest])
+    limits: dict[str, Any] = {"min_support": 30}
+    if kind == "density":
+        limits = {"min_density_share": 0.3, "sensor": sensor, "origins": views.origins, "counts": counts}
+    expected, kept = prune(plain, len(data.train), **limits)
+    assert 0 < int(kept.sum()) < 6
+    torch.testing.assert_close(outcome.mixtures["em"].means, expected.means)
+    assert outcome.rows[0]["n_components"] == int(kept.sum())
+
+
+@pytest.mark.parametrize("kind", ["support", "density"])
+def test_trees_are_pruned_while_they_grow(kind):
+    points, views = two_scans()
+    data = split("walls", points, 0.1, 0, views)
+    pruning = PruneOptions(prune=kind, min_support=100, min_density_share=0.3)
+    plain = compare(data, ["hierarchical"], SMALL, 0, ignore).mixtures["hierarchical"]
+    tree = compare(data, ["hierarchical"], SMALL, 0, ignore, pruning=pruning).mixtures["hierarchical"]
+    assert 0 < len(tree.weights) < len(plain.weights)
+    assert float(tree.weights.sum()) == pytest.approx(1)
+
+
+def test_pruning_by_density_needs_origins():
+    pruning = PruneOptions(prune="density")
+    for method in ("em", "hierarchical"):
+        with pytest.raises(InvalidArgumentError, match="prune='density' needs scans with sensor origins"):
+            compare(split("blobs", blobs(), 0.2, 0), [method], SMALL, 0, ignore, pruning=pruning)

@@ -21,7 +21,7 @@ from torch import Tensor
 from gmmtorch import datasets
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, prune
+from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture, LaserModel, prune
 from gmmtorch.mixture.estimators.trees.growth import Tree, grow
 from gmmtorch.mixture.estimators.trees.hierarchical import check_tree
 from gmmtorch.mixture.estimators.trees.nested import (
@@ -723,3 +723,52 @@ def test_real_surfaces_are_nearly_as_likely_as_flat_em(real_data: Path, name: st
     assert scores == sorted(scores)
     assert tree.score(fresh) > flat.score(fresh) - 0.3
     assert tree.score(fresh) > GaussianMixture(8, random_state=0).fit(points).score(fresh) + 0.3
+
+
+# -- pruning by density (thesis 2.1.4) --------------------------------------------------------------
+
+
+def two_walls() -> tuple[np.ndarray, LaserModel]:
+    """Points of two far apart walls around the origin, and a few stray points between them; the sensor."""
+    laser = LaserModel(angular_step=0.002)
+    along = np.linspace(-0.8, 0.8, 800)
+    walls = [np.stack([np.full(800, side * 4.0), 4 * np.tan(along)], 1) for side in (-1, 1)]
+    stray = np.stack([np.linspace(-3, 3, 9), np.full(9, 3.0)], 1)
+    noise = np.random.default_rng(0).normal(0, 0.01, (1609, 2))
+    return np.concatenate([*walls, stray]) + noise, laser
+
+
+def test_sparse_children_lose_their_points_to_their_siblings():
+    points, laser = two_walls()
+    options: dict[str, Any] = {"branching": 3, "max_levels": 1, "min_gain": 0.0, "min_support": 2.0}
+    plain = exact(**options).fit(points)
+    assert len(plain.weights_) == 3
+    least = float(np.min(plain.weights_))
+    assert least < 0.02  # the stray points
+    pruned = exact(min_density_share=0.2, sensor=laser, **options).fit(points, origins=np.zeros(2))
+    assert len(pruned.weights_) == 2
+    assert np.sum(pruned.weights_) == pytest.approx(1)
+    assert np.min(pruned.weights_) > 0.4
+    again = exact(min_density_share=1e-9, sensor=laser, **options).fit(points, origins=np.zeros((1, 2)))
+    np.testing.assert_array_equal(again.means_, plain.means_)
+
+
+def test_a_tree_of_sparse_children_is_one_node():
+    points, laser = two_walls()
+    found = exact(min_density_share=1e6, sensor=laser).fit(points, origins=np.zeros(2))
+    assert len(found.weights_) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "origins", "said"),
+    [
+        ({"min_density_share": 0.1}, np.zeros(2), "min_density_share=0.1 needs .* sensor"),
+        ({"min_density_share": 0.1, "sensor": LaserModel()}, None, "origins in fit"),
+        ({"min_density_share": 0.1, "sensor": LaserModel()}, np.zeros(3), r"origins has shape \(3,\)"),
+        ({"min_density_share": -1.0}, None, "min_density_share=-1"),
+        ({"sensor": "lidar"}, None, "sensor='lidar'"),
+    ],
+)
+def test_invalid_options_of_density_are_named(options, origins, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        exact(**options).fit(two_walls()[0], origins=origins)

@@ -45,19 +45,31 @@ def test_expected_density_by_hand():
     laser = LaserModel(angular_step=0.01)
     means, covariances = tensor([4.0, 3.0]), torch.diag(tensor(1e-4, 1.0))[None]  # normal along x
     found = expected_density(means, covariances, laser, tensor(0.0, 0.0))
-    assert float(found[0]) == pytest.approx(0.8 / 0.05)
+    assert float(found[0]) == pytest.approx(0.8 / (0.01 * math.sqrt(25 + 1.0001)))
     several = tensor([0.0, 3.0], [2.0, 3.0], [12.0, 3.0])  # at 4, 2 and 8 m
-    assert float(expected_density(means, covariances, laser, several)) == pytest.approx(1 / 0.02)
+    expected = 1 / (0.01 * math.sqrt(4 + 1.0001))
+    assert float(expected_density(means, covariances, laser, several)) == pytest.approx(expected)
 
 
 def test_expected_density_with_counts_by_hand():
     laser = LaserModel(angular_step=0.01)
-    means, covariances = tensor([4.0, 3.0]), torch.diag(tensor(1e-4, 1.0))[None]
+    means, covariances = tensor([4.0, 3.0]), torch.diag(tensor(1e-12, 1e-8))[None]
     origins = tensor([0.0, 3.0], [2.0, 3.0], [12.0, 3.0])
     views = tensor(25.0, 50.0, 12.5)
     for counts, expected in ((views * 3, 87.5), (tensor(0.0, 0.0, 7.0), 12.5), (tensor(2.0, 4.0, 0.0), 75)):
         found = expected_density(means, covariances, laser, origins, counts[None])
         assert float(found) == pytest.approx(expected)
+
+
+def test_the_density_of_a_large_component_is_that_of_its_mean_area_per_beam():
+    camera = DepthCameraModel(pixel_angle=0.01, max_incidence=0.0)
+    means, covariances = tensor([0.0, 0.0, 1.0]), torch.diag(tensor(0.5, 2.0, 1e-6))[None]
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
+    points = means + draws @ covariances[0].sqrt()
+    area = camera.point_density(points.norm(dim=1)).reciprocal().mean()
+    found = expected_density(means, covariances, camera, torch.zeros(3).double())
+    assert float(found) == pytest.approx(float(1 / area), rel=0.02)
 
 
 def test_prune_by_support():

@@ -19,6 +19,7 @@ from gmmtorch.mixture.estimators.sensor_model import (
     SensorModel,
     cos_incidence,
     estimate_normals,
+    measured_sensor,
 )
 from gmmtorch.simulation import laser_2d, simulate_scan, spinning_lidar
 from gmmtorch.simulation.sensors.range_sensors import depth_camera
@@ -262,3 +263,41 @@ def test_axial_noise_may_decrease_but_not_below_zero():
     DepthCameraModel(axial=(0.001, -0.0019, 0.001))
     with pytest.raises(InvalidArgumentError, match="axial"):
         DepthCameraModel(axial=(0.001, -0.0021, 0.001))
+
+
+# -- spacing of beams -------------------------------------------------------------------------------------
+
+
+class Sphere:
+    """A sphere of 5 m around the origin of the beams."""
+
+    def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
+        return torch.full_like(directions[:, 0], 5.0)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "density", "tolerance"),
+    [
+        (laser_2d(720), 720 / math.pi / 5, 0.01),
+        (spinning_lidar(32, 360, max_range=20.0), None, 0.1),
+        (depth_camera(120, 90), None, 0.4),  # pixels are denser off the axis
+    ],
+    ids=["laser", "lidar", "camera"],
+)
+def test_measured_sensor_has_the_density_of_the_scan(sensor, density, tolerance):
+    dim = sensor.directions.shape[1]
+    scan = simulate_scan(sensor, torch.eye(dim + 1).double(), Sphere(), torch.Generator().manual_seed(0))
+    if density is None:  # points within a cap around the middle of the field of view
+        axis = scan.points.mean(0) if sensor.max_range == math.inf else vector(1.0, 0.0, 0.0)
+        axis = axis / axis.norm()
+        near = (scan.points @ axis / 5).clamp(-1, 1).acos() < 0.15
+        density = float(near.sum()) / (2 * math.pi * 25 * (1 - math.cos(0.15)))
+    found = measured_sensor(scan.points + 3.0, scan.origin + 3.0)
+    assert float(found.point_density(5.0)) == pytest.approx(density, rel=tolerance)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_measured_sensor_of_too_few_directions_has_the_default_spacing(dim):
+    default = LaserModel() if dim == 2 else LidarModel()
+    for points in (torch.zeros(0, dim), torch.ones(1, dim), torch.ones(5, dim)):
+        assert measured_sensor(points, torch.zeros(dim)) == default

@@ -27,9 +27,14 @@ def fit_data_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> FitData
     import torch
 
     from gmmtorch.evaluation.fit_comparison import split
+    from gmmtorch.evaluation.fit_pruning import Views
 
-    points = _subset(torch.cat([scan.points for scan in scans]), config.max_points, config.seed)
-    return split(name, points, config.test_share, config.seed)
+    points = torch.cat([scan.points for scan in scans])
+    sizes = torch.tensor([len(scan.points) for scan in scans], device=points.device)
+    views = Views(torch.repeat_interleave(sizes), torch.stack([scan.origin.double() for scan in scans]))
+    chosen = _subset(points, config.max_points, config.seed)
+    views = views._replace(scan=views.scan[chosen])
+    return split(name, points[chosen], config.test_share, config.seed, views)
 
 
 def selected_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:
@@ -46,16 +51,16 @@ def selected_scans(config: DictConfig, device: str, on_event: Event) -> tuple[st
     return dataset.name, common.read_scans(dataset, indices, device, on_event)
 
 
-def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor:
-    """A random subset of `max_points` of the points (N, D), in their order; all points if there are fewer."""
+def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor | slice:
+    """Indices of a random subset of `max_points` of the points (N, D), in their order; all if there are
+    fewer."""
     import torch
 
     from gmmtorch.errors import InvalidArgumentError
 
     if max_points is None or points.shape[0] <= max_points:
-        return points
+        return slice(None)
     if max_points < 1:
         raise InvalidArgumentError(f"max_points={max_points} must be at least 1, or null.")
     generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randperm(points.shape[0], generator=generator)[:max_points].sort().values
-    return points[chosen.to(points.device)]
+    return torch.randperm(points.shape[0], generator=generator)[:max_points].sort().values.to(points.device)

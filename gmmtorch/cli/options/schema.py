@@ -18,18 +18,22 @@ from gmmtorch.evaluation.studies.study_options import (
     AucMemoryStudy,
     ComponentCountStudy,
     InitializationStudy,
+    MapVariantsStudy,
     PoseCorrectionStudy,
     SensorModelStudy,
     VarianceThresholdStudy,
 )
+from gmmtorch.mapping.learning.mixture_rule import MixtureRule
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.mixture.reduction.prune_options import PruneOptions
 
 STUDIES: dict[str, type] = {
     "approximation_error": ApproximationErrorStudy,
     "auc_memory": AucMemoryStudy,
     "component_count": ComponentCountStudy,
     "initialization": InitializationStudy,
+    "map_variants": MapVariantsStudy,
     "pose_correction": PoseCorrectionStudy,
     "sensor_model": SensorModelStudy,
     "variance_threshold": VarianceThresholdStudy,
@@ -40,12 +44,13 @@ STUDIES: dict[str, type] = {
 def _map_schema(rule: type) -> type:
     """Options of a map: of its learning rule, and of its queries."""
     runtime = ("dtype", "random_state", "memory_limit", "compiled")
-    return schema_of(map_schema.MapFile, rule, QueryOptions, without=runtime)
+    shared = (map_schema.MapFile, PruneOptions, MixtureRule)
+    return schema_of(*shared, rule, QueryOptions, without=runtime)
 
 
 def _commands() -> dict[str, type]:
     """The options of each command."""
-    mixture = schema_of(FitOptions, without=("dtype", "compiled"))
+    mixture = schema_of(FitOptions, PruneOptions, without=("dtype", "compiled"))
     return {
         "fit": schema_of(fit_schema.Fit, mixture=mixture),
         "map": map_schema.Map,

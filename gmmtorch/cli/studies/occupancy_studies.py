@@ -126,9 +126,40 @@ def _pose_correction(config: DictConfig, device: str, on_event: Event, on_rows: 
     return Found(rows, lambda: pose_correction_figures(rows), table, f"{name}: {len(scans)} scans")
 
 
+def _map_variants(config: DictConfig, device: str, on_event: Event, on_rows: OnRows) -> Found:
+    """Maps with changed options, such as pruning."""
+    from gmmtorch.errors import InvalidArgumentError
+    from gmmtorch.evaluation.methods import Form
+    from gmmtorch.evaluation.studies import map_variants
+    from gmmtorch.evaluation.studies.study_options import MapVariantsStudy
+    from gmmtorch.mapping.query_options import METHODS
+    from gmmtorch.report.studies.map_study_figures import map_variants_figures
+
+    protocol = protocol_of(config)
+    study = build(MapVariantsStudy, common.as_options(config.study), "study")
+    form = next((method for method in config.method if method in METHODS), "point")
+    variants = {}
+    for name, changes in study.variants.items():
+        if unknown := set(changes) - set(common.as_options(config.map)):
+            raise InvalidArgumentError(
+                f"study.variants.{name}.{min(unknown)} is not an option of map={config.map.name}."
+            )
+        variants[name] = Form(maps.map_factory(config, **changes), form)
+    name, scans = common.all_scans(config, device, on_event)
+    rows = map_variants.run(name, scans, variants, protocol, config.seed, on_event, on_rows)
+    table = (
+        "variant resolution n_components n_free_components nbytes auc auc_gain auc_gain_low auc_gain_high "
+        "held_out_log_likelihood build_seconds"
+    )
+    return Found(
+        rows, lambda: map_variants_figures(rows), table, f"{name}: {len(scans)} scans", line="variant"
+    )
+
+
 STUDIES: dict[str, Study] = {
     "approximation_error": _approximation_error,
     "auc_memory": _auc_memory,
+    "map_variants": _map_variants,
     "pose_correction": _pose_correction,
     "variance_threshold": _variance_threshold,
 }

@@ -34,6 +34,7 @@ from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
+from gmmtorch.evaluation.studies.map_variants import surface_mixture
 from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
@@ -245,7 +246,7 @@ def map_rows(
             "n_components_used": row["n_components"],
             "seconds": row["build_seconds"],
             **dict.fromkeys(_UNMEASURED),
-            "held_out_log_likelihood": _density(built.map).score(test),
+            "held_out_log_likelihood": _score(built.map, test),
             "nbytes": row["nbytes"],
             "rule": name,
             "setting": float(setting),
@@ -269,9 +270,6 @@ _UNMEASURED = (
 )
 
 
-def _density(built: object) -> GaussianMixture:
-    """A mixture of the map's surface components, weighted by their support."""
+def _score(built: object, points: Tensor) -> float:
     assert isinstance(built, GaussianMap)
-    hits = ~built.max_range
-    weight = built.support[hits]
-    return GaussianMixture.from_parameters(weight / weight.sum(), built.means[hits], built.covariances[hits])
+    return surface_mixture(built).score(points)

@@ -109,6 +109,29 @@ class AucMemoryStudy:
 
 
 @dataclass(frozen=True)
+class MapVariantsStudy:
+    """Options of `studies.map_variants`.
+
+    Attributes:
+        variants: for each variant, its options of the map that differ, such as {prune: support}. The first
+            one is compared with the others.
+    """
+
+    variants: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.variants:
+            raise InvalidArgumentError(
+                "variants={} is empty; give at least one, such as {support: {prune: support}}."
+            )
+        for name, changes in self.variants.items():
+            if not isinstance(changes, dict):
+                raise InvalidArgumentError(
+                    f"variants={{{name}: {changes!r}}} must be options of the map: {{prune: support}}."
+                )
+
+
+@dataclass(frozen=True)
 class PoseCorrectionStudy:
     """Options of `studies.pose_correction`. methods: forms of evidence."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import islice
 
 import torch
@@ -56,7 +57,8 @@ def surface_fit(rule: IncrementalRule, dim: int) -> SurfaceFit:
     """How a window is learned in `dim` dimensions. Raises `InvalidArgumentError` if `rule` is not fitted."""
     if rule.noise is None or rule.length is None or rule.cell is None:
         raise InvalidArgumentError("noise, length or cell is None; take rule.fitted(scans).")
-    return cell_fit(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations, dim)
+    fit = cell_fit(rule.noise, rule.length, rule.cell, rule.window_components, rule.iterations, dim)
+    return replace(fit, rule=rule)
 
 
 def cell_fit(

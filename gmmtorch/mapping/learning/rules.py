@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError, check_prior, check_resolution, check_whole
+from gmmtorch.mapping.learning.mixture_rule import MixtureRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -68,7 +69,7 @@ class NoveltyRule:
 
 
 @dataclass(frozen=True)
-class WindowedRule:
+class WindowedRule(MixtureRule):
     """Learns a mixture from every window of scans and adds it to the map; nothing is merged.
 
     noise: standard deviation of the range sensor (m). Its square is the smallest variance of a component;
@@ -97,6 +98,7 @@ class WindowedRule:
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("noise", "length"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidArgumentError(f"{name}={getattr(self, name)} must be above zero metres.")
@@ -130,7 +132,7 @@ class WindowedRule:
 
 
 @dataclass(frozen=True)
-class IncrementalRule:
+class IncrementalRule(MixtureRule):
     """Learns components from every window of scans, adds them, and merges the map under a budget.
 
     Options that are None are derived from the first scans, see `fitted`.
@@ -166,6 +168,7 @@ class IncrementalRule:
     novelty: NoveltyRule | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("noise", "length", "cell"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

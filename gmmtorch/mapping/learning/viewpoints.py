@@ -28,7 +28,7 @@ class AssignedViewpoints(NamedTuple):
     seen_count: Tensor
 
 
-AssignViewpoints = Callable[[Tensor, Tensor, int], AssignedViewpoints]
+AssignViewpoints = Callable[[Tensor, Tensor, float], AssignedViewpoints]
 """From the points (K, S) of each component in each scan, the weights (K,) and the number of points.
 
 A component that is no point's most likely one has no points; it is dropped.
@@ -41,7 +41,7 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
     The support of the components that are kept adds up to weight · N.
     """
 
-    def assign(counts: Tensor, weights: Tensor, n_points: int) -> AssignedViewpoints:
+    def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
         kept = counts.sum(1) > 0
         counts, support = counts[kept], weights[kept]
         support = support * (n_points * weight / support.sum())
@@ -59,7 +59,7 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
     a centroid of several would lose the free space around the sensors.
     """
 
-    def assign(counts: Tensor, weights: Tensor, n_points: int) -> AssignedViewpoints:
+    def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
         support = weights * n_points
         n_kept = min(max_origins, counts.shape[1])
         if n_kept < counts.shape[1]:

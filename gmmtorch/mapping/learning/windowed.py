@@ -29,6 +29,7 @@ def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Gen
         max_cells=rule.max_cells,
         dtype=SOFTMAX_DTYPES[rule.dtype],
         partition_by_moments=False,
+        rule=rule,
     )
     return fit_window(scans, fit, sampled_origins(rule.max_origins, generator))
 

@@ -32,6 +32,8 @@ _CLOSEST = 1e-3
 """Metres. Nearer readings are treated as at this range, so that noise and density stay finite."""
 
 _CHUNK_POINTS = 1 << 15
+_SPACING_NEIGHBORS = 32  # more than the beams of one ring that are nearer than the next ring
+_SPACING_BEAMS = 1_000  # of a scan, for which the spacing is measured
 
 
 class Deviations(NamedTuple):
@@ -238,6 +240,28 @@ def estimate_normals(points: ArrayLike, n_neighbors: int = 16) -> Tensor:
         patch = patch - patch.mean(1, keepdim=True)
         normals.append(torch.linalg.eigh(patch.transpose(1, 2) @ patch)[1][:, :, 0])
     return torch.cat(normals).to(points.device)
+
+
+def measured_sensor(points: ArrayLike, origin: ArrayLike) -> LaserModel | LidarModel:
+    """A sensor with the spacing of the beams of one scan: points (N, D), D = 2 or 3, and its origin (D,).
+
+    The spacing is the median over the beams: in 2D of the angles between neighbours, in 3D of the solid
+    angles per beam, π α²/n with α the angle to the n-th neighbour. Other properties are the defaults, and so
+    is the spacing if there are fewer than two directions.
+    """
+    points = as_tensor(points, "points", torch.float64).cpu()
+    direction, _ = beams(points, as_tensor(origin, "origin", torch.float64).cpu())
+    if points.shape[1] == 2:
+        gap = torch.atan2(direction[:, 1], direction[:, 0]).sort().values.diff()
+        gap = gap[gap > 0]
+        return LaserModel(angular_step=float(gap.median())) if len(gap) else LaserModel()
+    n = min(_SPACING_NEIGHBORS, len(points) - 1)
+    if n < 1:
+        return LidarModel()
+    asked = direction[:: max(1, len(points) // _SPACING_BEAMS)].numpy()
+    apart = np.median(cKDTree(direction.numpy()).query(asked, k=[n + 1])[0])
+    step = float(apart) * math.sqrt(math.pi / n)
+    return LidarModel(azimuth_step=step, elevation_step=step) if step > 0 else LidarModel()
 
 
 def _laser(distance: ArrayLike, noise: float, proportional: float, divergence: float) -> Deviations:

@@ -43,10 +43,10 @@ def expected_density(
 ) -> Tensor:
     """Points (K,) per m² (per metre in 2D) of a surface at the place of each component.
 
-    The density is the sensor's σ(r) at the component's mean, with the smallest eigenvector as surface
-    normal. With one origin (D,), this is the result. With several origins (S, D) and no `counts`, the
-    nearest origin alone determines the density. With `counts` (K, S), the points of each component seen
-    from each origin, the density is
+    The density is the sensor's σ(r), with r² = ‖μ − o‖² + tr Σ the mean squared distance of the component
+    from the origin o, and with the smallest eigenvector as surface normal. With one origin (D,), this is
+    the result. With several origins (S, D) and no `counts`, the nearest origin alone determines it. With
+    `counts` (K, S), the points of each component seen from each origin, the density is
 
         (Σ c_s σ_s)(Σ c_s) / Σ c_s²,
 
@@ -60,12 +60,26 @@ def expected_density(
     views = torch.arange(s, device=means.device).repeat(k)
     cos = cos_incidence(means[rows], origins[views], normals[rows])
     distance = (means[rows] - origins[views]).norm(dim=1)
-    density = sensor.point_density(distance, cos).view(k, s)
+    spread = covariances.diagonal(dim1=1, dim2=2).sum(1)[rows]
+    density = sensor.point_density((distance.square() + spread).sqrt(), cos).view(k, s)
     if counts is None:
         return density.gather(1, distance.view(k, s).argmin(1, keepdim=True)).squeeze(1)
     seen = counts.to(means)
     total = (seen * density).sum(1) * seen.sum(1)
     return total / seen.square().sum(1).clamp_min(torch.finfo(means.dtype).tiny)
+
+
+def density_share(
+    support: Tensor,
+    parameters: Parameters,
+    sensor: SensorModel,
+    origins: Tensor,
+    counts: Tensor | None = None,
+) -> Tensor:
+    """`support_density` of components with support (K,), as a share (K,) of their `expected_density`."""
+    _, means, covariances = parameters
+    expected = expected_density(means, covariances, sensor, origins, counts)
+    return support_density(support, covariances) / expected
 
 
 def prune(
@@ -107,9 +121,7 @@ def prune(
     if min_density_share > 0:
         counts = None if counts is None else as_tensor(counts, "counts").to(means)
         sensor, origins = _checked(means, sensor, origins, counts)
-        share = support_density(support, covariances) / expected_density(
-            means, covariances, sensor, origins, counts
-        )
+        share = density_share(support, parameters, sensor, origins, counts)
         kept &= share >= min_density_share
         largest += f", the largest share of the expected density {float(share.max()):.3g}"
     if not bool((kept & (weights > 0)).any()):

@@ -1,4 +1,4 @@
-"""Figures of studies of maps: AUC against bytes (thesis Table 3.1), pose correction, thresholds (Fig 3.8)."""
+"""Figures of studies of maps: AUC against bytes (Table 3.1), poses, thresholds (Fig 3.8), variants."""
 
 from __future__ import annotations
 
@@ -192,3 +192,36 @@ def cells_figure(
     style.colour_bar(figure, colours, grid.ravel().tolist(), "height z [m]", shrink=0.6)
     style.figure_title(figure, f"Cells of {style.metres(size)} with the dead band of a variance threshold")
     return figure
+
+
+def map_variants_figures(rows: style.Rows) -> dict[str, Figure]:
+    """Draws `map_variants`: the AUC of each variant minus that of the first, with components and bytes.
+
+    Args:
+        rows: dataset, variant, resolution (m), n_components, nbytes, auc, auc_gain, auc_gain_low,
+            auc_gain_high.
+    """
+    resolutions = list(dict.fromkeys(float(row["resolution"]) for row in rows))
+    variants = list(dict.fromkeys(str(row["variant"]) for row in rows))
+    figure = style.new_figure(3.0 + 6.4 * len(resolutions), 1.9 + 0.42 * len(variants))
+    grid = figure.subplots(1, len(resolutions), squeeze=False, sharey=True)
+    for axes, resolution in zip(grid[0], resolutions, strict=True):
+        own = [row for row in rows if float(row["resolution"]) == resolution]
+        places = [variants.index(str(row["variant"])) for row in own]
+        gains = [row["auc_gain"] for row in own]
+        below = [row["auc_gain"] - row["auc_gain_low"] for row in own]
+        above = [row["auc_gain_high"] - row["auc_gain"] for row in own]
+        axes.axvline(0, color=style.colour(0), linewidth=1, alpha=0.5)
+        axes.errorbar(gains, places, xerr=[below, above], fmt="o", color=style.colour(0), capsize=3)
+        for row, place in zip(own, places, strict=True):
+            text = f"{row['n_components']:,} components, {byte_text(row['nbytes'])}"
+            at = {"xycoords": ("axes fraction", "data"), "va": "center", "fontsize": style.TICK_SIZE}
+            axes.annotate(text, (1.02, place), annotation_clip=False, **at)
+        title = f"cells of {style.metres(resolution)}, {own[0]['variant']}: AUC {own[0]['auc']:.4f}"
+        style.label_axes(axes, title.replace("_", " "), "difference of AUC, 95 % interval", "")
+        axes.margins(y=0.08)
+        style.draw_grid(axes)
+    grid[0][0].set_yticks(range(len(variants)), [name.replace("_", " ") for name in variants])
+    grid[0][0].invert_yaxis()
+    style.figure_title(figure, f"Variants of a map: {rows[0]['dataset']}")
+    return {"map_variants": figure}

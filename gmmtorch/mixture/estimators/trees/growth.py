@@ -28,6 +28,7 @@ from gmmtorch.mixture.estimators.trees.nested import (
 )
 
 if TYPE_CHECKING:
+    from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
     from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture as Rule
 
 _WORST_ROUNDING = 0.02  # nats a point of float32 error above which float64 is used
@@ -106,6 +107,7 @@ def grow(
     rule: Rule,
     on_iteration: Callable[[int, float], None] | None = None,
     on_level: Callable[[Nodes, Members], None] | None = None,
+    density: DensityLimit | None = None,
 ) -> Growth:
     """Grow the tree of centred points (N, D) with weights (N,) above zero, float64.
 
@@ -114,6 +116,7 @@ def grow(
         rule: an estimator; its parameters say when a node is split, and how children are fitted.
         on_iteration: called with the EM iteration, from 1, and the lower bound, nats a point.
         on_level: called with the nodes of each level, starting with the root (level 0), and their members.
+        density: removes sparse children before the points are assigned to them.
     """
     nodes, members = _root(points, weight, rule.reg_covar)
     root, score, n_leaves, converged = nodes, nodes.bound.sum(), 1, True
@@ -141,7 +144,8 @@ def grow(
         if chosen.numel() == 0:
             break
         members, nodes = members.select(chosen, nodes.n), nodes.select(chosen)
-        split = _split(points, members, nodes, m, rule, report_bound, rest=score - nodes.own.sum())
+        rest = score - nodes.own.sum()
+        split = _split(points, members, nodes, m, rule, report_bound, rest, density)
         accepted = _accepted_splits(split, nodes, members.mass(nodes.n), free, rule)
         score = score - nodes.bound[accepted].sum()
         n_before = sum(len(level.parents) for level in levels)
@@ -203,11 +207,15 @@ def _shortlist(
 
 
 class _Split(NamedTuple):
-    """children of nodes; the assignment of the nodes' members to them; whether EM converged."""
+    """children of nodes; the assignment of the nodes' members to them; whether EM converged; value (G,) of
+    the assignment before pruning by density, which decides about the split: points that fit no surface would
+    prevent it.
+    """
 
     children: Children
     assignment: Assignment
     converged: bool
+    value: Tensor
 
 
 def _split(
@@ -218,6 +226,7 @@ def _split(
     rule: Rule,
     report_bound: Callable[[Tensor], None],
     rest: Tensor,
+    density: DensityLimit | None,
 ) -> _Split:
     """At most m children in each node. `report_bound` gets `rest` + Σ p log Σ_children per iteration."""
     mass = members.mass(nodes.n)
@@ -239,12 +248,17 @@ def _split(
     if found.is_coarse:
         packed, found = learn(torch.float64, found.children, max(1, rule.max_iter - found.n_iter))
     children = drop_weak_children(found.children, mass, rule.min_support)
-    return _Split(children, assign_members(packed, children, members, rule.soft_threshold), found.converged)
+    assignment = assign_members(packed, children, members, rule.soft_threshold)
+    value = assignment.value
+    if density is not None:
+        children = density.drop_sparse_children(children, nodes.parameters.means, assignment.members)
+        assignment = assign_members(packed, children, members, rule.soft_threshold)
+    return _Split(children, assignment, found.converged, value)
 
 
 def _accepted_splits(split: _Split, nodes: Nodes, mass: Tensor, free: float, rule: Rule) -> Tensor:
     """Mask (G,) of nodes whose split gains enough; if these exceed the limit of leaves, the best of them."""
-    gain = split.assignment.value - nodes.own
+    gain = split.value - nodes.own
     added = (split.children.weights > 0).sum(1) - 1
     dim = nodes.parameters.means.shape[1]
     n_parameters = added * (1 + dim + dim * (dim + 1) // 2)

@@ -7,12 +7,15 @@ from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import torch
-from sklearn.utils._param_validation import Interval
+from sklearn.utils._param_validation import HasMethods, Interval
 from torch import Tensor
 
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.estimator import AT_LEAST_ZERO, COUNT, MixtureEstimator
+from gmmtorch.mixture.estimators.sensor_model import SensorModel
+from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
 from gmmtorch.mixture.estimators.trees.growth import Tree, grow
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.validation import Array, RandomState
@@ -44,6 +47,10 @@ class HierarchicalGaussianMixture(MixtureEstimator):
             is a suitable value.
         min_support: children with less weight (points) are removed, and their points assigned to their
             siblings.
+        min_density_share: children with a smaller share of the density of points that the sensor gives a
+            surface are removed, and their points assigned to their siblings (2.1.4). If above zero, needs
+            `sensor`, and the origins in `fit`.
+        sensor: see `sensor_model`.
         min_gain: log-likelihood (nats) that a split must gain per free parameter that it adds. 1 is
             Akaike's criterion, ½ log N the Bayesian one, and 0 accepts any gain.
         random_state: used by `sample` only; the fit is deterministic. A seed, a `RandomState`, a
@@ -73,6 +80,8 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         "planarity_threshold": [AT_LEAST_ZERO],
         "thickness": [AT_LEAST_ZERO],
         "min_support": [AT_LEAST_ZERO],
+        "min_density_share": [AT_LEAST_ZERO],
+        "sensor": [HasMethods(["point_density"]), None],
         "min_gain": [AT_LEAST_ZERO],
     }
     node_parents: Tensor
@@ -93,6 +102,8 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         planarity_threshold: float = 0.0,
         thickness: float = 0.0,
         min_support: float = 4.0,
+        min_density_share: float = 0.0,
+        sensor: SensorModel | None = None,
         min_gain: float = 1.0,
         random_state: RandomState = None,
         dtype: str = "float32",
@@ -107,6 +118,8 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         self.planarity_threshold = planarity_threshold
         self.thickness = thickness
         self.min_support = min_support
+        self.min_density_share = min_density_share
+        self.sensor = sensor
         self.min_gain = min_gain
         self.random_state = random_state
         self.dtype = dtype
@@ -119,10 +132,15 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         y: Any = None,
         sample_weight: Array | None = None,
         on_iteration: Callable[[int, float], None] | None = None,
+        origins: ArrayLike | None = None,
     ) -> HierarchicalGaussianMixture:
-        """Fit the tree to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`."""
+        """Fit the tree to points X (N, D). Arguments and errors: see `MixtureEstimator.fit`.
+
+        origins: (D,) or (S, D), sensor origins, for `min_density_share`; the nearest one is taken to have
+        observed a component.
+        """
         points, weight, center = self._prepare(X, sample_weight)
-        found = grow(points, weight, self, on_iteration)
+        found = grow(points, weight, self, on_iteration, density=self._density_limit(origins, center))
         tree = found.tree._replace(means=found.tree.means + center)
         leaves = tree.leaves()
         mixture = Parameters(*(value[leaves] for value in found.tree[1:]))
@@ -130,6 +148,22 @@ class HierarchicalGaussianMixture(MixtureEstimator):
         self._store_fit(mixture, center, found.lower_bounds, found.converged, extra)
         self._warn_unless_converged()
         return self
+
+    def _density_limit(self, origins: ArrayLike | None, center: Tensor) -> DensityLimit | None:
+        if self.min_density_share == 0:
+            return None
+        dim = center.shape[0]
+        if self.sensor is None or origins is None or dim not in (2, 3):
+            raise InvalidArgumentError(
+                f"min_density_share={self.min_density_share} needs points in 2D or 3D (D = {dim}), sensor, "
+                "and origins in fit."
+            )
+        positions = as_tensor(origins, "origins", torch.float64, center.device)
+        if positions.ndim not in (1, 2) or positions.shape[-1] != dim or positions.numel() == 0:
+            raise InvalidArgumentError(
+                f"origins has shape {tuple(positions.shape)}; expected ({dim},) or (S, {dim})."
+            )
+        return DensityLimit(self.min_density_share, self.sensor, positions.reshape(-1, dim) - center)
 
     # -- the tree ---------------------------------------------------------------------------------
 

@@ -262,12 +262,20 @@ def run_em(
 def drop_weak_children(children: Children, mass: Tensor, min_support: float) -> Children:
     """Set children with less support than `min_support` to weight 0, in favour of their siblings.
 
-    mass (G,): of the nodes. The largest child of each node stays.
+    mass (G,): of the nodes.
     """
-    weights = children.weights
-    largest = weights == weights.amax(1, keepdim=True)
-    kept = torch.where((weights * mass[:, None] >= min_support) | largest, weights, 0.0)
-    return children._replace(weights=kept / kept.sum(1, keepdim=True))
+    return keep_children(children, children.weights * mass[:, None] >= min_support)
+
+
+def keep_children(children: Children, kept: Tensor) -> Children:
+    """Set children outside of the mask (G, m) to weight 0, in favour of their siblings.
+
+    A node without a child in the mask keeps its largest one.
+    """
+    kept = kept & (children.weights > 0)
+    largest = children.weights == children.weights.amax(1, keepdim=True)
+    weights = torch.where(torch.where(kept.any(1, keepdim=True), kept, largest), children.weights, 0.0)
+    return children._replace(weights=weights / weights.sum(1, keepdim=True))
 
 
 # -- assignment of members to children ------------------------------------------------------------
