@@ -91,6 +91,10 @@ class TiledMap:
             self._options = with_hit_length(self._options, sum(sums, torch.zeros(2, dtype=torch.float64)))
         return self._options
 
+    @query_options.setter
+    def query_options(self, options: QueryOptions) -> None:
+        self._options = options
+
     @property
     def n_components(self) -> int:
         return int(self.index.n_components.sum())
