@@ -160,6 +160,15 @@ def dense_ranks(keys: Tensor) -> tuple[Tensor, int]:
     return torch.from_numpy(number.reshape(-1)), len(unique)
 
 
+def ragged_index(lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Row (P,) of each entry of a ragged list whose rows have these lengths (R,), and its place in its row.
+
+    Both int64: rows 0, 0, …, 1, 1, …, and places 0, 1, …, 0, 1, … .
+    """
+    row = torch.repeat_interleave(lengths)
+    return row, torch.arange(len(row), device=row.device) - (lengths.cumsum(0) - lengths)[row]
+
+
 def _by_hash(keys: Tensor) -> bool:
     """Whether a hash table replaces sorting: for many keys, if fused kernels run."""
     return keys.dtype == torch.int64 and keys.shape[0] >= _MANY_KEYS and is_fused(keys)

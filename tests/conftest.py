@@ -13,7 +13,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-pytest.register_assert_rewrite("occupancy.protocol_contract", "mixture.estimator_contract")
+pytest.register_assert_rewrite(
+    "occupancy.protocol_contract", "mixture.estimator_contract", "mixture.fit_contract"
+)
 
 # A shell that starts a job in the background makes it ignore SIGINT, and its children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -19,6 +19,7 @@ from gmmtorch.linalg import (
     inverse_factor,
     largest_indices,
     pack_symmetric,
+    ragged_index,
     safe_cholesky,
     unpack_symmetric,
 )
@@ -179,3 +180,10 @@ def test_count_distinct_and_dense_ranks_equal_a_python_dict(keys):
     assert n == len(rank)
     assert number.dtype == torch.int64
     assert number.tolist() == [rank[key] for key in keys]
+
+
+@given(lengths=st.lists(st.integers(0, 4), max_size=8))
+def test_ragged_index_lists_rows_and_places(lengths):
+    row, place = ragged_index(torch.tensor(lengths, dtype=torch.int64))
+    expected = [(row, place) for row, length in enumerate(lengths) for place in range(length)]
+    assert list(zip(row.tolist(), place.tolist(), strict=True)) == expected

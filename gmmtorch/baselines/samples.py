@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gmmtorch.baselines.baseline_map import check_length
 from gmmtorch.errors import MemoryLimitError
+from gmmtorch.linalg import ragged_index
 from gmmtorch.scan import Scan
 
 _MAX_SAMPLES = 1 << 27
@@ -60,8 +61,7 @@ def beam_samples(
             f"{_MAX_SAMPLES:,}; increase spacing."
         )
     count = count.long()
-    beam = torch.repeat_interleave(count)
-    segment = torch.arange(beam.shape[0], device=beam.device) - (count.cumsum(0) - count)[beam]
+    beam, segment = ragged_index(count)
     within = torch.full((beam.shape[0],), 0.5, dtype=torch.float64)
     if generator is not None:
         within = torch.rand(beam.shape[0], generator=generator, dtype=torch.float64)
@@ -112,9 +112,8 @@ def _points_along(origin: Tensor, ends: Tensor, step: float) -> Tensor:
             f"free_resolution={step} m makes {int(count.sum()):,} free samples of one scan, above the limit "
             f"of {_MAX_SAMPLES:,}; increase it, or set max_range."
         )
-    count = count.long()
-    beam = torch.repeat_interleave(count)
-    number = torch.arange(beam.shape[0], device=beam.device) - (torch.cumsum(count, 0) - count)[beam] + 1
+    beam, before = ragged_index(count.long())
+    number = before + 1
     last = (length > step).nonzero().squeeze(1)
     share = torch.cat([number * step / length[beam], 1 - step / length[last]])
     return origin + (ends - origin)[torch.cat([beam, last])] * share[:, None]

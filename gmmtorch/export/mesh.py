@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, check_number
+from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.grid import check_resolution
 
@@ -131,16 +132,10 @@ def _windows(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> 
             "cells."
         )
     n = n.long()
-    sheet, number = _counted(n.prod(1))
+    sheet, number = ragged_index(n.prod(1))
     place = torch.stack([number // n[sheet, 1], number % n[sheet, 1]], 1)
     half = reach[sheet] / n[sheet]
     return _Windows(sheet, (2 * place + 1) * half - reach[sheet], half)
-
-
-def _counted(count: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows 0, 0, …, 1, 1, … of a ragged list with these lengths, and the place of each entry in its row."""
-    row = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
-    return row, torch.arange(len(row), device=count.device) - (count.cumsum(0) - count)[row]
 
 
 def _field(sheets: _Sheets, side: float, extent: float, memory_limit: int) -> _Field:
@@ -187,7 +182,7 @@ def _near(
 ) -> tuple[Tensor, Tensor]:
     """Keys (P,) and sums Σw, Σw·d, Σw·n (P, 5) of the lattice points near the sheets, in some windows."""
     band = _BAND * side
-    row, number = _counted(size.prod(1))
+    row, number = ragged_index(size.prod(1))
     n = size[row]
     cell = torch.stack([number // (n[:, 1] * n[:, 2]), number // n[:, 2] % n[:, 1], number % n[:, 2]], 1)
     cell = cell + first[row]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.evidence.hull_test import near_hulls
-from gmmtorch.linalg import argsort, dense_ranks
+from gmmtorch.linalg import argsort, dense_ranks, ragged_index
 from gmmtorch.occupancy.cones import CUTOFF, Cones
 from gmmtorch.occupancy.grid import check_resolution
 
@@ -150,9 +150,7 @@ class ConeIndex:
 
     def listed(self, buckets: Tensor) -> tuple[Tensor, Tensor]:
         """All entries of the lists of `buckets` (B,), in order: position in `buckets` (P,) and cone (P,)."""
-        count = self.list_lengths()[buckets]
-        place = torch.repeat_interleave(count)
-        within = torch.arange(place.shape[0], device=place.device) - (torch.cumsum(count, 0) - count)[place]
+        place, within = ragged_index(self.list_lengths()[buckets])
         return place, self.entries[self.starts[buckets][place] + within]
 
     def candidates(
@@ -194,9 +192,7 @@ class _Lattice(NamedTuple):
         """All pairs of a cone (C,) and a bucket (P, D) of its box, for buckets of `side` (m)."""
         first, last = ((x[cone] / side).floor().long() for x in (self.low, self.high))
         size = last - first + 1
-        count = size.prod(1)
-        row = torch.repeat_interleave(count)
-        rest = torch.arange(row.shape[0], device=cone.device) - (torch.cumsum(count, 0) - count)[row]
+        row, rest = ragged_index(size.prod(1))
         cells = []
         for axis in range(size.shape[1]):
             cells.append(first[row, axis] + rest % size[row, axis])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.rays.ray_traversal import row_major_strides
+from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy.grid import check_resolution
 from gmmtorch.occupancy.voxels.boxes import Box
 
@@ -80,9 +81,7 @@ def _cells_met(corners: Tensor, size: Tensor) -> Iterator[Tensor]:
         reach = torch.where(flat[triangle], torch.inf, spread[triangle])
         lowest = torch.maximum(height - reach, floor[triangle]).floor().clamp_min(0)
         highest = torch.minimum(height + reach, ceiling[triangle]).floor().clamp_max(size[2] - 1)
-        count = (highest - lowest + 1).clamp_min(0).long()
-        pair = torch.repeat_interleave(count)
-        step = torch.arange(len(pair), device=pair.device) - (count.cumsum(0) - count)[pair]
+        pair, step = ragged_index((highest - lowest + 1).clamp_min(0).long())
         which = triangle[pair]
         cells = torch.cat([column[pair], (lowest[pair] + step)[:, None]], 1)
         along = torch.einsum("pad,pd->pa", axes[which], cells + 0.5)
