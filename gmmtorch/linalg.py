@@ -87,7 +87,7 @@ def check_symmetric(matrices: Tensor, name: str) -> Tensor:
     return matrices
 
 
-def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+def check_rigid(transform: Tensor, dim: int, name: str = "transform") -> tuple[Tensor, Tensor]:
     """Rotation (D, D) and translation (D,), float64, of a rigid motion given as a matrix (D+1, D+1).
 
     Raises `InvalidArgumentError` unless the matrix is finite, its rotation is orthonormal with
@@ -96,7 +96,7 @@ def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     shape = (dim + 1, dim + 1)
     if tuple(transform.shape) != shape:
         raise InvalidArgumentError(
-            f"transform has shape {tuple(transform.shape)}; a rigid motion in {dim}D is {shape}."
+            f"{name} has shape {tuple(transform.shape)}; a rigid motion in {dim}D is {shape}."
         )
     matrix = transform.double()
     values = matrix.detach().cpu().numpy()
@@ -110,7 +110,7 @@ def check_rigid(transform: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     )
     if not rigid:
         raise InvalidArgumentError(
-            f"transform={matrix.tolist()} is not rigid; its rotation must be orthonormal with determinant 1, "
+            f"{name}={matrix.tolist()} is not rigid; its rotation must be orthonormal with determinant 1, "
             "its translation in metres, and its last row 0 … 0 1."
         )
     return matrix[:dim, :dim], matrix[:dim, dim]

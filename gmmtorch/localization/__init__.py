@@ -1,4 +1,4 @@
-"""Registration of maps: the rigid motion that aligns one map with another.
+"""Where a sensor or a map is: registration of two maps, and the poses of scans in a map.
 
 Names are imported on first use.
 """
@@ -13,8 +13,16 @@ if TYPE_CHECKING:
     from gmmtorch.localization.registration import Registration as Registration
     from gmmtorch.localization.registration import register as register
     from gmmtorch.localization.registration import yaw_starts as yaw_starts
+    from gmmtorch.localization.tracker import Location as Location
+    from gmmtorch.localization.tracker import Tracker as Tracker
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
-    {"Registration": "registration", "register": "registration", "yaw_starts": "registration"},
+    {
+        "Location": "tracker",
+        "Registration": "registration",
+        "Tracker": "tracker",
+        "register": "registration",
+        "yaw_starts": "registration",
+    },
 )

@@ -1,0 +1,125 @@
+"""Alignment of a scan's points with the surfaces of a map, from a rough pose.
+
+The log-likelihood of N points p_n under the pose T = (R, t), with each component as a kernel of height one
+and a uniform density ε of outliers, is
+
+    ℓ(T) = Σ_n log(1 + q_n / ε),   q_n = Σ_k exp(−½ d_nkᵀ (Σ_k + s² I)⁻¹ d_nk),   d_nk = R p_n + t − μ_k
+
+(point-to-distribution NDT, Magnusson 2009, with an annealed blur s). Newton's steps climb it on SE(3) or
+SE(2); where −∇²ℓ is not positive definite, EM's steps do. Each point adds at most log(1 + q_n/ε), so people
+and other changes have little weight.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
+from gmmtorch.localization.overlap import Motions
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.index.cone_index import ConeIndex
+
+CUTOFF = 3.5
+"""Deviations beyond which a component is left out of a point."""
+
+_OUTLIERS = 0.05  # ε, relative to the peak of a component
+_EXPLAINED = 0.1  # q above which components explain a point
+_SETTLED = 0.02  # of the blur: steps below this end a climb
+_SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
+_ENTRIES = {2: 16, 3: 64}  # of the index, for each component
+_RIDGE = 1e-9
+
+
+class Alignment(NamedTuple):
+    """Of B motions, world ← sensor: ℓ/N (B,), the share of explained points (B,), −∇²ℓ (B, F, F) in a shift
+    v (m) and a turn ω (rad) about the sensor, F = D + D(D−1)/2, and whether the last step was small (B,).
+    """
+
+    motions: Motions
+    score: Tensor
+    explained: Tensor
+    information: Tensor
+    converged: Tensor
+
+    def at(self, rows: Tensor) -> Alignment:
+        return Alignment(self.motions.at(rows), *(value[rows] for value in self[1:]))
+
+
+class AlignmentTarget:
+    """The surfaces of a map at one blur, listed by place.
+
+    Args:
+        surfaces: near the origin; their weights are not used.
+        blur: s (m), above zero.
+        normals: (K, D), towards the side from which a surface is seen; zero: from all sides. A sensor behind
+            a surface by more than the blur does not see it, so the two faces of a wall are not confused.
+    """
+
+    def __init__(self, surfaces: Parameters, blur: float, normals: Tensor | None = None) -> None:
+        means, dim = surfaces.means, surfaces.means.shape[1]
+        covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
+        self.blur, self.means, self.precisions = blur, means, torch.linalg.inv(covariances)
+        self.normals = torch.zeros_like(means) if normals is None else normals
+        nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        # A cone whose sensor is at the component's mean is the component's ellipsoid.
+        ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)
+        self.index = ConeIndex(ellipsoids, 1e-3 * blur, CUTOFF, entries_per_cone=_ENTRIES[dim])
+
+    def sums(self, points: Tensor, motions: Motions) -> AlignmentSums:
+        """ℓ of points (N, D) under each motion, and its derivatives."""
+        moved = points @ motions.rotations.mT + motions.translations[:, None]
+        lists = self.index.buckets(moved.flatten(0, 1)), self.index.starts, self.index.entries
+        target = self.means, self.precisions, self.normals
+        limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
+        return alignment_sums(points, motions, lists, target, limits)
+
+
+def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: int) -> Alignment:
+    """Climbs ℓ from B motions in parallel. A step that lowers ℓ is taken back, and the next one is shorter.
+
+    Args:
+        points: (N, D), N at least 1, sensor frame, metres, float64.
+        motions: world ← sensor. max_steps: evaluations of ℓ after the first one.
+    """
+    dim = points.shape[1]
+    scale = points.new_ones(dim + dim * (dim - 1) // 2)
+    scale[dim:] = 1 / points.norm(dim=1).amax().clamp_min(1e-9)  # a unit moves the farthest point by a metre
+    sums = target.sums(points, motions)
+    share = torch.ones_like(sums.score)
+    settled = torch.zeros_like(sums.score, dtype=torch.bool)
+    for _ in range(max_steps):
+        step = _steps(sums, scale, target.blur) * share[:, None]
+        trial = motions.moved(step)
+        tried = target.sums(points, trial)
+        better = tried.score >= sums.score
+        motions = Motions(*_chosen(better, trial, motions))
+        sums = AlignmentSums(*_chosen(better, tried, sums))
+        share = torch.where(better, (2 * share).clamp_max(1), share / 4)
+        settled = (step / scale).norm(dim=1) < _SETTLED * target.blur
+        if bool(settled.all()):
+            break
+    n = len(points)
+    return Alignment(motions, sums.score / n, sums.n_explained / n, sums.observed, settled)
+
+
+def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
+    """Steps (B, F), Newton's or EM's, which move no point by more than about `longest` metres."""
+    outer = scale[:, None] * scale
+    complete = sums.complete * outer
+    ridge = _RIDGE * complete.diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-12)
+    complete = complete + ridge[:, None, None] * torch.eye(len(scale)).to(scale)
+    observed = sums.observed * outer
+    _, flawed = torch.linalg.cholesky_ex(observed - _SADDLE * complete)
+    curvature = torch.where((flawed == 0)[:, None, None], observed, complete)
+    step = torch.linalg.solve(curvature, sums.gradient * scale)
+    length = step.norm(dim=1, keepdim=True)
+    return step * (longest / length.clamp_min(longest)) * scale
+
+
+def _chosen(better: Tensor, new: tuple[Tensor, ...], old: tuple[Tensor, ...]) -> list[Tensor]:
+    """Rows of `new` where `better` (B,), else of `old`."""
+    return [torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(new, old, strict=True)]

@@ -1,0 +1,347 @@
+"""Tracker: the pose of each scan of a moving sensor in a map that is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.linalg import check_rigid
+from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align
+from gmmtorch.localization.overlap import Motions, generators
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
+from gmmtorch.scan import check_positions
+
+_BLURS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # metres, one level after the other
+_FINE = 2  # the level at which a search around a good prediction begins
+_STEPS = 15  # of a level
+_SAME = 0.25  # of the blur: motions that are closer have climbed one peak
+_SECOND_CHANCE = 1  # the level after the first: starts are ranked there once more, by its blur
+_CLIMBED = 16  # starts that the first level climbs; each level after it climbs the better half
+_TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre of blur
+_PLACES = 0.5  # metres between the places of a search of the whole map
+_RANKED = 4 * _CLIMBED  # best starts, of which different ones are climbed
+_COARSE_POINTS = 200  # of the scan, that rank the starts
+_RANKED_AT_ONCE = 256  # starts
+_WIDER = 4  # times the first search
+_GLOBAL_AFTER = 1  # lost scans, before which the whole map is not searched
+
+_USUAL = 0.9  # of the share that the last scan had: less, and the search is wider
+_FLAT = 0.25  # of the next deviation: thinner components have a face
+_LOOSEST = 0.3  # metres of standard deviation
+_UNSEEN = 10.0  # metres of standard deviation of a direction that no surface fixes
+_ALIKE = 0.98  # of the best score: another pose is as good
+_APART = 0.3  # metres, and radians: poses are different
+_CORRELATED = 10.0  # points that share one error: that of their component (measured on a hall and an office)
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """The pose of a scan in a map.
+
+    pose: (D+1, D+1), map ← sensor, float64, metres.
+    covariance: (F, F) of the pose's error, a shift v (m, in the frame of the map) and a turn ω (rad) about
+        the sensor, F = D + D(D−1)/2. No direction has a standard deviation above 10 m.
+    explained: share of the points that lie on surfaces of the map.
+    doubts: reasons against the pose; the sensor is `found` if there are none.
+    """
+
+    pose: Tensor
+    covariance: Tensor
+    explained: float
+    doubts: tuple[str, ...]
+
+    @property
+    def found(self) -> bool:
+        return not self.doubts
+
+
+class Tracker:
+    """Localises the scans of a sensor, one after the other, in a map that stays as it is.
+
+    A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
+    motion predicts. If this fails, starts around the prediction are tried, then four times as far. After
+    a lost scan, and for the first scan without a pose, the whole map is searched: all headings at the places
+    from which the map was seen.
+
+    Args:
+        surfaces: a map, its components, or (means, covariances, weights).
+        pose: first pose (D+1, D+1), map ← sensor, metres. None: unknown.
+        distance, angle: errors of the first pose that the search covers, in metres along the ground and in
+            radians of the heading. Height, roll and pitch may be off by about 0.5 m and 10°.
+        n_points: of a scan that are used at most, drawn with a fixed seed.
+        least_explained: share of the points that must lie on surfaces of the map. Poses in other places
+            explained up to 0.81 of a hall's scans, true ones at least 0.98. Lower it where much has changed.
+
+    Raises `InvalidArgumentError` for a map without surfaces, a pose that is not rigid, or a search of the
+    whole map if `surfaces` does not state from where it was seen.
+    """
+
+    def __init__(
+        self,
+        surfaces: Surfaces,
+        pose: ArrayLike | None = None,
+        *,
+        distance: float = 0.5,
+        angle: float = math.radians(10),
+        n_points: int = 1000,
+        least_explained: float = 0.9,
+    ) -> None:
+        mixture = surface_mixture(surfaces, "surfaces")
+        if not len(mixture.weights):
+            raise InvalidArgumentError("surfaces has no surface component; give the map of a place.")
+        check_number("distance", distance)
+        check_number("angle", angle, math.pi)
+        check_whole("n_points", n_points, 1)
+        check_number("least_explained", least_explained, 1)
+        self.least_explained = least_explained
+        self.distance, self.angle, self.n_points = distance, angle, n_points
+        self.dim = mixture.means.shape[1]
+        self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
+        centered = mixture._replace(means=mixture.means - self._center)
+        normals = _normals(surfaces)
+        self._targets = [AlignmentTarget(centered, blur, normals) for blur in _BLURS]
+        self._places = _places(surfaces, self._center)
+        self.restart(pose)
+
+    def restart(self, pose: ArrayLike | None = None) -> None:
+        """Forgets all scans: the next one is near `pose` (D+1, D+1), map ← sensor, or anywhere if None.
+
+        Raises as the constructor does.
+        """
+        if pose is None and not len(self._places):
+            raise InvalidArgumentError(
+                "pose=None, but surfaces does not state from where it was seen; give the first pose or a map."
+            )
+        self.n_lost = 0
+        self._explained = 0.0
+        self._motion: Tensor | None = None
+        self._last: Tensor | None = None  # pose (D+1, D+1), about the centre
+        if pose is not None:
+            self._last = _rigid(pose, "pose", self._center)
+            self._last[: self.dim, self.dim] -= self._center
+
+    def locate(self, points: ArrayLike, motion: ArrayLike | None = None) -> Location:
+        """The pose of the next scan; if it is not `found`, the best guess.
+
+        Args:
+            points: (N, D) returns in the frame of the sensor, metres.
+            motion: (D+1, D+1) of the sensor since the last scan, last ← now, such as an odometry's. None: the
+                sensor moves as between the last two scans.
+
+        Raises `InvalidArgumentError` for another shape, NaN, or a motion that is not rigid.
+        """
+        rows = as_tensor(points, "points", torch.float64, self._center.device).detach()
+        if rows.ndim != 2 or rows.shape[1] != self.dim:
+            shape = tuple(rows.shape)
+            raise InvalidArgumentError(f"points has shape {shape}; expected (N, {self.dim}), metres.")
+        check_positions("points", rows)
+        measured = None if motion is None else _rigid(motion, "motion", self._center)
+        predicted = self._predicted(measured)
+        rows = self._thinned(rows)
+        best: Location | None = None
+        for level, starts, is_enough in self._searches(predicted, measured is not None) if len(rows) else ():
+            found = self._climbed(rows, starts, level)
+            best = found if best is None else _better(best, found)
+            if best.found and best.explained >= is_enough:
+                break
+        if best is None:
+            best = self._nothing(predicted)
+        self._remember(best, predicted, measured is not None)
+        return best
+
+    def _predicted(self, measured: Tensor | None) -> Tensor | None:
+        step = self._motion if measured is None else measured
+        return self._last if self._last is None or step is None else self._last @ step
+
+    def _searches(self, predicted: Tensor | None, is_measured: bool) -> Iterator[tuple[int, Motions, float]]:
+        """First level, starts, and the explained share that ends the search; the cheapest search first."""
+        if predicted is not None:
+            start = _motions(predicted[None], self.dim)
+            if self.n_lost == 0 and (is_measured or self._motion is not None):
+                yield _FINE, start, _USUAL * self._explained
+            yield _FINE, _around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
+            wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
+            yield 0, _around(start, *wide, _BLURS[0]), 0.0
+        if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
+            yield _FINE, _everywhere(self._places, _BLURS[_FINE]), 0.0
+
+    def _thinned(self, rows: Tensor) -> Tensor:
+        draw = torch.Generator().manual_seed(0)
+        return rows[torch.randperm(len(rows), generator=draw)[: self.n_points].to(rows.device)]
+
+    def _climbed(self, rows: Tensor, starts: Motions, first: int) -> Location:
+        """The location that the levels from `first` on reach from the best of the starts."""
+        motions = self._ranked(rows, starts, self._targets[first])
+        for number, target in enumerate(self._targets[first:]):
+            if number == _SECOND_CHANCE:
+                motions = motions.joined(self._ranked(rows, starts, target))
+            found = align(rows, target, motions, _STEPS)
+            found = found.at(
+                _best(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
+            )
+            motions = found.motions
+        return self._location(rows, found)
+
+    def _ranked(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Motions:
+        """The best starts that differ from each other, at most `_CLIMBED`."""
+        n = len(starts.translations)
+        if n <= _CLIMBED:
+            return starts
+        parts = torch.arange(n, device=rows.device).split(_RANKED_AT_ONCE)
+        score = torch.cat([target.sums(rows[:_COARSE_POINTS], starts.at(part)).score for part in parts])
+        order = score.argsort(descending=True, stable=True)
+        if n > _RANKED:
+            best = order[:_RANKED]
+            order = best[_best(starts.at(best), score[best], 1.01 * target.blur)]
+        return starts.at(order[:_CLIMBED])
+
+    def _location(self, rows: Tensor, found: Alignment) -> Location:
+        covariance, loosest = _covariance(found.information[0], rows)
+        doubts = []
+        if not bool(found.converged[0]):
+            doubts.append("the last step was longer than the tolerance")
+        share = float(found.explained[0])
+        if share < self.least_explained:
+            doubts.append(f"only {share:.0%} of the points lie on surfaces: another place, or a changed one")
+        if loosest > _LOOSEST:
+            doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
+        other = _apart(found.motions, found.motions, _APART, _APART)[0] > 1
+        if bool((other & (found.score >= _ALIKE * found.score[0])).any()):
+            doubts.append("another pose explains the scan as well")
+        pose = torch.eye(self.dim + 1).to(rows)
+        pose[: self.dim, : self.dim] = found.motions.rotations[0]
+        pose[: self.dim, self.dim] = found.motions.translations[0] + self._center
+        return Location(pose, covariance, share, tuple(doubts))
+
+    def _nothing(self, predicted: Tensor | None) -> Location:
+        """The prediction, for a scan without points."""
+        pose = torch.eye(self.dim + 1).to(self._center) if predicted is None else predicted.clone()
+        pose[: self.dim, self.dim] += self._center
+        n_free = self.dim + self.dim * (self.dim - 1) // 2
+        return Location(pose, _UNSEEN**2 * torch.eye(n_free).to(pose), 0.0, ("the scan has no points",))
+
+    def _remember(self, location: Location, predicted: Tensor | None, is_measured: bool) -> None:
+        if not location.found:
+            self.n_lost += 1
+            self._last, self._motion = predicted if is_measured else self._last, None
+            return
+        now = location.pose.clone()
+        now[: self.dim, self.dim] -= self._center
+        is_next = self._last is not None and self.n_lost == 0 and self._explained > 0
+        self._motion = torch.linalg.solve(self._last, now) if is_next else None
+        self._last, self.n_lost, self._explained = now, 0, location.explained
+
+
+def _better(some: Location, other: Location) -> Location:
+    return max(some, other, key=lambda location: (location.found, location.explained))
+
+
+def _rigid(matrix: ArrayLike, name: str, like: Tensor) -> Tensor:
+    pose = as_tensor(matrix, name, torch.float64, like.device).detach().clone()
+    check_rigid(pose, len(like), name)
+    return pose
+
+
+def _motions(poses: Tensor, dim: int) -> Motions:
+    """Poses (B, D+1, D+1) as motions."""
+    return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
+
+
+def _normals(surfaces: Surfaces) -> Tensor | None:
+    """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
+    the others. None if the surfaces do not state from where they were seen.
+    """
+    if isinstance(surfaces, GaussianMap):
+        surfaces = surfaces.components()
+    if not isinstance(surfaces, Components):
+        return None
+    solid = ~surfaces.max_range & (surfaces.support > 0)
+    variances, axes = torch.linalg.eigh(surfaces.covariances.double())
+    normals = axes[:, :, 0]
+    views = surfaces.origins.double()[surfaces.seen_from] - surfaces.means.double()[surfaces.seen_by]
+    heights = (views * normals[surfaces.seen_by]).sum(1)
+    sides = [torch.zeros(len(normals)).to(normals).index_add(0, surfaces.seen_by, side.to(normals))
+             for side in (heights > 0, heights < 0)]  # fmt: skip
+    sign = (sides[0] > 0).to(normals) - (sides[1] > 0).to(normals)  # 0 if seen from both sides
+    is_flat = variances[:, 0] < _FLAT**2 * variances[:, 1]
+    return (normals * (sign * is_flat)[:, None])[solid]
+
+
+def _places(surfaces: Surfaces, center: Tensor) -> Tensor:
+    """Places (S, D) from which the map was seen, one in each cell of `_PLACES` metres, about `center`."""
+    if isinstance(surfaces, GaussianMap):
+        surfaces = surfaces.components()
+    if not isinstance(surfaces, Components):
+        return center.new_zeros(0, len(center))
+    origins = surfaces.origins.to(center) - center
+    cells, member = torch.unique((origins / _PLACES).round(), dim=0, return_inverse=True)
+    first = torch.full((len(cells),), len(origins), device=center.device)
+    return origins[first.scatter_reduce(0, member, torch.arange(len(origins)).to(member), "amin")]
+
+
+def _turns(angles: Tensor, dim: int) -> Tensor:
+    """Rotations (A, D, D) by angles (A,), rad, about the vertical."""
+    return torch.linalg.matrix_exp(angles[:, None, None] * generators(dim)[-1].to(angles))
+
+
+def _around(start: Motions, distance: float, angle: float, blur: float) -> Motions:
+    """Starts on a lattice of places, `blur` metres apart, up to `distance` metres from one along the ground,
+    and of headings up to `angle` radians; the start itself among them.
+    """
+    dim, like = start.translations.shape[1], start.translations
+    n, m = math.ceil(distance / blur), math.ceil(angle / (_TURNED * blur))
+    side = torch.linspace(-distance, distance, 2 * n + 1).to(like)
+    places = torch.cartesian_prod(side, side)
+    places = places[places.norm(dim=1) <= distance * (1 + 1e-9)]
+    places = torch.nn.functional.pad(places, (0, dim - 2))
+    turned = _turns(torch.linspace(-angle, angle, 2 * m + 1).to(like), dim) @ start.rotations
+    return _crossed(turned, start.translations + places)
+
+
+def _everywhere(places: Tensor, blur: float) -> Motions:
+    """Starts at places (S, D) with all headings; upright in 3D."""
+    n = math.ceil(math.pi / (_TURNED * blur))
+    angles = torch.arange(n).to(places) * (2 * math.pi / n)
+    return _crossed(_turns(angles, places.shape[1]), places)
+
+
+def _crossed(rotations: Tensor, translations: Tensor) -> Motions:
+    """Every pair of a rotation and a translation."""
+    n = len(rotations)
+    return Motions(rotations.repeat(len(translations), 1, 1), translations.repeat_interleave(n, 0))
+
+
+def _apart(some: Motions, others: Motions, distance: float, angle: float) -> Tensor:
+    """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
+    shift = torch.cdist(some.translations, others.translations)
+    turn = torch.linalg.matrix_norm(some.rotations[:, None] - others.rotations) / math.sqrt(2)
+    return torch.maximum(shift / distance, turn / angle)
+
+
+def _best(motions: Motions, score: Tensor, distance: float) -> Tensor:
+    """Rows of motions by falling score, without those close to a better one: by less than `distance` (m) and
+    the turn that belongs to it.
+    """
+    order = score.argsort(descending=True, stable=True)
+    sorted_ = motions.at(order)
+    is_near = _apart(sorted_, sorted_, distance, _TURNED * distance) < 1
+    return order[~is_near.tril(-1).any(1)]
+
+
+def _covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
+    """The covariance (F, F) of a pose, and the largest standard deviation (m) at the median range."""
+    dim = rows.shape[1]
+    scale = information.new_ones(len(information))
+    scale[dim:] = 1 / rows.norm(dim=1).median().clamp_min(1e-3)
+    values, axes = torch.linalg.eigh(information * scale[:, None] * scale)
+    variances = _CORRELATED / values.clamp_min(_CORRELATED / _UNSEEN**2)
+    inner = axes @ (variances[:, None] * axes.mT)
+    return inner * scale[:, None] * scale, float(variances.max().sqrt())

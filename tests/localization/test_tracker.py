@@ -1,0 +1,156 @@
+"""Tracker: poses of simulated and real scans in a map, and what it says if there is none."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import gmmtorch as gt
+from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.localization import Tracker
+from gmmtorch.localization.overlap import generators
+
+
+def in_sensor_frame(scan: gt.Scan, pose: Tensor) -> Tensor:
+    return scan.transformed(torch.linalg.inv(pose)).points
+
+
+def moved(pose: Tensor, distance: float, angle: float, seed: int = 0) -> Tensor:
+    """A pose that is off by metres and radians in a random direction."""
+    dim, generator = len(pose) - 1, torch.Generator().manual_seed(seed)
+    shift = torch.randn(dim, generator=generator).double()
+    turn = torch.randn(dim * (dim - 1) // 2, generator=generator).double()
+    off = pose.clone()
+    off[:dim, dim] += distance * shift / shift.norm()
+    axis = torch.einsum("k,kij->ij", turn / turn.norm(), generators(dim))
+    off[:dim, :dim] = torch.linalg.matrix_exp(angle * axis) @ pose[:dim, :dim]
+    return off
+
+
+def errors(pose: Tensor, truth: Tensor) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    dim = len(pose) - 1
+    turn = pose[:dim, :dim].T @ truth[:dim, :dim] - torch.eye(dim)
+    angle = math.degrees(float(torch.linalg.matrix_norm(turn)) / math.sqrt(2))
+    return float((pose[:dim, dim] - truth[:dim, dim]).norm()), angle
+
+
+@pytest.fixture(scope="module")
+def building():
+    """Scans of the flat building with their poses, and a map of all but every fifth."""
+    scans = gt.datasets.load("synthetic_building_2d", n_scans=240)
+    m = gt.GaussianMap()
+    for number, scan in enumerate(scans):
+        if number % 5:
+            m.insert(scan)
+    return scans, m
+
+
+def test_held_out_scans_are_found_from_half_a_metre_and_ten_degrees(building):
+    scans, m = building
+    for number in range(0, len(scans), 30):
+        truth = scans.pose(number)
+        tracker = Tracker(m, moved(truth, 0.5, math.radians(10), number))
+        found = tracker.locate(in_sensor_frame(scans[number], truth))
+        distance, angle = errors(found.pose, truth)
+        assert found.found, (number, found.doubts)
+        assert distance < 0.1, number
+        assert angle < 1, number
+
+
+def test_a_sequence_is_tracked_by_rough_odometry_past_a_covered_sensor(building):
+    scans, m = building
+    tracker = Tracker(m, scans.pose(0))
+    for number in range(16):
+        truth = scans.pose(number)
+        motion = torch.linalg.solve(scans.pose(max(number - 1, 0)), truth)
+        points = in_sensor_frame(scans[number], truth)
+        is_covered = number in (6, 7)
+        found = tracker.locate(points[:0] if is_covered else points, moved(motion, 0.1, 0.05, number))
+        assert found.found != is_covered, (number, found.doubts)
+        if not is_covered:
+            assert errors(found.pose, truth)[0] < 0.1, number
+
+
+def test_the_first_pose_may_be_unknown(building):
+    scans, m = building
+    truth = scans.pose(7)
+    found = Tracker(m).locate(in_sensor_frame(scans[7], truth))
+    assert found.found
+    assert errors(found.pose, truth)[0] < 0.1
+
+
+def test_a_scan_of_another_place_is_not_found(building):
+    _, m = building
+    angle = torch.linspace(0, 2 * math.pi, 300).double()
+    star = (2 + torch.sin(7 * angle))[:, None] * torch.stack([angle.cos(), angle.sin()], 1)
+    found = Tracker(m, torch.eye(3)).locate(star)
+    assert not found.found
+    assert "another place" in " ".join(found.doubts)
+
+
+def test_a_corridor_leaves_its_direction_open():
+    along = torch.linspace(-15, 15, 61).double()
+    means = torch.cat([torch.stack([along, torch.full_like(along, side)], 1) for side in (-1.0, 1.0)])
+    shape = torch.diag(torch.tensor([0.1, 1e-4]).double()).repeat(len(means), 1, 1)
+    beam = torch.linspace(-4, 4, 200).double()
+    points = torch.cat([torch.stack([beam, torch.full_like(beam, side)], 1) for side in (-1.0, 1.0)])
+    found = Tracker((means, shape, torch.ones(len(means))), torch.eye(3)).locate(points)
+    assert not found.found
+    assert "direction open" in " ".join(found.doubts)
+    deviation = found.covariance.diagonal().sqrt()
+    assert float(deviation[0]) > 0.3
+    assert float(deviation[1]) < 0.1
+
+
+def test_far_from_the_origin_the_pose_is_the_same(building):
+    scans, m = building
+    there = torch.eye(3).double()
+    there[:2, 2] = torch.tensor([500e3, -300e3])
+    points, truth = in_sensor_frame(scans[5], scans.pose(5)), scans.pose(5)
+    means, covariances, weights = (
+        getattr(m.components(), name) for name in ("means", "covariances", "support")
+    )
+    near = Tracker((means, covariances, weights), moved(truth, 0.3, 0.1)).locate(points)
+    far = Tracker((means + there[:2, 2], covariances, weights), there @ moved(truth, 0.3, 0.1)).locate(points)
+    torch.testing.assert_close(far.pose, there @ near.pose, rtol=0, atol=1e-6)
+
+
+def test_same_scan_same_pose(building):
+    scans, m = building
+    points = in_sensor_frame(scans[5], scans.pose(5))
+    poses = [Tracker(m, moved(scans.pose(5), 0.3, 0.1)).locate(points).pose for _ in range(2)]
+    assert torch.equal(*poses)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pose": torch.ones(3, 3)}, "pose"),
+        ({"distance": -1}, "distance"),
+        ({"angle": 4}, "angle"),
+        ({"n_points": 0}, "n_points"),
+        ({"least_explained": 2}, "least_explained"),
+    ],
+)
+def test_bad_arguments_are_named(building, change, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        Tracker(building[1], **{"pose": torch.eye(3), **change})
+
+
+def test_bad_scans_and_maps_are_named(building):
+    tracker = Tracker(building[1], torch.eye(3))
+    with pytest.raises(InvalidArgumentError, match="points has shape"):
+        tracker.locate(torch.zeros(4, 3))
+    with pytest.raises(InvalidArgumentError, match="not finite"):
+        tracker.locate(torch.tensor([[math.nan, 0.0]]))
+    with pytest.raises(InvalidArgumentError, match="motion"):
+        tracker.locate(torch.zeros(4, 2), torch.ones(3, 3))
+    with pytest.raises(InvalidArgumentError, match="no surface"):
+        Tracker(gt.GaussianMap())
+    parts = torch.zeros(1, 2), torch.eye(2)[None], torch.ones(1)
+    with pytest.raises(InvalidArgumentError, match="does not state from where"):
+        Tracker(parts)
