@@ -2,7 +2,8 @@
 
 As on a GPU, an operation refuses tensors of both devices (except CPU tensors without dimensions), and
 `numpy()` needs `cpu()` first. `with pretended_gpu() as gpu:` runs code with `device="cuda"`. `gpu.waits`
-counts the operations after which Python waits for the device.
+counts the operations after which Python waits for the device. An operation whose result is a new tensor of
+more than `gpu.most_bytes` is out of memory.
 """
 
 from __future__ import annotations
@@ -115,17 +116,30 @@ def _check_devices(func: Any, name: str, args: Any, tensors: list[Tensor]) -> No
             raise RuntimeError(f"{func}: expected all tensors on the same device, but found cuda:0 and cpu.")
 
 
+def _check_memory(result: Any, arguments: Any, most_bytes: float) -> None:
+    """Raises as CUDA does if a new tensor is larger than `most_bytes`."""
+    given = {t.held.data_ptr() for t in tree_leaves(arguments) if isinstance(t, GPUTensor)}
+    for made in tree_leaves(result):
+        if isinstance(made, GPUTensor) and made.held.data_ptr() not in given:
+            asked = made.held.numel() * made.held.element_size()
+            if asked > most_bytes and made.held.is_contiguous():
+                asked_for = f"Tried to allocate {asked / 2**20:.2f} MiB. GPU 0 has a total capacity"
+                raise torch.OutOfMemoryError(f"CUDA out of memory. {asked_for}")
+
+
 class _Dispatch(TorchDispatchMode):
-    def __init__(self, waits: Counter[str]) -> None:
+    def __init__(self, gpu: PretendedGPU) -> None:
         super().__init__()
-        self.waits = waits
+        self.gpu = gpu
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         kwargs = kwargs or {}
         if _is_gpu(kwargs.get("device")) or any(
             isinstance(t, GPUTensor) for t in tree_leaves((args, kwargs))
         ):
-            return _run(func, args, kwargs, self.waits)
+            result = _run(func, args, kwargs, self.gpu.waits)
+            _check_memory(result, (args, kwargs), self.gpu.most_bytes)
+            return result
         return func(*args, **kwargs)
 
 
@@ -181,10 +195,11 @@ class _Move(torch.autograd.Function):
 
 
 class PretendedGPU:
-    """`waits`: operations after which Python waited for the device, by name."""
+    """`waits`: operations after which Python waited for the device, by name. `most_bytes` of a new tensor."""
 
     def __init__(self) -> None:
         self.waits: Counter[str] = Counter()
+        self.most_bytes = float("inf")
 
 
 @contextmanager
@@ -196,6 +211,6 @@ def pretended_gpu() -> Iterator[PretendedGPU]:
         stack.enter_context(mock.patch.object(torch, "inference_mode", torch.no_grad))
         for name, value in (("is_available", True), ("device_count", 1), ("_lazy_init", None)):
             stack.enter_context(mock.patch.object(torch.cuda, name, lambda value=value: value))
-        stack.enter_context(_Dispatch(gpu.waits))
+        stack.enter_context(_Dispatch(gpu))
         stack.enter_context(_Functions())
         yield gpu

@@ -85,13 +85,14 @@ class FusedKernel:
     def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
         """Run the body for the items 0 … n_items − 1.
 
-        Tensors must be contiguous, on `device`, and of the type of their pointers; they are not checked. On
-        a CPU the items are split over `torch.get_num_threads()` threads, unless the kernel `shares`.
+        Tensors must be on `device` and of the type of their pointers, which is not checked, and contiguous:
+        raises `GmmTorchError` for one that is not. On a CPU the items are split over
+        `torch.get_num_threads()` threads, unless the kernel `shares`.
         """
         if n_items == 0:
             return
         _load(device)
-        values = [a.data_ptr() if isinstance(a, Tensor) else 0 if a is None else a for a in arguments]
+        values = [self._value(place, argument) for place, argument in enumerate(arguments)]
         wp = _warp()
         if device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))
@@ -110,6 +111,17 @@ class FusedKernel:
         ]
         for job in jobs:
             job.result()  # Warp releases the interpreter's lock during a launch
+
+    def _value(self, place: int, argument: Tensor | float | None) -> float:
+        """What is passed for an argument: the address of a tensor, 0 for None."""
+        if not isinstance(argument, Tensor):
+            return 0 if argument is None else argument
+        if not argument.is_contiguous():
+            raise GmmTorchError(
+                f"argument {place} of kernel {self.name} has shape {tuple(argument.shape)} and strides "
+                f"{argument.stride()}, which are not contiguous; pass tensor.contiguous()."
+            )
+        return argument.data_ptr()
 
     def define(self, wp: Any) -> None:
         """Register the body and its entry with Warp."""

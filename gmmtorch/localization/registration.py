@@ -82,8 +82,9 @@ def register(
             out.
         initial: (D+1, D+1), or (B, D+1, D+1) for several starts, of which the best wins (see `yaw_starts`).
             None: the identity.
-        coarsest: first s (m), about the error of the initial pose. None: an eighth of the
-            smaller mixture's radius (root mean square).
+        coarsest: first s (m), if the initial pose is known to about that much, as in tracking: coarser levels
+            are left out, and a single start is tried once. None: an eighth of the smaller mixture's radius
+            (root mean square), and a single start is tried again two levels below.
         finest: last s (m). None: the median of the components' smallest deviations.
         max_iterations: of a level.
         tolerance: metres, also of a turn at the mixture's radius, below which a step ends a level.
@@ -115,7 +116,7 @@ def register(
     f_levels, g_levels = _levels(f, blurs), _levels(g, blurs)
     n_evaluated, climbed = 0, motions
     for number, blur in enumerate(blurs):
-        if len(start) == 1 and number == _SECOND_CHANCE:
+        if coarsest is None and len(start) == 1 and number == _SECOND_CHANCE:
             climbed = climbed.joined(motions)  # in case a coarser level climbed a wrong peak
         last = number == len(blurs) - 1
         ascent = Ascent(f_levels[number], g_levels[number], radius)

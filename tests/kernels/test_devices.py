@@ -9,6 +9,9 @@ from pretended_gpu import GPUTensor, pretended_gpu
 
 import gmmtorch as gt
 from gmmtorch.kernels import kernels
+from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.grouping import Rows, group_rows, truncated_expectation
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.forms.flux.box_flux import flux_evidence
@@ -57,10 +60,14 @@ def ask_points(device):
     return tuple(point_evidence(cones, 3 * cloud(1000).double().to(device) - 2, 0.1))
 
 
-def grid_flux(device):
+def grid_flux(device, tolerance=1e-2):
     cones = Cones(*(part.to(device) for part in cones_of(3, "any", 6)))
-    found = flux_evidence(cones, VoxelGrid((-2.0,) * 3, 1.0, (4, 4, 4)), 3.0, tolerance=1e-2)
+    found = flux_evidence(cones, VoxelGrid((-2.0,) * 3, 1.0, (4, 4, 4)), 3.0, tolerance=tolerance)
     return found.hits, found.misses
+
+
+def exact_grid_flux(device):
+    return grid_flux(device, 1e-6)
 
 
 def fit_mixture(device):
@@ -76,6 +83,25 @@ def build_and_ask_a_map(device):
     built.finish()
     asked = cloud(60).to(device)
     return built.means, built.occupancy(asked, 0.1), built.occupancy(asked, 0.2, method="monte_carlo")
+
+
+def list_visits(device):
+    origins, ends = (5 * part.to(device) for part in rays())
+    total = torch.zeros(4000, device=device)  # of the numbers of the rays in each voxel
+    for voxel, ray in traverse(origins, ends, (20, 20, 10)):
+        total.index_add_(0, voxel, (1 + ray).float())
+    return (total,)
+
+
+def truncated_e_step(device):
+    points = cloud(3000).double().to(device)
+    rows = Rows(points, torch.ones(3000, dtype=torch.float64, device=device))
+    covariances = 0.1 * torch.eye(3, dtype=torch.float64, device=device).repeat(40, 1, 1)
+    mixture = Parameters(torch.full_like(points[:40, 0], 1 / 40), points[:40], covariances)
+    groups = group_rows(rows, torch.arange(3000, device=device) % 40, mixture.means, torch.float64)
+    candidates = (torch.arange(40, device=device)[:, None] + torch.arange(16, device=device)) % 40
+    found = truncated_expectation(groups, candidates, mixture, want_owner=True)
+    return found.statistics, found.owner
 
 
 @pytest.mark.parametrize(
@@ -112,3 +138,20 @@ def test_the_pretended_gpu_refuses_what_a_gpu_refuses():
         assert float(x.sum()) == 3.0
         assert x.cpu().numpy().sum() == 3.0
         assert gpu.waits.total() >= 1
+
+
+@pytest.mark.parametrize(
+    ("work", "most_bytes"),
+    [(list_visits, 20_000), (ask_points, 300_000), (exact_grid_flux, 20_000), (truncated_e_step, 400_000)],
+)
+def test_work_goes_on_in_smaller_chunks_where_the_memory_of_the_gpu_ends(work, most_bytes, caplog):
+    caplog.set_level("INFO")
+    with kernels("torch"):
+        expected = work("cpu")
+    with pretended_gpu() as gpu:
+        gpu.most_bytes = most_bytes
+        found = work("cuda")
+    assert "GPU 0 is out of memory" in caplog.text
+    assert "chunks of" in caplog.text
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.held, other, rtol=1e-9, atol=1e-12)

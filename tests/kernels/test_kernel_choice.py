@@ -6,6 +6,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -95,12 +96,24 @@ def test_items_split_over_threads_are_each_run_once(n_threads):
 
 
 @pytest.mark.slow
-def test_two_processes_compile_at_once(tmp_path):
+def test_two_processes_compile_at_once_after_a_third_was_killed_while_it_compiled(tmp_path):
     code = "from gmmtorch.kernels import use_kernels; use_kernels('fused')"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
-    jobs = [subprocess.Popen([sys.executable, "-c", code], env=environment) for _ in range(2)]
+    command, environment = [sys.executable, "-c", code], {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    killed = subprocess.Popen(command, env=environment)
+    while killed.poll() is None and not any(path.is_file() for path in tmp_path.rglob("*")):
+        time.sleep(0.01)
+    killed.kill()
+    assert killed.wait() != 0
+    assert not list(tmp_path.rglob("*.o"))
+    jobs = [subprocess.Popen(command, env=environment) for _ in range(2)]
     assert [job.wait() for job in jobs] == [0, 0]
     assert list(tmp_path.rglob("*.o"))
+
+
+def test_a_tensor_that_is_not_contiguous_is_refused():
+    kernel = next(iter(compiler._sources.values()), None) or compiler.FusedKernel("unused", "int64* x", "")
+    with pytest.raises(GmmTorchError, match=rf"argument 1 of kernel {kernel.name} has shape \(3, 2\)"):
+        kernel._value(1, torch.ones(2, 3).T)
 
 
 def test_a_forked_process_makes_its_own_threads():

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.chunks import chunked
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.rays.ray_walk import PARAMETERS, TIE, walk
 
@@ -276,10 +277,20 @@ def _fused(
     cuts = _chunk_bounds(counts, chunk_visits)
     sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
     for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
-        voxels, rays = torch.empty(2, after - before, dtype=torch.int64, device=device)
-        _LIST_VISITS(stop - begin, begin, stops, voxels, rays, *grid, device=device)
         if after > before:
-            yield Visits(voxels, rays)
+            listed = functools.partial(_listed, grid, stops, {begin: before, stop: after}, begin)
+            yield from chunked(stop - begin, stop - begin, listed)
+
+
+def _listed(
+    grid: list[Tensor | float], stops: Tensor, known: dict[int, int], begin: int, part: slice
+) -> Visits:
+    """Visits of a run of rays; `known`: how many visits come before a ray, where Python has this number."""
+    first, last = begin + part.start, begin + part.stop
+    before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
+    voxels, rays = torch.empty(2, after - before, dtype=torch.int64, device=stops.device)
+    _LIST_VISITS(last - first, first, stops, voxels, rays, *grid, device=stops.device)
+    return Visits(voxels, rays)
 
 
 def _batched(
@@ -299,12 +310,27 @@ def _batched(
     # A ray that leaves the grid visits at most sum(shape) of its voxels.
     visits = torch.minimum((rays.last - rays.first).sum(1), size.sum() + 4 * len(shape))
     for begin, stop in itertools.pairwise(_chunk_bounds(visits, chunk_visits)):
-        part = _Rays(*(field[begin:stop] for field in rays))
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):
-            chunk = _crossings(part, shape, strides, axis, masked, compiled)
-            if chunk.voxel.numel():
-                yield Visits(chunk.voxel, chunk.ray + begin if begin else chunk.ray)
+            crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked, compiled)
+            yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found.voxel))
+
+
+def _crossings_of(
+    rays: _Rays,
+    begin: int,
+    shape: tuple[int, ...],
+    strides: list[int],
+    axis: int,
+    masked: bool,
+    compiled: bool,
+    part: slice,
+) -> Visits:
+    """`_crossings` of a run of rays that starts at `begin`."""
+    first, last = begin + part.start, begin + part.stop
+    some = _Rays(*(field[first:last] for field in rays))
+    found = _crossings(some, shape, strides, axis, masked, compiled)
+    return Visits(found.voxel, found.ray + first if first else found.ray)
 
 
 def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:

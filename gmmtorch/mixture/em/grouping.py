@@ -17,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gmmtorch.kernels.chunks import chunk_elements
+from gmmtorch.kernels.chunks import chunk_elements, chunked
 from gmmtorch.kernels.mixtures.truncated_e_step import (
     GroupedRows,
     fused_candidates,
@@ -172,18 +172,18 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     if is_fused_on(rows, natural):
         return fused_candidates(rows, groups.slot[place], natural, n_candidates)
     natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
-    chosen = []
-    step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
-    for begin in range(0, k, step):
-        part = slice(begin, min(begin + step, k))
+
+    def chosen(part: slice) -> Tensor:
         moved = shift_features(samples[part].double(), groups.centers[part, None])
         joint = (moved.flatten(0, 1) @ natural).to(samples.dtype).view(-1, n_samples, k)
         joint -= joint.amax(2, keepdim=True)
         score = joint.amax(1)
         own = torch.arange(part.start, part.stop, device=score.device)
         score[own - part.start, own] = torch.inf
-        chosen.append(largest_indices(score, n_candidates))
-    return torch.cat(chosen)
+        return largest_indices(score, n_candidates)
+
+    step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
+    return torch.cat(list(chunked(k, step, chosen)))
 
 
 # -- the E-step over candidates -------------------------------------------------------------------
@@ -224,16 +224,19 @@ def truncated_expectation(
     value = torch.zeros((), dtype=torch.float64, device=candidates.device)
     likeliest = torch.empty_like(groups.weight, dtype=torch.int64) if want_owner else None
     block_sums = _compiled_block_sums() if compiled else _block_sums
-    step = max(1, chunk_elements(groups.owner.device) // (block * m))
-    for begin in range(0, n_blocks, step):
-        part = slice(begin, begin + step)
-        owner = groups.owner[part]
+
+    def sums_of(part: slice) -> tuple[slice, Tensor, Tensor, Tensor | None]:
+        features, owner = groups.features[part], groups.owner[part]
         block_natural = natural.index_select(0, owner)
-        block_statistics, block_value = block_sums(block_natural, groups.features[part], groups.weight[part])
-        sums.index_add_(0, owner, block_statistics)
+        best = candidates[owner].gather(1, _likeliest(block_natural, features)) if want_owner else None
+        return part, *block_sums(block_natural, features, groups.weight[part]), best
+
+    step = max(1, chunk_elements(groups.owner.device) // (block * m))
+    for part, block_statistics, block_value, best in chunked(n_blocks, step, sums_of):
+        sums.index_add_(0, groups.owner[part], block_statistics)
         value += block_value
-        if likeliest is not None:
-            likeliest[part] = candidates[owner].gather(1, _likeliest(block_natural, groups.features[part]))
+        if likeliest is not None and best is not None:
+            likeliest[part] = best
     by_pair = sums.view(n_groups, n_features, m).transpose(1, 2).double()
     about_means = shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
     statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)

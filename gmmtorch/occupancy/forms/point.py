@@ -12,6 +12,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.chunks import chunked
 from gmmtorch.kernels.evidence.point_evidence import (
     PointTable,
     compiled_pair_evidence,
@@ -158,7 +159,11 @@ class PointForm:
         Raises `InvalidArgumentError` for another shape, NaN, or a length that is not above zero.
         """
         query = check_queries(points, self.dim)
-        parts = [self._evaluate(part, chunk_pairs) for part in query.split(_CHUNK_POINTS)]
+
+        def evaluated(part: slice) -> PointEvidence:
+            return self._evaluate(query[part], chunk_pairs)
+
+        parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [evaluated(slice(0))]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         if hit_length is not None:
             hits = hits * (_check_length(hit_length) / self.resolution)

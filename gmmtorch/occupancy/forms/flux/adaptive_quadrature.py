@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.chunks import chunked
 from gmmtorch.occupancy.cones import dot
 
 TOLERANCE = 1e-4
@@ -128,29 +129,39 @@ def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> T
     Differentiable: cuts and orders depend on detached values only. Panels to cut further are kept on a stack;
     a pass works on about `CHUNK_PANELS` of them.
     """
-    limits = variation_limits(tolerance)
     total = like.new_zeros(len(patches))
     index = torch.arange(len(patches), device=like.device)
     whole = like.new_zeros(like.shape[0] - 1, len(patches))
     stack = list(_Panels(index, whole, whole + 1).chunks()) if len(index) else []
     while stack:
         panels = _next_panels(stack)
-        geometry = patches.take(panels.patch).cut(panels.base, panels.scale)
-        with torch.no_grad():
-            inside = (~geometry.outside()).nonzero().squeeze(1)
-        panels, geometry = panels.take(inside), geometry.take(inside)
-        with torch.no_grad():
-            simple = geometry.simple()
-            variation = geometry.variation(simple)
-            fine = (variation <= limits[-1]).all(0) | (panels.scale.abs() < _SMALLEST).any(0)
-        ready, coarse = fine.nonzero().squeeze(1), (~fine).nonzero().squeeze(1)
-        if len(ready):
-            sums = _sums_by_order(geometry, ready, variation[:, ready], simple, limits)
-            total = total.index_add(0, panels.patch[ready], sums)
-        if len(coarse):
-            cut = _cut_triangles if patches.triangular else _cut_boxes
-            stack.extend(cut(panels.take(coarse), variation[:, coarse] / limits[-1]).chunks())
+        compute = functools.partial(_pass, patches, panels, variation_limits(tolerance))
+        for patch, sums, cut in chunked(len(panels.patch), len(panels.patch), compute):
+            total = total.index_add(0, patch, sums) if len(patch) else total
+            stack.extend(cut.chunks() if cut else ())
     return total
+
+
+def _pass(
+    patches: Patches, panels: _Panels, limits: tuple[float, ...], part: slice
+) -> tuple[Tensor, Tensor, _Panels | None]:
+    """Of some panels: patches and integrals of those that are fine enough, and the others cut further."""
+    panels = _Panels(*(field[..., part] for field in panels))
+    geometry = patches.take(panels.patch).cut(panels.base, panels.scale)
+    with torch.no_grad():
+        inside = (~geometry.outside()).nonzero().squeeze(1)
+    panels, geometry = panels.take(inside), geometry.take(inside)
+    with torch.no_grad():
+        simple = geometry.simple()
+        variation = geometry.variation(simple)
+        fine = (variation <= limits[-1]).all(0) | (panels.scale.abs() < _SMALLEST).any(0)
+    ready, coarse = fine.nonzero().squeeze(1), (~fine).nonzero().squeeze(1)
+    sums = variation.new_zeros(0)
+    if len(ready):
+        sums = _sums_by_order(geometry, ready, variation[:, ready], simple, limits)
+    cut = _cut_triangles if patches.triangular else _cut_boxes
+    further = cut(panels.take(coarse), variation[:, coarse] / limits[-1]) if len(coarse) else None
+    return panels.patch[ready], sums, further
 
 
 def _next_panels(stack: list[_Panels]) -> _Panels:
