@@ -25,7 +25,7 @@ class Runtime:
 
     device: cpu, cuda, cuda:1, …
     threads: CPU threads; null: torch chooses. The same number gives the same results.
-    dtype: type of the exponentials in EM; float64: all computations.
+    dtype: type of the exponentials in EM (float64 in fused exact EM); float64: all computations.
     compile: use torch.compile; faster for very large runs.
     kernels: fused kernels: auto, if the extra [fast] is installed; fused, an error if not; torch, never.
     memory_limit: bytes of a map's cells, at most.
