@@ -57,16 +57,21 @@ class FusedKernel:
             int32 and uint8, separated by commas. A pointer is a tensor, or None for a null pointer.
         body: C++ statements. GMM_ADD(pointer, value) adds so that items can meet in one place on CUDA.
         shares: whether items write to the same places. Such a launch uses one thread of a CPU.
+        strided: parameters whose tensors need not be contiguous, because the body is given their strides.
     """
 
-    def __init__(self, name: str, parameters: str, body: str, shares: bool = False) -> None:
-        self.name, self.shares = name, shares
+    def __init__(
+        self, name: str, parameters: str, body: str, shares: bool = False, strided: tuple[str, ...] = ()
+    ) -> None:
+        self.name, self.shares, self._strided = name, shares, strided
+        self._labels: list[str] = []
         casts, names, types = [], [], []
         for parameter in parameters.split(","):
             match = re.fullmatch(r"\s*(const\s+)?(\w+)\s*(\*?)\s*(\w+)\s*", parameter)
             if match is None:
                 raise ValueError(f"parameter {parameter!r} of kernel {name} is not `type name`.")
             const, kind, star, label = match.groups()
+            self._labels.append(label)
             names.append(label + "_" if star else label)
             types.append("uint64" if star else _TYPES[kind])
             if star:
@@ -85,14 +90,14 @@ class FusedKernel:
     def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
         """Run the body for the items 0 … n_items − 1.
 
-        Tensors must be on `device` and of the type of their pointers, which is not checked, and contiguous:
-        raises `GmmTorchError` for one that is not. On a CPU the items are split over
-        `torch.get_num_threads()` threads, unless the kernel `shares`.
+        Tensors must be on `device` and of the type of their pointers; this is not checked. Raises
+        `GmmTorchError` for a tensor that is not contiguous, unless it is `strided`. On a CPU the items are
+        split over `torch.get_num_threads()` threads, unless the kernel `shares`.
         """
         if n_items == 0:
             return
+        values = [self._value(*pair) for pair in zip(self._labels, arguments, strict=True)]
         _load(device)
-        values = [self._value(place, argument) for place, argument in enumerate(arguments)]
         wp = _warp()
         if device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))
@@ -112,13 +117,13 @@ class FusedKernel:
         for job in jobs:
             job.result()  # Warp releases the interpreter's lock during a launch
 
-    def _value(self, place: int, argument: Tensor | float | None) -> float:
+    def _value(self, label: str, argument: Tensor | float | None) -> float:
         """What is passed for an argument: the address of a tensor, 0 for None."""
         if not isinstance(argument, Tensor):
             return 0 if argument is None else argument
-        if not argument.is_contiguous():
+        if not argument.is_contiguous() and label not in self._strided:
             raise GmmTorchError(
-                f"argument {place} of kernel {self.name} has shape {tuple(argument.shape)} and strides "
+                f"{label} of kernel {self.name} has shape {tuple(argument.shape)} and strides "
                 f"{argument.stride()}, which are not contiguous; pass tensor.contiguous()."
             )
         return argument.data_ptr()

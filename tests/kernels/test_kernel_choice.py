@@ -111,9 +111,12 @@ def test_two_processes_compile_at_once_after_a_third_was_killed_while_it_compile
 
 
 def test_a_tensor_that_is_not_contiguous_is_refused():
-    kernel = next(iter(compiler._sources.values()), None) or compiler.FusedKernel("unused", "int64* x", "")
-    with pytest.raises(GmmTorchError, match=rf"argument 1 of kernel {kernel.name} has shape \(3, 2\)"):
-        kernel._value(1, torch.ones(2, 3).T)
+    turned = torch.ones(2, 3).T
+    kernel = compiler.FusedKernel("not_compiled", "float* x, float* y", "", strided=("y",))
+    del compiler._sources["not_compiled"]
+    with pytest.raises(GmmTorchError, match=r"x of kernel not_compiled has shape \(3, 2\).*contiguous"):
+        kernel(2, turned, turned, device=torch.device("cpu"))
+    assert kernel._value("y", turned) == turned.data_ptr()
 
 
 def test_a_forked_process_makes_its_own_threads():

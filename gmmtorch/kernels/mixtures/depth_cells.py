@@ -161,6 +161,7 @@ _KERNELS = {
         .replace("PATCH", str(PATCH))
         .replace("WIDTH", str(_WIDTH)),
         shares=True,
+        strided=("depth",),
     )
     for dtype, kind in ((torch.float32, "float"), (torch.float64, "double"))
 }
