@@ -153,7 +153,7 @@ def test_descriptions_are_read_from_docstrings():
         ),
         ("occupancy", "dataset=depth_frames dataset.pix", "dataset.pixel_stride="),
         ("occupancy", "report.figures=", "report.figures=false report.figures=true"),
-        ("occupancy", "map=windowed map.min", "map.min_points="),
+        ("occupancy", "map=windowed map.min_p", "map.min_points="),
         ("fit", "experiment=s", "experiment=sensor_model experiment=strategies"),
         (
             "explore",
