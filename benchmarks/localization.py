@@ -24,6 +24,8 @@ from gmmtorch.datasets import Dataset
 from gmmtorch.localization import Tracker
 from gmmtorch.localization.overlap import generators
 
+_IN_ORDER = 300  # first scans of a log
+
 
 class Place(NamedTuple):
     """A data set, every how many scans one is held out, and a map of the others."""
@@ -120,7 +122,7 @@ def without_a_pose(place: Place, m: gt.GaussianMap, most: int) -> list[Outcome]:
 
 def one_after_the_other(place: Place) -> list[Outcome]:
     tracker = Tracker(place.map, place.scan(0)[1])
-    return [located(tracker, *place.scan(number)) for number in range(len(place.scans))]
+    return [located(tracker, *place.scan(number)) for number in range(min(len(place.scans), _IN_ORDER))]
 
 
 def main() -> None:
@@ -142,7 +144,7 @@ def main() -> None:
     for name, place in (("hall", hall), ("intel", intel)):
         rows.append(row(f"{name}, from 0.5 m and 10° off", from_a_rough_pose(place)))
         rows.append(row(f"{name}, without a pose", without_a_pose(place, place.map, 20)))
-        rows.append(row(f"{name}, all scans in order", one_after_the_other(place)))
+        rows.append(row(f"{name}, scans in order", one_after_the_other(place)))
     rows.append(row("aces in the map of intel, without a pose", without_a_pose(aces, intel.map, 20)))
     rows.append(row("intel in the map of aces, without a pose", without_a_pose(intel, aces.map, 20)))
     table = markdown(list(rows[0]), [list(row.values()) for row in rows])

