@@ -7,7 +7,8 @@ and a uniform density ε of outliers, is
 
 (point-to-distribution NDT, Magnusson 2009, with an annealed blur s). Newton's steps climb it on SE(3) or
 SE(2); where −∇²ℓ is not positive definite, EM's steps do. Each point adds at most log(1 + q_n/ε), so people
-and other changes have little weight.
+and other changes have little weight. A flat component that was seen from one side only is left out while the
+sensor is behind it.
 """
 
 from __future__ import annotations

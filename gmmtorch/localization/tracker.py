@@ -31,7 +31,7 @@ _RANKED = 4 * _CLIMBED  # best starts, of which different ones are climbed
 _COARSE_POINTS = 200  # of the scan, that rank the starts
 _RANKED_AT_ONCE = 256  # starts
 _WIDER = 4  # times the first search
-_GLOBAL_AFTER = 1  # lost scans, before which the whole map is not searched
+_GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
 
 _USUAL = 0.9  # of the share that the last scan had: less, and the search is wider
 _FLAT = 0.25  # of the next deviation: thinner components have a face
@@ -106,9 +106,10 @@ class Tracker:
         self.dim = mixture.means.shape[1]
         self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
         centered = mixture._replace(means=mixture.means - self._center)
-        normals = _normals(surfaces)
+        seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
+        normals = _normals(seen) if isinstance(seen, Components) else None
         self._targets = [AlignmentTarget(centered, blur, normals) for blur in _BLURS]
-        self._places = _places(surfaces, self._center)
+        self._places = _places(seen, self._center) if isinstance(seen, Components) else mixture.means[:0]
         self.restart(pose)
 
     def restart(self, pose: ArrayLike | None = None) -> None:
@@ -255,14 +256,10 @@ def _motions(poses: Tensor, dim: int) -> Motions:
     return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
 
 
-def _normals(surfaces: Surfaces) -> Tensor | None:
+def _normals(surfaces: Components) -> Tensor:
     """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
-    the others. None if the surfaces do not state from where they were seen.
+    the others. In the order of `surface_mixture`.
     """
-    if isinstance(surfaces, GaussianMap):
-        surfaces = surfaces.components()
-    if not isinstance(surfaces, Components):
-        return None
     solid = ~surfaces.max_range & (surfaces.support > 0)
     variances, axes = torch.linalg.eigh(surfaces.covariances.double())
     normals = axes[:, :, 0]
@@ -275,12 +272,8 @@ def _normals(surfaces: Surfaces) -> Tensor | None:
     return (normals * (sign * is_flat)[:, None])[solid]
 
 
-def _places(surfaces: Surfaces, center: Tensor) -> Tensor:
+def _places(surfaces: Components, center: Tensor) -> Tensor:
     """Places (S, D) from which the map was seen, one in each cell of `_PLACES` metres, about `center`."""
-    if isinstance(surfaces, GaussianMap):
-        surfaces = surfaces.components()
-    if not isinstance(surfaces, Components):
-        return center.new_zeros(0, len(center))
     origins = surfaces.origins.to(center) - center
     cells, member = torch.unique((origins / _PLACES).round(), dim=0, return_inverse=True)
     first = torch.full((len(cells),), len(origins), device=center.device)

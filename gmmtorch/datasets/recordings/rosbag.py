@@ -265,20 +265,19 @@ class RosBag(Dataset):
         record = self._records[index]
         message = self._message(index)
         try:
-            if self._sensor.kind == bag_topics.CLOUD:
-                return sensor_messages.cloud_points(message, record.stamp)
-            if self._sensor.kind == bag_topics.LIST:
-                return sensor_messages.listed_points(message, self._sensor.field, record.stamp)
-            if self._sensor.kind == bag_topics.LASER:
-                return sensor_messages.laser_points(message)
-            return self._camera_reading(message)
+            return self._points(message, record.stamp)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
                 f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: {error}."
             ) from error
 
-    def _camera_reading(self, message: dict[str, Any]) -> Reading:
-        raise NotImplementedError
+    def _points(self, message: dict[str, Any], stamp: int) -> Reading:
+        """The points of a decoded message of a laser or lidar, measured at a stamp in ns."""
+        if self._sensor.kind == bag_topics.CLOUD:
+            return sensor_messages.cloud_points(message, stamp)
+        if self._sensor.kind == bag_topics.LIST:
+            return sensor_messages.listed_points(message, self._sensor.field, stamp)
+        return sensor_messages.laser_points(message)
 
     def _message(self, index: int) -> dict[str, Any]:
         """The decoded message of scan `index` of the source. Reading in order does not search the bag."""
@@ -313,7 +312,7 @@ class DepthBag(RosBag):
         self.intrinsics = sensor_messages.camera_matrix(reader.decode(message))
         super().__init__(*arguments)
 
-    def _camera_reading(self, message: dict[str, Any]) -> Reading:
+    def _points(self, message: dict[str, Any], stamp: int) -> Reading:
         points = back_project(self._depth(message), self.intrinsics, self.pixel_stride)
         return sensor_messages.reading(points.numpy(), None, None)
 

@@ -34,7 +34,7 @@ from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
 from gmmtorch.evaluation.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
-from gmmtorch.evaluation.studies.map_variants import surface_mixture
+from gmmtorch.evaluation.studies.map_variants import surface_score
 from gmmtorch.evaluation.studies.study_options import ComponentCountStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import WindowedRule
@@ -272,4 +272,4 @@ _UNMEASURED = (
 
 def _score(built: object, points: Tensor) -> float:
     assert isinstance(built, GaussianMap)
-    return surface_mixture(built).score(points)
+    return surface_score(built, points)

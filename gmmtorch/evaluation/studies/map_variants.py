@@ -56,18 +56,20 @@ def run(
                     "auc_gain": gain.mean,
                     "auc_gain_low": gain.low,
                     "auc_gain_high": gain.high,
-                    "held_out_log_likelihood": surface_mixture(built.map).score(ends),
+                    "held_out_log_likelihood": surface_score(built.map, ends),
                 }
             )
         on_rows(rows)
     return rows
 
 
-def surface_mixture(built: GaussianMap) -> GaussianMixture:
-    """A mixture of the map's components of surfaces, weighted by their support."""
+def surface_score(built: GaussianMap, points: torch.Tensor) -> float:
+    """Mean log-likelihood (nats) of points (N, D) under the surfaces of a map, before the codec rounds them,
+    weighted by their support.
+    """
     hits = ~built.max_range
-    weight = built.support[hits]
-    return GaussianMixture.from_parameters(weight / weight.sum(), built.means[hits], built.covariances[hits])
+    weight, means, covariances = built.support[hits], built.means[hits], built.covariances[hits]
+    return GaussianMixture.from_parameters(weight / weight.sum(), means, covariances).score(points)
 
 
 def _by_label(built: Built) -> tuple[torch.Tensor, torch.Tensor]:
