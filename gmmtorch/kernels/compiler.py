@@ -1,17 +1,15 @@
 """FusedKernel: a loop in C++ that Warp compiles for the CPU (with its own LLVM) or for CUDA.
 
-All kernels are one Warp module, so that a machine compiles once. The result is cached in a folder; without a
-folder that can be written, in a temporary one, for this process.
+Each kernel is a Warp module of its own, compiled at its first use: a machine compiles only what it runs. The
+result is cached in a folder; without a folder that can be written, in a temporary one, for this process.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
 import itertools
 import logging
 import os
-import pkgutil
 import re
 import sys
 import tempfile
@@ -30,12 +28,10 @@ from gmmtorch.errors import GmmTorchError
 
 logger = logging.getLogger(__name__)
 
-_MODULE = "gmmtorch_kernels"
 _TYPES = {"int64": "int64", "double": "float64", "float": "float32", "bool": "bool"}
 _POINTERS = {"int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
 _LEAST_ITEMS = 1 << 10  # of a thread
 _lock = threading.RLock()
-_sources: dict[str, FusedKernel] = {}
 
 _PRELUDE = """
 #if defined(__CUDA_ARCH__)
@@ -58,12 +54,20 @@ class FusedKernel:
         body: C++ statements. GMM_ADD(pointer, value) adds so that items can meet in one place on CUDA.
         shares: whether items write to the same places. Such a launch uses one thread of a CPU.
         strided: parameters whose tensors need not be contiguous, because the body is given their strides.
+        rounds_each: whether the compiler must round every product, as tensor operations do, and not contract
+            a * b + c. Results of such a kernel can equal those of tensor operations to the bit.
     """
 
     def __init__(
-        self, name: str, parameters: str, body: str, shares: bool = False, strided: tuple[str, ...] = ()
+        self,
+        name: str,
+        parameters: str,
+        body: str,
+        shares: bool = False,
+        strided: tuple[str, ...] = (),
+        rounds_each: bool = False,
     ) -> None:
-        self.name, self.shares, self._strided = name, shares, strided
+        self.name, self.shares, self._strided, self._rounds_each = name, shares, strided, rounds_each
         self._labels: list[str] = []
         casts, names, types = [], [], []
         for parameter in parameters.split(","):
@@ -85,7 +89,7 @@ class FusedKernel:
             f"    {name}_body(begin + wp.int64(wp.tid()), {', '.join(names)})\n"
         )
         self._kernel: Any = None
-        _sources[name] = self
+        self._loaded: set[torch.device] = set()
 
     def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
         """Run the body for the items 0 … n_items − 1.
@@ -97,7 +101,7 @@ class FusedKernel:
         if n_items == 0:
             return
         values = [self._value(*pair) for pair in zip(self._labels, arguments, strict=True)]
-        _load(device)
+        self.load(device)
         wp = _warp()
         if device.type == "cuda":
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))
@@ -128,21 +132,57 @@ class FusedKernel:
             )
         return argument.data_ptr()
 
-    def define(self, wp: Any) -> None:
-        """Register the body and its entry with Warp."""
+    def load(self, device: torch.device) -> None:
+        """Compile the kernel for a device, or load it from the cache; nothing if that is done.
+
+        Raises `GmmTorchError` if it does not compile.
+        """
+        if device in self._loaded:
+            return
+        with _lock:
+            if device in self._loaded:
+                return
+            wp = _warp()
+            if self._kernel is None:
+                self._kernel = self._defined(wp)
+            module, block = self._kernel.module, 1 if device.type == "cpu" else None
+            if not (Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block)).is_dir():
+                _announce(str(device), wp.config.kernel_cache_dir)
+            begin = time.perf_counter()
+            try:
+                loaded = module.load(wp.get_device(str(device)), block)
+            except Exception as error:
+                raise GmmTorchError(f"kernel {self.name} does not compile for {device} ({error})") from error
+            if not loaded:
+                raise GmmTorchError(f"kernel {self.name} does not compile for {device}")
+            logger.debug("Kernel %s is ready after %.2f s.", self.name, time.perf_counter() - begin)
+            self._loaded.add(device)
+
+    def _defined(self, wp: Any) -> Any:
+        """The kernel of Warp: the body and its entry, in a module of their own."""
         import linecache
 
         for part in (self._stub, self._entry):
             path = f"<gmmtorch kernel {self.name} {'stub' if part is self._stub else 'entry'}>"
             linecache.cache[path] = (len(part), None, part.splitlines(True), path)
-        scope: dict[str, Any] = {"wp": wp, "__name__": _MODULE}
+        scope: dict[str, Any] = {"wp": wp, "__name__": f"gmmtorch_{self.name}"}
         exec(compile(self._stub, f"<gmmtorch kernel {self.name} stub>", "exec"), scope)
         body = f"{self.name}_body"
         scope[body] = wp.func_native(self._body)(scope[body])
         exec(compile(self._entry, f"<gmmtorch kernel {self.name} entry>", "exec"), scope)
-        self._kernel = wp.kernel(
-            scope[self.name], enable_backward=False, module=wp.get_module(_MODULE), grid_stride=False
-        )
+        module = wp.get_module(scope["__name__"])
+        wp.set_module_options({"fuse_fp": not self._rounds_each}, module)
+        return wp.kernel(scope[self.name], enable_backward=False, module=module, grid_stride=False)
+
+
+@functools.cache
+def _announce(device: str, folder: str) -> None:
+    """Logs, once for each device, that kernels are compiled."""
+    logger.info(
+        "Compiling fused kernels for %s, each at its first use (seconds in all); they are kept in %s.",
+        device,
+        folder,
+    )
 
 
 @functools.cache
@@ -154,15 +194,18 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)  # a child process has no threads
 
 
+_PROBE = FusedKernel("probe", "int64* value", "value[item] = item + 1;")
+
+
 @functools.cache
 def compiler_failure() -> str | None:
-    """Why the kernel compiler does not work, or None. The first call compiles the kernels for the CPU."""
+    """Why the kernel compiler does not work, or None. The first call compiles a small kernel and runs it."""
+    value = torch.zeros(1, dtype=torch.int64)
     try:
-        with _lock:
-            _load(torch.device("cpu"))
+        _PROBE(1, value, device=value.device)
     except GmmTorchError as error:
         return str(error)
-    return None
+    return None if int(value) == 1 else "a kernel gives a wrong result"
 
 
 @functools.cache
@@ -221,34 +264,3 @@ def _temporary_folder() -> Path:
 
 
 _kept: list[object] = []  # removed when the process ends
-
-
-def _load(device: torch.device) -> None:
-    if str(device) not in _loaded:
-        with _lock:
-            if str(device) not in _loaded:
-                _compile(device)
-                _loaded.add(str(device))
-
-
-_loaded: set[str] = set()
-
-
-def _compile(device: torch.device) -> None:
-    """Compile all kernels for a device, or load them from the cache."""
-    wp = _warp()
-    package = importlib.import_module("gmmtorch.kernels")
-    for found in pkgutil.walk_packages(package.__path__, "gmmtorch.kernels."):
-        importlib.import_module(found.name)
-    for kernel in _sources.values():
-        if kernel._kernel is None:
-            kernel.define(wp)
-    module, begin = wp.get_module(_MODULE), time.perf_counter()
-    logger.info("Loading the fused kernels for %s; the first time they are compiled (seconds).", device)
-    try:
-        loaded = module.load(wp.get_device(str(device)), 1 if device.type == "cpu" else None)
-    except Exception as error:
-        raise GmmTorchError(f"the kernels do not compile for {device} ({error})") from error
-    if not loaded:
-        raise GmmTorchError(f"the kernels do not compile for {device}")
-    logger.info("The fused kernels are ready after %.1f s.", time.perf_counter() - begin)

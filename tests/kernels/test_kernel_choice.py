@@ -110,10 +110,26 @@ def test_two_processes_compile_at_once_after_a_third_was_killed_while_it_compile
     assert list(tmp_path.rglob("*.o"))
 
 
+@pytest.mark.slow
+def test_only_kernels_that_run_are_compiled_and_one_line_says_so(tmp_path):
+    code = """import logging, torch
+from gmmtorch.kernels.mixtures.distinct_keys import distinct_keys
+logging.basicConfig(level=logging.INFO)
+from gmmtorch.kernels import use_kernels
+use_kernels("fused")
+distinct_keys(torch.arange(5), False)"""
+    command, environment = [sys.executable, "-c", code], {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    options = {"env": environment, "capture_output": True, "text": True, "check": True}
+    first, second = (subprocess.run(command, **options) for _ in range(2))
+    assert first.stderr.count("Compiling fused kernels") == 1
+    assert "Compiling" not in second.stderr
+    compiled = sorted(path.parent.name.rsplit("_", 1)[0] for path in tmp_path.rglob("*.o"))
+    assert compiled == ["wp_gmmtorch_distinct_keys", "wp_gmmtorch_probe"]
+
+
 def test_a_tensor_that_is_not_contiguous_is_refused():
     turned = torch.ones(2, 3).T
     kernel = compiler.FusedKernel("not_compiled", "float* x, float* y", "", strided=("y",))
-    del compiler._sources["not_compiled"]
     with pytest.raises(GmmTorchError, match=r"x of kernel not_compiled has shape \(3, 2\).*contiguous"):
         kernel(2, turned, turned, device=torch.device("cpu"))
     assert kernel._value("y", turned) == turned.data_ptr()
