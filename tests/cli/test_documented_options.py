@@ -1,10 +1,12 @@
-"""docs/commands.md documents every option of each command with its default."""
+"""docs/commands.md documents every option of each command with its default; its command lines compose."""
 
 from __future__ import annotations
 
 import functools
 import re
+import shlex
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -13,6 +15,7 @@ from command_runs import CHECKOUT, as_it_was, composed
 from omegaconf import DictConfig, OmegaConf
 
 LINES = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").splitlines()
+PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 COMMANDS = ["occupancy", "map", "view", "fit", "export", "explore", "robot", "team"]
 CHOICES = [
     *([command] for command in COMMANDS),
@@ -209,3 +212,35 @@ def test_documented_defaults_match_the_configuration(command):
             compared += 1
     assert not wrong
     assert compared > 1
+
+
+# -- documented command lines ------------------------------------------------------------------------
+
+
+def command_lines(page: Path) -> list[tuple[str, str]]:
+    """Each `gmmtorch-` line of a page's shell blocks: the command, and its arguments."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [
+        (found[1], found[2])
+        for block in blocks
+        for line in block.splitlines()
+        if (found := re.match(r"(?:\.venv/bin/|[A-Z_]+=\S+ )*gmmtorch-(\w+)(.*)", line))
+    ]
+
+
+def overrides(arguments: str) -> list[str]:
+    """The overrides of a command line; of a sweep, the first value of each."""
+    words = shlex.split(arguments.replace("…", ""), comments=True)
+    found = [word for word in words if "=" in word and not word.startswith("hydra")]
+    return [re.sub(r"=([^,\[{]*),.*", r"=\1", word) for word in found] if "-m" in words else found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_documented_command_lines_compose(page):
+    for command, arguments in command_lines(page):
+        composed(command, *overrides(arguments))
+
+
+def test_command_lines_are_found_in_the_pages():
+    assert sum(len(command_lines(page)) for page in PAGES) > 50
