@@ -32,7 +32,7 @@ _SOURCES = {
     "pcd_viewpoint": _Source("scan_folder", "PcdViewpoint"),
     "depth_frames": _Source("depth_frames", "DepthFrames"),
     "octomap_log": _Source("octomap_log", "OctomapLog"),
-    "rosbag": _Source("recordings.rosbag", "open_rosbag"),
+    "rosbag": _Source("recordings.ros.rosbag", "open_rosbag"),
     "kitti": _Source("recordings.kitti", "Kitti"),
     "tum": _Source("recordings.tum", "TumRgbd"),
     "mesh": _Source("meshes", "MeshSamples"),

@@ -119,7 +119,7 @@ def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypat
     from rosbags.rosbag1 import Writer
     from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-    from gmmtorch.datasets.recordings import rosbags_access
+    from gmmtorch.datasets.recordings.ros import rosbags_access
 
     path = tmp_path / f"a.{suffix}"
     bag = BagWriter(path)
@@ -141,7 +141,7 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
     """`ros2 bag record --compression-mode file`."""
     from rosbags import rosbag2
 
-    from gmmtorch.datasets.recordings import rosbags_access
+    from gmmtorch.datasets.recordings.ros import rosbags_access
 
     bag, folder = BagWriter(tmp_path / "a.db3"), tmp_path / "bag"
     bag.writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
@@ -371,7 +371,7 @@ def test_an_unusable_layout_is_refused_at_once(tmp_path):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_announced_lengths_are_checked_before_anything_is_allocated(packed):
-    from gmmtorch.datasets.recordings.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
+    from gmmtorch.datasets.recordings.ros.message_decoder import BASE, NAME, SEQUENCE, MessageDecoder
 
     numbers, items = (BASE, ("float64", 0)), (NAME, "Item")
     definitions = {

@@ -180,7 +180,7 @@ def test_a_sweep_that_outlasts_the_poses_is_kept_and_counted(tmp_path):
     ],
 )
 def test_times_of_points_are_understood_in_every_unit(values, expected):
-    from gmmtorch.datasets.recordings.sensor_messages import point_offsets
+    from gmmtorch.datasets.recordings.ros.sensor_messages import point_offsets
 
     found = point_offsets(values, 100_000_000_000)
     assert (found is None) == (expected is None)

@@ -1,1 +1,1 @@
-"""Recordings of robots: ROS bags, KITTI and TUM sequences, and the trajectories and transforms in them."""
+"""Recordings of robots: ROS bags, KITTI and TUM sequences, and trajectory files."""

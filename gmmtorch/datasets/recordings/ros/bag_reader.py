@@ -12,8 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmmtorch.datasets.recordings.message_decoder import MessageDecoder
-from gmmtorch.datasets.recordings.rosbags_access import load_rosbags
+from gmmtorch.datasets.recordings.ros.message_decoder import MessageDecoder
+from gmmtorch.datasets.recordings.ros.rosbags_access import (
+    parsed_definitions,
+    reader_class,
+    standard_definitions,
+    unpack_zstd,
+)
 from gmmtorch.errors import DataError, GmmTorchError
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
@@ -53,18 +58,16 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        rosbags = load_rosbags()
         self.path = _bag_file(path)
         self._is_ros1 = self.path.suffix == ".bag"
         with self._errors():
-            self._reader: Any = (rosbags.ros1 if self._is_ros1 else rosbags.ros2)(_bounded(self.path))
+            self._reader: Any = reader_class(self._is_ros1)(_bounded(self.path))
             self._reader.open()
-            self._unpack = rosbags.unpack_zstd
             self._connections = [
                 c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
             ]  # columns of a damaged database can be empty
             self._decoder = MessageDecoder(
-                {**self._own_definitions(rosbags), **rosbags.definitions(self._is_ros1)},
+                {**self._own_definitions(), **standard_definitions(self._is_ros1)},
                 packed=self._is_ros1,
             )
 
@@ -89,7 +92,7 @@ class BagReader:
             for connection, time, data in self._reader.messages(connections=chosen, start=start):
                 content = bytes(data)
                 if not self._is_ros1 and content.startswith(_ZSTD):  # CDR starts with a zero
-                    content = self._unpack(content)
+                    content = unpack_zstd(content)
                 yield RawMessage(connection.topic, connection.msgtype, time, content)
 
     def decode(self, message: RawMessage) -> dict[str, Any]:
@@ -101,11 +104,11 @@ class BagReader:
                 f"{self.path}, topic {message.topic}, recorded at {message.time / 1e9:.3f} s: {error}."
             ) from error
 
-    def _own_definitions(self, rosbags: Any) -> dict[str, Any]:
+    def _own_definitions(self) -> dict[str, Any]:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            if c.msgtype not in found and (parsed := rosbags.parsed(c.msgdef, c.msgtype)):
+            if c.msgtype not in found and (parsed := parsed_definitions(c.msgdef, c.msgtype)):
                 found.update(parsed)
         return found
 

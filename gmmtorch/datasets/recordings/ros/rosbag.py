@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset, Ranges
-from gmmtorch.datasets.recordings import bag_topics, sensor_messages
-from gmmtorch.datasets.recordings.bag_poses import BagSurvey, PoseOptions
-from gmmtorch.datasets.recordings.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.sensor_messages import Reading
+from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
+from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, PoseOptions
+from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
+from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, increasing
-from gmmtorch.datasets.recordings.transform_tree import frame_name, stamp_of
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_choice, check_whole
 from gmmtorch.pinhole import back_project
 from gmmtorch.scan import FARTHEST, Scan

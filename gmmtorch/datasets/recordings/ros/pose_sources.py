@@ -6,8 +6,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gmmtorch.datasets.recordings.ros.transform_tree import (
+    TransformTree,
+    frame_name,
+    stamp_of,
+    transform_matrix,
+)
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, Poses, Trajectory, pose_matrix
-from gmmtorch.datasets.recordings.transform_tree import TransformTree, frame_name, stamp_of, transform_matrix
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 

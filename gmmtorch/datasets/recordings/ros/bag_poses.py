@@ -9,9 +9,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.bag_reader import BagReader, RawMessage
-from gmmtorch.datasets.recordings.bag_topics import POSE_TYPES, TF_TYPES, listed
-from gmmtorch.datasets.recordings.pose_sources import (
+from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.ros.bag_topics import POSE_TYPES, TF_TYPES, listed
+from gmmtorch.datasets.recordings.ros.pose_sources import (
     BodyPoses,
     PosesByIndex,
     PoseSource,
@@ -20,8 +20,8 @@ from gmmtorch.datasets.recordings.pose_sources import (
     mount_matrix,
     pose_sample,
 )
+from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.datasets.recordings.trajectory import Trajectory, read_rows, read_trajectory
-from gmmtorch.datasets.recordings.transform_tree import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 _HEAD_BYTES = 1024

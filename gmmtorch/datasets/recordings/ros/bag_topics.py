@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from gmmtorch.datasets.recordings.bag_reader import BagReader, Topic
-from gmmtorch.datasets.recordings.message_decoder import BASE, NAME, SEQUENCE
+from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, Topic
+from gmmtorch.datasets.recordings.ros.message_decoder import BASE, NAME, SEQUENCE
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
