@@ -99,8 +99,8 @@ class TreeSearch:
 
     The return of a branch is the information of its views, given each other and the teammates' plans,
     plus the goal's weight for every metre of progress, both discounted by depth. The view from the start
-    counts as taken. UCT chooses the primitive that maximises Q̄(a) + c √(ln N / N_a). A leaf counts as
-    visited with zero return until its round ends.
+    counts as taken. UCT chooses the primitives (see `_Tree._promising`). A leaf counts as visited with zero
+    return until its round ends.
     """
 
     def __init__(self, primitives: Primitives, rule: SearchRule) -> None:
@@ -212,7 +212,12 @@ class _Tree:
         return math.inf if node.parent is None else self._rule.widening * math.sqrt(node.visits)
 
     def _promising(self, node: _Node, turn: int) -> _Node | None:
-        """Return the child that UCT prefers among those that are neither exhausted nor waiting."""
+        """Return the child that UCT prefers among those that are neither exhausted nor waiting.
+
+        It maximises Q̄(a) + c √(ln N / N_a), where Q̄(a) is the mean return of the branches through child a,
+        N_a its visits, N those of `node`, and c is `exploration` times the largest return found so far
+        (Kocsis & Szepesvári 2006, Bandit based Monte-Carlo planning; thesis 4.3).
+        """
         c, log_visits = self._rule.exploration * self._scale, math.log(max(node.visits, 1))
         best, best_score = None, -math.inf
         for child in node.children:
