@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -106,57 +106,32 @@ class World:
         contain no surface, a camera that sees only the neighbouring cells, or a world without room for a
         robot, and `MemoryLimitError` for more than `MAX_CELLS` cells.
         """
-        check_resolution(resolution)
-        if not 0 < vertical_fov <= math.pi:
-            raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
-        for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
-        if max_range <= robot_radius + 2 * resolution:
-            raise InvalidArgumentError(
-                f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
-                f"resolution={resolution} m); use a longer range or finer cells."
-            )
+        _check_sizes(resolution, vertical_fov, max_range, robot_radius, spacing)
         triangles = checked_triangles(triangles, name)
         mesh = MeshWorld(triangles)
         box = _lattice_box(mesh, bounds, resolution, name)
         place = None if start is None else _point(start, "start")
+        options = _CellOptions(
+            resolution,
+            box.low.tolist(),
+            box.high.tolist(),
+            vertical_fov,
+            max_range,
+            robot_radius,
+            None if place is None else place.tolist(),
+            spacing,
+        )
 
         def compute() -> dict[str, Tensor]:
-            grounded = above_floor(mesh, resolution, box)
-            occupied, clear = occupied_and_clear(
-                mesh, triangles, resolution, box, grounded, robot_radius, on_event
-            )
-            if not bool(occupied.any()):
+            cells = _compute_cells(mesh, triangles, box, options, name, on_event)
+            if cells is None:
                 raise InvalidArgumentError(
                     f"bounds={_listed(bounds)} contain no surface of {name}, which extends from "
                     f"{_text(mesh.low, mesh.high)}; use wider bounds that include a floor."
                 )
-            navigable = connected(clear, mesh, resolution, box, place, robot_radius, name)
-            seen = observable_cells(
-                mesh,
-                occupied,
-                box,
-                resolution,
-                viewpoints(navigable, max(1, round(spacing / resolution))),
-                view_directions(vertical_fov, max(resolution / (_SHARP * max_range), _FINEST)),
-                max_range,
-                on_event,
-            )
-            seen = (seen | navigable) & (grounded | occupied)
-            return {"occupied": occupied, "observable": seen, "navigable": navigable}
+            return cells
 
-        options = {
-            "resolution": resolution,
-            "low": box.low.tolist(),
-            "high": box.high.tolist(),
-            "vertical_fov": vertical_fov,
-            "max_range": max_range,
-            "robot_radius": robot_radius,
-            "start": None if place is None else place.tolist(),
-            "spacing": spacing,
-        }
-        cells = cached_cells(triangles, options, _CELLS, box.shape, compute) if cache else compute()
+        cells = cached_cells(triangles, options._asdict(), _CELLS, box.shape, compute) if cache else compute()
         return cls(name, mesh, resolution, box, **cells, robot_radius=robot_radius, start=place)
 
     def start_poses(
@@ -180,6 +155,54 @@ class World:
     def centers(self, cells: Tensor) -> Tensor:
         """Centres (..., 3), metres, of cells (..., 3) relative to the low corner of the box."""
         return (cells + self.box.low + 0.5).double() * self.resolution
+
+
+class _CellOptions(NamedTuple):
+    """What the cells of a world depend on besides its triangles; the key of the cache."""
+
+    resolution: float
+    low: list[int]
+    high: list[int]
+    vertical_fov: float
+    max_range: float
+    robot_radius: float
+    start: list[float] | None
+    spacing: float
+
+
+def _compute_cells(
+    mesh: MeshWorld, triangles: Tensor, box: Box, options: _CellOptions, name: str, on_event: Event
+) -> dict[str, Tensor] | None:
+    """Return the occupied, observable and navigable cells; None if no cell is occupied."""
+    resolution, radius = options.resolution, options.robot_radius
+    grounded = above_floor(mesh, resolution, box)
+    occupied, clear = occupied_and_clear(mesh, triangles, resolution, box, grounded, radius, on_event)
+    if not bool(occupied.any()):
+        return None
+    start = None if options.start is None else _point(options.start, "start")
+    navigable = connected(clear, mesh, resolution, box, start, radius, name)
+    places = viewpoints(navigable, max(1, round(options.spacing / resolution)))
+    angle = max(resolution / (_SHARP * options.max_range), _FINEST)
+    directions = view_directions(options.vertical_fov, angle)
+    seen = observable_cells(mesh, occupied, box, resolution, places, directions, options.max_range, on_event)
+    seen = (seen | navigable) & (grounded | occupied)
+    return {"occupied": occupied, "observable": seen, "navigable": navigable}
+
+
+def _check_sizes(
+    resolution: float, vertical_fov: float, max_range: float, robot_radius: float, spacing: float
+) -> None:
+    check_resolution(resolution)
+    if not 0 < vertical_fov <= math.pi:
+        raise InvalidArgumentError(f"vertical_fov={vertical_fov} must be above 0 and at most π rad.")
+    for key, value in {"max_range": max_range, "robot_radius": robot_radius, "spacing": spacing}.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InvalidArgumentError(f"{key}={value} must be above zero metres.")
+    if max_range <= robot_radius + 2 * resolution:
+        raise InvalidArgumentError(
+            f"max_range={max_range} m ends within two cells of the robot (robot_radius={robot_radius} m, "
+            f"resolution={resolution} m); use a longer range or finer cells."
+        )
 
 
 def _point(place: Sequence[float] | Tensor, name: str) -> Tensor:
