@@ -27,6 +27,8 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.mixtures.lattice_rounding import LatticeConstants, lattice_rounding
 from gmmtorch.scan import FARTHEST
 
 PER_OCTAVE = 4
@@ -55,6 +57,7 @@ AXIS_ORDERS = {dim: torch.tensor(list(itertools.permutations(range(dim)))) for d
 
 # Literals and exact powers of two: the same bits on every machine.
 _ROOTS = torch.tensor([1.0, 1.189207115002721, 1.4142135623730951, 1.6817928305074292], dtype=torch.float64)
+_BOUNDS = torch.tensor([0.5946035575013605, 0.8408964152537145], dtype=torch.float64)  # 2^-3/4, 2^-1/4
 _EXP2 = torch.tensor([2.0**e for e in range(-256, 256)], dtype=torch.float64)
 
 
@@ -122,6 +125,10 @@ def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     Covariances that are not quite positive definite become so. Raises `InvalidArgumentError` beyond
     `FARTHEST` and `LARGEST_DEVIATION`, or where rounding leads there: what is returned `is_valid`.
     """
+    if is_fused(means, covariances):
+        found = lattice_rounding(means, covariances, _constants(means.shape[1]))
+        if found is not None:
+            return Lattice(*found)
     _check(means, covariances)
     exact, rows = _exact(means, covariances)
     if len(rows) == len(means):
@@ -155,6 +162,22 @@ def floor_divide(values: Tensor, divisor: int) -> Tensor:
     return torch.div(values, divisor, rounding_mode="floor")
 
 
+def _constants(dim: int) -> LatticeConstants:
+    return LatticeConstants(
+        orders=AXIS_ORDERS[dim],
+        roots=_ROOTS,
+        bounds=_BOUNDS,
+        per_octave=PER_OCTAVE,
+        precision=PRECISION,
+        least_deviation=LEAST_DEVIATION,
+        largest_deviation=LARGEST_DEVIATION,
+        largest_ratio=LARGEST_RATIO,
+        steepest=STEEPEST,
+        farthest=FARTHEST,
+        largest_variance=LARGEST_VARIANCE,
+    )
+
+
 def _check(means: Tensor, covariances: Tensor) -> None:
     for name, value, limit in (("means", means, FARTHEST), ("covariances", covariances, LARGEST_VARIANCE)):
         bad = ~(value.abs() <= limit).flatten(1).all(1)  # NaN is bad, too
@@ -186,7 +209,7 @@ def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> 
     # The variance of the first axis must be a lattice value: this excludes most orders.
     variances = covariances.diagonal(dim1=1, dim2=2)
     least, largest = LEAST_DEVIATION, LARGEST_DEVIATION
-    steps = (torch.log2(variances.clamp_min(1e-300)) * (PER_OCTAVE / 2)).round().long().clamp(least, largest)
+    steps = _deviation_steps(variances.clamp_min(1e-300)).clamp(least, largest)
     fits = (power(2 * steps) == variances)[:, AXIS_ORDERS[dim][:, 0]]  # (K, orders)
     if before is not None:
         fits &= torch.arange(fits.shape[1]) < before[:, None]
@@ -209,7 +232,7 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
     axes = AXIS_ORDERS[dim][axis_order]
     mean = means.gather(1, axes)
     variances, shears = _factors(covariances[_pairs(axes)])
-    steps = (torch.log2(variances) * (PER_OCTAVE / 2)).round().long()
+    steps = _deviation_steps(variances)
     steps = torch.maximum(steps, steps[:, :1] - LARGEST_RATIO).clamp_min(LEAST_DEVIATION)
     steps = steps.cummin(1).values  # equal deviations may differ by a rounding error
     blank = Lattice(axis_order, steps, steps.new_zeros(len(mean), shears.shape[1]), torch.zeros_like(steps))
@@ -270,6 +293,12 @@ def _pivots(covariances: Tensor) -> Tensor:
     orders = AXIS_ORDERS[dim]
     chosen = (orders[None, :, 0] == first[:, None]) & (orders[None, :, 1] == rest.argmax(1)[:, None])
     return chosen.long().argmax(1)
+
+
+def _deviation_steps(variances: Tensor) -> Tensor:
+    """The nearest log2 of deviations in steps; without a logarithm, whose last bit depends on the machine."""
+    mantissa, exponent = torch.frexp(variances)
+    return (exponent.long() - 1) * (PER_OCTAVE // 2) + torch.bucketize(mantissa, _BOUNDS, right=True)
 
 
 def _to_steps(values: Tensor, exponents: Tensor) -> Tensor:
