@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, to_nanoseconds
+from gmmtorch.datasets.recordings.trajectory import to_nanoseconds
 from gmmtorch.errors import InvalidArgumentError, OutputError
+from gmmtorch.export.message_fields import built_message, cloud_fields, odometry_fields, transform_fields
 from gmmtorch.optional_packages import needs_extra
 from gmmtorch.scan import ArrayLike, Scan
-
-_BASE, _NAME, _ARRAY = 1, 2, 3
-_POINT_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def write_bag(
@@ -127,54 +125,21 @@ class BagWriter:
         key = (topic, name)
         if key not in self._connections:
             self._connections[key] = self.writer.add_connection(topic, name, typestore=self.types)
-        content = self._built(name, fields, _nanoseconds(time))
+        content = built_message(self.types, name, fields, _nanoseconds(time))
         serialize = self.types.serialize_ros1 if self._is_ros1 else self.types.serialize_cdr
         stamp = _nanoseconds(time if received is None else received)
         self.writer.write(self._connections[key], stamp, serialize(content, name))
-
-    def _built(self, name: str, fields: Mapping[str, Any], stamp: int) -> Any:
-        """An object of message type `name`."""
-        values: dict[str, Any] = {}
-        for field, (kind, content) in self.types.fielddefs[name][1]:
-            given = fields.get(field)
-            if kind == _NAME:
-                if content == "builtin_interfaces/msg/Time" and given is None and name.endswith("/Header"):
-                    given = {"sec": stamp // NANOSECONDS, "nanosec": stamp % NANOSECONDS}
-                values[field] = self._built(content, given or {}, stamp)
-            elif kind == _BASE:
-                values[field] = given if given is not None else "" if content[0] == "string" else 0
-            elif content[0][0] == _NAME:
-                values[field] = [self._built(content[0][1], item, stamp) for item in given or []]
-            elif content[0][1][0] == "string":
-                values[field] = list(given or [])
-            else:
-                code = {"bool": "u1", "byte": "u1", "char": "u1", "octet": "u1"}.get(content[0][1][0])
-                size = content[1] if kind == _ARRAY else 0
-                array = np.zeros(size) if given is None else given
-                values[field] = np.asarray(array, dtype=np.dtype(code or content[0][1][0]))
-        return self.types.types[name](**values)
 
     def transforms(
         self, time: float, edges: Mapping[tuple[str, str], ArrayLike], static: bool = False
     ) -> None:
         """Writes transforms (parent, child) → parent ← child to /tf, or to /tf_static."""
-        entries = [
-            {
-                "header": {"frame_id": parent},
-                "child_frame_id": child,
-                "transform": dict(zip(("translation", "rotation"), _pose_fields(matrix), strict=True)),
-            }
-            for (parent, child), matrix in edges.items()
-        ]
         topic = "/tf_static" if static else "/tf"
-        self.message(topic, "tf2_msgs/msg/TFMessage", time, {"transforms": entries})
+        self.message(topic, "tf2_msgs/msg/TFMessage", time, transform_fields(edges))
 
     def odometry(self, topic: str, time: float, frame: str, child: str, matrix: ArrayLike) -> None:
         """Writes an Odometry message: the pose of `child` in `frame`."""
-        position, orientation = _pose_fields(matrix)
-        pose = {"pose": {"position": position, "orientation": orientation}}
-        fields = {"header": {"frame_id": frame}, "child_frame_id": child, "pose": pose}
-        self.message(topic, "nav_msgs/msg/Odometry", time, fields)
+        self.message(topic, "nav_msgs/msg/Odometry", time, odometry_fields(frame, child, matrix))
 
     def cloud(
         self, topic: str, time: float, frame: str, points: ArrayLike, offsets: ArrayLike | None = None
@@ -193,26 +158,7 @@ class BagWriter:
 
     def cloud_table(self, topic: str, time: float, frame: str, table: np.ndarray) -> None:
         """Writes a structured array (N,) or (H, W) as PointCloud2: its fields, in its byte order."""
-        rows = np.atleast_2d(table)
-        dtypes = {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
-        big = any(dtype.byteorder == ">" for dtype, _ in dtypes.values())
-        point_fields = [
-            {"name": name, "offset": offset, "datatype": _POINT_TYPES[dtype.str[1:]], "count": 1}
-            for name, (dtype, offset) in dtypes.items()
-        ]
-        step = table.dtype.itemsize
-        fields = {
-            "header": {"frame_id": frame},
-            "height": rows.shape[0],
-            "width": rows.shape[1],
-            "fields": point_fields,
-            "is_bigendian": big,
-            "point_step": step,
-            "row_step": step * rows.shape[1],
-            "is_dense": True,
-            "data": np.frombuffer(rows.tobytes(), np.uint8),
-        }
-        self.message(topic, "sensor_msgs/msg/PointCloud2", time, fields)
+        self.message(topic, "sensor_msgs/msg/PointCloud2", time, cloud_fields(frame, table))
 
     def laser(
         self,
@@ -259,12 +205,3 @@ class BagWriter:
 
 def _nanoseconds(time: float) -> int:
     return time if isinstance(time, int) else int(to_nanoseconds(np.array(float(time))))
-
-
-def _pose_fields(matrix: ArrayLike) -> tuple[dict[str, float], dict[str, float]]:
-    """Translation and rotation of a pose (4, 4) as fields of messages."""
-    from scipy.spatial.transform import Rotation
-
-    pose = np.asarray(matrix, dtype=np.float64)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return dict(zip("xyz", pose[:3, 3].tolist(), strict=True)), dict(zip("xyzw", turn.tolist(), strict=True))

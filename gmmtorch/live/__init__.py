@@ -1,1 +1,1 @@
-"""Maps shown live: the browser viewer."""
+"""Live maps: the browser viewer, and ROS 2 topics."""

@@ -14,9 +14,14 @@ from gmmtorch.errors import DataError
 
 
 class TransformTree:
-    """Transforms parent ← child, each static or over time. Frames are named without a leading slash."""
+    """Transforms parent ← child, each static or over time. Frames are named without a leading slash.
 
-    def __init__(self) -> None:
+    keep: seconds of transforms that are kept, for live topics; None: all. A stamp that is older starts the
+    transforms of its frame again, because the clock was set back.
+    """
+
+    def __init__(self, keep: float | None = None) -> None:
+        self._keep = None if keep is None else int(keep * NANOSECONDS)
         self._samples: dict[str, tuple[array[int], array[float]]] = {}
         self._static: dict[str, np.ndarray] = {}
         self._parents: dict[str, Counter[str]] = {}
@@ -34,9 +39,24 @@ class TransformTree:
                     continue
             else:
                 times, numbers = self._samples.setdefault(child, (array("q"), array("d")))
-                times.append(stamp_of(entry["header"]))
+                stamp = stamp_of(entry["header"])
+                self._forget(times, numbers, stamp)
+                times.append(stamp)
                 numbers.extend([*(translation[a] for a in "xyz"), *(rotation[a] for a in "xyzw")])
+                self._edges.pop(child, None)
             self._parents.setdefault(child, Counter())[parent] += 1
+
+    def _forget(self, times: array[int], numbers: array[float], stamp: int) -> None:
+        """Removes samples of a frame that are not kept, now and then."""
+        if self._keep is None or not times:
+            return
+        if stamp < times[-1] - self._keep:
+            n_old = len(times)
+        elif times[len(times) // 2] < stamp - self._keep:  # half of them, so that each is moved once
+            n_old = len(times) // 2 + 1
+        else:
+            return
+        del times[:n_old], numbers[: 7 * n_old]
 
     def __len__(self) -> int:
         return len(self._parents)

@@ -1,0 +1,210 @@
+"""DdsMiddleware: ROS 2 topics over DDS (RTPS), the protocol of rmw_fastrtps and rmw_cyclonedds."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.live.ros.idl_types import IdlTypes
+from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
+from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint
+from gmmtorch.live.ros.quality import Quality
+from gmmtorch.optional_packages import needs_extra
+
+LOOPBACK = "127.0.0.1"
+MAX_DOMAIN = 232
+_PARTICIPANTS = 60  # processes with a node on one machine, at most
+_TOPIC_PREFIX = "rt"
+_MOST_SAMPLES = 1000
+_BLOCKED = 100_000_000  # ns that a reliable publisher waits for slow subscribers
+
+_DOMAINS: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+"""Open domains. Cyclone DDS has one of each number in a process; its nodes share it."""
+_LOCK = threading.Lock()
+
+
+class DdsMiddleware:
+    """One participant of a DDS domain, with Cyclone DDS.
+
+    Args:
+        types: of the messages.
+        domain: number of the domain, 0 … 232.
+        interface: name or address of the network interface; 127.0.0.1: only this machine, without multicast.
+        peers: addresses of machines that are contacted besides this one.
+
+    Raises `InvalidArgumentError` if the domain or interface cannot be used, and `GmmTorchError` if cyclonedds
+    is not installed.
+    """
+
+    def __init__(
+        self, types: MessageTypes, domain: int, interface: str = LOOPBACK, peers: Sequence[str] = ()
+    ) -> None:
+        with needs_extra("middleware=dds needs", "cyclonedds", "ros"):
+            from cyclonedds.builtin import (
+                BuiltinDataReader,
+                BuiltinTopicDcpsPublication,
+                BuiltinTopicDcpsSubscription,
+            )
+            from cyclonedds.core import DDSException
+            from cyclonedds.domain import DomainParticipant
+        self._error = DDSException
+        self._idl = IdlTypes(types.definitions)
+        self._topics: dict[tuple[str, str], Any] = {}
+        self._entities: list[Any] = []
+        try:
+            self._domain = _open_domain(domain, _settings(interface, peers))
+            self._participant: Any = DomainParticipant(domain)
+            kinds = (BuiltinTopicDcpsPublication, True), (BuiltinTopicDcpsSubscription, False)
+            self._known = [(BuiltinDataReader(self._participant, kind), is_pub) for kind, is_pub in kinds]
+        except DDSException as error:
+            raise InvalidArgumentError(
+                f"domain={domain}, interface={interface} cannot be used by DDS ({_text(error)}): "
+                f"`ip address` lists the interfaces; {LOOPBACK} is this machine alone."
+            ) from error
+
+    def publisher(self, topic: str, message_type: str, quality: Quality) -> Callable[[bytes], None]:
+        from cyclonedds.pub import DataWriter
+
+        qos = _policies(quality, encoded=True)
+        writer = DataWriter(self._participant, self._topic(topic, message_type), qos=qos)
+        self._entities.append(writer)
+
+        def send(message: bytes) -> None:
+            try:
+                writer.write(self._idl.sample(message_type, message))
+            except self._error as error:
+                raise GmmTorchError(f"DDS did not send a message on {topic}: {_text(error)}.") from error
+
+        return send
+
+    def subscribe(
+        self, topic: str, message_type: str, quality: Quality, on_message: Callable[[bytes], None]
+    ) -> None:
+        from cyclonedds.core import Listener
+        from cyclonedds.sub import DataReader
+
+        qos = _policies(quality)
+        reader: Any = DataReader(self._participant, self._topic(topic, message_type), qos=qos)
+
+        def receive() -> None:
+            for sample in reader.take(N=_MOST_SAMPLES):
+                cdr = getattr(sample, "cdr", None)  # absent if a publisher has ended
+                if cdr is not None and len(cdr) <= MAX_MESSAGE_BYTES:
+                    on_message(cdr)
+
+        class Receiver(Listener):
+            def on_data_available(self, _: Any) -> None:
+                receive()
+
+        listener = Receiver()
+        reader.set_listener(listener)
+        receive()  # what came before the listener
+        self._entities += [reader, listener]
+
+    def endpoints(self) -> list[Endpoint]:
+        found = []
+        for reader, is_publisher in self._known:
+            for sample in reader.read(N=10 * _MOST_SAMPLES):
+                name, kind = getattr(sample, "topic_name", ""), ros_type(getattr(sample, "type_name", ""))
+                if name.startswith(f"{_TOPIC_PREFIX}/") and kind is not None and _is_alive(sample):
+                    quality = _quality(sample.qos)
+                    found.append(Endpoint(name[len(_TOPIC_PREFIX) :], kind, quality, is_publisher))
+        return found
+
+    def close(self) -> None:
+        for entity in self._entities:
+            if hasattr(entity, "set_listener"):
+                entity.set_listener(None)
+        self._entities.clear()
+        self._topics.clear()
+        self._known.clear()
+        self._participant = self._domain = None
+
+    def _topic(self, topic: str, message_type: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        key = topic, message_type
+        if key not in self._topics:
+            try:
+                made = Topic(self._participant, _TOPIC_PREFIX + topic, self._idl.type(message_type))
+            except self._error as error:
+                raise InvalidArgumentError(
+                    f"topic={topic} cannot have type={message_type} in DDS ({_text(error)}); a topic has one "
+                    f"type, such as {dds_type(message_type)}."
+                ) from error
+            self._topics[key] = made
+        return self._topics[key]
+
+
+def _settings(interface: str, peers: Sequence[str]) -> str:
+    """The configuration of Cyclone DDS."""
+    is_address = interface.replace(".", "").isdigit()
+    kind = "address" if is_address else "name"
+    local = interface.startswith("127.") or interface == "lo"
+    multicast = "false" if local else "default"
+    named = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in [LOOPBACK] * local + list(peers))
+    return (
+        "<CycloneDDS><Domain><General><Interfaces>"
+        f"<NetworkInterface {kind}={quoteattr(interface)}/></Interfaces>"
+        f"<AllowMulticast>{multicast}</AllowMulticast></General>"
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex>"
+        f"<Peers>{named}</Peers></Discovery>"
+        "</Domain></CycloneDDS>"
+    )
+
+
+def _open_domain(number: int, settings: str) -> Any:
+    from cyclonedds.domain import Domain
+
+    if not 0 <= number <= MAX_DOMAIN:
+        raise InvalidArgumentError(f"domain={number} must be in 0 … {MAX_DOMAIN} (ROS_DOMAIN_ID).")
+    with _LOCK:
+        found = _DOMAINS.get(number)
+        if found is None:
+            found = Domain(number, settings)
+            found.settings = settings
+            _DOMAINS[number] = found
+        if found.settings != settings:
+            raise InvalidArgumentError(
+                f"domain={number} is open in this process with another interface or other peers; close its "
+                "nodes, or use the same."
+            )
+    return found
+
+
+def _policies(quality: Quality, encoded: bool = False) -> Any:
+    from cyclonedds.core import Policy, Qos
+
+    policies = [
+        Policy.Reliability.Reliable(_BLOCKED) if quality.reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if quality.latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(quality.depth),
+    ]
+    if encoded:  # ROS 2 uses the first version of CDR
+        policies.append(Policy.DataRepresentation(use_cdrv0_representation=True))
+    return Qos(*policies)
+
+
+def _quality(qos: Any) -> Quality:
+    from cyclonedds.core import Policy
+
+    return Quality(
+        reliable=isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable),
+        latched=qos[Policy.Durability] != Policy.Durability.Volatile,
+    )
+
+
+def _is_alive(sample: Any) -> bool:
+    from cyclonedds.core import InstanceState
+
+    info = getattr(sample, "sample_info", None)
+    return info is None or info.instance_state == InstanceState.Alive
+
+
+def _text(error: Exception) -> str:
+    return str(getattr(error, "msg", "") or error).strip(" .")

@@ -1,0 +1,277 @@
+"""Node: publishes and subscribes to ROS 2 topics without an installation of ROS."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any
+
+from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
+from gmmtorch.live.ros import dds, quality, zenoh_middleware
+from gmmtorch.live.ros.message_types import MessageTypes
+from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint, Middleware
+from gmmtorch.live.ros.topic_names import TopicNames
+
+logger = logging.getLogger("gmmtorch")
+MIDDLEWARE = ("dds", "zenoh")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+CLOCK = "rosgraph_msgs/msg/Clock"
+_WAITING_BYTES = 4 * MAX_MESSAGE_BYTES
+_REPEAT = 10.0  # s between two warnings of one kind
+_TRANSFORM_SECONDS = 30.0
+
+Callback = Callable[[dict[str, Any]], None]
+
+
+@dataclass
+class Subscription:
+    """A subscribed topic, and its messages that wait for `Node.spin_once`.
+
+    n_received: messages so far. n_dropped: of these, the oldest ones that did not fit into the queue.
+    n_malformed: messages that could not be decoded.
+    """
+
+    topic: str
+    type: str
+    callback: Callback
+    depth: int
+    waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
+    waiting_bytes: int = 0
+    n_received: int = 0
+    n_dropped: int = 0
+    n_malformed: int = 0
+
+
+class Node:
+    """A ROS 2 node over DDS or Zenoh.
+
+        with Node("listener") as node:
+            node.subscribe("/scan", "sensor_msgs/msg/LaserScan", lambda scan: print(len(scan["ranges"])))
+            node.spin(seconds=10)
+
+    Messages are dictionaries of their fields. Callbacks run in the thread that calls `spin` or `spin_once`.
+    It speaks only to this machine, unless `interface`, `peers` or `router` name another.
+
+    Args:
+        name: of the node.
+        middleware: "dds" (rmw_fastrtps, rmw_cyclonedds) or "zenoh" (rmw_zenoh).
+        domain: ROS_DOMAIN_ID; None: of the environment, else 0.
+        namespace: of relative topic names.
+        remap: topic → other topic.
+        interface: of DDS: name or address of a network interface.
+        peers: of DDS: addresses of other machines, where multicast does not reach them.
+        router: of Zenoh: endpoint of the router.
+        use_sim_time: `now` is the time of /clock.
+
+    Raises `InvalidArgumentError` for arguments that cannot be used, and `GmmTorchError` if a package is
+    missing.
+    """
+
+    def __init__(
+        self,
+        name: str = "gmmtorch",
+        *,
+        middleware: str = "dds",
+        domain: int | None = None,
+        namespace: str = "",
+        remap: Mapping[str, str] | None = None,
+        interface: str = dds.LOOPBACK,
+        peers: Sequence[str] = (),
+        router: str = zenoh_middleware.ROUTER,
+        use_sim_time: bool = False,
+    ) -> None:
+        check_choice("middleware", middleware, MIDDLEWARE)
+        self.names = TopicNames(name, namespace, remap)
+        self.types = MessageTypes()
+        number = _environment_domain() if domain is None else domain
+        self._middleware: Middleware = (
+            dds.DdsMiddleware(self.types, number, interface, peers)
+            if middleware == "dds"
+            else zenoh_middleware.ZenohMiddleware(self.types, number, self.names, router)
+        )
+        self.transforms = TransformTree(keep=_TRANSFORM_SECONDS)
+        self._arrived = threading.Condition()
+        self._n_arrived = 0
+        self._subscriptions: list[Subscription] = []
+        self._warned: dict[str, float] = {}
+        self._clock: int | None = None
+        self._use_sim_time = use_sim_time
+        if use_sim_time:
+            self.subscribe("/clock", CLOCK, self._note_clock)
+
+    def __enter__(self) -> Node:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leaves the network."""
+        self._middleware.close()
+
+    # -- topics ---------------------------------------------------------------------------------------
+
+    def publisher(
+        self, topic: str, message_type: str, offered: quality.Quality | None = None
+    ) -> Callable[..., None]:
+        """Declares a publisher; the result publishes a message from nested fields and a stamp (ns).
+
+        The stamp goes into headers that have none; without one it is `now`. Fields that are not given are
+        zero or empty. Bytes are a message that is encoded already.
+        """
+        name = self.names.resolve(topic)
+        self.types.check(message_type)
+        send = self._middleware.publisher(
+            name, message_type, offered or quality.published(name, message_type)
+        )
+
+        def publish(message: Mapping[str, Any] | bytes, stamp: int | None = None) -> None:
+            if not isinstance(message, bytes):
+                message = self.types.encode(message_type, message, self.now() if stamp is None else stamp)
+            send(message)
+
+        return publish
+
+    def subscribe(
+        self,
+        topic: str,
+        message_type: str,
+        callback: Callback,
+        requested: quality.Quality | None = None,
+    ) -> Subscription:
+        """Calls `callback` with each message of a topic."""
+        name = self.names.resolve(topic)
+        self.types.check(message_type)
+        asked = requested or quality.subscribed(name, message_type)
+        made = Subscription(name, message_type, callback, max(asked.depth, 1))
+        self._subscriptions.append(made)
+        self._middleware.subscribe(name, message_type, asked, lambda data: self._receive(made, data))
+        return made
+
+    def topics(self) -> dict[str, list[str]]:
+        """The published topics with their types."""
+        found: dict[str, set[str]] = {}
+        for endpoint in self.publishers():
+            found.setdefault(endpoint.topic, set()).add(endpoint.type)
+        return {topic: sorted(found[topic]) for topic in sorted(found)}
+
+    def publishers(self) -> list[Endpoint]:
+        """The publishers of all topics."""
+        return [endpoint for endpoint in self._middleware.endpoints() if endpoint.is_publisher]
+
+    def explain_silence(self, subscription: Subscription) -> str:
+        """Why a subscription receives nothing: no publisher, another type, or a quality that cannot match."""
+        publishers = self.publishers()
+        named = [endpoint for endpoint in publishers if endpoint.topic == subscription.topic]
+        if not named:
+            listed = "; ".join(f"{topic} ({', '.join(types)})" for topic, types in self.topics().items())
+            return f"topic {subscription.topic} has no publisher. Published topics: {listed or 'none'}"
+        if all(endpoint.type != subscription.type for endpoint in named):
+            types = ", ".join(sorted({endpoint.type for endpoint in named}))
+            return f"topic {subscription.topic} has messages of type {types}, not {subscription.type}"
+        asked = quality.subscribed(subscription.topic, subscription.type)
+        for endpoint in named:
+            if reason := quality.mismatch(endpoint.quality, asked):
+                return f"topic {subscription.topic} cannot be received: {reason}"
+        return f"topic {subscription.topic} has a publisher, which sends nothing"
+
+    # -- time and transforms --------------------------------------------------------------------------
+
+    def now(self) -> int:
+        """The time in ns: of the system, or of /clock (0 before its first message)."""
+        return (self._clock or 0) if self._use_sim_time else time.time_ns()
+
+    def listen_to_transforms(self) -> tuple[Subscription, Subscription]:
+        """Collects /tf and /tf_static in `transforms`, whose last 30 s are kept."""
+        return (
+            self.subscribe("/tf", TRANSFORMS, lambda message: self.transforms.add(message, static=False)),
+            self.subscribe(
+                "/tf_static", TRANSFORMS, lambda message: self.transforms.add(message, static=True)
+            ),
+        )
+
+    def _note_clock(self, message: dict[str, Any]) -> None:
+        self._clock = int(message["clock"]["sec"]) * 1_000_000_000 + int(message["clock"]["nanosec"])
+
+    # -- messages -------------------------------------------------------------------------------------
+
+    def spin(self, seconds: float | None = None) -> None:
+        """Calls callbacks for some seconds; None: until it is interrupted."""
+        end = None if seconds is None else time.monotonic() + seconds
+        while end is None or time.monotonic() < end:
+            self.spin_once(0.1 if end is None else max(0.0, min(0.1, end - time.monotonic())))
+
+    def spin_once(self, timeout: float = 0.0) -> bool:
+        """Calls the callback of the oldest waiting message; returns whether one came in `timeout` (s)."""
+        with self._arrived:
+            if not self._arrived.wait_for(self._has_waiting, timeout):
+                return False
+            subscription = min((s for s in self._subscriptions if s.waiting), key=lambda s: s.waiting[0][0])
+            _, data = subscription.waiting.popleft()
+            subscription.waiting_bytes -= len(data)
+        try:
+            message = self.types.decode(data, subscription.type)
+        except DataError as error:
+            self._note_malformed(subscription, error)
+            return True
+        try:
+            subscription.callback(message)
+        except (DataError, ValueError, KeyError, TypeError, OverflowError) as error:
+            self._note_malformed(subscription, error)
+        return True
+
+    def warn(self, kind: str, text: str) -> None:
+        """Logs a warning, and no other one of this kind for ten seconds."""
+        now = time.monotonic()
+        if now - self._warned.get(kind, -_REPEAT) >= _REPEAT:
+            self._warned[kind] = now
+            logger.warning("%s", text)
+
+    @property
+    def counts(self) -> dict[str, Counter[str]]:
+        """Messages received, dropped and malformed, by topic."""
+        return {
+            s.topic: Counter(received=s.n_received, dropped=s.n_dropped, malformed=s.n_malformed)
+            for s in self._subscriptions
+        }
+
+    def _has_waiting(self) -> bool:
+        return any(subscription.waiting for subscription in self._subscriptions)
+
+    def _receive(self, subscription: Subscription, data: bytes) -> None:
+        """Queues a message; called by threads of the middleware."""
+        with self._arrived:
+            self._n_arrived += 1
+            subscription.n_received += 1
+            subscription.waiting.append((self._n_arrived, data))
+            subscription.waiting_bytes += len(data)
+            while (
+                len(subscription.waiting) > subscription.depth or subscription.waiting_bytes > _WAITING_BYTES
+            ):
+                _, oldest = subscription.waiting.popleft()
+                subscription.waiting_bytes -= len(oldest)
+                subscription.n_dropped += 1
+            self._arrived.notify()
+
+    def _note_malformed(self, subscription: Subscription, error: Exception) -> None:
+        subscription.n_malformed += 1
+        self.warn(
+            f"malformed {subscription.topic}",
+            f"{subscription.n_malformed} messages of {subscription.topic} cannot be used; the last: {error}",
+        )
+
+
+def _environment_domain() -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not (text.isascii() and text.isdecimal()):
+        raise InvalidArgumentError(f"ROS_DOMAIN_ID={text!r} must be a whole number 0 … {dds.MAX_DOMAIN}.")
+    return int(text)

@@ -1,0 +1,203 @@
+"""Nodes over DDS and over Zenoh: messages, names, quality of service, discovery and damaged messages."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.export.message_fields import cloud_fields, transform_fields
+from gmmtorch.live.ros import Node, Quality
+
+pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
+
+CLOUD, STRING, GRID = "sensor_msgs/msg/PointCloud2", "std_msgs/msg/String", "nav_msgs/msg/OccupancyGrid"
+_NUMBERS = itertools.count()
+MakeNode = Callable[..., Node]
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def wait_until(is_done: Callable[[], bool], *nodes: Node, seconds: float = 30.0) -> None:
+    """Spins the nodes until the condition holds."""
+    end = time.monotonic() + seconds
+    while not is_done():
+        assert time.monotonic() < end, "nothing arrived"
+        for node in nodes:
+            node.spin_once(0.02)
+
+
+@pytest.fixture(params=["dds", "zenoh"])
+def make_node(request) -> Iterator[MakeNode]:
+    """Makes nodes that hear each other, and no other process."""
+    package = {"dds": "cyclonedds", "zenoh": "zenoh"}[request.param]
+    pytest.importorskip(package, reason=f"needs the extra [ros]: {package}")
+    domain = 1 + (11 * os.getpid() + next(_NUMBERS)) % 200
+    nodes, router, options = [], None, {"middleware": request.param, "domain": domain}
+    if request.param == "zenoh":
+        from gmmtorch.live.ros.zenoh_middleware import open_router
+
+        options["router"] = f"tcp/127.0.0.1:{free_port()}"
+        router = open_router(options["router"])
+
+    def make(name: str = "test", **more: object) -> Node:
+        nodes.append(Node(name, **{**options, **more}))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.close()
+    if router is not None:
+        router.close()
+
+
+def test_a_cloud_arrives_as_it_was_published(make_node):
+    talker, listener = make_node("talker"), make_node("listener")
+    received = []
+    listener.subscribe("/points", CLOUD, received.append)
+    publish = talker.publisher("/points", CLOUD)
+    table = np.zeros(20_000, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    table["x"] = np.random.default_rng(0).normal(size=len(table))
+    sent = time.monotonic()
+
+    def is_received() -> bool:
+        nonlocal sent
+        if (
+            time.monotonic() > sent and not received
+        ):  # the first ones may come before the nodes know each other
+            publish(cloud_fields("lidar", table), stamp=1_500_000_007)
+            sent = time.monotonic() + 0.1
+        return bool(received)
+
+    wait_until(is_received, listener)
+    message = received[0]
+    assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_007}, "frame_id": "lidar"}
+    assert message["data"].tobytes() == table.tobytes()
+    assert [field["name"] for field in message["fields"]] == ["x", "y", "z"]
+
+
+def test_a_latched_message_reaches_a_late_subscriber(make_node):
+    talker = make_node("talker")
+    publish = talker.publisher("/map", GRID)
+    publish({"info": {"width": 2, "height": 1, "resolution": 0.5}, "data": np.array([0, 100])})
+    time.sleep(0.2)
+    listener, received = make_node("listener"), []
+    listener.subscribe("/map", GRID, received.append, Quality(latched=True, depth=1))
+    wait_until(lambda: bool(received), listener)
+    assert received[0]["data"].tolist() == [0, 100]
+    assert received[0]["info"]["resolution"] == 0.5
+
+
+def test_topics_names_and_remapping(make_node):
+    talker = make_node("talker", namespace="robot1", remap={"points": "/velodyne_points"})
+    listener = make_node("listener", namespace="/robot1/")
+    talker.publisher("points", CLOUD)
+    talker.publisher("~/state", STRING)
+    wanted = {"/velodyne_points": [CLOUD], "/robot1/talker/state": [STRING]}
+    wait_until(lambda: wanted.items() <= listener.topics().items(), listener)
+    subscription = listener.subscribe("points", CLOUD, lambda _: None)
+    assert subscription.topic == "/robot1/points"
+    text = listener.explain_silence(subscription)
+    assert "topic /robot1/points has no publisher" in text
+    assert f"/velodyne_points ({CLOUD})" in text
+
+
+def test_silence_is_explained_by_type_and_quality(make_node):
+    talker, listener = make_node("talker"), make_node("listener")
+    talker.publisher("/points", STRING)
+    talker.publisher("/tf", "tf2_msgs/msg/TFMessage", Quality(reliable=False))
+    wait_until(lambda: {"/points", "/tf"} <= listener.topics().keys(), listener)
+    cloud = listener.subscribe("/points", CLOUD, lambda _: None)
+    assert f"has messages of type {STRING}, not {CLOUD}" in listener.explain_silence(cloud)
+    moving, _ = listener.listen_to_transforms()
+    assert "publish it reliable" in listener.explain_silence(moving)
+
+
+def test_transforms_are_collected(make_node):
+    talker, listener = make_node("talker"), make_node("listener")
+    listener.listen_to_transforms()
+    static, moving = (talker.publisher(name, "tf2_msgs/msg/TFMessage") for name in ("/tf_static", "/tf"))
+    static(transform_fields({("base", "lidar"): np.eye(4)}), stamp=0)
+    sent = time.monotonic()
+
+    def is_complete() -> bool:
+        nonlocal sent
+        if time.monotonic() > sent:
+            moving(transform_fields({("odom", "base"): np.eye(4)}), stamp=time.time_ns())
+            sent = time.monotonic() + 0.1
+        return listener.transforms.frames == ["base", "lidar", "odom"]
+
+    wait_until(is_complete, listener)
+    assert listener.transforms.chain("lidar") == ["lidar", "base", "odom"]
+
+
+def test_damaged_messages_and_floods_are_counted():
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    with Node("test", domain=201) as node:
+        received = []
+        subscription = node.subscribe("/text", STRING, received.append, Quality(depth=3))
+        whole = node.types.encode(STRING, {"data": "x" * 10})
+        for data in (whole[:9], b"", whole):
+            node._receive(subscription, data)
+        while node.spin_once():
+            pass
+        assert subscription.n_malformed == 2
+        assert [message["data"] for message in received] == ["x" * 10]
+        for _ in range(8):
+            node._receive(subscription, whole)
+        assert (len(subscription.waiting), subscription.n_dropped) == (3, 5)
+        assert node.counts["/text"] == {"received": 11, "dropped": 5, "malformed": 2}
+
+
+def test_simulated_time_comes_from_the_clock():
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    with Node("test", domain=201, use_sim_time=True) as node:
+        assert node.now() == 0
+        clock = node._subscriptions[0]
+        node._receive(clock, node.types.encode(clock.type, {"clock": {"sec": 3, "nanosec": 5}}))
+        node.spin_once()
+        assert node.now() == 3_000_000_005
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"name": "a b"}, "name='a b'"),
+        ({"namespace": "a//b"}, "namespace="),
+        ({"remap": {"/a b": "/c"}}, "topic='/a b'"),
+        ({"middleware": "tcp"}, "middleware="),
+        ({"domain": 233}, "domain=233"),
+        ({"domain": 202, "interface": "nowhere0"}, "interface=nowhere0"),
+        ({"middleware": "zenoh", "router": "tcp/127.0.0.1:9"}, "does not answer"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(options, words):
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    pytest.importorskip("zenoh", reason="needs the extra [ros]: eclipse-zenoh")
+    with pytest.raises(InvalidArgumentError, match=words.replace("(", r"\(")):
+        Node(**options)
+
+
+def test_the_domain_of_the_environment_is_used(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "one")
+    with pytest.raises(InvalidArgumentError, match="ROS_DOMAIN_ID='one'"):
+        Node("test")
+
+
+def test_unknown_types_and_names_are_refused(make_node):
+    node = make_node()
+    with pytest.raises(InvalidArgumentError, match="not a message type"):
+        node.publisher("/a", "my_msgs/msg/Thing")
+    with pytest.raises(InvalidArgumentError, match="not a name of ROS"):
+        node.subscribe("/a b", STRING, lambda _: None)
+    assert issubclass(DataError, GmmTorchError)
