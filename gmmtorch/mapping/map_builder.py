@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -238,10 +237,14 @@ def check_same_run(path: str | Path, stored: Mapping[str, Any], run: Mapping[str
 
 
 def resident_bytes() -> int:
-    """Memory of this process now; the largest so far on systems without /proc."""
+    """Memory of this process now; the largest so far on systems without /proc; 0 on Windows."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
+        if sys.platform == "win32":
+            return 0
+        import resource  # Windows has no such module
+
         largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return largest if sys.platform == "darwin" else 1024 * largest
