@@ -29,7 +29,7 @@ CUTOFF = 3.5
 
 _OUTLIERS = 0.05  # ε, relative to the peak of a component
 _EXPLAINED = 0.1  # q above which components explain a point
-_SETTLED = 0.02  # of the blur: steps below this end a climb
+_SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _ENTRIES = {2: 16, 3: 64}  # of the index, for each component
 _RIDGE = 1e-9
@@ -63,8 +63,9 @@ class AlignmentTarget:
     def __init__(self, surfaces: Parameters, blur: float, normals: Tensor | None = None) -> None:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
-        self.blur, self.means, self.precisions = blur, means, torch.linalg.inv(covariances)
-        self.normals = torch.zeros_like(means) if normals is None else normals
+        normals = torch.zeros_like(means) if normals is None else normals
+        self.blur, self.means, self.normals = blur, means.contiguous(), normals.contiguous()
+        self.precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
         nothing = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         # A cone whose sensor is at the component's mean is the component's ellipsoid.
         ellipsoids = Cones(means, covariances, means, surfaces.weights, nothing)

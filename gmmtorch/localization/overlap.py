@@ -14,6 +14,7 @@ C = A + Σ_j, W = C⁻¹, z = W d and lever l = R μ_i, of each pair
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -38,6 +39,9 @@ _LONGEST = 1.0  # step, as the root mean square of the Mahalanobis distances tha
 _THICKNESSES = 4  # and in thicknesses of the components
 
 
+_SMALL_TURN = 1e-8  # rad²
+
+
 class Motions(NamedTuple):
     """B rigid motions x → R x + t: rotations (B, D, D), translations (B, D)."""
 
@@ -53,8 +57,7 @@ class Motions(NamedTuple):
     def moved(self, steps: Tensor) -> Motions:
         """Perturbed by steps (B, D + D(D−1)/2): translations v, then rotations ω about t."""
         dim = self.translations.shape[1]
-        turn = torch.einsum("bk,kij->bij", steps[:, dim:], generators(dim).to(steps))
-        return Motions(torch.linalg.matrix_exp(turn) @ self.rotations, self.translations + steps[:, :dim])
+        return Motions(turns(steps[:, dim:]) @ self.rotations, self.translations + steps[:, :dim])
 
 
 class Pairs(NamedTuple):
@@ -86,12 +89,25 @@ class Overlap(NamedTuple):
         return Overlap(*(value[rows] for value in self))
 
 
+@functools.cache
 def generators(dim: int) -> Tensor:
     """Skew matrices G_k (D(D−1)/2, D, D): Σ_k ω_k G_k x is ω × x in 3D, ω (−y, x) in 2D."""
     if dim == 2:
         return torch.tensor([[[0.0, -1.0], [1.0, 0.0]]], dtype=torch.float64)
     basis = torch.eye(3, dtype=torch.float64)
     return torch.stack([torch.linalg.cross(axis.expand(3, 3), basis, dim=1).T for axis in basis])
+
+
+def turns(angles: Tensor) -> Tensor:
+    """Rotations (B, D, D) exp(Σ_k ω_k G_k) by angles ω (B, D(D−1)/2), rad: Rodrigues' formula."""
+    dim = 2 if angles.shape[1] == 1 else 3
+    skew = (angles @ generators(dim).to(angles).flatten(1)).view(-1, dim, dim)
+    square = angles.square().sum(1)[:, None, None]
+    is_small = square < _SMALL_TURN  # a series, so that derivatives exist at zero
+    angle = torch.where(is_small, 1.0, square).sqrt()
+    first = torch.where(is_small, 1 - square / 6, angle.sin() / angle)
+    second = torch.where(is_small, 0.5 - square / 24, 2 * (0.5 * angle).sin().square() / angle.square())
+    return torch.eye(dim).to(angles) + first * skew + second * skew @ skew
 
 
 def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pairs) -> Overlap:
@@ -144,7 +160,7 @@ def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> t
         lever: R μ_i (D, P). shift: t − μ_j (D, P). moved: A (D, D, P). still: Σ_j (D, D, P).
     """
     dim = len(lever)
-    turns = generators(dim).to(lever)
+    spins = generators(dim).to(lever)
     precision, half_log_det = _inverse(moved + still)
     offset = lever + shift
     pull = _times(precision, offset[:, None])[:, 0]
@@ -152,13 +168,13 @@ def _pair_terms(lever: Tensor, shift: Tensor, moved: Tensor, still: Tensor) -> t
 
     arm = lever - _times(moved, pull[:, None])[:, 0]
     matched = _times(moved, precision)
-    turned = torch.einsum("kij,jp->kip", turns, arm)
-    slope = -(pull * turned).sum(1) - torch.einsum("kij,jip->kp", turns, matched)
+    turned = torch.einsum("kij,jp->kip", spins, arm)
+    slope = -(pull * turned).sum(1) - torch.einsum("kij,jip->kp", spins, matched)
 
     jacobian = torch.cat([torch.eye(dim).to(lever)[..., None].expand(-1, -1, lever.shape[1]),
-                          torch.einsum("kij,jp->ikp", turns, lever)], 1)  # fmt: skip
+                          torch.einsum("kij,jp->ikp", spins, lever)], 1)  # fmt: skip
     information = _times(jacobian.transpose(0, 1), _times(precision, jacobian))
-    swept = torch.einsum("kij,jlp->kilp", turns, moved)
+    swept = torch.einsum("kij,jlp->kilp", spins, moved)
     change = [_times(precision, s + s.transpose(0, 1)) for s in swept]
     for k, one in enumerate(change):
         for m, other in enumerate(change):

@@ -13,22 +13,26 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align
-from gmmtorch.localization.overlap import Motions, generators
+from gmmtorch.localization.overlap import Motions, deviations, turns
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.reduction.moments import merge_components
 from gmmtorch.scan import check_positions
 
 _BLURS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # metres, one level after the other
 _FINE = 2  # the level at which a search around a good prediction begins
-_STEPS = 15  # of a level
+_STEPS = 15  # of the first and the last level of a search
+_BETWEEN_STEPS = 6  # of the levels between, which only lead to the peak of the next one
+_COARSE_SHARE = 0.4  # of the points, on all levels but the last one
 _SAME = 0.25  # of the blur: motions that are closer have climbed one peak
 _SECOND_CHANCE = 1  # the level after the first: starts are ranked there once more, by its blur
-_CLIMBED = 16  # starts that the first level climbs; each level after it climbs the better half
+_CLIMBED = 6  # starts that the first level climbs; each level after it climbs the better half
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre of blur
 _PLACES = 0.5  # metres between the places of a search of the whole map
-_RANKED = 4 * _CLIMBED  # best starts, of which different ones are climbed
-_COARSE_POINTS = 200  # of the scan, that rank the starts
+_RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
+_RANKING_POINTS = 150  # of the scan, that rank the starts
 _RANKED_AT_ONCE = 256  # starts
 _WIDER = 4  # times the first search
 _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
@@ -108,7 +112,12 @@ class Tracker:
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
         normals = _normals(seen) if isinstance(seen, Components) else None
-        self._targets = [AlignmentTarget(centered, blur, normals) for blur in _BLURS]
+        normals = torch.zeros_like(centered.means) if normals is None else normals
+        self._targets = [
+            AlignmentTarget(merged, blur, faces)
+            for blur in _BLURS
+            for merged, faces in (_merged(centered, normals, blur),)
+        ]
         self._places = _places(seen, self._center) if isinstance(seen, Components) else mixture.means[:0]
         self.restart(pose)
 
@@ -184,7 +193,9 @@ class Tracker:
         for number, target in enumerate(self._targets[first:]):
             if number == _SECOND_CHANCE:
                 motions = motions.joined(self._ranked(rows, starts, target))
-            found = align(rows, target, motions, _STEPS)
+            is_last = target is self._targets[-1]
+            used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
+            found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
             found = found.at(
                 _best(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
             )
@@ -197,7 +208,7 @@ class Tracker:
         if n <= _CLIMBED:
             return starts
         parts = torch.arange(n, device=rows.device).split(_RANKED_AT_ONCE)
-        score = torch.cat([target.sums(rows[:_COARSE_POINTS], starts.at(part)).score for part in parts])
+        score = torch.cat([target.sums(rows[:_RANKING_POINTS], starts.at(part)).score for part in parts])
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
@@ -272,6 +283,16 @@ def _normals(surfaces: Components) -> Tensor:
     return (normals * (sign * is_flat)[:, None])[solid]
 
 
+def _merged(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Parameters, Tensor]:
+    """The surfaces with those merged that a blur hides: smaller ones of one side in a cell of that size."""
+    small = deviations(surfaces)[:, -1] < blur
+    alone = torch.where(small, -1, torch.arange(len(small)).to(small.device))
+    keys = torch.cat([(surfaces.means / blur).floor(), normals.round(), alone[:, None]], 1)
+    cells, labels = torch.unique(keys, dim=0, return_inverse=True)
+    summed = torch.zeros(len(cells), normals.shape[1]).to(normals).index_add(0, labels, normals)
+    return merge_components(*surfaces, labels, len(cells)), torch.nn.functional.normalize(summed)
+
+
 def _places(surfaces: Components, center: Tensor) -> Tensor:
     """Places (S, D) from which the map was seen, one in each cell of `_PLACES` metres, about `center`."""
     origins = surfaces.origins.to(center) - center
@@ -282,7 +303,8 @@ def _places(surfaces: Components, center: Tensor) -> Tensor:
 
 def _turns(angles: Tensor, dim: int) -> Tensor:
     """Rotations (A, D, D) by angles (A,), rad, about the vertical."""
-    return torch.linalg.matrix_exp(angles[:, None, None] * generators(dim)[-1].to(angles))
+    axis = torch.eye(dim * (dim - 1) // 2).to(angles)[-1]
+    return turns(angles[:, None] * axis)
 
 
 def _around(start: Motions, distance: float, angle: float, blur: float) -> Motions:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from gmmtorch.localization import alignment
 from gmmtorch.localization.alignment import AlignmentTarget, align
-from gmmtorch.localization.overlap import Motions, generators
+from gmmtorch.localization.overlap import Motions, generators, turns
 from gmmtorch.mixture.em.exact import Parameters
 
 
@@ -49,6 +51,15 @@ def score_of_all_pairs(points: Tensor, surfaces: Parameters, blur: float, step: 
     square = torch.einsum("nki,kij,nkj->nk", offset, precision, offset)
     heights = torch.where(square <= alignment.CUTOFF**2, torch.exp(-0.5 * square), 0.0)
     return torch.log1p(heights.sum(1) / alignment._OUTLIERS).sum()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 1.0, math.pi, 7.0])
+def test_turns_are_matrix_exponentials(dim, size):
+    angles = torch.randn(5, dim * (dim - 1) // 2, generator=torch.Generator().manual_seed(0)).double()
+    angles = size * angles / angles.norm(dim=1, keepdim=True)
+    expected = torch.linalg.matrix_exp(torch.einsum("bk,kij->bij", angles, generators(dim)))
+    torch.testing.assert_close(turns(angles), expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -49,17 +49,18 @@ _BODY = """
             total += height;
             for (int i = 0; i < DIM; ++i) {
                 pull[i] += height * p[i];
-                for (int j = 0; j < DIM; ++j) {
+                for (int j = i; j < DIM; ++j) {
                     weight[i][j] += height * precision[i * DIM + j];
                     spread[i][j] += height * p[i] * p[j];
                 }
             }
         }
+        if (total == outliers) continue;  // no component is near: all sums stay as they are
         for (int i = 0; i < DIM; ++i) pull[i] /= total;
         for (int i = 0; i < DIM; ++i)
-            for (int j = 0; j < DIM; ++j) {
-                weight[i][j] /= total;
-                spread[i][j] = weight[i][j] - spread[i][j] / total + pull[i] * pull[j];
+            for (int j = i; j < DIM; ++j) {
+                weight[i][j] = weight[j][i] = weight[i][j] / total;
+                spread[i][j] = spread[j][i] = weight[i][j] - spread[i][j] / total + pull[i] * pull[j];
             }
         double jacobian[DIM][FREE] = {{0.0}};
         for (int i = 0; i < DIM; ++i) jacobian[i][i] = 1.0;
