@@ -55,6 +55,7 @@ SIMD = """
     auto fused = [](vec a, vec b, vec c) { return fma(a, b, c); };
     auto get = [](vec v, int) { return v; };
     auto set = [](vec& v, int, double x) { v = x; };
+    auto largest = [](vec v) { return v; };
 #else
     typedef double vec __attribute__((ext_vector_type(8)));
     typedef decltype(vec() < vec()) mask;
@@ -64,6 +65,13 @@ SIMD = """
     auto fused = [](vec a, vec b, vec c) { return __builtin_elementwise_fma(a, b, c); };
     auto get = [](vec v, int i) { return v[i]; };
     auto set = [](vec& v, int i, double x) { v[i] = x; };
+    auto largest = [](vec v) {
+        vec other = __builtin_shufflevector(v, v, 4, 5, 6, 7, 4, 5, 6, 7);
+        v = v > other ? v : other;
+        other = __builtin_shufflevector(v, v, 2, 3, 2, 3, 2, 3, 2, 3);
+        v = v > other ? v : other;
+        return v[0] > v[1] ? v[0] : v[1];
+    };
     auto expo = [](vec x) {  // relative error below 4e-16 between -700 and 700, where it is clamped
         x = x < -700.0 ? (vec)(-700.0) : x;
         x = x > 700.0 ? (vec)(700.0) : x;

@@ -130,50 +130,103 @@ _EXPECTATION = """
     value[item] = sum;
 """
 _CHOICE = """
+    // A component is compared with the samples of a group only if an upper bound of its logits shows that it
+    // can be a candidate: log(weight density at the mean) - (distance - radius)^2 / (2 variance), for the
+    // ball around the samples. The candidates are exact.
     const int64_t first_group = n_groups * item / n_parts, last_group = n_groups * (item + 1) / n_parts;
-    vec *logits = (vec*)scratch + 2 * item * n_padded, *best = logits + n_padded;
+    vec* logits = (vec*)scratch + item * n_padded * 3;
+    double *upper = (double*)(logits + n_padded), *best = upper + n_padded;
+    int64_t *listed = (int64_t*)(best + n_padded), *found = listed + n_padded;
+    double *score = scores + item * n_candidates, reach = 32.0;  // nats below the largest bound
+    for (int64_t k = 0; k < n_padded; ++k) best[k] = -HUGE_VAL;
+    // Puts x of component k into a row of the largest ones, in which place `worst` is replaced next.
+    auto insert = [&](double x, int64_t k, int64_t first, int64_t& n, int64_t& worst, int64_t* names) {
+        const int64_t place = n < n_candidates ? n++ : worst;
+        if (names) names[place] = k;
+        score[place] = x;
+        if (n < n_candidates) return;
+        worst = first;
+        for (int64_t j = first + 1; j < n_candidates; ++j)
+            if (score[j] < score[worst]) worst = j;
+    };
     vec x[WIDTH];
     for (int64_t g = first_group; g < last_group; ++g) {
         const double* center = centers + g * DIM;
-        if (begin[g] == begin[g + 1])
-            for (int64_t k = 0; k < n_padded; ++k) best[k] = (vec)(-1e300);
-        for (int64_t sample = 0; sample < n_samples; sample += LANES) {
-            if (begin[g] == begin[g + 1]) break;
+        int64_t n_found = 0;
+        for (int64_t sample = 0; sample < n_samples && begin[g] < begin[g + 1]; sample += LANES) {
             LOAD
+            vec squared = (vec)(0.0), top = (vec)(-1e300), peak = (vec)(-1e300);
+            for (int i = 0; i < DIM; ++i) squared += x[1 + i] * x[1 + i];
+            const double radius = sqrt(largest(squared));
             int f = 1 + DIM;
             for (int i = 0; i < DIM; ++i)
                 for (int n = i; n < DIM; ++n, ++f)
                     x[f] += x[1 + i] * center[n] + center[i] * x[1 + n] + x[0] * (center[i] * center[n]);
             for (int i = 0; i < DIM; ++i) x[1 + i] += x[0] * center[i];
-            vec peak = (vec)(-1e300);
-            LOGITS
-            if (sample == 0)
-                for (int64_t k = 0; k < n_components; ++k) best[k] = logits[k] - peak;
-            else
-                for (int64_t k = 0; k < n_components; ++k) {
-                    const vec under = logits[k] - peak;
-                    best[k] = under > best[k] ? under : best[k];
+            for (int64_t k = 0; k < n_padded; k += LANES) {
+                const vec* own = (const vec*)(bounds + k);
+                vec gap = (vec)(0.0);
+                for (int i = 0; i < DIM; ++i) {
+                    const vec off = own[i * n_padded / LANES] - center[i];
+                    gap += off * off;
                 }
+                gap = root(gap) - radius;
+                gap = (gap > 0.0 ? gap : (vec)(0.0)) * own[(DIM + 1) * n_padded / LANES];
+                const vec most = own[DIM * n_padded / LANES] - gap * gap;
+                *(vec*)(upper + k) = most;
+                top = most > top ? most : top;
+            }
+            const double most = largest(top);
+            double below = HUGE_VAL, from = most - reach;
+            int64_t n_listed = 0, n_best = 0, worst = 0;
+            while (from < below) {
+                for (int64_t k = 0; k < n_padded; k += LANES) {
+                    const vec bound = *(const vec*)(upper + k);
+                    if (!any((bound >= from) & (bound < below))) continue;
+                    for (int l = 0; l < LANES; ++l) {
+                        if (!(upper[k + l] >= from && upper[k + l] < below)) continue;
+                        const double* w = natural + (k + l) * WIDTH;
+                        vec logit = x[0] * w[0];
+                        for (int i = 1; i < WIDTH; ++i) logit = fused(x[i], (vec)(w[i]), logit);
+                        peak = logit > peak ? logit : peak;
+                        logits[n_listed] = logit;
+                        listed[n_listed++] = k + l;
+                    }
+                }
+                n_best = worst = 0;
+                for (int64_t j = 0; j < n_listed; ++j) {
+                    const vec under = logits[j] - peak;
+                    if (n_best == n_candidates && !any(under > score[worst])) continue;
+                    insert(largest(under), j, 0, n_best, worst, nullptr);
+                }
+                // No component below `from` is more likely than the worst of the candidates.
+                below = from;
+                const bool enough = n_best == n_candidates;
+                from = enough ? score[worst] - largest(-peak) - SLACK : most - 4.0 * (most - from);
+                if (n_listed == n_padded) break;
+            }
+            reach = most - GMM_MIN(from, below);
+            for (int64_t j = 0; j < n_listed; ++j) {
+                double& own = best[listed[j]];
+                if (own == -HUGE_VAL) found[n_found++] = listed[j];
+                own = GMM_MAX(own, largest(logits[j] - peak));
+            }
         }
-        int64_t* chosen = candidates + g * n_candidates;
-        double* score = scores + item * n_candidates;
+        if (n_found == 0)  // no rows: any candidates
+            for (int64_t k = 0; k < n_candidates; ++k) found[n_found++] = k;
         int64_t n_chosen = 1, worst = 0;
+        int64_t* chosen = candidates + g * n_candidates;
         chosen[0] = g;
-        for (int64_t k = 0; k < n_components; ++k) {
-            if (k == g) continue;
-            if (n_chosen == n_candidates && (n_candidates == 1 || !any(best[k] > score[worst]))) continue;
-            double largest = get(best[k], 0);
-            for (int l = 1; l < LANES; ++l) largest = GMM_MAX(largest, get(best[k], l));
-            const int64_t place = n_chosen < n_candidates ? n_chosen++ : worst;
-            chosen[place] = k;
-            score[place] = largest;
-            if (n_chosen < n_candidates) continue;
-            worst = 1;
-            for (int64_t j = 2; j < n_candidates; ++j)
-                if (score[j] < score[worst]) worst = j;
+        for (int64_t j = 0; j < n_found; ++j) {
+            const int64_t k = found[j];
+            if (k != g && n_candidates > 1 && k < n_components)
+                if (n_chosen < n_candidates || best[k] > score[worst])
+                    insert(best[k], k, 1, n_chosen, worst, chosen);
+            best[k] = -HUGE_VAL;
         }
     }
 """
+_SLACK = 1e-6  # nats of rounding in a bound
 
 
 def _kernel(name: str, body: str, parameters: str, dim: int, kind: str) -> FusedKernel:
@@ -187,7 +240,9 @@ def _kernel(name: str, body: str, parameters: str, dim: int, kind: str) -> Fused
     rows = f"const {kind}* features, const {kind}* weight, const int64* begin, const double* centers,"
     sizes = " int64 n_groups, int64 n_components, int64 n_candidates, int64 n_padded, int64 n_parts, "
     return FusedKernel(
-        f"{name}_{dim}d_{kind}", rows + sizes + parameters, SIMD + body.replace("SKIPPED", str(SKIPPED))
+        f"{name}_{dim}d_{kind}",
+        rows + sizes + parameters,
+        SIMD + body.replace("SKIPPED", str(SKIPPED)).replace("SLACK", str(_SLACK)),
     )
 
 
@@ -205,8 +260,8 @@ _EXPECTATIONS = _kernels(
 _CHOICES = _kernels(
     "candidates",
     _CHOICE,
-    "const int64* slots, int64 n_samples, const double* natural, double* scratch, double* scores,"
-    " int64* candidates",
+    "const int64* slots, int64 n_samples, const double* natural, const double* bounds, double* scratch,"
+    " double* scores, int64* candidates",
 )
 
 
@@ -240,22 +295,30 @@ def fused_expectation(
     return statistics.sum(0), value.sum(), likeliest
 
 
-def fused_candidates(rows: GroupedRows, slots: Tensor, natural: Tensor, n_candidates: int) -> Tensor:
+def fused_candidates(
+    rows: GroupedRows, slots: Tensor, natural: Tensor, bounds: Tensor, n_candidates: int
+) -> Tensor:
     """The most likely `n_candidates` components (G, m) for the sampled slots (G, n) of each of the G groups.
 
-    Component g is a candidate of group g. natural: (G, F), of the components. The order is arbitrary.
+    Component g is a candidate of group g. The order is arbitrary.
+
+    Args:
+        natural: (G, F), of the components. bounds (D + 2, G): their means; the logarithm of weight times
+            density at the mean; and √(1/2v), v at least the largest variance.
     """
     k, width = natural.shape
-    n_parts, padded = _n_parts(k), k + -k % 4
+    n_parts, padded = _n_parts(k), k + -k % CPU_LANES
     table = natural.new_zeros(padded, width)
     table[:k], table[k:, 0] = natural, -1e300
-    scratch = natural.new_empty(n_parts, 2, padded, CPU_LANES)
+    padded_bounds = natural.new_zeros(bounds.shape[0], padded)
+    padded_bounds[:, :k], padded_bounds[-2, k:] = bounds, -1e300
+    scratch = natural.new_empty(n_parts, 3, padded, CPU_LANES)
     scores = natural.new_empty(n_parts, n_candidates)
     candidates = torch.empty(k, n_candidates, dtype=torch.int64)
     sizes = k, k, n_candidates, padded, n_parts
     kernel = _CHOICES[rows.centers.shape[1], rows.features.dtype]
-    sampled = slots.contiguous(), slots.shape[1]
-    kernel(n_parts, *rows, *sizes, *sampled, table, scratch, scores, candidates, device=natural.device)
+    given = slots.contiguous(), slots.shape[1], table, padded_bounds
+    kernel(n_parts, *rows, *sizes, *given, scratch, scores, candidates, device=natural.device)
     return candidates
 
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.chunks import chunk_elements
-from gmmtorch.kernels.mixtures import e_step
+from gmmtorch.kernels.mixtures import e_step, m_step
 from gmmtorch.kernels.mixtures.e_step import expectation as expectation
 from gmmtorch.kernels.mixtures.e_step import exponent_floor as exponent_floor
 from gmmtorch.linalg import inverse_factor, safe_cholesky, triangle_indices, unpack_symmetric
@@ -64,6 +64,10 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
     weights, means, covariances = parameters
     dim = means.shape[1]
+    if m_step.is_fused_on(*parameters):
+        found = m_step.fused_natural_parameters(*parameters)
+        if found is not None:
+            return found
     factors = safe_cholesky(covariances)
     whiten = inverse_factor(factors)
     precision = whiten @ whiten.transpose(-2, -1)

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.kernels.chunks import chunk_elements, chunked
+from gmmtorch.kernels.mixtures import m_step
 from gmmtorch.kernels.mixtures.truncated_e_step import (
     GroupedRows,
     fused_candidates,
@@ -26,10 +27,8 @@ from gmmtorch.kernels.mixtures.truncated_e_step import (
 )
 from gmmtorch.linalg import (
     argsort,
-    inverse_factor,
     largest_indices,
     pack_symmetric,
-    safe_cholesky,
     unpack_symmetric,
 )
 from gmmtorch.mixture.em.exact import (
@@ -170,7 +169,8 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
     place = place.clamp_max_(groups.slot.shape[0] - 1)  # of empty groups, whose candidates are unused
     natural, rows = natural_parameters(parameters), groups.rows()
     if is_fused_on(rows, natural):
-        return fused_candidates(rows, groups.slot[place], natural, n_candidates)
+        bounds = _logit_bounds(parameters, natural)
+        return fused_candidates(rows, groups.slot[place], natural, bounds, n_candidates)
     natural, samples = natural.T.contiguous(), rows.features[groups.slot[place]]
 
     def chosen(part: slice) -> Tensor:
@@ -184,6 +184,15 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
 
     step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
     return torch.cat(list(chunked(k, step, chosen)))
+
+
+def _logit_bounds(parameters: Parameters, natural: Tensor) -> Tensor:
+    """Means, log π_k N(μ_k | μ_k, Σ_k), and √(1/2v), (D + 2, K); v = ‖Σ²‖^½ bounds the largest variance."""
+    means, covariances = parameters.means, parameters.covariances
+    dim = means.shape[1]
+    peak = natural[:, 0] + 0.5 * (natural[:, 1 : 1 + dim] * means).sum(1)
+    variance = (covariances @ covariances).square().sum((1, 2)).pow(0.25)
+    return torch.cat([means.T, torch.stack([peak, (0.5 / variance).sqrt()])])
 
 
 # -- the E-step over candidates -------------------------------------------------------------------
@@ -207,12 +216,14 @@ def truncated_expectation(
     parameters: Parameters,
     want_owner: bool = False,
     compiled: bool = False,
+    own: Tensor | None = None,
 ) -> Expectation:
     """E-step of `exact.expectation`, restricted to the candidates (G, m) of each of the G groups.
 
     With `want_owner`, also returns each row's most likely candidate. `compiled`: use torch.compile.
+    `own`: the `centered_parameters`, if they are known.
     """
-    rows, own = groups.rows(), centered_parameters(parameters)
+    rows, own = groups.rows(), centered_parameters(parameters) if own is None else own
     if not compiled and is_fused_on(rows, own, candidates):
         fused = fused_expectation(rows, candidates, own, parameters.means, want_owner)
         return Expectation(fused[0], float(fused[1]), _owner_of_rows(groups, fused[2]))
@@ -255,7 +266,12 @@ def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
 
 def centered_parameters(parameters: Parameters) -> Tensor:
     """Natural parameters (K, F) of the components about their own means."""
-    return natural_parameters(parameters._replace(means=torch.zeros_like(parameters.means)))
+    weights, means, covariances = parameters
+    if m_step.is_fused_on(*parameters):
+        found = m_step.fused_natural_parameters(weights, None, covariances)
+        if found is not None:
+            return found
+    return natural_parameters(parameters._replace(means=torch.zeros_like(means)))
 
 
 def local_parameters(parameters: Parameters, centers: Tensor, candidates: Tensor) -> Tensor:
@@ -298,11 +314,13 @@ def _likeliest(natural: Tensor, features: Tensor) -> Tensor:
     return torch.where(joint == joint.amax(1, keepdim=True), place, 0).amax(1).long()
 
 
-def rounding(groups: Groups, parameters: Parameters) -> tuple[float, float]:
+def rounding(groups: Groups, own: Tensor) -> tuple[float, float]:
     """Expected error of a float32 E-step, nats a point: the mean, and that of the worst group.
 
-    The error is ε/2 E[‖x‖²] tr Σ⁻¹. It is also the relative error of a component's smallest variance.
+    The error is ε/2 E[‖x‖²] tr Σ⁻¹. It is also the relative error of a component's smallest variance. `own`
+    (K, F): the `centered_parameters`.
     """
-    precision = inverse_factor(safe_cholesky(parameters.covariances)).square().sum((1, 2))
+    diagonal = pack_symmetric(torch.eye(groups.centers.shape[1], dtype=own.dtype, device=own.device))
+    precision = -2 * (own[:, -diagonal.shape[0] :] @ diagonal)
     error = groups.spread * precision * (torch.finfo(torch.float32).eps / 2)
     return float(error.sum() / groups.mass.sum()), float((error / groups.mass.clamp_min(1e-300)).max())

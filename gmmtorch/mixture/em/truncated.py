@@ -15,12 +15,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.mixtures.m_step import fused_steps, is_fused_on
 from gmmtorch.mixture.em.cells import pool_into_cells
 from gmmtorch.mixture.em.exact import Parameters, maximization, shift_features
 from gmmtorch.mixture.em.grouping import (
     Expectation,
     Groups,
     Rows,
+    centered_parameters,
     choose_candidates,
     group_rows,
     owners_of,
@@ -81,36 +83,49 @@ class Momentum:
 
     def step(self, statistics: Tensor, parameters: Parameters) -> Parameters:
         """The next parameters, from statistics (K, F) relative to the means of `parameters`."""
-        em_step = _moved(maximization(statistics, self._reg_covar, _centered(parameters)), parameters.means)
         last, self._last = self._last, (statistics, parameters.means)
-        self._em_step = em_step
-        self.is_extrapolated = False
-        if last is None:
-            return em_step
-        share = self._age / (self._age + 3)
-        self._age += 1
-        if share == 0:
-            return em_step
-        before = shift_features(last[0], last[1] - parameters.means)
-        ahead = statistics + share * (statistics - before)
-        trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
-        ahead = torch.where(trusted[:, None], ahead, statistics)
-        moved = _moved(maximization(ahead, self._reg_covar, _centered(parameters)), parameters.means)
-        thickness, em_thickness = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (moved, em_step))
-        trusted &= thickness > 0.3 * em_thickness
-        self.is_extrapolated = True
-        weights = torch.where(trusted, moved.weights, em_step.weights)
-        return Parameters(
-            weights / weights.sum(),
-            torch.where(trusted[:, None], moved.means, em_step.means),
-            torch.where(trusted[:, None, None], moved.covariances, em_step.covariances),
-        )
+        share = 0.0 if last is None else self._age / (self._age + 3)
+        self._age += last is not None
+        self.is_extrapolated = share > 0
+        given = statistics, parameters, self._reg_covar, last if self.is_extrapolated else None, share
+        if is_fused_on(statistics, *parameters):
+            em_step, ahead = fused_steps(*given)
+        else:
+            em_step, ahead = _steps(*given)
+        self._em_step = Parameters(*em_step)
+        return self._em_step if ahead is None else Parameters(*ahead)
 
     def undo(self) -> Parameters:
         """EM's own parameters of the last step. Resets the momentum."""
         assert self._em_step is not None
         self._last, self._age, self.is_extrapolated = None, 0, False
         return self._em_step
+
+
+def _steps(
+    statistics: Tensor,
+    parameters: Parameters,
+    reg_covar: float,
+    last: tuple[Tensor, Tensor] | None,
+    share: float,
+) -> tuple[Parameters, Parameters | None]:
+    """EM's own step and the extrapolated one; the twin of `kernels.mixtures.m_step.fused_steps`."""
+    em_step = _moved(maximization(statistics, reg_covar, _centered(parameters)), parameters.means)
+    if last is None:
+        return em_step, None
+    before = shift_features(last[0], last[1] - parameters.means)
+    ahead = statistics + share * (statistics - before)
+    trusted = ahead[:, 0] > 0.2 * statistics[:, 0]
+    ahead = torch.where(trusted[:, None], ahead, statistics)
+    moved = _moved(maximization(ahead, reg_covar, _centered(parameters)), parameters.means)
+    thickness, em_thickness = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (moved, em_step))
+    trusted &= thickness > 0.3 * em_thickness
+    weights = torch.where(trusted, moved.weights, em_step.weights)
+    return em_step, Parameters(
+        weights / weights.sum(),
+        torch.where(trusted[:, None], moved.means, em_step.means),
+        torch.where(trusted[:, None, None], moved.covariances, em_step.covariances),
+    )
 
 
 def _centered(parameters: Parameters) -> Parameters:
@@ -142,9 +157,10 @@ def run_truncated(
     while len(bounds) < settings.max_iter:
         if left == 0 and not frozen:
             new_sets, left = _candidate_sets(rows, owner, parameters, settings), next(lengths)
-        groups = _with_enough_digits(rows, new_sets[0], parameters)
+        own = centered_parameters(parameters)
+        groups = _with_enough_digits(rows, new_sets[0], parameters.means, own)
         last_of_set = left == 1 and not frozen
-        found = truncated_expectation(groups, new_sets[1], parameters, last_of_set, settings.compiled)
+        found = truncated_expectation(groups, new_sets[1], parameters, last_of_set, settings.compiled, own)
         statistics, value = _summed(found, settings.processes)
         bound = value / total
         if bounds and bound < bounds[-1]:
@@ -187,23 +203,25 @@ def _candidate_sets(
     rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings, candidates: Tensor | None = None
 ) -> tuple[Groups, Tensor]:
     """The groups of these owners, and the candidates of each group, chosen if not given."""
-    groups = _with_enough_digits(rows, group_rows(rows, owner, parameters.means, settings.dtype), parameters)
+    means = parameters.means
+    groups = group_rows(rows, owner, means, settings.dtype)
+    groups = _with_enough_digits(rows, groups, means, centered_parameters(parameters))
     if candidates is None:
         candidates = choose_candidates(groups, parameters, settings.n_candidates)
     return groups, candidates
 
 
-def _with_enough_digits(rows: Rows, groups: Groups, parameters: Parameters) -> Groups:
+def _with_enough_digits(rows: Rows, groups: Groups, means: Tensor, own: Tensor) -> Groups:
     """The same groups, in float64 and relative to the current means if float32 has too few digits.
 
     This is checked at each step, because components become thinner and move away from their group's center.
     """
     if groups.features.dtype == torch.float64:
         return groups
-    average, worst = rounding(groups, parameters)
+    average, worst = rounding(groups, own)
     if average <= _AVERAGE_ROUNDING and worst <= _WORST_ROUNDING:
         return groups
-    return group_rows(rows, owners_of(groups), parameters.means, torch.float64)
+    return group_rows(rows, owners_of(groups), means, torch.float64)
 
 
 def fit_truncated(
