@@ -126,6 +126,14 @@ def test_pixels_drop_out_in_the_given_share():
     assert len(frame.ends) == len(frame.is_hit) == len(frame.pixel)
 
 
+def test_known_distances_give_the_same_frame():
+    camera = DepthCamera(40, 30)
+    here, teammate = pose(4, 3, 2), torch.tensor([[4.5, 3.5, 2.0]], dtype=torch.float64)
+    one = camera.sense(ROOM, here, teammate, 0.3, seeded())
+    other = camera.sense(ROOM, here, teammate, 0.3, seeded(), camera.distances(ROOM, here))
+    assert all(torch.equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
+
+
 def test_the_number_of_random_draws_does_not_depend_on_the_world():
     camera = DepthCamera(40, 30, dropout=0.2)
     teammates = torch.tensor([[4.5, 3.0, 2.0]], dtype=torch.float64)

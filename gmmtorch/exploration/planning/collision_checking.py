@@ -17,6 +17,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.exploration.planning.coordination import PeerTrajectories, clear_of
 from gmmtorch.exploration.robot.mapper import LocalMap
 from gmmtorch.exploration.world.navigable import collides
+from gmmtorch.kernels.rays.path_clearance import Motions, motions_are_clear
 from gmmtorch.occupancy.grid import check_resolution
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "clear_of",
     "collides",
     "feasible",
+    "feasible_motions",
     "inflated",
     "local_map_of",
     "passable_cells",
@@ -177,6 +179,27 @@ def feasible(
     return safe | still
 
 
+def feasible_motions(
+    motions: Motions, longest: Tensor, local_map: LocalMap, peers: PeerTrajectories, after: int
+) -> Tensor:
+    """`feasible` of motions, (N, P), by the fused kernel.
+
+    Args:
+        longest: (2,), longest step (m) and largest turn (rad) in a step. after: steps of the peers before
+            the motions begin.
+    """
+    return motions_are_clear(
+        motions,
+        local_map.passable,
+        local_map.low,
+        local_map.resolution,
+        _points_of_a_step(float(longest[0]), float(longest[1]), _SPACING * local_map.resolution),
+        peers.paths,
+        min(after, peers.paths.shape[1] - 1),
+        peers.separation,
+    )
+
+
 def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
     """Return boxes of offsets up to (i, j, k), by rising i, whose union is Σ max(|·| − 1, 0)² < square."""
 
@@ -218,14 +241,19 @@ def _points_along(states: Tensor, spacing: float) -> Tensor:
     chord = step.square().sum(-1)
     longest = math.sqrt(float(chord.max())) if chord.numel() else 0.0
     turn = float((yaw[..., 1:] - yaw[..., :-1]).abs().max()) if chord.numel() else 0.0
+    n = _points_of_a_step(longest, turn, spacing)
+    return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
+
+
+def _points_of_a_step(longest: float, turn: float, spacing: float) -> int:
+    """Number of points on each step; no step is longer than `longest` m or turns by more than `turn` rad."""
     room = spacing - longest * turn / 4
     if room <= 0:
         raise InvalidArgumentError(
             f"Steps of {longest:.3g} m and {turn:.3g} rad are too long to be checked in cells of "
             f"{spacing:.3g} m; use a shorter step or coarser cells."
         )
-    n = max(1, math.ceil(longest / room))
-    return torch.cat([place[..., :-1, :] + step * (i / n) for i in range(1, n)] + [place[..., 1:, :]], -2)
+    return max(1, math.ceil(longest / room))
 
 
 def _leaves(here: Tensor, states: Tensor, local_map: LocalMap, radius: float) -> Tensor:

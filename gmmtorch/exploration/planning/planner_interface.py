@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from gmmtorch.exploration.information.view_library import ViewLibrary
-from gmmtorch.exploration.planning.collision_checking import feasible
+from gmmtorch.exploration.planning.collision_checking import feasible, feasible_motions
 from gmmtorch.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.exploration.planning.primitives import Primitives
 from gmmtorch.exploration.planning.roadmap import Roadmap
 from gmmtorch.exploration.robot.mapper import LocalMap
+from gmmtorch.kernels.choice import is_fused
 
 LEAST = 0.05
 """Smallest displacement (m) that counts as motion."""
@@ -94,6 +95,23 @@ def options(
     return Options(paths, braking, safe)
 
 
+def continuations(
+    primitives: Primitives, states: Tensor, task: PlanningTask, after: int
+) -> tuple[Tensor, Tensor]:
+    """The ends (N, P, 7) of all primitives from states (N, 7), and which primitives are feasible (N, P).
+
+    Args:
+        after: primitives of the robot before these states.
+    """
+    passable = task.local_map.passable
+    continued = primitives.continued(states) if is_fused(passable, states) else None
+    if continued is None:
+        there = options(primitives, states, task, after=after)
+        return there.paths[:, :, -1], there.feasible
+    steps = after * primitives.dynamics.n_steps
+    return continued[0].ends, feasible_motions(*continued, task.local_map, task.peers, steps)
+
+
 def is_boxed_in(primitives: Primitives, task: PlanningTask) -> bool:
     """Return whether no primitive that moves the robot is feasible. Turning in place at rest always is."""
     here = options(primitives, task.state[None].double(), task, may_escape=True)
@@ -123,7 +141,7 @@ class Waiting:
             turn[:, 2] = turn[:, 2].where((turn[:, :2] == 0).all(1), 0)
             path = self._primitives.rollout(task.state[None])[0, int(turn[:, 2].argmax())]
         else:
-            return self.rest(task)
+            return self.rest(task.state)
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
 
     def boxed_in(self, task: PlanningTask) -> Plan | None:
@@ -136,9 +154,9 @@ class Waiting:
         plan = self.plan(task)
         return replace(plan, kind="boxed_in") if self._count > self._patience else None
 
-    def rest(self, task: PlanningTask) -> Plan:
-        """Come to rest and stay."""
-        path = self._primitives.rollout(task.state[None])[0, self._primitives.stop]
+    def rest(self, state: Tensor) -> Plan:
+        """Come to rest from a state (7,) and stay."""
+        path = self._primitives.rollout(state[None])[0, self._primitives.stop]
         return Plan(path, self._primitives.braking(path[-1]), path[-1:, :4], 0.0, "wait")
 
     def over(self) -> None:

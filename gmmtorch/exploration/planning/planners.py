@@ -89,7 +89,7 @@ class TreePlanner:
             return self._waiting.plan(task)
         self._waiting.over()
         if self._journey is None and found.information <= _NOTHING * self._largest:
-            return self._waiting.rest(task)
+            return self._waiting.rest(task.state)
         kind = "explore" if self._journey is None else "travel"
         return Plan(found.path, found.braking, found.views, found.value, kind)
 

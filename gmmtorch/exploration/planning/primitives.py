@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.rays.path_clearance import Motions
 
 _ROUNDING = 1e-9
 
@@ -115,6 +116,7 @@ class Primitives:
         ends = torch.cat([torch.zeros(len(library), 4, dtype=torch.float64), self.commands], 1)
         self._paths = self._rollout(ends)
         self._stops = self._braking(ends)
+        self._longest = self._longest_steps()
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -148,6 +150,24 @@ class Primitives:
         if follows is None:
             return self._braking(states)
         return _moved(self._stops[follows], flat).view(*states.shape[:-1], *self._stops.shape[1:])
+
+    def continued(self, states: Tensor) -> tuple[Motions, Tensor] | None:
+        """Return the motions from states (N, 7) after primitives, and the longest step (m) and the largest
+        turn (rad) in a step, (2,); None if a state has velocities with which no primitive ends.
+        """
+        follows = self._follows(states)
+        if follows is None:
+            return None
+        ends = _moved(self._paths[follows, :, -1:], states[:, None])[:, :, 0]
+        return Motions(self._paths, self._stops, follows, states, ends), self._longest[follows].amax(0)
+
+    def _longest_steps(self) -> Tensor:
+        """Return the longest step (m) and largest turn (rad) of the motions after each primitive, (P, 2)."""
+        rest = _moved(self._stops.expand(len(self), *self._stops.shape), self._paths[:, :, -1])
+        states = torch.cat([torch.zeros_like(rest[..., :1, :]), self._paths, rest], -2)[..., :4]
+        step = states[..., 1:, :] - states[..., :-1, :]
+        length = step[..., :3].square().sum(-1).sqrt()
+        return torch.stack([length.flatten(1).amax(1), step[..., 3].abs().flatten(1).amax(1)], 1)
 
     def _follows(self, states: Tensor) -> Tensor | None:
         """Return the primitive (N,) whose final velocities each state (N, 7) has; None if any state has

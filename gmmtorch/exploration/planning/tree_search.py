@@ -12,7 +12,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_whole
 from gmmtorch.exploration.information.view_cache import ViewCache
 from gmmtorch.exploration.planning.global_planner import Goal
-from gmmtorch.exploration.planning.planner_interface import Options, PlanningTask, options
+from gmmtorch.exploration.planning.planner_interface import PlanningTask, continuations, options
 from gmmtorch.exploration.planning.primitives import Primitives
 
 _FAR = 1e4  # metres
@@ -155,7 +155,7 @@ class _Tree:
         if goal is not None:
             self._metres[0] = _finite(goal.cost(start))
         self._options = options(primitives, start[None], task, may_escape=True)
-        self._open([root], self._options)
+        self._open([root], self._options.paths[:, :, -1], self._options.feasible)
 
     def grow(self, first: Sequence[int]) -> None:
         """Try the branch `first`, then the most promising leaves, round by round."""
@@ -262,18 +262,17 @@ class _Tree:
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]
             states = self._states[[node.number for node in some]]
-            self._open(some, options(self._primitives, states, self._task, after=depth))
+            self._open(some, *continuations(self._primitives, states, self._task, depth))
 
-    def _open(self, nodes: list[_Node], follow: Options) -> None:
-        """Store the primitives that can follow nodes."""
+    def _open(self, nodes: list[_Node], ends: Tensor, feasible: Tensor) -> None:
+        """Store the primitives that can follow N nodes: ends (N, P, 7), and which are feasible (N, P)."""
         rows = [node.number for node in nodes]
-        ends = follow.paths[:, :, -1]
         self._ends[rows] = ends
         order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
         if self._goal is not None:  # primitives that lead towards it come first
             self._metres_after[rows] = order = _finite(self._goal.cost(ends))
-        order = order.masked_fill(~follow.feasible, math.inf).argsort(dim=1, stable=True)
-        count = follow.feasible.sum(1).tolist()
+        order = order.masked_fill(~feasible, math.inf).argsort(dim=1, stable=True)
+        count = feasible.sum(1).tolist()
         for node, actions, n in zip(nodes, order.tolist(), count, strict=True):
             node.untried, node.closed = actions[:n], n == 0
 

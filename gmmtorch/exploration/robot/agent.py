@@ -73,8 +73,12 @@ class Agent:
         # Each robot has its own generator, so its draws do not depend on the other robots.
         seed = options.seed * _SEEDS_PER_MISSION + robot.number
         self._generator = torch.Generator().manual_seed(seed)
-        self._local_map: LocalMap | None = None
+        self._local_map: LocalMap | None = None  # none is needed at rest
         self._rests = False
+        self._begun = False
+        self._seen_from: tuple[Tensor, Tensor] | None = (
+            None  # the last pose, and the distances along its beams
+        )
         self._plan: Plan | None = None
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
@@ -105,8 +109,11 @@ class Agent:
         """A depth image of the world, in which teammates at (M, 3) are masked."""
         with self.watch("rendering"):
             options = self.options
+            pose = self.robot.state[:4]
+            if self._seen_from is None or not torch.equal(self._seen_from[0], pose):
+                self._seen_from = pose.clone(), options.camera.distances(mesh, pose)
             frame = options.camera.sense(
-                mesh, self.robot.state[:4], others, options.dynamics.radius, self._generator
+                mesh, pose, others, options.dynamics.radius, self._generator, self._seen_from[1]
             )
             return frame.to(options.device)
 
@@ -179,9 +186,13 @@ class Agent:
         """Takes the snapshot of the map that `propose` uses, whatever arrives meanwhile."""
         robot, options = self.robot, self.options
         with self.watch("planning"):
-            self._local_map = robot.local_map(options.planning_prior, options.dynamics.radius, options.window)
-            self._rests = robot.should_rest(now)
-            robot.roadmap.update(self._local_map)
+            self._begun, self._rests = True, robot.should_rest(now)
+            self._local_map = None
+            if not self._rests:
+                self._local_map = robot.local_map(
+                    options.planning_prior, options.dynamics.radius, options.window
+                )
+                robot.roadmap.update(self._local_map)
 
     def propose(
         self, now: float, final: Collection[int], peers: PeerTrajectories, since: float | None = None
@@ -195,9 +206,12 @@ class Agent:
 
         Raises `RuntimeError` before the first `begin_planning`.
         """
-        if self._local_map is None:
+        if not self._begun:
             raise RuntimeError("begin_planning() must come before propose().")
         with self.watch("planning"):
+            if self._local_map is None:
+                self._plan = self._waiting.rest(self.robot.state)
+                return self._plan
             known = [
                 heard.views.to(torch.float64)
                 for number, heard in sorted(self.robot.plans.items())
@@ -217,14 +231,11 @@ class Agent:
                 generator=self._generator,
                 trail=self.robot.trail,
             )
-            if self._rests:
-                self._plan = self._waiting.rest(task)
-            else:
-                self._plan = (
-                    retreat(self._primitives, task)
-                    or self._waiting.boxed_in(task)
-                    or self.robot.planner.plan(task)
-                )
+            self._plan = (
+                retreat(self._primitives, task)
+                or self._waiting.boxed_in(task)
+                or self.robot.planner.plan(task)
+            )
         return self._plan
 
     def follow(self) -> None:

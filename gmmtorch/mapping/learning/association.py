@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.choice import is_fused
+from gmmtorch.kernels.mixtures.explained_points import explained_points
 from gmmtorch.linalg import dense_ranks
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.cones import whitening
@@ -59,21 +61,39 @@ def count_explained(
     limit = explained_within(components.dim, explained)
     inverse, _ = whitening(components.covariances[rows])
     means = components.means[rows].double()
-    gained = components.support.new_zeros(len(rows))
-    reach = None if frees is None else box_around(components.selected(rows), limit)
-    for part, some in _portions(points, len(rows), reach):
+    if is_fused(points, means):
+        gained, found = explained_points(points, means, inverse, limit, _LEAST_DISTANCE, near[rows], frees)
+    else:
+        gained, found = _shared_out(components.selected(rows), points, inverse, limit, near[rows], frees)
+    gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
+    counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
+    return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
+
+
+def _shared_out(
+    components: Components,
+    points: Tensor,
+    inverse: Tensor,
+    limit: float,
+    near: Tensor,
+    frees: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """`explained_points` in tensor operations; inverse (K, D, D)."""
+    means = components.means.double()
+    gained = means.new_zeros(len(components))
+    found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    reach = None if frees is None else box_around(components, limit)
+    for part, some in _portions(points, len(components), reach):
         offset = points[part, None].double() - means[some]
         squared = torch.einsum("kij,nkj->nki", inverse[some], offset).square().sum(-1)
         explains = squared < limit
         if frees is not None:
-            explains &= near[rows[some]] | ~frees[part, None]
+            explains &= near[some] | ~frees[part, None]
         share = torch.where(explains, squared.clamp_min(_LEAST_DISTANCE).reciprocal(), 0.0)
         total = share.sum(1)
         found[part] = total > 0
         gained[some] += (share / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]).sum(0)
-    gain = components.support.new_zeros(k).index_copy_(0, rows, gained * weight)
-    counts = components.seen_count.index_add(0, nearest[rows], gain[rows])
-    return Explained(replace(components, support=components.support + gain, seen_count=counts), found)
+    return gained, found
 
 
 def explained_within(dim: int, explained: float | None) -> float:

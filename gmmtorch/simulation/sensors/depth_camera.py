@@ -105,6 +105,7 @@ class DepthCamera:
         others: ArrayLike,
         radius: float,
         generator: torch.Generator,
+        truth: Tensor | None = None,
     ) -> DepthFrame:
         """The frame at a pose.
 
@@ -116,24 +117,31 @@ class DepthCamera:
             pose: (4,) x, y, z in metres, yaw in radians.
             others: (M, 3) centres of the teammates' bodies, metres.
             radius: radius of a teammate's body (m).
+            truth: the `distances` from this pose, if they are known.
         """
-        pose = as_tensor(pose, "pose", torch.float64)
+        pose = _checked_pose(pose)
         others = as_tensor(others, "others", torch.float64)
-        _check_finite("pose", pose, (4,))
         _check_finite("others", others, (len(others), 3))
         origin, directions = pose[:3], self._turned(float(pose[3]))
         error = torch.randn(len(directions), generator=generator, dtype=torch.float64) * self.noise
         kept = torch.rand(len(directions), generator=generator, dtype=torch.float64) >= self.dropout
-        truth = world.distances(origin, directions, threads=torch.get_num_threads())
+        truth = self.distances(world, pose) if truth is None else truth
         reach = truth.clamp_max(self.max_range)
         reading = reach + error * reach.square() * self.directions[:, 0]  # z = r · directions[:, 0]
         is_hit = (truth < self.max_range) & (reading < self.max_range)
         reading = torch.where(is_hit, reading.clamp_min(_CLOSEST_READING), self.max_range)
+        body = radius + _TEAMMATE_MARGIN
+        others = others[(others - origin).norm(dim=1) < self.max_range + body + _TEAMMATE_MARGIN]
         if len(others):
-            kept &= _distance_to_spheres(others - origin, radius + _TEAMMATE_MARGIN, directions) >= reach
+            kept &= _distance_to_spheres(others - origin, body, directions) >= reach
         pixel = kept.nonzero().squeeze(1)
         ends = torch.addcmul(origin, directions[pixel], reading[pixel, None])
         return DepthFrame(origin, ends, is_hit[pixel], pixel)
+
+    def distances(self, world: MeshWorld, pose: ArrayLike) -> Tensor:
+        """Distances (height · width,), metres, to the first surface along the beams from a pose (4,)."""
+        pose = _checked_pose(pose)
+        return world.distances(pose[:3], self._turned(float(pose[3])), threads=torch.get_num_threads())
 
     def image(self, frame: DepthFrame) -> Tensor:
         """Depth image (height, width) of a frame of this camera, metres along the optical axis.
@@ -164,6 +172,12 @@ def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> 
     hits = (root >= 0) & (along > 0)
     entry = torch.where(hits, along - root.clamp_min(0).sqrt(), math.inf)
     return torch.where(distance <= radius**2, 0.0, entry).amin(1)
+
+
+def _checked_pose(pose: ArrayLike) -> Tensor:
+    pose = as_tensor(pose, "pose", torch.float64)
+    _check_finite("pose", pose, (4,))
+    return pose
 
 
 def _check_finite(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
