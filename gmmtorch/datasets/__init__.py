@@ -52,7 +52,7 @@ def load(
     poses: str | Path | None = None,
     **options: Any,
 ) -> Dataset:
-    """The data set `name`: a sequence of `Scan`s, each read when it is accessed.
+    """The data set `name`: a sequence of scans, each read when it is accessed.
 
     Args:
         name: carmen, scan_folder, pcd_viewpoint, depth_frames, octomap_log, rosbag, kitti, tum, mesh or

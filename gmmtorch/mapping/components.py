@@ -29,7 +29,8 @@ class Components:
 
     A viewpoint is a component, an origin that observed it, and the number of points observed from there.
 
-    means (K, D), covariances (K, D, D).
+    means (K, D): metres.
+    covariances (K, D, D): m².
     support (K,): number of points of each component.
     max_range (K,) bool: the component describes ends of no-return beams, not a surface.
     ids (K, 2): robot, sequence number.

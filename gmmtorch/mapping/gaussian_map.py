@@ -227,7 +227,7 @@ class GaussianMap(nn.Module):
                 world ← camera.
             intrinsics: (3, 3) pinhole matrix of images of this size, in pixels.
             pixel_stride: uses every `pixel_stride`-th pixel of every `pixel_stride`-th row; each counts for
-                `pixel_stride`² points. With 1, every pixel is used.
+                `pixel_stride²` points. With 1, every pixel is used.
             max_range: pixels at or beyond it (m) are left out, as are pixels that are zero or not finite.
             depth_scale: metres per unit of the images, such as 0.001 for millimetres. Images of integers need
                 it; None: metres, in a floating type.

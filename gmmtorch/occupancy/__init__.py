@@ -5,8 +5,9 @@ Public names are imported when they are first used, so that `import gmmtorch.occ
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from gmmtorch.occupancy.cones import Cones as Cones
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from gmmtorch.occupancy.voxels.rolling_window import RollingWindow as RollingWindow
     from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence as SparseEvidence
 
-_NAMES = {
+_MODULES = {
     "cones": ["Cones"],
     "evidence": ["CellClass", "Evidence", "Thresholds", "occupancy_probability"],
     "forms.cone.cone_evidence": ["cone_evidence"],
@@ -57,12 +58,6 @@ _NAMES = {
     "voxels.rolling_window": ["RollingWindow"],
     "voxels.sparse_evidence": ["SparseEvidence"],
 }
-_HOMES = {name: f"gmmtorch.occupancy.{module}" for module, names in _NAMES.items() for name in names}
-
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'gmmtorch.occupancy' has no attribute {name!r}")
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__, {name: module for module, names in _MODULES.items() for name in names}
+)

@@ -40,6 +40,8 @@ class Restored(NamedTuple):
 class Store:
     """Keeps the records, sessions and progress of one robot in a SQLite file.
 
+    Usage::
+
         with Store(path, robot=0) as store:
             store.restore(replica)
             datagrams = replica.datagrams()

@@ -1,0 +1,87 @@
+"""Sphinx: the site of gmmtorch. `./scripts/site.sh` builds it to outputs/site, without a network."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import version as installed
+from typing import Any
+
+project = "gmmtorch"
+author = "The gmmtorch developers"
+project_copyright = "The gmmtorch developers"
+release = installed("gmmtorch")
+version = release
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"gmmtorch {release}"
+html_static_path: list[str] = []
+html_copy_source = False
+suppress_warnings = ["ref.python"]  # words of Literal types that are also names of attributes
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath", "attrs_block"]
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+
+autodoc_member_order = "groupwise"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+default_role = "code"  # docstrings quote code by single backticks
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+
+_TOP = {
+    "README.md": "index.md",
+    "BENCHMARKS.md": "benchmarks.md",
+    "CHANGELOG.md": "changes.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "examples": "examples.md",
+}
+"""Files of the repository's root, and the pages of the site that show them."""
+_FIELD = re.compile(r"([a-z_]\w*(?:, [a-z_]\w*)*(?: \([^)]*\))?(?: bool)?): (.+)")
+
+
+def _links(app: Any, name: str, source: list[str]) -> None:
+    """Pages link to files of the repository, where people read them too. On the site these are its pages."""
+    for path, page in _TOP.items():
+        source[0] = re.sub(rf"\]\(\.\./{re.escape(path)}(?=[#)])", f"]({page}", source[0])
+
+
+def _included_links(app: Any, path: Any, parent: str, source: list[str]) -> None:
+    """Links of the root's files start at the root."""
+    source[0] = re.sub(r"\]\((?!\w+:|#)", "](../", source[0]).replace("](../docs/", "](")
+    _links(app, parent, source)
+
+
+def _docstring(app: Any, what: str, name: str, item: Any, options: Any, lines: list[str]) -> None:
+    """Writes the lines `field: text` of a class as a definition list, and keeps norms such as |x|."""
+    found: list[str] = []
+    for line in lines:
+        field = _FIELD.fullmatch(line) if what == "class" else None
+        if (
+            found
+            and found[-1]
+            and line
+            and found[-1].startswith(" ") != bool(field)
+            and not line.startswith(" ")
+        ):
+            found.append("")  # before and after the list
+        found += [f"``{field[1]}``", f"    {field[2]}"] if field else [line]
+    lines[:] = [re.sub(r"\|(?=\S)", r"\|", line) for line in found]
+
+
+def _skip(app: Any, what: str, name: str, item: Any, skip: bool, options: Any) -> bool:
+    """Leaves out what scikit-learn's base class adds for the routing of metadata."""
+    return skip or name.endswith(("_request", "_metadata_routing"))
+
+
+def setup(app: Any) -> None:
+    app.connect("source-read", _links)
+    app.connect("include-read", _included_links)
+    app.connect("autodoc-process-docstring", _docstring, priority=400)  # before napoleon
+    app.connect("autodoc-skip-member", _skip)
