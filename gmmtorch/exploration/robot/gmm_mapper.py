@@ -29,7 +29,7 @@ from gmmtorch.mapping.learning.viewpoints import all_origins
 from gmmtorch.mapping.rays.component_rays import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
-from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
+from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.sharing.broadcast import Broadcast
@@ -270,30 +270,17 @@ class GmmMapper(Mapper):
     def _evidence(self, batch: Components, resolution: float, box: Box) -> CellEvidence:
         """The evidence of components for the cells of a box."""
         rule = self._rule
-        surfaces, empty = (
-            batch.selected((batch.max_range == kind).nonzero().squeeze(1)) for kind in (False, True)
+        return component_evidence(
+            batch,
+            resolution,
+            box,
+            rays_per_cell=rule.rays,
+            shell=rule.shell,
+            hits_per_ray=rule.hits_per_ray,
+            thinned=True,
+            empty_rays_per_cell=_EMPTY_RAYS * rule.rays,
+            empty_cutoff=_EMPTY_CUTOFF,
         )
-        parts = []
-        if len(surfaces):
-            parts.append(
-                component_evidence(
-                    surfaces,
-                    resolution,
-                    box,
-                    rays_per_cell=rule.rays,
-                    shell=rule.shell,
-                    hits_per_ray=rule.hits_per_ray,
-                    thinned=True,
-                )
-            )
-        if len(empty):
-            rays = _EMPTY_RAYS * rule.rays
-            parts.append(
-                component_evidence(
-                    empty, resolution, box, rays_per_cell=rays, cutoff=_EMPTY_CUTOFF, thinned=True
-                )
-            )
-        return sum_evidence(parts) if parts else CellEvidence.empty(box.low.device)
 
 
 def _key(batch: Components) -> bytes:

@@ -10,9 +10,10 @@ from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.rays.cell_counts import flags_of_cells
 from gmmtorch.kernels.rays.cell_entropy import entropy_removed
 from gmmtorch.occupancy.evidence import Thresholds, bernoulli_entropy, check_prior, occupancy_probability
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index
+from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
 
@@ -78,8 +79,7 @@ class BeliefMap:
         self.grid = SparseEvidence(resolution, box=bounds, dtype=torch.float32)
         self.rule = rule
         self._low = box.low
-        self._observable = observable.reshape(-1).to(device)
-        self._shape = box.shape
+        self._observable = observable.to(device)
         self.observable_bits = float(observable.sum())
         self.clear()
 
@@ -93,17 +93,13 @@ class BeliefMap:
     def add(self, evidence: CellEvidence) -> Tensor:
         """Add evidence; returns which of its cells (C,) are observable."""
         before = self.grid.add(evidence)
-        chosen = self._is_observable(evidence.cells)
+        chosen = flags_of_cells(evidence.cells, self._low, self._observable)
         added = evidence.hits, evidence.misses
         removed = entropy_removed(before, added, chosen, self.rule.prior, self.rule.clamp)
         self.known_bits += removed.bits
         self.entropy_bits -= removed.chosen_bits
         self.n_observed += removed.n_new
         return chosen
-
-    def _is_observable(self, cells: Tensor) -> Tensor:
-        flat, inside = flat_index(cells - self._low, self._shape)
-        return inside & self._observable[flat]
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3), on the device of the cells."""

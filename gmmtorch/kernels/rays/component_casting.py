@@ -82,6 +82,8 @@ _QUANTILE = """
 
 _COMPONENT = """
     const int64_t row = item / parts, part = item % parts, by = seen_by[row];
+    const bool returns = !max_range[by];
+    const double cutoff = cutoffs[returns ? 0 : 1], rays_per_cell = densities[returns ? 0 : 1];
     const double* mean = means + 3 * by;
     const double* sigma = covariances + 9 * by;
     const double* origin = origins + 3 * seen_from[row];
@@ -100,7 +102,6 @@ _COMPONENT = """
         }
     }
     if (near_from > near_to) return;
-    const bool returns = !max_range[by];
     const int64_t times = returns && near_to >= 1.0 ? hits_per_ray : 1;
     double l[3][3];  // Cholesky factor
     for (int i = 0; i < 3; ++i) {
@@ -174,6 +175,7 @@ _COMPONENT = """
 
 _DRAWS = f"""
     const double* lows = bounds + 6;
+    const double* shrinkages = shrinkage + (returns ? 0 : n_radii);
     const int dim = 3;
     const double unit = 1.0, CLOSEST = 0x1p-33, STEP = {_RADII / _FARTHEST_DRAW!r};
     const int64_t size0 = (int64_t)(bounds[9] - lows[0]), size1 = (int64_t)(bounds[10] - lows[1]);
@@ -192,8 +194,8 @@ _DRAWS = f"""
         }}
         const double position = sqrt(square) * STEP;
         const int64_t step_of = (int64_t)position;
-        const double below = shrinkage[step_of];
-        const double shrunk = below + (position - (double)step_of) * (shrinkage[step_of + 1] - below);
+        const double below = shrinkages[step_of];
+        const double shrunk = below + (position - (double)step_of) * (shrinkages[step_of + 1] - below);
         double end[3];
         for (int i = 0; i < 3; ++i) {{
             end[i] = mean[i];
@@ -232,8 +234,9 @@ _CAST = FusedKernel(
     "cast_components",
     "const double* means, const double* covariances, const double* origins, const bool* max_range,"
     " const int64* ids, const int64* seen_by, const int64* seen_from, const double* seen_count,"
-    " const double* sobol, int64 n_sobol, const double* shrinkage, const double* bounds, int64 parts,"
-    " double resolution, double rays_per_cell, int64 least, int64 most, double cutoff, double area,"
+    " const double* sobol, int64 n_sobol, const double* shrinkage, int64 n_radii, const double* bounds,"
+    " int64 parts, double resolution, const double* densities, int64 least, int64 most,"
+    " const double* cutoffs, double area,"
     " double shell, int64 hits_per_ray, bool thinned, double* hits, double* misses, bool* failed",
     _QUANTILE + _COMPONENT + _DRAWS,
     shares=True,
@@ -250,10 +253,10 @@ def cast_components(
     bounds: Tensor,
     *,
     resolution: float,
-    rays_per_cell: float,
+    rays_per_cell: tuple[float, float],
     least: int,
     most: int,
-    cutoff: float,
+    cutoff: tuple[float, float],
     shell: float,
     hits_per_ray: int,
     thinned: bool,
@@ -264,6 +267,7 @@ def cast_components(
         means: (K, 3), covariances: (K, 3, 3), origins: (V, 3), metres, float64. max_range: (K,) bool.
         ids: (K, 2) int64.
         bounds: (4, 3) float64, lowest and highest cell of the box whose rays count, and of the window.
+        rays_per_cell, cutoff: of components of surfaces, and of those of no-return beams.
         shell: metres before a component's surface that rays do not count as free.
 
     For the others see `component_evidence`. A cell differs from the twin's by rounding, unless a ray passes
@@ -280,14 +284,15 @@ def cast_components(
         *(value.contiguous() for value in (means, covariances, origins, max_range, ids, *seen)),
         points,
         points.shape[1],
-        _shrinkage(cutoff, str(device)),
+        _shrinkages(cutoff, str(device)),
+        _RADII + 2,
         bounds.contiguous(),
         parts,
         resolution,
-        rays_per_cell,
+        torch.tensor(rays_per_cell, dtype=torch.float64, device=device),
         least,
         most,
-        cutoff,
+        torch.tensor(cutoff, dtype=torch.float64, device=device),
         EFFECTIVE_AREA,
         shell,
         hits_per_ray,
@@ -393,6 +398,12 @@ def _shrinkage(cutoff: float, device: str) -> Tensor:
     shrunk = low / radius.clamp_min(1e-9)
     shrunk[:8] = shrunk[8]  # F loses its digits near 0, where the factor is constant
     return shrunk.to(device)
+
+
+@functools.cache
+def _shrinkages(cutoffs: tuple[float, float], device: str) -> Tensor:
+    """`_shrinkage` of two cutoffs, (2, _RADII + 2)."""
+    return torch.stack([_shrinkage(cutoff, device) for cutoff in cutoffs])
 
 
 def _chi3(radius: Tensor) -> Tensor:

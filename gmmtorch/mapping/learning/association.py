@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -98,8 +99,12 @@ def _shared_out(
 
 def explained_within(dim: int, explained: float | None) -> float:
     """The squared Mahalanobis distance within which components explain points; see `count_explained`."""
-    if explained is not None:
-        return explained
+    return _quantile(dim) if explained is None else explained
+
+
+@functools.cache
+def _quantile(dim: int) -> float:
+    """The 95 % quantile of χ² with `dim` degrees of freedom."""
     from scipy.stats import chi2
 
     return float(chi2.ppf(0.95, dim))

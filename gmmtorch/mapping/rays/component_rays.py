@@ -75,6 +75,8 @@ def component_evidence(
     shell: float = 0.0,
     hits_per_ray: int = 1,
     thinned: bool = False,
+    empty_rays_per_cell: float | None = None,
+    empty_cutoff: float | None = None,
 ) -> CellEvidence:
     """Evidence of components in the cells of a box, from their rays: see `component_rays`.
 
@@ -88,16 +90,45 @@ def component_evidence(
         hits, few for each cell, are the noisy part.
     thinned: in the first half of the way, follow only a quarter of a viewpoint's rays, with four times the
         weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
+    empty_rays_per_cell, empty_cutoff: `rays_per_cell` and `cutoff` of components of no-return beams, if they
+        differ.
     """
     check_whole("hits_per_ray", hits_per_ray, 1)
     if not 0 <= shell < math.inf:
         raise InvalidArgumentError(f"shell={shell} must be finite, at least zero cells.")
     density = _Density(resolution, rays_per_cell, least, most, cutoff)
+    of_empty = _Density(
+        resolution,
+        rays_per_cell if empty_rays_per_cell is None else empty_rays_per_cell,
+        least,
+        most,
+        cutoff if empty_cutoff is None else empty_cutoff,
+    )
     seen = _counted(components, resolution)
     if is_fused(components.means, box.low):
-        found = _fused(components, seen, box, density, shell, hits_per_ray, thinned)
+        found = _fused(components, seen, box, (density, of_empty), shell, hits_per_ray, thinned)
         if found is not None:
             return found
+    if density == of_empty:
+        return _drawn(components, seen, box, density, shell, hits_per_ray, thinned)
+    is_empty = components.max_range[components.seen_by[seen]]
+    return sum_evidence(
+        _drawn(components, seen[chosen], box, each, shell, hits_per_ray, thinned)
+        for chosen, each in ((~is_empty, density), (is_empty, of_empty))
+        if bool(chosen.any())
+    )
+
+
+def _drawn(
+    components: Components,
+    seen: Tensor,
+    box: Box,
+    density: _Density,
+    shell: float,
+    hits_per_ray: int,
+    thinned: bool,
+) -> CellEvidence:
+    """`component_evidence` of the viewpoints `seen` (C,), from a list of their rays."""
     seen = seen[_in_reach(components, seen, box, density)]
     # If a component's points cannot be in the box, only its passing rays matter.
     ends_here = (
@@ -117,7 +148,7 @@ def _fused(
     components: Components,
     seen: Tensor,
     box: Box,
-    density: _Density,
+    densities: tuple[_Density, _Density],
     shell: float,
     hits_per_ray: int,
     thinned: bool,
@@ -125,7 +156,9 @@ def _fused(
     """`component_evidence` by the fused kernel; None where the twin repairs, refuses or saves memory."""
     if len(seen) == 0:
         return CellEvidence.empty(seen.device)
-    extent = _extent(components, seen, density)
+    density, of_empty = densities
+    cutoff = torch.where(components.max_range, of_empty.cutoff, density.cutoff)
+    extent = _extent(components, seen, cutoff, density.resolution)
     if extent is None:
         return None
     window = intersection(box, extent)
@@ -143,10 +176,10 @@ def _fused(
         Seen(components.seen_by[seen], components.seen_from[seen], count),
         torch.stack([*box, *window]).double(),
         resolution=density.resolution,
-        rays_per_cell=density.rays_per_cell,
+        rays_per_cell=(density.rays_per_cell, of_empty.rays_per_cell),
         least=density.least,
         most=density.most,
-        cutoff=density.cutoff,
+        cutoff=(density.cutoff, of_empty.cutoff),
         shell=shell * density.resolution,
         hits_per_ray=hits_per_ray,
         thinned=thinned,
@@ -154,12 +187,16 @@ def _fused(
     return None if found is None else CellEvidence.from_dense(window.low, *found)
 
 
-def _extent(components: Components, seen: Tensor, density: _Density) -> Box | None:
-    """Cells that the rays of the viewpoints `seen` (C,) can meet; None if they are too far away."""
+def _extent(components: Components, seen: Tensor, cutoff: Tensor, resolution: float) -> Box | None:
+    """Cells that the rays of the viewpoints `seen` (C,) can meet; None if they are too far away.
+
+    Args:
+        cutoff: (K,), deviations.
+    """
     means, origins = components.means.double(), components.origins.double()
-    spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
+    spread = cutoff[:, None] * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
     corners = torch.cat([means - spread, means + spread, origins[components.seen_from[seen]]])
-    cells = (corners / density.resolution).floor().nan_to_num(math.inf)
+    cells = (corners / resolution).floor().nan_to_num(math.inf)
     if not bool(cells.abs().max() < _FARTHEST):
         return None
     cells = cells.long()

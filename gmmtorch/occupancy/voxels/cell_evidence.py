@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.kernels.rays.cell_counts import list_counted_cells
 from gmmtorch.kernels.rays.ray_traversal import row_major_strides
 
 
@@ -32,15 +33,7 @@ class CellEvidence(NamedTuple):
     @classmethod
     def from_dense(cls, low: Tensor, hits: Tensor, misses: Tensor) -> CellEvidence:
         """The cells with any evidence of a dense block (nx, ny, nz) whose lowest cell is `low` (3,)."""
-        _, ny, nz = hits.shape
-        flat = ((hits > 0) | (misses > 0)).flatten().nonzero().squeeze(1)
-        column = flat // nz
-        cells = torch.stack([column // ny, column % ny, flat % nz], 1)
-        return cls(
-            cells + low,
-            hits.flatten().index_select(0, flat).float(),
-            misses.flatten().index_select(0, flat).float(),
-        )
+        return cls(*list_counted_cells(low, hits, misses))
 
 
 def sum_evidence(parts: Iterable[CellEvidence]) -> CellEvidence:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.kernels.rays.cell_counts import add_counts
 from gmmtorch.kernels.rays.cell_index import BlockKeys, cell_index
 from gmmtorch.kernels.rays.ray_traversal import CHUNK_VISITS
 from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
@@ -134,15 +135,12 @@ class SparseEvidence(SparseLattice):
         self._check_cells(evidence.cells)
         index = self._index_of(evidence.cells)
         if len(index) and bool(index.min() < 0):
-            columns = self.columns(evidence.cells[index < 0])
-            self._allocate(self.block_keys(columns).unique())
-            index = self._index_of(evidence.cells)
+            missing = (index < 0).nonzero().squeeze(1)
+            cells = evidence.cells.index_select(0, missing)
+            self._allocate(self.block_keys(self.columns(cells)).unique())
+            index[missing] = self._index_of(cells)
         # Index 0, of cells outside, is in the empty block, which stays empty.
-        inside = index > 0
-        before = [counts.view(-1).index_select(0, index) for counts in self.counts]
-        for counts, old, more in zip(self.counts, before, evidence[1:], strict=True):
-            counts.view(-1).index_copy_(0, index, old + torch.where(inside, more, 0.0).to(old.dtype))
-        return before[0], before[1]
+        return add_counts(self.counts, index, evidence.hits, evidence.misses)
 
     def add_from(self, other: SparseEvidence, box: Box) -> None:
         """Add the evidence that another store has in a box; cells outside the box of this store are ignored.

@@ -18,6 +18,7 @@ EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 OPTIONS = {
     "plain": {},
     "thinned": {"thinned": True, "shell": 0.5, "hits_per_ray": 8},
+    "empty apart": {"thinned": True, "shell": 0.5, "empty_rays_per_cell": 2.0, "empty_cutoff": 1.5},
     "few": {"rays_per_cell": 0.1, "least": 1, "most": 3, "cutoff": 1.0, "thinned": True},
 }
 BOXES = {
