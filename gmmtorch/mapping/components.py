@@ -35,9 +35,10 @@ class Components:
     max_range (K,) bool: the component describes ends of no-return beams, not a surface.
     ids (K, 2): robot, sequence number.
     origins (S, D): sensor positions.
-    Fields can be arrays, lists or tensors; they become float64, int64 and bool tensors.
     seen_by, seen_from, seen_count (E,): `seen_count[e]` points of component `seen_by[e]` were observed from
         `origins[seen_from[e]]`. The counts of a component add up to its support.
+
+    Fields can be arrays, lists or tensors; they become float64, int64 and bool tensors.
     """
 
     means: Tensor

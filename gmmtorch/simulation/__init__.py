@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from gmmtorch.simulation.sensors.range_sensors import sense as sense
     from gmmtorch.simulation.sensors.range_sensors import simulate_scan as simulate_scan
     from gmmtorch.simulation.sensors.range_sensors import spinning_lidar as spinning_lidar
-    from gmmtorch.simulation.sensors.trajectories import poses_2d as poses_2d
-    from gmmtorch.simulation.sensors.trajectories import poses_3d as poses_3d
-    from gmmtorch.simulation.sensors.trajectories import smooth_path as smooth_path
+    from gmmtorch.simulation.sensors.sensor_paths import poses_2d as poses_2d
+    from gmmtorch.simulation.sensors.sensor_paths import poses_3d as poses_3d
+    from gmmtorch.simulation.sensors.sensor_paths import smooth_path as smooth_path
     from gmmtorch.simulation.worlds.hall_3d import World3D as World3D
     from gmmtorch.simulation.worlds.hall_3d import building_3d as building_3d
     from gmmtorch.simulation.worlds.mesh_world import MeshWorld as MeshWorld
@@ -45,7 +45,7 @@ _MODULES = {
         "simulate_scan",
         "spinning_lidar",
     ),
-    "sensors.trajectories": ("poses_2d", "poses_3d", "smooth_path"),
+    "sensors.sensor_paths": ("poses_2d", "poses_3d", "smooth_path"),
     "worlds.hall_3d": ("World3D", "building_3d"),
     "worlds.mesh_world": ("MeshWorld",),
     "worlds.office_2d": ("World2D", "building_2d"),

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_triangles
-from gmmtorch.simulation.sensors.trajectories import smooth_path
+from gmmtorch.simulation.sensors.sensor_paths import smooth_path
 from gmmtorch.simulation.worlds.floor_plan import DrawPiece, Room, furnish
 from gmmtorch.simulation.worlds.furniture import (
     CEILING,

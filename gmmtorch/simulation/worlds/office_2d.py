@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.simulation.sensors.mesh_raycasting import ray_segments
-from gmmtorch.simulation.sensors.trajectories import smooth_path
+from gmmtorch.simulation.sensors.sensor_paths import smooth_path
 from gmmtorch.simulation.worlds.floor_plan import (
     Footprint,
     Piece,
