@@ -21,8 +21,8 @@ from gmmtorch.exploration.robot.robot_state import Robot
 from gmmtorch.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.exploration.world.scoring import BeliefMap
 from gmmtorch.exploration.world.world import World
-from gmmtorch.occupancy.voxels.boxes import Box, flat_index
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.kernels.rays.ray_marks import mark_cells_of_rays
+from gmmtorch.occupancy.voxels.boxes import Box, to_lattice
 from gmmtorch.sharing.transport.simulated_network import Network
 from gmmtorch.simulation.sensors.depth_camera import DepthFrame
 
@@ -41,8 +41,7 @@ class MissionScore:
 
     def __init__(self, world: World, agents: Sequence[Agent], network: Network, options: TeamOptions) -> None:
         self.union = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
-        bits = torch.int16 if len(agents) < 16 else torch.int32
-        self.seen_by = torch.zeros(world.observable.numel(), dtype=bits, device=options.device)
+        self.seen_by = torch.zeros(world.observable.numel(), dtype=torch.int32, device=options.device)
         self._box = Box(*(side.to(options.device) for side in world.box))
         self.samples: dict[str, list[Any]] = {
             "times": [],
@@ -100,9 +99,10 @@ class MissionScore:
         width, world = self._options.camera.width, self._world
         row, column = frame.pixel // width, frame.pixel % width
         some = (row % _SEEN_STRIDE == 0) & (column % _SEEN_STRIDE == 0)
-        seen = cast_evidence(frame.origin, frame.ends[some], frame.is_hit[some], world.resolution, self._box)
-        flat, _ = flat_index(seen.cells - self._box.low, world.box.shape)
-        self.seen_by[flat] |= 1 << robot.number
+        stops = to_lattice(frame.ends[some], world.resolution, "ends")
+        starts = to_lattice(frame.origin, world.resolution, "origin").expand_as(stops)
+        marks = self.seen_by.view(world.box.shape)
+        mark_cells_of_rays(marks, starts, stops, frame.is_hit[some], self._box.low, 1 << robot.number)
 
     def _missing_share(self) -> float:
         """Of the records that any robot holds, the largest share that one robot lacks."""

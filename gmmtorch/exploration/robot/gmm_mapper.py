@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -126,6 +127,7 @@ class GmmMapper(Mapper):
         self._n_frames = 0
         self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
         self._by_place: list[tuple[Tensor, Components]] = []  # batches with the box (2, 3) that they explain
+        self._near: tuple[list[Components], Components] | None = None  # the last `_seen_from_near`
 
     # -- sensing ----------------------------------------------------------------------------------
 
@@ -218,7 +220,12 @@ class GmmMapper(Mapper):
             for offset in itertools.product((-1, 0, 1), repeat=3)
             for batch in self._by_origin.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
         ]
-        return summed(Components.concatenate(near)) if near else None
+        if not near:
+            return None
+        known = [] if self._near is None else self._near[0]
+        if self._near is None or len(known) != len(near) or any(map(operator.is_not, known, near)):
+            self._near = near, summed(Components.concatenate(near))
+        return self._near[1]
 
     def _origin_cell(self, origin: Tensor) -> tuple[int, ...]:
         """The cell of `_by_origin` that contains a place (3,)."""

@@ -94,10 +94,12 @@ _KERNEL = FusedKernel(
     float* gain = gains + item * n_blocks;
     float* taken = takens + item * n_blocks;
     // p: first hits. v: those of the sharpened occupancy. kp, kv: upper halves of K p and K v.
-    float* p = scratch + item * 4 * n_columns;
+    float* p = scratch + item * 6 * n_columns;
     float* v = p + n_columns;
     float* kp = v + n_columns;
     float* kv = kp + n_columns;
+    float* met = kv + n_columns;  // the occupancies, and the sharpened ones
+    float* sharpened = met + n_columns;
     for (int64_t beam = 0; beam < n_beams; ++beam) {{
         const int64_t t = yaws[item] * n_beams + beam;
         int64_t n = lengths[t];
@@ -107,16 +109,22 @@ _KERNEL = FusedKernel(
         }}
         const int32_t* offset = offsets + t * n_columns;
         const float* volume = volumes + t * n_columns;
+        int64_t first = 0;  // cell that can be hit
+        while (first < n && occupancies[base + offset[first]] == 0.0f) ++first;
+        for (int64_t i = first; i < n; ++i) met[i] = occupancies[base + offset[i]];
+        for (int64_t i = first; i < n; ++i) {{
+            const float oo = met[i] * met[i], clear = 1.0f - met[i];
+            sharpened[i] = oo / (clear * clear + oo);
+        }}
         float reach = 1.0f, sharp_reach = 1.0f;
         double total = 0.0, information = 0.0;
-        int64_t stop = 0;  // after the last cell that can be hit
-        for (int64_t i = 0; i < n; ++i) {{
-            const float o = occupancies[base + offset[i]], clear = 1.0f - o;
+        int64_t stop = first;  // after the last cell that can be hit
+        for (int64_t i = first; i < n; ++i) {{
+            const float o = met[i], clear = 1.0f - o, sharp = sharpened[i];
             p[i] = reach * o;
             v[i] = 0.0f;
             if (o == 0.0f) continue;
             stop = i + 1;
-            const float oo = o * o, sharp = oo / (clear * clear + oo);
             v[i] = sharp_reach * sharp;
             total += clear * p[i];
             if (is_shannon && o < 1.0f) {{
@@ -130,31 +138,47 @@ _KERNEL = FusedKernel(
         }}
         if (!(total > WORTHLESS)) continue;
         if (!is_shannon) {{
-            for (int64_t i = 0; i < stop; ++i) {{
+            for (int64_t i = first; i < stop; ++i) {{
                 kp[i] = 0.5f * p[i];
                 kv[i] = 0.5f * v[i];
             }}
             for (int64_t s = 1; s <= band; ++s) {{
                 const float* diagonal = kernel + ((s - 1) * n_templates + t) * n_columns;
-                for (int64_t i = 0; i + s < stop; ++i) {{
+                for (int64_t i = first; i + s < stop; ++i) {{
                     kp[i] += diagonal[i] * p[i + s];
                     kv[i] += diagonal[i] * v[i + s];
                 }}
             }}
             double like = 0.5 * reach * reach, cross = (double)reach * sharp_reach;  // without a hit
-            for (int64_t i = 0; i < stop; ++i) {{
+            for (int64_t i = first; i < stop; ++i) {{
                 like += p[i] * kp[i];
                 cross += p[i] * kv[i] + v[i] * kp[i];
             }}
             information = log(2.0 * like) - 2.0 * log(cross);
         }}
         const float share = (float)(GMM_MAX(information, 0.0) / total);
-        for (int64_t i = 0; i < stop; ++i) {{
+        // Neighbouring cells mostly share a block, whose sums stay in registers.
+        int64_t block = -1;
+        float gained = 0.0f, took = 0.0f;
+        for (int64_t i = first; i < stop; ++i) {{
             if (p[i] == 0.0f) continue;
-            const int64_t cell = base + offset[i], block = blocks[cell];
-            const float o = occupancies[cell], clear = 1.0f - o, resolved = clear * p[i];
-            gain[block] += resolved * volume[i] * share;
-            taken[block] += GMM_MIN(clear * o, resolved / REACHED) * volume[i];
+            const int64_t next = blocks[base + offset[i]];
+            if (next != block) {{
+                if (block >= 0) {{
+                    gain[block] = gained;
+                    taken[block] = took;
+                }}
+                block = next;
+                gained = gain[block];
+                took = taken[block];
+            }}
+            const float o = met[i], clear = 1.0f - o, resolved = clear * p[i];
+            gained += resolved * volume[i] * share;
+            took += GMM_MIN(clear * o, resolved / REACHED) * volume[i];
+        }}
+        if (block >= 0) {{
+            gain[block] = gained;
+            taken[block] = took;
         }}
     }}
     """,
@@ -188,7 +212,7 @@ def _fused(
         cells.block,
         shannon_information,
         math.log(IMAGE_ODDS),
-        torch.empty(n_views, 4, n_columns, device=device),
+        torch.empty(n_views, 6, n_columns, device=device),
         gain,
         taken,
         device=device,
