@@ -67,7 +67,8 @@ class Roadmap:
 
     def update(self, local_map: LocalMap) -> None:
         """Replace the nodes inside the local map, including those that are no longer passable."""
-        self._resolution, self._cached = local_map.resolution, None
+        if self._resolution != local_map.resolution:
+            self._resolution, self._cached = local_map.resolution, None
         passable, low = local_map.passable.cpu().numpy(), local_map.low.cpu().numpy()
         first = -(-low // self._factor)
         last = (low + passable.shape) // self._factor
@@ -78,7 +79,10 @@ class Roadmap:
         flags, known = _flags(passable[whole], self._factor)
         for block, inside, outside in _blocks_between(first, last):
             kept = self._blocks.setdefault(block, np.zeros((_BLOCK,) * 3, np.uint8))
-            kept[inside] = (kept[inside] & ~known[outside]) | flags[outside]
+            new = (kept[inside] & ~known[outside]) | flags[outside]
+            if not np.array_equal(kept[inside], new):
+                kept[inside] = new
+                self._cached = None
 
     def route(self, start: Tensor, goals: Tensor) -> Route:
         """Return the shortest routes from `start` (3,) to goals (M, 3), metres."""
