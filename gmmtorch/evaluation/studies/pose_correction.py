@@ -90,7 +90,7 @@ def evaluate_correction(
     train = [scans[i] for i in train_index]
     origins, ends = queries.test_beams([scans[i] for i in test_index], protocol.max_beams, seed)
     asked = {r: queries.hit_and_free(origins, ends, protocol.free, r, seed) for r in protocol.resolution}
-    rows = []
+    rows: list[Row] = []
     for kept in protocol.kept:
         on_event("pose correction", 0, 3)
         shown = queries.keep_share(train, kept, protocol.removal, seed)
@@ -101,35 +101,38 @@ def evaluate_correction(
         on_event("pose correction", 1, 3)
         ids = build_by_scan(perturbed_map, moved)
         n_components, nbytes = perturbed_map.n_components, perturbed_map.nbytes
-        cases = [(method, resolution) for method in methods for resolution in protocol.resolution]
-        clean, before = (
-            {case: _auc(built, *case, asked[case[1]]) for case in cases}
-            for built in (true_map, perturbed_map)
-        )
+        clean, before = (_aucs(built, methods, asked) for built in (true_map, perturbed_map))
         on_event("pose correction", 2, 3)
         correct_poses(perturbed_map, ids, motions)
-        for method, resolution in cases:
-            rows.append(
-                {
-                    "dataset": name,
-                    "method": method,
-                    "removal": protocol.removal,
-                    "kept": float(kept),
-                    "resolution": float(resolution),
-                    "pose_noise_m": float(protocol.pose_noise[0]),
-                    "pose_noise_rad": float(protocol.pose_noise[1]),
-                    "n_components": n_components,
-                    "nbytes": nbytes,
-                    "auc": before[method, resolution],
-                    "auc_corrected": _auc(perturbed_map, method, resolution, asked[resolution]),
-                    "auc_clean": clean[method, resolution],
-                }
-            )
+        rows += [
+            {
+                "dataset": name,
+                "method": method,
+                "removal": protocol.removal,
+                "kept": float(kept),
+                "resolution": float(resolution),
+                "pose_noise_m": float(protocol.pose_noise[0]),
+                "pose_noise_rad": float(protocol.pose_noise[1]),
+                "n_components": n_components,
+                "nbytes": nbytes,
+                "auc": before[method, resolution],
+                "auc_corrected": after,
+                "auc_clean": clean[method, resolution],
+            }
+            for (method, resolution), after in _aucs(perturbed_map, methods, asked).items()
+        ]
         on_rows(rows)
         on_event("pose correction", 3, 3)
     return rows
 
 
-def _auc(built: GaussianMap, method: str, resolution: float, asked: Queries) -> float:
-    theta = torch.as_tensor(built.occupancy(asked.points, resolution, method)).cpu()
-    return metrics.roc(theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]).auc
+def _aucs(
+    built: GaussianMap, methods: Sequence[str], asked: dict[float, Queries]
+) -> dict[tuple[str, float], float]:
+    """The AUC of a map for each method and resolution."""
+    found = {}
+    for method in methods:
+        for resolution, ask in asked.items():
+            theta = torch.as_tensor(built.occupancy(ask.points, resolution, method)).cpu()
+            found[method, resolution] = metrics.roc(theta[ask.of(OCCUPIED)], theta[ask.of(FREE)]).auc
+    return found

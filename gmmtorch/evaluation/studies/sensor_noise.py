@@ -116,26 +116,10 @@ def run(
         mixture = _learn(cloud, variant, k, typical, study, seed)
         seconds = time.perf_counter() - begin
         built = _as_map(mixture, cloud, train, n_total, study, seed)
-        added = float(torch.as_tensor(mixture.score_samples(ends, test_noise)).mean())
-        fitted = mixture.score(ends)
-        row: Row = {
-            "dataset": name,
-            "variant": variant,
-            "n_components": built.n_components,
-            "nbytes": built.nbytes,
-            "seconds": seconds,
-            "n_iterations": mixture.n_iter_,
-            "converged": mixture.converged_,
-            "held_out_log_likelihood": added if variant.startswith("noise") else fitted,
-            "log_likelihood_noise_added": added,
-            "log_likelihood_as_fitted": fitted,
-        }
-        for field, ask in asked.items():
-            theta = torch.as_tensor(built.occupancy(ask.points, study.resolution))
-            occupied, empty = theta[ask.of(queries.OCCUPIED)], theta[ask.of(queries.FREE)]
-            row[field] = area = metrics.roc(occupied, empty).auc
-            if field == "auc":
-                row["auc_low"], row["auc_high"] = metrics.auc_interval(occupied, empty, area, seed)
+        row: Row = {"dataset": name, "variant": variant}
+        row |= {"n_components": built.n_components, "nbytes": built.nbytes, "seconds": seconds}
+        row |= _scores(mixture, variant, ends, test_noise)
+        row |= _areas(built, asked, study.resolution, seed)
         smallest = torch.linalg.eigvalsh(mixture.covariances)[:, 0]
         row |= {
             "thickness": float(smallest.median().sqrt()),
@@ -147,6 +131,31 @@ def run(
         rows.append(row)
     on_event("sensor model", len(stages), len(stages))
     return rows
+
+
+def _scores(mixture: DeconvolvedGaussianMixture, variant: str, ends: Tensor, noise: Tensor) -> Row:
+    """What a fitted mixture says of itself and of held-out hits (N, 3) with their noise (N, 3, 3)."""
+    added = float(torch.as_tensor(mixture.score_samples(ends, noise)).mean())
+    fitted = mixture.score(ends)
+    return {
+        "n_iterations": mixture.n_iter_,
+        "converged": mixture.converged_,
+        "held_out_log_likelihood": added if variant.startswith("noise") else fitted,
+        "log_likelihood_noise_added": added,
+        "log_likelihood_as_fitted": fitted,
+    }
+
+
+def _areas(built: GaussianMap, asked: dict[str, queries.Queries], resolution: float, seed: int) -> Row:
+    """The areas under the ROC curve of a map's answers, and the interval of `auc`."""
+    row: Row = {}
+    for field, ask in asked.items():
+        theta = torch.as_tensor(built.occupancy(ask.points, resolution))
+        occupied, empty = theta[ask.of(queries.OCCUPIED)], theta[ask.of(queries.FREE)]
+        row[field] = area = metrics.roc(occupied, empty).auc
+        if field == "auc":
+            row["auc_low"], row["auc_high"] = metrics.auc_interval(occupied, empty, area, seed)
+    return row
 
 
 def _normals(points: Tensor, n_neighbors: int) -> Tensor | None:

@@ -83,13 +83,7 @@ def map_figure(
     slices = np.concatenate([band[0] for band in bands])
     height = _slice_height(panels[0], flown)
     for axes, panel in zip(slices, panels, strict=False):
-        cells = f"cells of {style.metres(panel.resolution)}"
-        image = slice_image(panel, height, max_pixels, shown_pixels)
-        # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
-        image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
-        _draw_paths(axes, panel, paths)
-        caption = f"slice at z = {style.metres(height)}, {cells}" if dim == 3 else cells
-        style.label_axes(axes, f"{panel.title}\n{caption}")
+        _draw_slice(axes, panel, paths, height, max_pixels, shown_pixels)
     greys = ScalarMappable(Normalize(0, 1), occupancy_colours())
     for band in bands:
         style.colour_bar(figure, greys, band[0].tolist(), "occupancy probability θ")
@@ -107,6 +101,24 @@ def map_figure(
     style.legend_below(figure, _legend(bool(paths), dim))
     style.figure_title(figure, title)
     return figure
+
+
+def _draw_slice(
+    axes: Axes,
+    panel: MapPanel,
+    paths: list[np.ndarray],
+    height: float,
+    max_pixels: int,
+    shown_pixels: int,
+) -> None:
+    """Draws θ of the cells in 2D, or of those at z = `height` (m) in 3D, and the sensor paths."""
+    cells = f"cells of {style.metres(panel.resolution)}"
+    image = slice_image(panel, height, max_pixels, shown_pixels)
+    # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
+    image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
+    _draw_paths(axes, panel, paths)
+    caption = f"slice at z = {style.metres(height)}, {cells}" if panel.dim == 3 else cells
+    style.label_axes(axes, f"{panel.title}\n{caption}")
 
 
 def _draw_heights(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -31,7 +32,7 @@ from gmmtorch.report.scenes.scene import (
     height_bar,
     path_balls,
 )
-from gmmtorch.report.scenes.scene_renderer import Camera
+from gmmtorch.report.scenes.scene_renderer import Camera, Canvas
 from gmmtorch.report.table import byte_text, count_text
 
 _SIDE = 6.6  # inches, width of a panel
@@ -94,14 +95,8 @@ def map_scene_figure(
     size = f"{count_text(len(points), 'point')}, {byte_text(_POINT_BYTES * len(points))}"
     shown = [(f"measured: {size}", _spots(cloud, _POINT_PIXELS / canvas.scale, scale, hidden, box))]
     if components is not None:
-        kept = hidden.kept & _lie_inside(components, box)
-        ellipsoids = Ellipsoids(
-            components.means[kept].double(),
-            components.covariances[kept].double(),
-            height_colours(components.means[kept, 2], scale),
-            hidden.top,
-        )
-        shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", ellipsoids))
+        surfaces = _surfaces(components, scale, hidden, box)
+        shown.append((f"surfaces of the map: {count_text(len(components), 'component')}", surfaces))
     centres, side = cells_near(points[_inside(points, box)], resolution)
     for one in maps:
         theta = one.occupancy(centres).cpu()
@@ -109,19 +104,25 @@ def map_scene_figure(
         occupied = centres[(theta >= one.occupied_from) & ~is_unknown]
         shown.append((one.title, _spots(occupied, _FILL * side, scale, hidden, box)))
     path = [path_balls(trajectory.double(), _PATH_PIXELS / canvas.scale, _PATH)] if len(trajectory) else []
-    n_columns = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
-    n_rows = math.ceil(len(shown) / n_columns)
-    tall = min((canvas.top - canvas.bottom) / (canvas.right - canvas.left), _TALLEST)
-    figure = style.new_figure(_SIDE * n_columns + 0.9, (_SIDE * tall + 0.5) * n_rows + 0.5)
-    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
-    for axes in panels[len(shown) :]:
-        axes.set_visible(False)
+    figure, panels = _sheet(len(shown), canvas)
     for axes, (name, part) in zip(panels, shown, strict=False):
         draw_scene(axes, [part, *path], low, high, camera, canvas)
         axes.set_title(name, fontsize=style.TITLE_SIZE)
-    height_bar(figure, panels.tolist(), scale)
+    height_bar(figure, panels, scale)
     style.figure_title(figure, title)
     return figure
+
+
+def _sheet(n_panels: int, canvas: Canvas) -> tuple[Figure, list[Axes]]:
+    """Returns a figure and its axes row by row; those beyond `n_panels` are hidden."""
+    n_columns = 1 if n_panels == 1 else 2 if n_panels in (2, 4) else 3
+    n_rows = math.ceil(n_panels / n_columns)
+    tall = min((canvas.top - canvas.bottom) / (canvas.right - canvas.left), _TALLEST)
+    figure = style.new_figure(_SIDE * n_columns + 0.9, (_SIDE * tall + 0.5) * n_rows + 0.5)
+    panels: list[Axes] = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
+    for axes in panels[n_panels:]:
+        axes.set_visible(False)
+    return figure, panels
 
 
 def cells_near(points: Tensor, resolution: float, reach: int = _REACH) -> tuple[Tensor, float]:
@@ -170,6 +171,13 @@ class _Hidden:
         distance = (offset[..., None, :] @ inverse @ offset[..., None]).flatten(1)
         owner = chosen.gather(1, distance.argmin(1, keepdim=True)).squeeze(1)
         return ~self.kept[owner] | (places[:, 2] > self.top)
+
+
+def _surfaces(components: Components, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:
+    """The components in the box that are not hidden, coloured by height."""
+    kept = hidden.kept & _lie_inside(components, box)
+    means, covariances = components.means[kept], components.covariances[kept]
+    return Ellipsoids(means.double(), covariances.double(), height_colours(means[:, 2], scale), hidden.top)
 
 
 def _spots(places: Tensor, radius: float, scale: Normalize, hidden: _Hidden, box: Corners) -> Ellipsoids:

@@ -181,15 +181,19 @@ def mixture_scene_figure(
     strings = [path_balls(path, radius, style.colour(robot)) for robot, path in enumerate(paths)]
     draw_scene(axes, [components, *strings], low, high, camera, canvas)
     for robot, path in enumerate(paths):
-        flat = camera.project(path).numpy()[:, :2]
-        look: dict[str, Any] = {"color": style.colour(robot), "path_effects": style.halo(2.5)}
-        axes.plot(*flat.T, color=style.colour(robot), linewidth=0.8, alpha=0.35, zorder=3)  # hidden parts
-        for (x, y), shape in ((flat[0], "o"), (flat[-1], "^")):
-            axes.plot(x, y, shape, markersize=9, markeredgecolor="#111111", zorder=4, **look)
+        _mark_path(axes, camera.project(path).numpy()[:, :2], style.colour(robot))
     height_bar(figure, axes, scale)
     style.legend_below(figure, path_handles(trajectories, (-np.inf, np.inf), True, traveller), max_columns=9)
     style.figure_title(figure, _scene_title(kept) if title is None else title)
     return figure
+
+
+def _mark_path(axes: Axes, flat: np.ndarray, hue: str) -> None:
+    """Draws a path (M, 2) on the picture plane thinly, where surfaces hide it too, and marks its ends."""
+    axes.plot(*flat.T, color=hue, linewidth=0.8, alpha=0.35, zorder=3)
+    look: dict[str, Any] = {"color": hue, "path_effects": style.halo(2.5)}
+    for (x, y), shape in ((flat[0], "o"), (flat[-1], "^")):
+        axes.plot(x, y, shape, markersize=9, markeredgecolor="#111111", zorder=4, **look)
 
 
 def _scene_title(kept: Tensor) -> str:
