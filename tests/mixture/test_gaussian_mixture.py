@@ -1,66 +1,34 @@
-"""GaussianMixture: scikit-learn's results, given starts, precision, gradients, and invalid files.
-
-`test_estimators` runs the contract of all estimators on it.
-"""
+"""GaussianMixture: scikit-learn's results, starts, kinds of arrays, awkward clouds and gradients."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from mixture.dtype_recorder import DtypeRecorder
+from mixture.mixture_cases import blobs, fitted, given_start
 from sklearn import mixture as sklearn_mixture
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from gmmtorch.errors import (
-    DataError,
-    GmmTorchError,
     InvalidArgumentError,
     NumericalError,
 )
-from gmmtorch.files import pack_tensors
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-
 SEEDED = ["kmeans", "random_points", "bounding_box"]
 INITS = [*SEEDED, "flat_pieces"]
 
 
-def blobs(n: int = 400, dim: int = 2, seed: int = 0) -> np.ndarray:
-    """Three overlapping clusters of different shapes."""
-    rng = np.random.default_rng(seed)
-    centers = np.array([[-2.0, 0.0, 1.0], [2.0, 1.0, -1.0], [0.5, -2.5, 0.0]])[:, :dim]
-    shapes = rng.normal(size=(3, dim, dim)) * 0.5 + 0.5 * np.eye(dim)
-    label = rng.integers(3, size=n)
-    return centers[label] + np.einsum("nij,nj->ni", shapes[label], rng.normal(size=(n, dim)))
-
-
-def given_start(dim: int, k: int = 3, seed: int = 1) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(k, dim, dim)) * 0.2
-    weights = rng.random(k) + 0.5
-    return {
-        "weights_init": weights / weights.sum(),
-        "means_init": rng.normal(size=(k, dim)) * 1.5,
-        "precisions_init": np.eye(dim) + root @ root.transpose(0, 2, 1),
-    }
-
-
-def fitted(dim: int = 2, **options) -> GaussianMixture:
-    return GaussianMixture(3, random_state=0, **options).fit(blobs(dim=dim))
-
-
-# -- against scikit-learn ---------------------------------------------------------------------------
+# -- against scikit-learn --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -97,21 +65,6 @@ def test_kmeans_start_is_as_good_as_scikit_learn():
     found = GaussianMixture(3, random_state=0, n_init=3).fit(x)
     reference = sklearn_mixture.GaussianMixture(3, random_state=0, n_init=3).fit(x)
     assert found.score(x) == pytest.approx(reference.score(x), abs=5e-3)
-
-
-class DtypeRecorder(TorchDispatchMode):
-    """Records every floating dtype of the inputs and outputs of operations."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: dict[torch.dtype, set[str]] = {}
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves((args, kwargs, result)):
-            if isinstance(leaf, Tensor) and leaf.is_floating_point():
-                self.seen.setdefault(leaf.dtype, set()).add(str(func))
-        return result
 
 
 @pytest.mark.parametrize("init", INITS)
@@ -255,7 +208,7 @@ def test_warm_start_with_another_shape_is_rejected_or_restarts(n_components, dim
         assert gmm.means_.shape == (n_components, dim)
 
 
-# -- awkward clouds -----------------------------------------------------------------------------------
+# -- awkward clouds --------------------------------------------------------------------------------
 
 
 def all_finite(gmm: GaussianMixture) -> bool:
@@ -316,7 +269,7 @@ def test_indefinite_precisions_init_is_named():
         GaussianMixture(2, precisions_init=np.stack([np.eye(2), -np.eye(2)])).fit(blobs())
 
 
-# -- samples -----------------------------------------------------------------------------------------
+# -- samples ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -370,7 +323,7 @@ def test_mixture_works_as_a_module_of_a_network():
     assert torch.equal(other(points), out)
 
 
-# -- scikit-learn's tools ---------------------------------------------------------------------------
+# -- scikit-learn's tools --------------------------------------------------------------------------
 
 
 def test_mixture_works_in_pipelines_and_grid_search():
@@ -382,129 +335,7 @@ def test_mixture_works_in_pipelines_and_grid_search():
     assert search.best_params_ == {"n_components": 3}
 
 
-# -- given parameters -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
-def test_from_parameters_gives_a_fitted_mixture(kind, tmp_path):
-    gmm = fitted()
-    parts = (kind(p.copy()) for p in (gmm.weights_, gmm.means_, gmm.covariances_))
-    other = GaussianMixture.from_parameters(*parts, tol=0.5, lower_bounds=[-3.0, -2.0], converged=False)
-    assert (other.n_components, other.tol, other.n_iter_, other.lower_bound_, other.converged_) == (
-        3,
-        0.5,
-        2,
-        -2.0,
-        False,
-    )
-    assert (other.score_samples(blobs()) == gmm.score_samples(blobs())).all()
-    assert isinstance(other.means_, Tensor) == (kind is torch.from_numpy)
-    other.save(tmp_path / "m.safetensors")
-    assert torch.equal(GaussianMixture.load(tmp_path / "m.safetensors").means, gmm.means)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("weights", [0.5, 0.6]),
-        ("weights", [1.5, -0.5]),
-        ("weights", [1.0]),
-        ("means", [[0.0, 0.0], [np.nan, 0.0]]),
-        ("means", [0.0, 1.0]),
-        ("covariances", np.eye(2)),
-        ("covariances", np.stack([np.eye(2), -np.eye(2)])),
-    ],
-)
-def test_from_parameters_rejects_invalid_values(name, value):
-    valid = {"weights": [0.5, 0.5], "means": np.zeros((2, 2)), "covariances": np.stack([np.eye(2)] * 2)}
-    GaussianMixture.from_parameters(**{k: np.asarray(v) for k, v in valid.items()})
-    with pytest.raises(GmmTorchError, match=name):
-        GaussianMixture.from_parameters(**{k: np.asarray(v) for k, v in {**valid, name: value}.items()})
-
-
 # -- files -----------------------------------------------------------------------------------------
-
-
-def test_options_that_json_lacks_do_not_prevent_saving(tmp_path):
-    start = {name: torch.from_numpy(value) for name, value in given_start(2).items()}
-    gmm = GaussianMixture(
-        3, **start, random_state=torch.Generator().manual_seed(0), tol=np.float32(0.01)
-    ).fit(blobs())
-    gmm.save(tmp_path / "m.safetensors")
-    assert torch.equal(GaussianMixture.load(tmp_path / "m.safetensors").means, gmm.means)
-
-
-def valid_parts() -> tuple[dict[str, Tensor], dict]:
-    gmm = fitted()
-    tensors = {name: getattr(gmm, name).clone() for name in ("weights", "means", "covariances")}
-    facts = {"lower_bounds": [-1.0], "converged": True, "arrays": True, "parameters": {"n_components": 3}}
-    return tensors, facts
-
-
-def write_parts(folder: Path, tensors: dict[str, Tensor], facts: dict) -> Path:
-    path = folder / "m.safetensors"
-    path.write_bytes(pack_tensors(tensors, "gmmtorch.mixture", 1, **facts))
-    return path
-
-
-def test_the_base_of_the_invalid_files_is_valid(tmp_path):
-    assert GaussianMixture.load(write_parts(tmp_path, *valid_parts())).n_components == 3
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"weights": torch.tensor([0.5, 0.6, -0.1], dtype=torch.float64)},
-        {"weights": torch.ones(3, dtype=torch.float64)},
-        {"weights": torch.ones(2, dtype=torch.float64) / 2},
-        {"weights": torch.ones(3) / 3},
-        {"weights": torch.full((3,), float("nan"), dtype=torch.float64)},
-        {"means": torch.zeros(3, dtype=torch.float64)},
-        {"means": torch.zeros(0, 2, dtype=torch.float64)},
-        {"means": torch.zeros(3, 0, dtype=torch.float64)},
-        {"means": torch.full((3, 2), float("inf"), dtype=torch.float64)},
-        {"means": None},
-        {"covariances": torch.zeros(3, 2, dtype=torch.float64)},
-        {"covariances": -torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)},
-        {"covariances": torch.tensor([[1.0, 0.9], [-0.9, 1.0]], dtype=torch.float64).repeat(3, 1, 1)},
-    ],
-    ids=lambda c: next(iter(c)),
-)
-def test_file_with_invalid_tensors_is_rejected(tmp_path, change):
-    tensors, facts = valid_parts()
-    tensors = {k: v for k, v in {**tensors, **change}.items() if v is not None}
-    with pytest.raises(DataError, match=r"m\.safetensors"):
-        GaussianMixture.load(write_parts(tmp_path, tensors, facts))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"lower_bounds": "text"},
-        {"lower_bounds": None},
-        {"parameters": 7},
-        {"parameters": "text"},
-        {"arrays": None, "parameters": None},
-    ],
-)
-def test_file_with_invalid_facts_is_rejected(tmp_path, change):
-    tensors, facts = valid_parts()
-    with pytest.raises(DataError, match=r"m\.safetensors"):
-        GaussianMixture.load(write_parts(tmp_path, tensors, {**facts, **change}))
-
-
-@pytest.mark.parametrize("name", ["lower_bounds", "converged", "arrays", "parameters"])
-def test_file_without_a_required_fact_is_rejected(tmp_path, name):
-    tensors, facts = valid_parts()
-    facts.pop(name)
-    with pytest.raises(DataError, match=name):
-        GaussianMixture.load(write_parts(tmp_path, tensors, facts))
-
-
-def test_unknown_parameters_in_a_file_are_ignored(tmp_path):
-    tensors, facts = valid_parts()
-    facts["parameters"] = {"n_components": 3, "unheard_of": 1, "tol": 0.5}
-    assert GaussianMixture.load(write_parts(tmp_path, tensors, facts)).tol == 0.5
 
 
 def test_far_float32_points_warn_and_float64_points_do_not():
@@ -516,13 +347,6 @@ def test_far_float32_points_warn_and_float64_points_do_not():
         warnings.simplefilter("error")
         GaussianMixture(2, random_state=0, max_iter=500).fit(far)
         GaussianMixture(2, random_state=0, max_iter=500).fit(points.astype(np.float32))
-
-
-def test_n_samples_seen_of_given_parameters_is_none():
-    gmm = fitted()
-    given_one = GaussianMixture.from_parameters(gmm.weights_, gmm.means_, gmm.covariances_)
-    assert given_one.n_samples_seen_ is None
-    assert gmm.n_samples_seen_ == 400
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-9, 1e15, 1e39, 1e300])

@@ -1,0 +1,298 @@
+"""The growth of a tree of mixtures against a naive implementation in loops."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mixture.fit_contract import blobs
+from mixture.tree_cases import exact, room
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+from torch import Tensor
+
+from gmmtorch.mixture import GaussianMixture, HierarchicalGaussianMixture
+from gmmtorch.mixture.estimators.trees.growth import grow
+from gmmtorch.mixture.estimators.trees.nested import (
+    Children,
+    Members,
+    assign_members,
+    pack,
+    principal_axes_start,
+    run_em,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+# -- the algorithm, in loops -----------------------------------------------------------------------
+
+
+class NaiveTree:
+    """Hierarchical EM one node, one point and one component at a time. Node: (parent, w, μ, Σ)."""
+
+    def __init__(self, points: np.ndarray, weight: np.ndarray, **rule: Any) -> None:
+        self.points, self.rule = points, rule
+        mean, covariance = self.moments(points, weight)
+        self.nodes: list[tuple[int, float, np.ndarray, np.ndarray]] = []
+        self.members: list[np.ndarray] = []
+        level = [(-1, 1.0, mean, covariance, weight)]
+        for _ in range(rule["max_levels"]):
+            below: list[Any] = []
+            for index, w, mean, covariance, p in level:
+                below += self.split(index, w, mean, covariance, p)
+            first = len(self.nodes)
+            self.nodes += [child[:4] for child in below]
+            self.members += [child[4] for child in below]
+            level = [(first + i, *child[1:]) for i, child in enumerate(below)]
+
+    def bound(self, weight: np.ndarray) -> float:
+        """Σ q log(π N(x) / q) over the leaves, with q the share of each point in each leaf."""
+        value = 0.0
+        for i, (_, w, mean, covariance) in enumerate(self.nodes):
+            if i not in [node[0] for node in self.nodes]:
+                q = self.members[i] / weight
+                log_joint = math.log(w) + multivariate_normal(mean, covariance).logpdf(self.points)
+                value += weight @ np.where(q > 0, q * (log_joint - np.log(np.where(q > 0, q, 1))), 0)
+        return float(value / weight.sum())
+
+    def moments(self, points: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        mean = np.average(points, axis=0, weights=p)
+        offset = points - mean
+        covariance = sum(q * np.outer(x, x) for q, x in zip(p, offset, strict=True)) / p.sum()
+        return mean, covariance + self.rule["reg_covar"] * np.eye(points.shape[1])
+
+    def start(self, p: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """Pieces halved across their longest direction, the widest first."""
+        pieces = [np.flatnonzero(p > 0)]
+        while len(pieces) < self.rule["branching"]:
+            widest = []
+            for piece in pieces:
+                variance = np.linalg.eigvalsh(self.moments(self.points[piece], p[piece])[1])
+                longest = variance[-1] - self.rule["reg_covar"]
+                widest.append(p[piece].sum() * longest if longest > self.rule["reg_covar"] else 0)
+            order = [i for i in np.argsort(widest)[::-1] if widest[i] > 0]
+            if not order:
+                break
+            halves = list(pieces)
+            for i in order[: min(len(pieces), self.rule["branching"] - len(pieces))]:
+                mean, covariance = self.moments(self.points[pieces[i]], p[pieces[i]])
+                axis = np.linalg.eigh(covariance)[1][:, -1]
+                side = (self.points[pieces[i]] - mean) @ axis > 0
+                halves[i] = pieces[i][~side]
+                halves.append(pieces[i][side])
+            pieces = halves
+        return [(p[i].sum() / p.sum(), *self.moments(self.points[i], p[i])) for i in pieces]
+
+    def joint(self, mixture: list[tuple[float, np.ndarray, np.ndarray]]) -> np.ndarray:
+        return np.stack(
+            [math.log(w) + multivariate_normal(m, c).logpdf(self.points) for w, m, c in mixture], 1
+        )
+
+    def split(
+        self, index: int, weight: float, mean: np.ndarray, covariance: np.ndarray, p: np.ndarray
+    ) -> list[Any]:
+        variance = np.linalg.eigvalsh(covariance)
+        if variance[0] < self.rule["planarity_threshold"] * variance.sum():
+            return []
+        if p.sum() < 2 * self.rule["min_support"]:
+            return []
+        mixture, last = self.start(p), -math.inf
+        for _ in range(self.rule["max_iter"]):
+            joint = self.joint(mixture)
+            value = p @ logsumexp(joint, axis=1) / p.sum()
+            gamma = np.exp(joint - logsumexp(joint, axis=1, keepdims=True)) * p[:, None]
+            mixture = [(g.sum() / p.sum(), *self.moments(self.points, g)) for g in gamma.T if g.sum() > 1e-14]
+            if value - last < self.rule["tol"]:
+                break
+            last = value
+        mixture = [child for child in mixture if child[0] * p.sum() >= self.rule["min_support"]]
+        if len(mixture) < 2:
+            return []
+        total = sum(child[0] for child in mixture)
+        mixture = [(w / total, m, c) for w, m, c in mixture]
+        joint = self.joint(mixture)
+        gain = p @ (logsumexp(joint, axis=1) - multivariate_normal(mean, covariance).logpdf(self.points))
+        dim = len(mean)
+        price = self.rule["min_gain"] * (len(mixture) - 1) * (1 + dim + dim * (dim + 1) / 2)
+        if gain < max(price, self.rule["tol"] * p.sum()):
+            return []
+        gamma = np.exp(joint - joint.max(1, keepdims=True))
+        gamma[gamma <= self.rule["soft_threshold"]] = 0  # the largest is 1
+        shares = gamma / gamma.sum(1, keepdims=True) * p[:, None]
+        return [(index, weight * w, m, c, q) for (w, m, c), q in zip(mixture, shares.T, strict=True)]
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("branching", [2, 5])
+def test_tree_equals_a_naive_implementation(dim, branching):
+    rng = np.random.default_rng(dim)
+    points = np.concatenate([room(240, noise=0.002)[:, :dim], blobs(dim, 80)])
+    weight = rng.uniform(0.2, 3.0, len(points))
+    rule: dict[str, Any] = {
+        "branching": branching,
+        "max_levels": 3,
+        "max_iter": 12,
+        "tol": 1e-3,
+        "reg_covar": 1e-4,
+        "min_support": 6.0,
+        "min_gain": 0.2,
+        "soft_threshold": 0.1,
+        "planarity_threshold": 0.002,
+    }
+    tree = exact(**rule).fit(points, sample_weight=weight)
+    naive = NaiveTree(points, weight, **rule)
+    assert tree.n_levels_ > 1
+    assert len(tree.node_parents_) == len(naive.nodes)
+    assert tree.lower_bound_ == pytest.approx(naive.bound(weight), abs=1e-6)
+    mine = zip(tree.node_parents_, tree.node_weights_, tree.node_means_, tree.node_covariances_, strict=True)
+    for found, expected in zip(rows_of(list(mine)), rows_of(naive.nodes), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def rows_of(nodes: list[tuple[int, float, np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """The values of each node and its parent, in an order that does not depend on the order of siblings."""
+    rows = []
+    for parent, weight, mean, covariance in nodes:
+        _, above_weight, above_mean, above = (
+            nodes[parent] if parent >= 0 else (0, 1.0, 0 * mean, 0 * covariance)
+        )
+        values = (above_weight, above_mean, above, weight, mean, covariance)
+        rows.append(np.concatenate([np.ravel(value) for value in values]))
+    return sorted(rows, key=lambda row: tuple(np.round(row, 4)))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("k", [5, 8])
+def test_one_level_equals_flat_em_from_the_same_start(dim, k):
+    points = torch.from_numpy(room(500)[:, :dim])
+    center = points.mean(0)
+    members = Members(torch.arange(500), torch.zeros(500, dtype=torch.int64), torch.ones(500).double())
+    packed = pack(points, members, center[None], torch.float64)
+    start = principal_axes_start(packed, 1, k, 1e-6)
+    flat = GaussianMixture(
+        k,
+        weights_init=start.weights[0],
+        means_init=start.means[0] + center,
+        precisions_init=torch.linalg.inv(start.covariances[0]),
+        dtype="float64",
+    ).fit(points)
+    tree = exact(branching=k, max_levels=1, min_support=0.0).fit(points)
+    assert tree.n_levels_ == 1
+    # The first bound is that of one Gaussian, the last that of the accepted level.
+    np.testing.assert_allclose(tree.lower_bounds_[1:-1], flat.lower_bounds_, atol=1e-9)
+    for name in ("weights", "means", "covariances"):
+        torch.testing.assert_close(getattr(tree, name), getattr(flat, name), rtol=1e-6, atol=1e-9)
+
+
+def present(children: Children, node: int) -> Children:
+    """The children of a node with weight above zero, from left to right."""
+    order = children.means[node, :, 0].argsort()
+    return Children(*(value[node][order][children.weights[node][order] > 0] for value in children))
+
+
+def test_nodes_of_a_batch_are_fitted_independently():
+    """The nodes have very different numbers of points; some have fewer places than children."""
+    points = torch.from_numpy(room(400))
+    points[:30] = points[0]
+    points[30:60] = points[[30, 31] * 15]
+    node = torch.repeat_interleave(torch.arange(5), torch.tensor([30, 30, 40, 250, 50]))
+    shuffle = torch.randperm(400, generator=torch.Generator().manual_seed(0))
+    members = Members(shuffle, node[shuffle], 0.5 + torch.arange(400).double() % 7)
+    options: dict[str, Any] = {"reg_covar": 1e-4, "tol": 1e-4, "max_iter": 40, "worst_error": math.inf}
+
+    def learn(members: Members, centers: Tensor) -> tuple[Children, list[Tensor]]:
+        packed = pack(points, members, centers, torch.float64)
+        start, values = principal_axes_start(packed, len(centers), 6, 1e-4), []
+        mass = members.mass(len(centers))
+        found = run_em(packed, start, mass, on_values=lambda v: values.append(v.clone()), **options)
+        return found.children, values
+
+    centers = torch.stack([points[node == i].mean(0) for i in range(5)])
+    together, values = learn(members, centers)
+    assert (together.weights > 0).sum(1).tolist() == [1, 2, 6, 6, 6]
+    for i in range(5):
+        separate, _ = learn(members.select(torch.tensor([i]), 5), centers[i : i + 1])
+        for found, expected in zip(present(together, i), present(separate, 0), strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+    rises = torch.stack(values).diff(dim=0)
+    assert bool((rises > -1e-3).all())
+    assert int((rises[-1] == 0).sum()) >= 3  # the nodes converge independently
+
+
+# -- assignment of points to children --------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 99), threshold=st.sampled_from([0.0, 0.01, 0.3, 0.9, 1.0]), dim=st.integers(1, 3))
+def test_points_are_assigned_by_responsibility_and_keep_their_weight(seed, threshold, dim):
+    rng = np.random.default_rng(seed)
+    points, weight = rng.normal(size=(40, dim)), rng.uniform(0.1, 2.0, 40)
+    node = rng.integers(0, 3, 40)
+    centers = rng.normal(size=(3, dim))
+    roots = rng.normal(size=(3, 4, dim, dim)) + np.eye(dim)
+    weights = rng.dirichlet(np.ones(4), size=3)
+    weights[1] = [0.5, 0.0, 0.5, 0.0]  # with two absent children
+    means = rng.normal(size=(3, 4, dim))
+    covariances = roots @ roots.swapaxes(2, 3) + 0.1 * np.eye(dim)
+    members = Members(torch.arange(40), torch.from_numpy(node), torch.from_numpy(weight))
+    packed = pack(torch.from_numpy(points), members, torch.from_numpy(centers), torch.float64)
+    children = Children(*(torch.from_numpy(value) for value in (weights, means, covariances)))
+    found = assign_members(packed, children, members, threshold)
+    shares = np.zeros((40, 12))
+    shares[found.members.point, found.members.node] = found.members.weight
+    values = np.zeros(3)
+    for i, (x, p, g) in enumerate(zip(points, weight, node, strict=True)):
+        density = [
+            w * multivariate_normal(centers[g] + m, c).pdf(x)
+            for w, m, c in zip(weights[g], means[g], covariances[g], strict=True)
+        ]
+        gamma = np.array(density) / sum(density)
+        gamma[gamma <= max(threshold, 1e-30) * gamma.max()] *= (
+            gamma.argmax() == np.arange(4)[gamma <= max(threshold, 1e-30) * gamma.max()]
+        )
+        expected = np.zeros(12)
+        expected[4 * g : 4 * g + 4] = p * gamma / gamma.sum()
+        np.testing.assert_allclose(shares[i], expected, rtol=1e-7, atol=1e-12)
+        values[g] += p * math.log(sum(density))
+    np.testing.assert_allclose(found.value, values, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(shares.sum(1), weight, rtol=1e-14)
+    at = [
+        multivariate_normal(
+            (centers[:, None] + means).reshape(12, dim)[c], covariances.reshape(12, dim, dim)[c]
+        ).logpdf(points[i])
+        for i, c in zip(found.members.point, found.members.node, strict=True)
+    ]
+    np.testing.assert_allclose(found.log_density, at, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("soft_threshold", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_every_level_has_the_whole_weight_of_each_point(soft_threshold, dtype):
+    points = torch.from_numpy(room(600))
+    weight = torch.rand(600, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.1
+    rule = HierarchicalGaussianMixture(
+        60, branching=4, max_levels=3, soft_threshold=soft_threshold, dtype=dtype
+    )
+    held: list[tuple[Tensor, Members]] = []
+    tree = grow(
+        points, weight, rule, on_level=lambda nodes, members: held.append((nodes.place, members))
+    ).tree
+    assert int(tree.levels().max()) == 3
+    shares = torch.zeros(600, len(tree.parents), dtype=torch.float64)
+    for places, members in held[1:]:
+        shares[members.point, places[members.node]] += members.weight
+    for level in range(1, 4):
+        torch.testing.assert_close(shares[:, tree.at_level(level)].sum(1), weight, rtol=1e-13, atol=0)
+    inner = torch.unique(tree.parents[tree.parents >= 0])
+    for node in inner:
+        torch.testing.assert_close(
+            shares[:, tree.parents == node].sum(1), shares[:, node], rtol=1e-13, atol=0
+        )
+    assert float((shares[:, tree.leaves()] > 0).sum(1).double().mean()) > (
+        1.0 if soft_threshold < 1 else 0.99
+    )

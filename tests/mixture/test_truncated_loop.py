@@ -1,0 +1,420 @@
+"""The loop of truncated EM: its bounds, momentum, precision, and the way from cells to points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from mixture.fit_contract import check_mixture
+from mixture.truncated_cases import beads, cloud, random_parameters, random_weight, room, rows_of
+from torch import Tensor
+
+from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture.em import exact as em
+from gmmtorch.mixture.em import loop, truncated
+from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.em.grouping import (
+    Rows,
+    centered_parameters,
+    choose_candidates,
+    group_rows,
+    nearest,
+    rounding,
+    truncated_expectation,
+)
+from gmmtorch.mixture.em.initialization import flat_pieces, moments_of
+from gmmtorch.mixture.em.truncated import Momentum, Settings, fit_truncated, run_truncated
+
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+# -- the loop --------------------------------------------------------------------------------------
+
+
+def check_run(found: loop.EMResult, max_iter: int, slack: float = 0.0) -> None:
+    assert 1 <= found.n_iter <= max_iter
+    assert np.isfinite(found.lower_bounds).all()
+    assert (np.diff(found.lower_bounds) >= -slack).all()
+    assert all(bool(torch.isfinite(value).all()) for value in found.parameters)
+    assert float(found.parameters.weights.min()) >= 0
+    assert float(found.parameters.weights.sum()) == pytest.approx(1, abs=1e-9)
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 300),
+    dim=st.sampled_from([1, 2, 3, 5]),
+    k=st.integers(1, 9),
+    n_candidates=st.integers(2, 5),
+    tol=st.sampled_from([0.0, 1e-6, 1e-3, 0.1]),
+    max_iter=st.integers(1, 40),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    grain=st.sampled_from([0.0, 0.5]),
+    are_points=st.booleans(),
+)
+def test_bounds_never_decrease_and_every_run_ends(
+    seed, n, dim, k, n_candidates, tol, max_iter, dtype, grain, are_points
+):
+    points = cloud(n, dim, seed)
+    points = (points / grain).round() * grain if grain else points  # with equal points
+    weight = random_weight(n, seed)
+    rows = rows_of(points, weight, are_points)
+    calls: list[tuple[int, float]] = []
+    setup = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    parameters = random_parameters(k, dim, seed)
+    found, owner, _ = run_truncated(rows, nearest(points, parameters.means), parameters, setup)
+    check_run(found, max_iter)
+    assert calls == list(enumerate(found.lower_bounds, 1))
+    assert owner.shape == (n,)
+    assert set(owner.tolist()) <= set(range(k))
+    if found.n_iter < max_iter:
+        assert found.converged
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    dim=st.integers(1, 3),
+    k=st.integers(1, 6),
+    n_candidates=st.integers(2, 5),
+    max_iter=st.integers(1, 20),
+)
+def test_result_is_at_least_as_good_as_the_last_bound(seed, dim, k, n_candidates, max_iter):
+    points, weight, parameters = (
+        cloud(400, dim, seed),
+        random_weight(400, seed),
+        random_parameters(k, dim, seed),
+    )
+    setup = Settings(1e-9, 1e-4, max_iter, torch.float64, n_candidates)
+    found, owner, candidates = run_truncated(
+        rows_of(points, weight), nearest(points, parameters.means), parameters, setup
+    )
+    joint = em.log_joint(points, found.parameters)
+    allowed = torch.full_like(joint, -torch.inf).scatter(1, candidates[owner], 0.0)
+    bound, score = (torch.logsumexp(j, 1) @ weight / weight.sum() for j in (joint + allowed, joint))
+    assert found.lower_bounds[-1] - 1e-7 <= float(bound) <= float(score) + 1e-12
+
+
+def test_one_iteration_equals_one_em_step():
+    points, weight, parameters = cloud(500, 3), random_weight(500), random_parameters(5, 3)
+    setup = Settings(1e-6, 0.0, 1, torch.float64)
+    found, *_ = run_truncated(rows_of(points, weight), nearest(points, parameters.means), parameters, setup)
+    step = loop.natural_step(em.quadratic_features(points), weight, 1e-6, torch.float64)
+    expected, bound = step(parameters)
+    assert found.lower_bounds == [pytest.approx(bound, rel=1e-12)]
+    torch.testing.assert_close(tuple(found.parameters), tuple(expected), rtol=1e-9, atol=1e-10)
+
+
+# -- momentum --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n_iter", "share"), [(10, 1.0), (100, 0.5)])
+def test_momentum_converges_faster_than_em(n_iter, share):
+    generator = torch.Generator().manual_seed(0)
+    label = torch.rand(3000, 1, generator=generator, dtype=torch.float64) < 0.5
+    points = torch.randn(3000, 1, generator=generator, dtype=torch.float64) + torch.where(label, 1.0, -1.0)
+    parameters = Parameters(
+        torch.tensor([0.8, 0.2], dtype=torch.float64),
+        torch.tensor([[-0.2], [0.3]], dtype=torch.float64),
+        torch.full((2, 1, 1), 2.0, dtype=torch.float64),
+    )
+    rows, owner = rows_of(points), torch.zeros(3000, dtype=torch.int64)
+    step = loop.natural_step(rows.features(), rows.weight, 0.0, torch.float64)
+    plain = loop.run_em(step, parameters, tol=0.0, max_iter=n_iter)
+    found, *_ = run_truncated(rows, owner, parameters, Settings(0.0, 0.0, n_iter, torch.float64))
+    assert found.n_iter == n_iter
+    best = loop.run_em(step, parameters, tol=0.0, max_iter=1500).lower_bounds[-1]
+    assert best - plain.lower_bounds[-1] > 1e-5  # plain EM converges slowly
+    assert best - found.lower_bounds[-1] < share * (best - plain.lower_bounds[-1])
+
+
+def test_momentum_undo_gives_the_em_step_and_resets():
+    parameters, momentum = random_parameters(3, 2), Momentum(1e-6)
+    rows = rows_of(cloud(300, 2))
+
+    def expect(at: Parameters) -> Tensor:
+        groups = group_rows(rows, nearest(rows.points, at.means), at.means, torch.float64)
+        return truncated_expectation(groups, choose_candidates(groups, at, 16), at).statistics
+
+    step = loop.natural_step(rows.features(), rows.weight, 1e-6, torch.float64)
+    for moves in (False, False, True, True):
+        plain = step(parameters)[0]
+        following = momentum.step(expect(parameters), parameters)
+        assert momentum.is_extrapolated is moves
+        close = torch.allclose(following.means, plain.means, rtol=0, atol=1e-9)
+        assert close is not moves
+        parameters = following
+    undone = momentum.undo()
+    torch.testing.assert_close(tuple(undone), tuple(plain), rtol=1e-9, atol=1e-10)
+    assert not momentum.is_extrapolated
+    momentum.step(expect(undone), undone)
+    assert not momentum.is_extrapolated
+
+
+class Spy:
+    """An E-step that records its inputs and results, and decreases the bound at given calls."""
+
+    def __init__(self, failing: tuple[int, ...] = ()) -> None:
+        self.failing, self.given, self.dtypes, self.sets, self.found = failing, [], [], [], []
+
+    def __call__(self, groups, candidates, parameters, want_owner=False, *rest):
+        found = truncated_expectation(groups, candidates, parameters, want_owner, *rest)
+        if len(self.given) in self.failing:
+            found = found._replace(value=found.value - 1e6)
+        self.given.append(parameters)
+        self.dtypes.append(groups.features.dtype)
+        self.sets.append(candidates)
+        self.found.append(found)
+        return found
+
+
+def run_spied(monkeypatch: pytest.MonkeyPatch, spy: Spy, k: int = 20, max_iter: int = 12) -> loop.EMResult:
+    points, _ = beads(1500, k)
+    rows = rows_of(torch.from_numpy(points - points.mean(0)))
+    first, owner = flat_pieces(rows.points, rows.weight, k, 1e-6)
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 0.0, max_iter, torch.float64))
+    check_run(found, max_iter)
+    return found
+
+
+def test_momentum_that_decreases_the_bound_is_undone(monkeypatch):
+    spy = Spy(failing=(4,))
+    found = run_spied(monkeypatch, spy)
+    assert found.n_iter == 12
+    assert len(spy.given) == 13
+    at, statistics = spy.given[3], spy.found[3].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+    assert not torch.allclose(spy.given[4].means, spy.given[5].means, rtol=0, atol=1e-9)
+    # The result is also EM's own step, although the momentum has extrapolated again by then.
+    at, statistics = spy.given[-1], spy.found[-1].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(found.parameters.means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.parameters.covariances[0], (plain.covariances[0]), rtol=1e-9, atol=0)
+
+
+def test_small_gain_of_an_extrapolated_step_does_not_end_the_run(monkeypatch):
+    points, _ = beads(1500, 20, gap=2.0)
+    rows = rows_of(torch.from_numpy(points - points.mean(0)))
+    first, owner = flat_pieces(rows.points, rows.weight, 20, 1e-6)
+    spy = Spy()
+
+    def weak(*arguments):
+        found = spy(*arguments)
+        if len(spy.found) == 5:  # an extrapolated step that gains a thousandth of tol
+            found = found._replace(value=spy.found[3].value + 1500 * 1e-7)
+        return found
+
+    monkeypatch.setattr(truncated, "truncated_expectation", weak)
+    found, *_ = run_truncated(rows, owner, first, Settings(1e-6, 1e-4, 300, torch.float64))
+    check_run(found, 300)
+    assert found.n_iter > 10
+    at, statistics = spy.given[4], spy.found[4].statistics
+    plain = em.maximization(statistics, 1e-6, at)
+    torch.testing.assert_close(spy.given[5].means, plain.means + at.means, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("failing", [(2,), (5, 6)])  # without and with momentum
+def test_candidates_that_decrease_the_bound_are_replaced_by_the_old_ones(monkeypatch, failing):
+    spy = Spy(failing)
+    found = run_spied(monkeypatch, spy, max_iter=20)
+    assert found.n_iter == 20
+    old, new = spy.sets[failing[0] - 1], spy.sets[failing[0]]
+    assert all(given is new for given in spy.sets[failing[0] : failing[-1] + 1])
+    assert all(given is old for given in spy.sets[failing[-1] + 1 :])  # permanently
+
+
+def test_run_ends_if_the_em_step_decreases_the_bound(monkeypatch):
+    spy = Spy(failing=(3, 4))
+    found = run_spied(monkeypatch, spy)
+    assert found.converged
+    assert found.n_iter == 3
+
+
+# -- rounding --------------------------------------------------------------------------------------
+
+
+def thin_wall(n: int, size: float, seed: int = 0) -> Tensor:
+    """Points of an oblique wall with side `size`, 0.1 mm thick."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = (rng.random((n, 3)) - 0.5) * [size, size, 0] + 1e-4 * rng.normal(size=(n, 3))
+    points = points @ turn.T
+    return torch.from_numpy(points - points.mean(0))
+
+
+def two_halves(points: Tensor) -> Parameters:
+    """Components of the two halves of a cloud, cut along x."""
+    beyond = (points[:, 0] > 0).long()
+    weight = points.new_ones(len(points))
+    return moments_of(em.quadratic_features(points), weight, beyond, 2, 1e-6)
+
+
+@pytest.mark.parametrize(("size", "dtype"), [(0.2, torch.float32), (30.0, torch.float64)])
+def test_large_thin_cloud_uses_float64_and_equals_em(size, dtype, monkeypatch):
+    points = thin_wall(4000, size)
+    rows, parameters = rows_of(points), two_halves(points)
+    setup = Settings(1e-6, 0.0, 1)
+    owner = nearest(points, parameters.means)
+    spy = Spy()
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    found, *_ = run_truncated(rows, owner, parameters, setup)
+    assert spy.dtypes == [dtype]
+    expected, total = em.direct_step(points, rows.weight, parameters, 1e-6)
+    tolerance = 1e-8 if dtype == torch.float64 else 1e-3
+    assert found.lower_bounds[0] == pytest.approx(float(total) / 4000, abs=tolerance)
+    least, truth = (torch.linalg.eigvalsh(p.covariances)[:, 0] for p in (found.parameters, expected))
+    torch.testing.assert_close(least, truth, rtol=100 * tolerance, atol=0)
+
+
+def test_components_that_become_thin_switch_to_float64(monkeypatch):
+    points = thin_wall(4000, 30.0)
+    rows, parameters = rows_of(points), two_halves(points)
+    parameters = parameters._replace(covariances=parameters.covariances + torch.eye(3, dtype=torch.float64))
+    owner = nearest(points, parameters.means)
+    spy = Spy()
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    found, *_ = run_truncated(rows, owner, parameters, Settings(1e-6, 0.0, 2))
+    assert spy.dtypes == [torch.float32, torch.float64]
+    for at, bound in zip(spy.given, found.lower_bounds, strict=True):
+        score = torch.logsumexp(em.log_joint(points, at), 1).mean()
+        assert bound == pytest.approx(float(score), abs=1e-4)
+    thinnest = torch.linalg.eigvalsh(found.parameters.covariances)[:, 0]
+    torch.testing.assert_close(thinnest, torch.full_like(thinnest, 1.01e-6), rtol=0.01, atol=0)
+
+
+def test_large_thin_piece_of_low_weight_switches_to_float64(monkeypatch):
+    rng = np.random.default_rng(0)
+    blobs = 0.05 * rng.normal(size=(40_000, 3)) + 5 * rng.random((40, 3))[rng.integers(40, size=40_000)]
+    points = torch.cat([torch.from_numpy(blobs), thin_wall(20, 20.0)])
+    owner = torch.cat([torch.zeros(40_000, dtype=torch.int64), torch.ones(20, dtype=torch.int64)])
+    of_wall = points[40_000:]
+    covariances = torch.stack([torch.cov(points[:40_000].T), torch.cov(of_wall.T, correction=0)])
+    covariances[1] += 1e-6 * torch.eye(3, dtype=torch.float64)
+    parameters = Parameters(
+        torch.tensor([0.9995, 0.0005], dtype=torch.float64),
+        torch.stack([points[:40_000].mean(0), of_wall.mean(0)]),
+        covariances,
+    )
+    groups = group_rows(rows_of(points), owner, parameters.means, torch.float32)
+    average, worst = rounding(groups, centered_parameters(parameters))
+    assert average < 0.02 < worst
+    # Brute force of ε/2 E‖x‖² tr Σ⁻¹, group by group.
+    half_eps = torch.finfo(torch.float32).eps / 2
+    errors, counts = [], []
+    for k, own in enumerate((points[:40_000], of_wall)):
+        spread = float((own - parameters.means[k]).square().sum(1).mean())
+        errors.append(half_eps * spread * float(torch.linalg.inv(covariances[k]).trace()))
+        counts.append(len(own))
+    assert worst == pytest.approx(max(errors), rel=1e-4)
+    assert average == pytest.approx(np.average(errors, weights=counts), rel=1e-4)
+    spy = Spy()
+    monkeypatch.setattr(truncated, "truncated_expectation", spy)
+    run_truncated(rows_of(points), owner, parameters, Settings(max_iter=1))
+    assert spy.dtypes == [torch.float64]
+
+
+@pytest.mark.parametrize("k", [4, 24])  # all components are candidates, or not
+def test_thin_walls_500_km_apart_are_fitted_independently(k):
+    wall = thin_wall(1200, 3.0)
+    offset = torch.tensor([5e5, -2e5, 1e3], dtype=torch.float64)
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-5}
+    separate = GaussianMixture(k // 2, **options).fit(wall)
+    both = GaussianMixture(k, **options).fit(torch.cat([wall + offset, wall - offset]))
+    check_mixture(both, torch.cat([wall + offset, wall - offset]).numpy(), at_most=k)
+    score = float(both.score_samples(wall + offset).mean())
+    assert score + np.log(2) == pytest.approx(float(separate.score_samples(wall).mean()), abs=0.05)
+
+
+# -- from cells to points --------------------------------------------------------------------------
+
+
+@settings(max_examples=30)
+@example(  # new candidates on the points would decrease the bound
+    seed=9, k=6, dim=2, grain=0.0, max_iter=4, tol=0.0, n_candidates=2, dtype=torch.float64
+)
+@given(
+    seed=st.integers(0, 10**6),
+    k=st.integers(1, 7),
+    dim=st.integers(1, 3),
+    grain=st.sampled_from([0.0, 0.05, 0.25]),
+    max_iter=st.integers(2, 30),
+    tol=st.sampled_from([0.0, 1e-4, 1e-2]),
+    n_candidates=st.integers(2, 7),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_bounds_never_decrease_from_cells_to_points(seed, k, dim, grain, max_iter, tol, n_candidates, dtype):
+    points = cloud(1200, dim, seed) + 3 * (torch.arange(1200) % 4)[:, None]
+    points = (points / grain).round() * grain if grain else points
+    points = points - points.mean(0)
+    weight = random_weight(1200, seed)
+    first, owner = flat_pieces(points, weight, k, 1e-6)
+    k = first.weights.shape[0]
+    calls: list[tuple[int, float]] = []
+    setup = Settings(1e-6, tol, max_iter, dtype, n_candidates, lambda *call: calls.append(call))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(truncated, "_MANY_POINTS", 1000)
+        runs: list[Rows] = []
+        run = truncated.run_truncated
+        patch.setattr(
+            truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
+        )
+        found = fit_truncated(Rows(points, weight), owner, first, setup)
+    assert [rows.are_points for rows in runs] == [False, True]
+    assert float(runs[0].weight.sum()) == pytest.approx(float(weight.sum()))
+    check_run(found, max_iter, slack=1e-6 if dtype == torch.float32 else 1e-10)
+    assert calls == list(enumerate(found.lower_bounds, 1))
+
+
+def test_few_points_or_many_dimensions_are_not_pooled(monkeypatch):
+    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
+    monkeypatch.setattr(truncated, "pool_into_cells", None)  # a call would fail
+    for points, k, max_iter in ((cloud(900, 2), 2, 9), (cloud(1200, 4), 2, 9), (cloud(1200, 2), 20, 9)):
+        fit_truncated(
+            rows_of(points),
+            torch.zeros(len(points), dtype=torch.int64),
+            random_parameters(k, points.shape[1]),
+            Settings(max_iter=max_iter),
+        )
+    cells = Rows(em.quadratic_features(cloud(1200, 2)), torch.ones(1200, dtype=torch.float64), False)
+    fit_truncated(cells, torch.zeros(1200, dtype=torch.int64), random_parameters(2, 2), Settings())
+
+
+def test_fit_through_cells_is_as_good(monkeypatch):
+    x = room(6000)
+    options: dict[str, Any] = {"algorithm": "truncated", "init_params": "flat_pieces", "tol": 1e-4}
+    direct = GaussianMixture(30, **options).fit(x)
+    monkeypatch.setattr(truncated, "_MANY_POINTS", 1000)
+    pooled = GaussianMixture(30, **options).fit(x)
+    assert pooled.lower_bounds_ != direct.lower_bounds_
+    assert pooled.score(x) == pytest.approx(direct.score(x), abs=0.05)
+
+
+# -- the contract ----------------------------------------------------------------------------------
+
+
+def test_many_points_start_on_a_sample_without_its_bounds(monkeypatch):
+    points = torch.from_numpy(beads(6000, 5)[0])
+    first, owner = flat_pieces(points, torch.ones(6000).double(), 5, 1e-6)
+    runs, seen = [], []
+    run = truncated.run_truncated
+    monkeypatch.setattr(
+        truncated, "run_truncated", lambda rows, *rest: (runs.append(rows), run(rows, *rest))[1]
+    )
+    found = fit_truncated(
+        Rows(points, torch.ones(6000).double()),
+        owner,
+        first,
+        Settings(on_iteration=lambda *at: seen.append(at)),
+    )
+    sample, whole = runs
+    assert sample.weight.shape[0] == 2000
+    assert len(torch.unique(sample.values, dim=0)) == 2000
+    assert whole.weight.shape[0] == 6000
+    assert seen == list(enumerate(found.lower_bounds, 1))
+    assert found.lower_bounds == sorted(found.lower_bounds)
