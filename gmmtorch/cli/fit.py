@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event, Row
-    from gmmtorch.evaluation.fit_comparison import FitOutcome
+    from gmmtorch.evaluation.fits.fit_comparison import FitOutcome
 
 TABLE = (
     "method n_components n_components_used seconds n_iterations log_likelihood held_out_log_likelihood "
@@ -50,7 +50,7 @@ def run(config: DictConfig) -> float | None:
 
 def _run_streamed(config: DictConfig) -> float | None:
     """The same for a streamed fit; returns None in workers."""
-    from gmmtorch.evaluation.fit_comparison import FitOutcome
+    from gmmtorch.evaluation.fits.fit_comparison import FitOutcome
 
     folder = common.run_dir()
     streamed = fit_stream.run(config, folder)
@@ -65,7 +65,7 @@ def _run_streamed(config: DictConfig) -> float | None:
 
 def _compare(config: DictConfig, device: str, folder: Path, on_event: Event) -> list[Row]:
     """A row for each method; saves and draws every mixture."""
-    from gmmtorch.evaluation.fit_comparison import compare
+    from gmmtorch.evaluation.fits.fit_comparison import compare
 
     data = fit_data(config, device, on_event)
     outcome = compare(
@@ -89,7 +89,7 @@ def _show(config: DictConfig, points: Tensor, outcome: FitOutcome, folder: Path)
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     if not (config.report.figures or config.report.tensorboard):
         return
-    from gmmtorch.evaluation.fit_comparison import NO_LIKELIHOODS, in_use
+    from gmmtorch.evaluation.fits.fit_comparison import NO_LIKELIHOODS, in_use
     from gmmtorch.report.maps.accuracy_figures import comparison_figure, convergence_figure
     from gmmtorch.report.scenes.mixture_figures import mixture_figure
     from gmmtorch.report.style import label_of

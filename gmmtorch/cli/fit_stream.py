@@ -16,7 +16,7 @@ from gmmtorch.cli import common
 from gmmtorch.cli.from_options.fit_data import fit_data
 
 if TYPE_CHECKING:
-    from gmmtorch.evaluation.streamed_fit import Split, Streamed
+    from gmmtorch.evaluation.fits.streamed_fit import Split, Streamed
     from gmmtorch.mixture.streaming.checkpoints import Checkpoint
 
 
@@ -46,7 +46,7 @@ def is_wanted(config: DictConfig) -> bool:
 
 def run(config: DictConfig, folder: Path) -> Streamed | None:
     """Run a streamed fit, write its row and save its mixture. Returns None in workers."""
-    from gmmtorch.evaluation.streamed_fit import fit_streamed
+    from gmmtorch.evaluation.fits.streamed_fit import fit_streamed
     from gmmtorch.mixture.streaming.distributed import joined
     from gmmtorch.report.progress import ProgressBars
 
@@ -126,7 +126,7 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
 
 def _split(config: DictConfig, device: str, on_event: Any) -> Split:
     from gmmtorch.datasets.point_files.point_chunks import open_points
-    from gmmtorch.evaluation.streamed_fit import split_data, split_source
+    from gmmtorch.evaluation.fits.streamed_fit import split_data, split_source
 
     stream = config.stream
     if config.points is None:

@@ -26,7 +26,7 @@ from gmmtorch.cli.options import schema
 from gmmtorch.cli.studies import fit_studies, occupancy_studies
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.evaluation import methods
-from gmmtorch.evaluation.fit_comparison import ESTIMATORS
+from gmmtorch.evaluation.fits.fit_comparison import ESTIMATORS
 from gmmtorch.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.exploration.mission.trials import WorldOptions
 from gmmtorch.exploration.planning.planners import PLANNERS

@@ -12,7 +12,7 @@ from sklearn.cluster import MeanShift
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.evaluation.fit_comparison import FitData, Row, split
+from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, split
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies import component_count
 from gmmtorch.evaluation.studies.component_count import (

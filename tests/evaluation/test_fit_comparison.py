@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
-from gmmtorch.evaluation.fit_pruning import Views
+from gmmtorch.evaluation.fits.fit_comparison import ESTIMATORS, FitOutcome, compare, means, split
+from gmmtorch.evaluation.fits.fit_pruning import Views
 from gmmtorch.evaluation.metrics import psnr2
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimators.sensor_model import measured_sensor

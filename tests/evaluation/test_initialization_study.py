@@ -11,7 +11,7 @@ import torch
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import ignore
-from gmmtorch.evaluation.fit_comparison import FitData, Row, compare, split
+from gmmtorch.evaluation.fits.fit_comparison import FitData, Row, compare, split
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies import initialization_study as initialization
 from gmmtorch.evaluation.studies.initialization_study import box_covariances, fit_timed, run

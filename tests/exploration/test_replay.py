@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import random
 import resource
 import shutil
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ import pytest
 from exploration.replays import RULES, Together, content, log, mapped, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from own_process import answer_of
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import DatasetShard, shard_indices
@@ -334,15 +332,7 @@ def test_progress_of_another_log_or_rule_is_rejected(tmp_path):
 @pytest.mark.slow
 def test_the_process_of_a_robot_is_killed():
     """In its own process, as it forks; see `kill_replay`."""
-    done = subprocess.run(
-        [sys.executable, "-m", "exploration.kill_replay", str(N_KILLS)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(done.stdout)
+    found = answer_of("exploration.kill_replay", N_KILLS)
     assert found["kills"] == N_KILLS
     assert all(made["lost"] == made["doubled"] == 0 for made in found["robots"])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import random
@@ -19,6 +18,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
+from own_process import answer_of
 from sharing.schedules import act, components, run_schedule
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -488,15 +488,7 @@ def _raise_full(*_, **__):
 @pytest.mark.slow
 def test_acknowledged_records_survive_a_kill_at_any_time():
     """In a separate process, because it forks; see `kill_store`."""
-    done = subprocess.run(
-        [sys.executable, "-m", "sharing.kill_store", str(N_KILLS)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    kills = json.loads(done.stdout)
+    kills = answer_of("sharing.kill_store", N_KILLS)
     assert kills["kills"] == N_KILLS
     assert kills["acknowledged"] > N_KILLS
     assert kills["lost"] == kills["unequal"] == kills["refused"] == kills["failed"] == 0

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event
-    from gmmtorch.evaluation.fit_comparison import FitData
+    from gmmtorch.evaluation.fits.fit_comparison import FitData
     from gmmtorch.scan import Scan
 
 
@@ -26,8 +26,8 @@ def fit_data_of(config: DictConfig, name: str, scans: Sequence[Scan]) -> FitData
     """The same for given scans of the data set with this name."""
     import torch
 
-    from gmmtorch.evaluation.fit_comparison import split
-    from gmmtorch.evaluation.fit_pruning import Views
+    from gmmtorch.evaluation.fits.fit_comparison import split
+    from gmmtorch.evaluation.fits.fit_pruning import Views
 
     points = torch.cat([scan.points for scan in scans])
     sizes = torch.tensor([len(scan.points) for scan in scans], device=points.device)

@@ -84,7 +84,7 @@ def _component_count(config: DictConfig, device: str, on_event: Event, on_rows: 
 
 def _found(rows: list[Row], figures: Figures, line: str, columns: str) -> Found:
     """The table shows means over the seeds for each value of the field `line` and number of components."""
-    from gmmtorch.evaluation.fit_comparison import means
+    from gmmtorch.evaluation.fits.fit_comparison import means
 
     table = means(rows, (line, "n_components"))
     return Found(

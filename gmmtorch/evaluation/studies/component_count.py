@@ -31,7 +31,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import held_out, queries
 from gmmtorch.evaluation.events import Event, OnRows, Row, ignore
-from gmmtorch.evaluation.fit_comparison import FitData, row_of
+from gmmtorch.evaluation.fits.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.methods import MapFactory
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
 from gmmtorch.evaluation.studies.map_variants import surface_score

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.evaluation.events import Event, OnRows, Row
-from gmmtorch.evaluation.fit_comparison import FitData, row_of
+from gmmtorch.evaluation.fits.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.evaluation.studies.study_options import InitializationStudy
 from gmmtorch.mixture.em import exact as em

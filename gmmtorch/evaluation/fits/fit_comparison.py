@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event, OnRows, Row
-from gmmtorch.evaluation.fit_pruning import Views, pruned, tree_options
+from gmmtorch.evaluation.fits.fit_pruning import Views, pruned, tree_options
 from gmmtorch.evaluation.metrics import psnr2, psnr_terms
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.estimator import MixtureEstimator

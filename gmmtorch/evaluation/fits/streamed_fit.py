@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation.events import Event, Row
-from gmmtorch.evaluation.fit_comparison import FitData, row_of
+from gmmtorch.evaluation.fits.fit_comparison import FitData, row_of
 from gmmtorch.evaluation.protocol_options import FitOptions
 from gmmtorch.mixture.gaussian_mixture import GaussianMixture
 from gmmtorch.mixture.streaming.checkpoints import Checkpoint
