@@ -25,7 +25,7 @@ def as_tensor(
     Arrays can have any strides and byte order. Large arrays share memory with the result if they can.
 
     Args:
-        value: a tensor, an array, whatever NumPy turns into an array of numbers, or a list of these.
+        value: a tensor, an array, anything that NumPy converts to an array of numbers, or a list of these.
         name: name of the argument, for errors.
         dtype: type of the result. None: float32 and float64 stay, all other types become float64.
         device: device of the result. None: that of a tensor, otherwise the CPU.

@@ -50,7 +50,7 @@ def start(name: str, run: Callable[[DictConfig], Any]) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGINT raises `KeyboardInterrupt` here, whatever the process was started with.
+    """SIGINT raises `KeyboardInterrupt` here, even if the process was started with SIGINT ignored.
 
     A shell starts background processes with SIGINT ignored. Python drops an exception that is raised
     in `__del__` or in a callback of a library; such an interrupt is sent again.

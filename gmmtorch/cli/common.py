@@ -23,14 +23,14 @@ _ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
 
 
 def conf_dir() -> str:
-    """The folder of configuration files: in the package if it is installed, beside the package in a
+    """The folder of configuration files: in the package if it is installed, next to the package in a
     checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "occupancy.yaml").is_file():
             return str(candidate)
     raise FileNotFoundError(
-        f"conf/ is neither in {package} nor beside it; install gmmtorch again, or use a complete checkout."
+        f"conf/ is neither in {package} nor next to it; install gmmtorch again, or use a complete checkout."
     )
 
 

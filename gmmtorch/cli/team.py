@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _COMMAND = (sys.executable, "-m", "gmmtorch.cli.robot")
 _PATIENCE = 30.0
-"""Seconds for a robot to end once it is told to."""
+"""Seconds in which a robot must end after it is asked to."""
 _TAIL = 1 << 14
 """Bytes at the end of a robot's output that are searched for its last line."""
 _IGNORED_LINE = "Set the environment variable HYDRA_FULL_ERROR"
@@ -36,7 +36,7 @@ _ERROR = "gmmtorch: error: "
 
 
 class RobotProcess:
-    """A robot's process. It ends when it is told to, and when the process that started it has ended.
+    """A robot's process. It ends when it is asked to, or when the process that started it has ended.
 
     Args:
         overrides: its options. folder: its run directory; its output goes to output.log there.

@@ -85,7 +85,7 @@ def serve(viewer: MapViewer) -> None:
 
 
 def _trajectories(config: DictConfig, path: Path, dim: int) -> list[Tensor]:
-    """The sensor positions (S, D) in `trajectory`, or in the files beside the map: one of each recording."""
+    """The sensor positions (S, D) in `trajectory`, or in the files next to the map: one of each recording."""
     from gmmtorch.errors import MissingDataError
 
     if config.trajectory is not None:

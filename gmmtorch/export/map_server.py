@@ -1,6 +1,6 @@
 """Writes 2D maps for ROS map_server and Nav2: a grey image, and a YAML file that describes it.
 
-A pixel of value x stands for the occupancy probability p = (255 − x)/255. A cell is occupied if p is
+A pixel of value x encodes the occupancy probability p = (255 − x)/255. A cell is occupied if p is
 above `occupied_thresh`, free if p is below `free_thresh`, and unknown otherwise. `origin` is the lower
 left corner of the image. The first image row is the top of the map (highest y).
 """

@@ -38,7 +38,7 @@ class ProgressBars:
             self._bars.pop(stage).close()
 
     def note(self, stage: str, text: str) -> None:
-        """Shows text beside the bar of a stage, if that bar is open."""
+        """Shows text next to the bar of a stage, if that bar is open."""
         if stage in self._bars:
             self._bars[stage].set_postfix_str(text, refresh=False)  # shown with the next step
 

@@ -76,7 +76,7 @@ class Store:
         """Open or create the store of a robot.
 
         Args:
-            path: the file. SQLite writes `<path>-wal` beside it.
+            path: the file. SQLite writes `<path>-wal` next to it.
             robot: number of the robot.
             facts: plain values by name that identify the world or log. They are written to a new file; an
                 existing file must have equal ones.

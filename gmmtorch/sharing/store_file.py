@@ -66,7 +66,7 @@ def open_file(path: Path, facts: Mapping[str, Any], max_bytes: int) -> tuple[sql
             error,
         )
     try:
-        # SQLite cannot read a log without writing beside it.
+        # SQLite cannot read a log without writing a file next to it.
         with tempfile.TemporaryDirectory(prefix="gmmtorch-") as folder:
             for suffix in ("", "-wal"):
                 with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -109,8 +109,8 @@ def explained(error: Exception, path: Path) -> GmmTorchError:
     if isinstance(error, OSError) or code in _DISK:
         return OutputError(f"{path} cannot be written ({error}).")
     return DataError(
-        f"{path} is damaged, or is no store of gmmtorch ({error}). Move it away and start anew: teammates "
-        "have what was sent."
+        f"{path} is damaged, or is no store of gmmtorch ({error}). Move it away; a new store is made: "
+        "teammates have what was sent."
     )
 
 
@@ -165,10 +165,13 @@ def _open_tables(db: sqlite3.Connection, path: Path, max_bytes: int) -> None:
                 f"{VERSION}. Give another folder, or update gmmtorch."
             )
         if found != set(_TABLES):
-            raise DataError(f"{path} has other tables than a store of gmmtorch. Move it away and start anew.")
+            raise DataError(
+                f"{path} has other tables than a store of gmmtorch. Move it away; a new store is made."
+            )
         if (problem := _value(db, "quick_check(1)")) != "ok":
             raise DataError(
-                f"{path} is damaged ({problem}). Move it away and start anew: teammates have what was sent."
+                f"{path} is damaged ({problem}). Move it away; a new store is made: "
+                "teammates have what was sent."
             )
     pages = max_bytes // _value(db, "page_size")
     _set(db, "journal_mode = WAL", "synchronous = FULL", "wal_autocheckpoint = 256")
@@ -183,7 +186,9 @@ def _check_facts(db: sqlite3.Connection, path: Path, facts: Mapping[str, Any]) -
     try:
         kept = {name: json.loads(value) for name, value in db.execute("SELECT name, value FROM fact")}
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: its facts are damaged ({error}). Move it away and start anew.") from error
+        raise DataError(
+            f"{path}: its facts are damaged ({error}). Move it away; a new store is made."
+        ) from error
     own = json.loads(json.dumps(dict(facts)))
     if not kept:
         with transaction(db):

@@ -105,7 +105,7 @@ def team_key(path: str | None) -> TeamKey | None:
 
 
 def address(name: str, text: str, least_port: int = 0) -> tuple[str, int]:
-    """The address of a text host:port. Port 0 stands for any free port."""
+    """The address of a text host:port. Port 0 means any free port."""
     from gmmtorch.errors import InvalidArgumentError
 
     host, colon, port = str(text).rpartition(":")

@@ -58,7 +58,7 @@ class OccupancyReport(Report):
     """Figures of gmmtorch-occupancy.
 
     magnify: number of regions of a 2D map with a magnified figure.
-    scene: draw 3D maps in space, beside the points and the components.
+    scene: draw 3D maps in space, next to the points and the components.
     """
 
     magnify: int = 0
@@ -120,7 +120,7 @@ class View:
     """Options of gmmtorch-view.
 
     path: map file, run directory of gmmtorch-map, or folder of tiles.
-    trajectory: TUM or KITTI file; null: trajectory.tum beside the map and of each recording.
+    trajectory: TUM or KITTI file; null: trajectory.tum next to the map and of each recording.
     bounds: of a map in tiles, the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened.
     html: file to write, .html, instead of serving a page.
     shape: ellipsoids, splats, surfaces or none.

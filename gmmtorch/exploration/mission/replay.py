@@ -44,7 +44,7 @@ class ReplayMission:
     scans. A robot that is killed and restarted with the same store and log reads the few scans since then
     again, publishes nothing before it is as far as it was, and continues: its final map equals that of a
     robot that was never killed. If the progress is lost, it begins again; the records that it sent before
-    stay in the team's map beside the new ones until the log is over.
+    stay in the team's map together with the new ones until the log is over.
 
     A scan that cannot be read is left out and counted; the first one is logged.
 

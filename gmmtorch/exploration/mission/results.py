@@ -94,7 +94,7 @@ def variant_of(
 
 
 def differing(rows: Sequence[Mapping[str, Any]], without: Collection[str] = ()) -> list[str]:
-    """The fields of `VARIANT` in which rows differ. The name `gmm_thesis` stands for the options `THESIS`."""
+    """The fields of `VARIANT` in which rows differ. The name `gmm_thesis` means the options `THESIS`."""
     free = [row for row in rows if row.get("framework") != "gmm_thesis"]
     return [
         field
@@ -133,7 +133,7 @@ def with_times(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def with_network_costs(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows with what sharing cost, beside the same mission on a network without losses.
+    """Rows with what sharing cost, compared with the same mission on a network without losses.
 
     - `bits_per_byte`: entropy reduction (bits) per byte on the wire, headers included.
     - `t90_ratio`, `wire_ratio`: t90 and bytes on the wire, divided by those of the lossless companion: the

@@ -21,7 +21,7 @@ from gmmtorch.exploration.planning.tree_search import Found, SearchRule, TreeSea
 
 _NOTHING = 1e-3  # share of the largest value below which information counts as zero
 _STUCK = 0.3  # metres of progress that a branch must make
-_REMEMBERED = 32  # abandoned views that are remembered
+_REMEMBERED = 32  # abandoned views that are stored
 
 
 @dataclass(frozen=True)

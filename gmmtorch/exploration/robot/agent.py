@@ -35,7 +35,7 @@ _LATEST_PLANS = 10
 _RESTING_PLANS = 10
 """Plans of a robot at rest, of which one is sent."""
 _PATIENCE = 15
-"""Plans in a row that lead nowhere before a robot looks around: to leave a start takes up to six."""
+"""Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
 
 
 class Agent:
@@ -183,7 +183,7 @@ class Agent:
     # -- planning ---------------------------------------------------------------------------------
 
     def begin_planning(self, now: float) -> None:
-        """Takes the snapshot of the map that `propose` uses, whatever arrives meanwhile."""
+        """Takes the snapshot of the map that `propose` uses. Later messages do not change it."""
         robot, options = self.robot, self.options
         with self.watch("planning"):
             self._begun, self._rests = True, robot.should_rest(now)

@@ -142,7 +142,7 @@ class Radio:
         self, make: Callable[[int | None], list[bytes]], now: float, spare: int = 0
     ) -> list[bytes]:
         """Datagrams to be sent now, which `make` makes from the bytes available at the time `now` (s); None
-        stands for no limit.
+        means no limit.
 
         spare: bytes that must be available, or nothing is made. Views need room for a whole datagram, so that
         they never delay a record.

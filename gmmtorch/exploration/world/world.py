@@ -55,7 +55,7 @@ class World:
         box: the lattice cells of the bounds.
         occupied: (nx, ny, nz) bool, cells that the mesh meets.
         navigable: bool, connected cells above a floor at whose centre a robot does not touch the mesh. Cells
-            without a surface below them are outside, such as the rock beside a mine without a roof.
+            without a surface below them are outside, such as the rock around a mine without a roof.
         observable: bool, cells that a camera in the navigable space can see: occupied cells, and free cells
             above a floor.
         robot_radius: metres.

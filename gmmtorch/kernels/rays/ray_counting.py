@@ -200,7 +200,7 @@ def _count_in_blocks_fused(
 def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:
     """Block in the table, and place in the block, (V,) each, of packed cell indices (V,).
 
-    The field of each axis is cut into block bits and local bits; each kind is packed anew.
+    The field of each axis is cut into block bits and local bits; each kind is packed again.
     """
     bits = tuple(b + local_bits for b in block_bits)
     packed = voxel.int() if sum(bits) < 31 else voxel

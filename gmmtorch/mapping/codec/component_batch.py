@@ -50,7 +50,7 @@ def decode(data: bytes) -> Components:
     """The components of a batch, on the CPU.
 
     Raises `DataError`, with the reason, for data that `encode` did not write. Memory is bounded in proportion
-    to the length of the data, whatever numbers they contain.
+    to the length of the data, for any numbers in them.
     """
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if len(data) <= _CHECKSUM_BYTES:

@@ -13,7 +13,7 @@ Then, with p = `PRECISION`:
 
 So, in the rounded component's deviations, a mean is off by at most 2⁻ᵖ⁻¹ along each of D axes
 (`MEAN_ERROR`), and so is L below its diagonal (`SHEAR_ERROR`; L₃₁ by up to 2⁻²ᵖ⁻² more). The deviation in
-any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, whatever the component's shape.
+any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, for any shape of the component.
 Restored covariances are positive definite by construction. The lattice is fixed in the world frame: the
 result depends on the component only, and rounding again changes nothing.
 """

@@ -27,7 +27,7 @@ LEAST_COUNT, LARGEST_COUNT = -10 * PER_OCTAVE, 40 * PER_OCTAVE
 """Steps: 2⁻¹⁰ and 2⁴⁰ points. Counts below half the least become zero; larger ones are refused."""
 MOST_POINTS = 2.0 ** (LARGEST_COUNT / PER_OCTAVE)
 NO_COUNT = LEAST_COUNT - 1
-"""The number that stands for a count of zero."""
+"""The number that encodes a count of zero."""
 COUNT_ERROR = lattice.DEVIATION_ERROR
 """Largest relative error of a count."""
 

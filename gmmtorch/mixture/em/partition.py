@@ -2,7 +2,7 @@
 
 A piece is halved at its mean, across its longest direction, while it is thicker than the sensor's
 noise explains, or longer than a component may be, and both halves keep enough points. All pieces of
-a level are halved as one batch of tensor operations. A wall thus gives few pieces, a curved surface
+a level are halved as one batch of tensor operations. So a wall gives few pieces, a curved surface
 more pieces the lower the noise, and edges and clutter as many as their points support. If the number
 of pieces is limited, pieces with many points, large extent and above all large thickness come first.
 

@@ -20,7 +20,7 @@ def step_size(batch: float, seen: float, kappa: float) -> float:
     """η = (n / (m + n))^κ, for a batch of weight n after points of weight m.
 
     For batches of equal size η is (t + 1)^−κ, t = 0, 1, …: Liang & Klein's (t + 2)^−κ after a first batch
-    with η = 1. With κ = 1 every point counts equally, whatever the batches.
+    with η = 1. With κ = 1 every point counts equally, in batches of any size.
     """
     return float((batch / (seen + batch)) ** kappa)
 

@@ -238,7 +238,7 @@ def _log_bounds(noise: Tensor, parameters: Parameters) -> Callable[[Tensor], tup
     """A function that bounds log π_k + log N(x | μ_k, Σ_k + R) (n, K) from below and above, for any of the R.
 
     Because low I ≼ R ≼ high I, the determinant and the quadratic form of Σ + R are between those of
-    Σ + low I and Σ + high I. Two plain mixtures, which are fast to evaluate, thus bound every log-density.
+    Σ + low I and Σ + high I. So two plain mixtures, which are fast to evaluate, bound every log-density.
     """
     spread = torch.linalg.eigvalsh(noise)
     low, high = spread[:, 0].amin().clamp_min(0), spread[:, -1].amax()

@@ -30,7 +30,7 @@ def support_density(support: Tensor, covariances: Tensor) -> Tensor:
 
     λ₀ ≥ λ₁ are the largest eigenvalues of the covariances (K, D, D), and support (K,) is the number of
     points N. The 2σ ellipse of an evenly covered square has 1.05 times the area of the square, and the
-    interval of a segment 1.15 times its length. A well-sampled surface thus has about its point density.
+    interval of a segment 1.15 times its length. So a well-sampled surface has about its point density.
     """
     variances = torch.linalg.eigvalsh(covariances).clamp_min(torch.finfo(covariances.dtype).tiny)
     if covariances.shape[-1] == 3:
@@ -106,7 +106,7 @@ def prune(
         sensor: see `sensor_model`.
         origins: (D,) or (S, D), sensor origins, world frame.
         counts: (K, S) points of each component seen from each origin, if known. Components without
-            any are kept whatever their density.
+            any are kept at any density.
 
     Raises `InvalidArgumentError` for invalid arguments, and if no component would remain.
     """

@@ -1,6 +1,6 @@
 """Processes that share one fit: each reads its own points, and all have the same parameters.
 
-They exchange one sum of K × F sufficient statistics per iteration, whatever the number of points.
+They exchange one sum of K × F sufficient statistics per iteration, independent of the number of points.
 Processes started by torchrun form a group; a single process is a group of one.
 """
 

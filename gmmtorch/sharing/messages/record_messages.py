@@ -267,7 +267,7 @@ def encode_announcements(
 ) -> list[bytes]:
     """Datagrams of all keys that are held, at least one.
 
-    Each speaks of another range of keys, so that any of them may get lost. Raises `InvalidArgumentError` for
+    Each covers another range of keys, so any of them may be lost. Raises `InvalidArgumentError` for
     values out of range.
     """
     _check_sender(sender, incarnation)

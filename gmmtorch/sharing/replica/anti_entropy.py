@@ -19,7 +19,7 @@ _CALLS_IN_FLIGHT = 3
 network with less delay than a tick, announces before it has received the datagrams of the last tick, and
 its announcement arrives a tick later."""
 MOST_PEERS = 64
-"""Robots whose gaps are remembered: those that announced last."""
+"""Largest number of robots whose gaps are stored: those that announced last."""
 MOST_REMEMBERED = 1 << 16
 """Intervals of what these robots lack, all together, and of what they hold: 1 MiB each. Two honest robots
 at their limits, or hundreds usually, need as many. The robot with most of them is forgotten until it

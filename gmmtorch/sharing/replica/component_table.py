@@ -102,7 +102,7 @@ class ComponentTable:
 
 
 def fingerprints(components: Components) -> list[bytes]:
-    """A hash (BLAKE2b, 16 bytes) of each component (K,), without its id, whatever its batch."""
+    """A hash (BLAKE2b, 16 bytes) of each component (K,), without its id, in any batch."""
     c = components
     flags = c.max_range.double()[:, None]
     rows = _bits(torch.cat([c.means, pack_symmetric(c.covariances), c.support[:, None], flags], 1))

@@ -258,7 +258,7 @@ class Replica:
     # -- reading ----------------------------------------------------------------------------------
 
     def digest(self) -> bytes:
-        """16 bytes, equal for equal contents, whatever the order of arrival."""
+        """16 bytes, equal for equal contents in any order of arrival."""
         return self._records.digest()
 
     def components(self) -> Components:

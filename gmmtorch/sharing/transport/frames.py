@@ -26,7 +26,7 @@ class FramedTransport(ABC):
 
     A subclass sends frames (`_carry`), passes received ones to `_take` from one thread, and ends that thread
     (`_shut`). A network that is down is no error: `_count_failure` counts it. The times `now` are not used:
-    `deliver` returns what has arrived, whatever the clocks of the team show.
+    `deliver` returns what has arrived; it does not depend on the clocks of the team.
 
     Attributes:
         sent, received: frames that were given to the network and that came from it, refused ones included.
@@ -187,7 +187,7 @@ class FramedTransport(ABC):
             raise GmmTorchError(f"The transport of robot {self.robot} is closed; open another.")
 
     def _take(self, frame: bytes, source: str) -> None:
-        """Open a received frame, whatever its bytes, and append its datagram to the queue. For one thread."""
+        """Open a received frame of any bytes, and append its datagram to the queue. For one thread."""
         opened = self._opener.open(frame, source)
         with self._lock:
             self.received = _sum(self.received, Traffic(1, len(frame)))

@@ -153,7 +153,7 @@ class Opener:
         return dict(self._sessions.duplicates)
 
     def open(self, frame: bytes, source: str = "") -> tuple[int, bytes] | None:
-        """(sender, datagram), or None if the frame is refused. Never raises, whatever the bytes.
+        """(sender, datagram), or None if the frame is refused. Never raises, for any bytes.
 
         source: the address that the frame came from, for the log. The first refusal of each kind is logged.
         """

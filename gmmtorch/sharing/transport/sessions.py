@@ -10,7 +10,7 @@ from dataclasses import dataclass
 WINDOW = 1024
 """Numbers below the highest one of a session for which replays are detected; lower numbers are refused."""
 MAX_SESSIONS = 1024
-"""Sessions that are remembered. Of more, those that were silent longest are forgotten."""
+"""Largest number of stored sessions. Beyond it, the sessions that were silent longest are removed."""
 RETURNS = 4
 """How often a session must continue after another one of the same robot id, until they are two robots."""
 SILENCE = 60.0

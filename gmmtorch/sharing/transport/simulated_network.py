@@ -83,7 +83,7 @@ class Network:
 
     Without jitter, a sender's datagrams arrive in order. With jitter, they overtake one another if their
     delays differ by more than the time between them. Losses have a random generator of their own: the same
-    `seed` loses the same datagrams whatever the other conditions are. Delivered datagrams are not stored.
+    `seed` loses the same datagrams under all other conditions. Delivered datagrams are not stored.
     """
 
     def __init__(self, n_robots: int, conditions: LinkConditions | None = None, seed: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Where the poses of a recording's scans come from: TF, a topic of poses, a trajectory file, or nowhere."""
+"""Where scans get their poses: TF, a topic of poses, a trajectory file, or a sensor that stands still."""
 
 from __future__ import annotations
 

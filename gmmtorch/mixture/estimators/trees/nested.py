@@ -2,7 +2,7 @@
 
 The points of a node are its members. A point may be a member of several nodes, with a share of its
 weight in each. Members are packed in blocks of one node, so that all nodes are one batch of small
-matrix products, whatever their numbers of members. Coordinates relative to the node's centre keep
+matrix products, for any numbers of members. Coordinates relative to the node's centre keep
 enough digits in float32.
 """
 
