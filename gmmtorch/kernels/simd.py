@@ -51,6 +51,7 @@ SIMD = """
     constexpr int LANES = 1;
     auto any = [](mask m) { return m; };
     auto root = [](vec x) { return sqrt(x); };
+    auto down = [](vec x) { return floor(x); };
     auto expo = [](vec x) { return exp(x); };
     auto fused = [](vec a, vec b, vec c) { return fma(a, b, c); };
     auto get = [](vec v, int) { return v; };
@@ -62,6 +63,7 @@ SIMD = """
     constexpr int LANES = 8;
     auto any = [](mask m) { return __builtin_reduce_or(m) != 0; };
     auto root = [](vec x) { return __builtin_elementwise_sqrt(x); };
+    auto down = [](vec x) { return __builtin_elementwise_floor(x); };
     auto fused = [](vec a, vec b, vec c) { return __builtin_elementwise_fma(a, b, c); };
     auto get = [](vec v, int i) { return v[i]; };
     auto set = [](vec& v, int i, double x) { v[i] = x; };

@@ -5,8 +5,8 @@ therefore sums of z and z², multiplied by u, v and their products. A patch that
 the view and in depth, is added to the cell that contains its mean. The pixels of any other patch are added
 one by one. The points themselves are never stored.
 
-The fused kernel runs on the CPU. Its cells are those of the twin, except for patches and points within
-rounding of the side of a cell; sums differ by rounding.
+On a CPU the fused kernel passes over an image in one item; on CUDA each patch is an item. Its cells are those
+of the twin, except for patches and points within rounding of the side of a cell; sums differ by rounding.
 """
 
 from __future__ import annotations
@@ -29,57 +29,88 @@ PATCH = 4
 """Side of a patch in pixels."""
 
 _WIDTH = 10  # features in 3D
-_BODY = """
-    // One item for an image: cells are numbered in the order of their first points. A free place holds -1.
-    int64_t n_found = *n_cells, number = -1;
-    double now[3] = {0.5, 0.5, 0.5};
-    const double *a = view, *b = view + 3, *c = view + 6, *t = view + 9;
-    // Adds n points with these sums and products, about the camera, to the cell of their mean.
-    auto add = [&](double n, const double* first, const double* second) {
-        double cell[3];
-        bool inside = n_found <= max_cells, same = true;
-        for (int i = 0; i < 3; ++i) {
-            const double q = first[i] / n + t[i];
-            inside = inside && fabs(q) < REACH;  // false for NaN
-            cell[i] = floor(q);
-            same = same && cell[i] == now[i];
-        }
-        if (!inside) n_found = max_cells + 1;
-        if (!inside) return;
-        if (!same) {
-            int64_t key = 0;
-            for (int i = 0; i < 3; ++i) {
-                now[i] = cell[i];
-                key = (key << KEY_BITS) | (int64_t)(cell[i] + REACH);
-            }
-            uint64_t hash = (uint64_t)key * 0x9E3779B97F4A7C15ull;
-            int64_t at = (int64_t)((hash ^ (hash >> 32)) & (uint64_t)(n_places - 1));
-            while (places[at] >= 0 && keys[places[at]] != key) at = (at + 1) & (n_places - 1);
-            if (places[at] < 0) {
-                if (n_found >= max_cells) {
-                    n_found = max_cells + 1;
-                    return;
+_COLUMNS = """
+            for (int u = 0; u < PATCH; ++u) of_columns[u] = (vec)(0.0);
+#if !defined(__CUDA_ARCH__)
+            if (full && column_step == 1) {  // column u of eight patches, from four vectors of columns
+                typedef KIND loose __attribute__((ext_vector_type(8), aligned(alignof(KIND))));
+                vec x[4];
+                const loose* given = (const loose*)(corner + v * row_step);
+                for (int i = 0; i < 4; ++i) {
+                    x[i] = __builtin_convertvector(given[i], vec);
+                    if (row + 2 * PATCH <= n_rows) __builtin_prefetch(corner + (v + PATCH) * row_step + LANES * i);
                 }
-                places[at] = n_found;
-                for (int f = 0; f < WIDTH; ++f) sums[n_found * WIDTH + f] = 0.0;
-                for (int64_t i = 0; i < n_images; ++i) counts[n_found * n_images + i] = 0.0;
-                keys[n_found++] = key;
-            }
-            number = places[at];
+                const vec a0 = __builtin_shufflevector(x[0], x[1], 0, 4, 8, 12, 1, 5, 9, 13);
+                const vec a1 = __builtin_shufflevector(x[2], x[3], 0, 4, 8, 12, 1, 5, 9, 13);
+                const vec a2 = __builtin_shufflevector(x[0], x[1], 2, 6, 10, 14, 3, 7, 11, 15);
+                const vec a3 = __builtin_shufflevector(x[2], x[3], 2, 6, 10, 14, 3, 7, 11, 15);
+                of_columns[0] = __builtin_shufflevector(a0, a1, 0, 1, 2, 3, 8, 9, 10, 11);
+                of_columns[1] = __builtin_shufflevector(a0, a1, 4, 5, 6, 7, 12, 13, 14, 15);
+                of_columns[2] = __builtin_shufflevector(a2, a3, 0, 1, 2, 3, 8, 9, 10, 11);
+                of_columns[3] = __builtin_shufflevector(a2, a3, 4, 5, 6, 7, 12, 13, 14, 15);
+            } else
+#endif
+            for (int u = 0; u < PATCH; ++u)
+                for (int l = 0; l < LANES; ++l) {
+                    const int64_t place = PATCH * l + u;
+                    if (full || column + place < n_columns)
+                        set(of_columns[u], l, (double)corner[v * row_step + place * column_step]);
+                }
+"""
+_BODY = """
+    // Patches item, item + n_items, ... of an image, LANES side by side.
+    const double *a = view, *b = view + 3, *c = view + 6, *t = view + 9;
+    double now[3] = {0.5, 0.5, 0.5};
+    int64_t number = -1;
+    bool overflows = *n_cells > max_cells;
+    // The number of a cell, or -1 beyond max_cells.
+    auto number_of = [&](const double* cell) {
+        int64_t key = 0;
+        for (int i = 0; i < 3; ++i) key = (key << KEY_BITS) | (int64_t)(cell[i] + REACH);
+        uint64_t hash = (uint64_t)key * 0x9E3779B97F4A7C15ull;
+        int64_t at = (int64_t)((hash ^ (hash >> 32)) & (uint64_t)(n_places - 1));
+#if defined(__CUDA_ARCH__)
+        // The number is the place: threads claim places of `keys`, which are -1 as long as they are free.
+        typedef unsigned long long word;
+        for (int64_t tried = 0; tried < n_places; ++tried, at = (at + 1) & (n_places - 1)) {
+            const int64_t found = (int64_t)atomicCAS((word*)(keys + at), ~0ull, (word)key);
+            if (found == key) return at;
+            if (found < 0) return (int64_t)atomicAdd((word*)n_cells, 1ull) < max_cells ? at : (int64_t)-1;
         }
-        double* sum = sums + number * WIDTH;
-        double o[3];
-        for (int i = 0; i < 3; ++i) o[i] = t[i] - now[i];
-        sum[0] += n;
-        for (int i = 0, f = 4; i < 3; ++i) {
-            sum[1 + i] += first[i] + n * o[i];
-            for (int j = i; j < 3; ++j, ++f)
-                sum[f] += second[f - 4] + first[i] * o[j] + o[i] * (first[j] + n * o[j]);
+        atomicAdd((word*)n_cells, (word)max_cells + 1);
+        return (int64_t)-1;
+#else
+        // Cells are numbered in the order of their first points. A free place holds -1.
+        while (places[at] >= 0 && keys[places[at]] != key) at = (at + 1) & (n_places - 1);
+        if (places[at] >= 0) return (int64_t)places[at];
+        if (*n_cells >= max_cells) {
+            *n_cells = max_cells + 1;
+            return (int64_t)-1;
         }
-        counts[number * n_images + image] += n;
+        const int64_t made = (*n_cells)++;
+        places[at] = (int32_t)made;
+        keys[made] = key;
+        for (int f = 0; f < WIDTH; ++f) sums[made * WIDTH + f] = 0.0;
+        for (int64_t i = 0; i < n_images; ++i) counts[made * n_images + i] = 0.0;
+        return made;
+#endif
     };
-    for (int64_t row = 0; row < n_rows; row += PATCH)
-    for (int64_t column = 0; column < n_columns; column += PATCH * LANES) {
+    // Adds n points in a cell, with these sums of features about its corner.
+    auto add = [&](const double* cell, double n, const double* features) {
+        if (cell[0] != now[0] || cell[1] != now[1] || cell[2] != now[2]) {
+            for (int i = 0; i < 3; ++i) now[i] = cell[i];
+            number = number_of(cell);
+            overflows = overflows || number < 0;
+        }
+        if (overflows) return;
+        GMM_ADD(sums + number * WIDTH, n);
+        for (int f = 1; f < WIDTH; ++f) GMM_ADD(sums + number * WIDTH + f, features[f]);
+        GMM_ADD(counts + number * n_images + image, n);
+    };
+    const int64_t n_across = (n_columns + PATCH * LANES - 1) / (PATCH * LANES);
+    const int64_t n_blocks = n_across * ((n_rows + PATCH - 1) / PATCH);
+    for (int64_t block = item; block < n_blocks && !overflows; block += n_items) {
+        const int64_t row = PATCH * (block / n_across), column = PATCH * LANES * (block % n_across);
         const auto* corner = depth + row * row_step + column * column_step;
         const int64_t n_rows_here = GMM_MIN((int64_t)PATCH, n_rows - row);
         const bool full = column + PATCH * LANES <= n_columns;
@@ -89,13 +120,10 @@ _BODY = """
         for (int f = 0; f < 6; ++f) m[f] = (vec)(0.0);
         for (int64_t v = 0; v < n_rows_here; ++v) {
             vec z0 = (vec)(0.0), z1 = z0, y0 = z0, y1 = z0, y2 = z0;
+            vec of_columns[PATCH];
+            COLUMNS
             for (int u = 0; u < PATCH; ++u) {
-                vec z = (vec)(0.0);
-                for (int l = 0; l < LANES; ++l) {
-                    const int64_t place = PATCH * l + u;
-                    if (full || column + place < n_columns)
-                        set(z, l, (double)corner[v * row_step + place * column_step]);
-                }
+                vec z = of_columns[u];
                 const mask good = (z > 0.0) & (z < max_range);  // false for NaN
                 z = good ? z : (vec)(0.0);
                 n += good ? (vec)(1.0) : (vec)(0.0);
@@ -110,53 +138,70 @@ _BODY = """
             m[0] += y0, m[1] += y1, m[2] += y0 * w, m[3] += y2, m[4] += y1 * w, m[5] += y0 * (w * w);
         }
         if (!any(n > 0.0)) continue;
-        const mask is_whole = (far - near <= deepest) & (far <= farthest_whole);
-        vec ray[3], lane, first[3], second[6];
+        const mask is_whole = (far - near <= deepest) & (far <= farthest_whole) & (n > 0.0);
+        const vec whole = is_whole ? (vec)(1.0) : (vec)(0.0);
+        vec ray[3], lane, first[3], second[6], shift[3], cell[3], features[WIDTH], beyond = (vec)(0.0);
         for (int l = 0; l < LANES; ++l) set(lane, l, (double)(column + PATCH * l));
         for (int i = 0; i < 3; ++i) {
             ray[i] = a[i] + lane * b[i] + (double)row * c[i];
             first[i] = ray[i] * s[0] + b[i] * s[1] + c[i] * s[2];
+            const vec mean = first[i] / n + t[i];
+            cell[i] = down(mean);
+            shift[i] = t[i] - cell[i];
+            beyond = (mean > -REACH) & (mean < REACH) ? beyond : (vec)(1.0);
+            features[1 + i] = first[i] + n * shift[i];
         }
+        overflows = overflows || any((beyond > 0.0) & is_whole);
+        if (overflows) break;
         for (int j = 0; j < 3; ++j) {
             const vec z = m[0] * ray[j] + m[1] * b[j] + m[2] * c[j];
             const vec u = m[1] * ray[j] + m[3] * b[j] + m[4] * c[j];
             const vec v = m[2] * ray[j] + m[4] * b[j] + m[5] * c[j];
             for (int i = 0; i <= j; ++i) second[i * (5 - i) / 2 + j] = ray[i] * z + b[i] * u + c[i] * v;
         }
-        const vec whole = is_whole ? (vec)(1.0) : (vec)(0.0);
-        for (int l = 0; l < LANES; ++l) {
+        for (int i = 0, f = 4; i < 3; ++i)
+            for (int j = i; j < 3; ++j, ++f)
+                features[f] = second[f - 4] + first[i] * shift[j] + shift[i] * features[1 + j];
+        for (int l = 0; l < LANES && !overflows; ++l) {
             if (get(n, l) == 0.0) continue;
-            double p[3], pp[6];
+            double p[WIDTH], corner_of[3];
             if (get(whole, l) > 0.0) {
-                for (int f = 0; f < 3; ++f) p[f] = get(first[f], l);
-                for (int f = 0; f < 6; ++f) pp[f] = get(second[f], l);
-                add(get(n, l), p, pp);
+                for (int i = 0; i < 3; ++i) corner_of[i] = get(cell[i], l);
+                for (int f = 1; f < WIDTH; ++f) p[f] = get(features[f], l);
+                add(corner_of, get(n, l), p);
                 continue;
             }
             const int64_t begin = PATCH * l, end = GMM_MIN(begin + PATCH, n_columns - column);
-            for (int64_t v = 0; v < n_rows_here; ++v)
-            for (int64_t u = begin; u < end; ++u) {
+            for (int64_t v = 0; v < n_rows_here && !overflows; ++v)
+            for (int64_t u = begin; u < end && !overflows; ++u) {
                 const double z = (double)corner[v * row_step + u * column_step];
                 if (!(z > 0.0 && z < max_range)) continue;
-                for (int i = 0; i < 3; ++i)
-                    p[i] = z * (a[i] + (double)(column + u) * b[i] + (double)(row + v) * c[i]);
-                for (int i = 0, f = 0; i < 3; ++i)
-                    for (int j = i; j < 3; ++j, ++f) pp[f] = p[i] * p[j];
-                add(1.0, p, pp);
+                double x[3];
+                for (int i = 0; i < 3; ++i) {
+                    const double q = z * (a[i] + (double)(column + u) * b[i] + (double)(row + v) * c[i]);
+                    const double at = q + t[i];
+                    if (!(fabs(at) < REACH)) overflows = true;
+                    corner_of[i] = floor(at);
+                    x[i] = p[1 + i] = q + (t[i] - corner_of[i]);
+                }
+                for (int i = 0, f = 4; i < 3; ++i)
+                    for (int j = i; j < 3; ++j, ++f) p[f] = x[i] * x[j];
+                if (!overflows) add(corner_of, 1.0, p);
             }
         }
     }
-    *n_cells = n_found;
+    if (overflows) *n_cells = max_cells + 1;
 """
 _KERNELS = {
     dtype: FusedKernel(
         f"depth_cells_{kind}",
         f"const {kind}* depth, int64 n_rows, int64 n_columns, int64 row_step, int64 column_step,"
         " const double* view, double max_range, double deepest, double farthest_whole, int64 image,"
-        " int64 n_images, int64 max_cells, int64 n_places, int64* places, int64* keys, double* sums,"
-        " double* counts, int64* n_cells",
+        " int64 n_images, int64 n_items, int64 max_cells, int64 n_places, int32* places, int64* keys,"
+        " double* sums, double* counts, int64* n_cells",
         SIMD
-        + _BODY.replace("KEY_BITS", str(KEY_BITS))
+        + _BODY.replace("COLUMNS", _COLUMNS.replace("KIND", kind))
+        .replace("KEY_BITS", str(KEY_BITS))
         .replace("REACH", repr(REACH))
         .replace("PATCH", str(PATCH))
         .replace("WIDTH", str(_WIDTH)),
@@ -202,7 +247,7 @@ def depth_cells(views: Sequence[DepthView], side: float, max_cells: int) -> Dept
     there are more than `max_cells`, or if a patch or point is `REACH` cells or more away from the reference
     point along an axis.
     """
-    if views[0].depth.device.type == "cpu" and is_fused(*(view.depth for view in views)):
+    if is_fused(*(view.depth for view in views)):
         return _fused(views, side, max_cells)
     return _batched(views, side, max_cells)
 
@@ -213,27 +258,28 @@ def _limits(view: DepthView, side: float) -> tuple[float, float]:
 
 
 def _fused(views: Sequence[DepthView], side: float, max_cells: int) -> DepthCells | None:
+    device, on_cpu = views[0].depth.device, views[0].depth.device.type == "cpu"
     n_places = 1 << (2 * max_cells).bit_length()
-    places, keys = torch.full((n_places,), -1), torch.empty(max_cells, dtype=torch.int64)
-    sums = torch.empty(max_cells, _WIDTH, dtype=torch.float64)
-    counts = torch.empty(max_cells, len(views), dtype=torch.float64)
-    n_cells = torch.zeros(1, dtype=torch.int64)
+    places = torch.full((n_places,), -1, dtype=torch.int32) if on_cpu else None
+    n_rows = max_cells if on_cpu else n_places  # on CUDA the place of a cell is its number
+    keys = torch.empty(n_rows, dtype=torch.int64) if on_cpu else torch.full((n_rows,), -1, device=device)
+    make = torch.empty if on_cpu else torch.zeros
+    sums = make(n_rows, _WIDTH, dtype=torch.float64, device=device)
+    counts = make(n_rows, len(views), dtype=torch.float64, device=device)
+    n_cells = torch.zeros(1, dtype=torch.int64, device=device)
     tables = max_cells, n_places, places, keys, sums, counts, n_cells
     for image, view in enumerate(views):
         depth = view.depth
-        given = (
-            depth,
-            *depth.shape,
-            *depth.stride(),
-            view.rays.contiguous(),
-            view.max_range,
-            *_limits(view, side),
-        )
-        _KERNELS[depth.dtype](1, *given, image, len(views), *tables, device=depth.device)
+        height, width = depth.shape
+        n_items = 1 if on_cpu else -(-height // PATCH) * -(-width // PATCH)
+        rays, sizes = view.rays.to(device).contiguous(), (height, width, *depth.stride())
+        given = rays, view.max_range, *_limits(view, side), image, len(views), n_items
+        _KERNELS[depth.dtype](n_items, depth, *sizes, *given, *tables, device=device)
     found = int(n_cells)
     if found > max_cells:
         return None
-    order = keys[:found].argsort()
+    used = torch.arange(found) if on_cpu else (keys >= 0).nonzero().squeeze(1)
+    order = used[keys[used].argsort()]
     return DepthCells(_corners(keys[order]), sums[order], counts[order])
 
 
