@@ -38,7 +38,8 @@ _COLUMNS = """
                 const loose* given = (const loose*)(corner + v * row_step);
                 for (int i = 0; i < 4; ++i) {
                     x[i] = __builtin_convertvector(given[i], vec);
-                    if (row + 2 * PATCH <= n_rows) __builtin_prefetch(corner + (v + PATCH) * row_step + LANES * i);
+                    if (row + 2 * PATCH > n_rows) continue;
+                    __builtin_prefetch(corner + (v + PATCH) * row_step + LANES * i);
                 }
                 const vec a0 = __builtin_shufflevector(x[0], x[1], 0, 4, 8, 12, 1, 5, 9, 13);
                 const vec a1 = __builtin_shufflevector(x[2], x[3], 0, 4, 8, 12, 1, 5, 9, 13);
