@@ -1,7 +1,7 @@
-"""Components rounded to the codec's lattice; the twin, which defines it, is in `mapping.codec.lattice`.
+"""Components rounded to the codec's lattice and restored; the twins are in `mapping.codec.lattice`.
 
-The fused kernel computes one component in one item, with the operations of the twin in the same order, each
-of them rounded: its whole numbers equal the twin's. Replicas compare bits.
+A fused kernel computes one component in one item, with the operations of the twin in the same order, each
+of them rounded: its results equal the twin's to the bit. Replicas compare bits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gmmtorch.kernels.compiler import FusedKernel
 
 DIMENSIONS = (2, 3)
 
-_ROUNDING = """
+_RESTORED = """
     typedef union { double x; int64_t bits; } Both;
     struct Place { int64_t order, steps[DIM], shear[PAIRS]; double slope[PAIRS], mean[DIM]; };
     // 2^e, and the factor 2^(steps / per_octave).
@@ -26,6 +26,35 @@ _ROUNDING = """
         return roots[steps - whole * per_octave] * two_to(whole);
     };
     auto exponent = [&](int64_t steps) { return floor_of(steps, per_octave) - precision; };
+    // The component at a place, and whether the place is within bounds.
+    auto restored = [&](const Place& p, double* m, double* c) {
+        const int64_t* axis = orders + p.order * DIM;
+        double v[DIM], lower[DIM][DIM];
+        bool valid = p.steps[0] <= most_steps && p.steps[0] - p.steps[DIM - 1] <= most_ratio;
+        for (int a = 0; a < DIM; ++a) {
+            v[a] = power(2 * p.steps[a]);
+            m[axis[a]] = p.mean[a] * two_to(exponent(p.steps[a]));
+            valid = valid && fabs(m[axis[a]]) <= farthest;
+        }
+        for (int f = 0; f < PAIRS; ++f) valid = valid && fabs(p.slope[f]) <= steepest;
+        lower[0][0] = v[0];
+        lower[1][0] = p.slope[0] * v[0];
+        lower[1][1] = p.slope[0] * lower[1][0] + v[1];
+        if (DIM == 3) {
+            const double s = p.slope[PAIRS / 2], t = p.slope[PAIRS - 1];
+            lower[DIM - 1][0] = s * v[0];
+            lower[DIM - 1][1] = s * lower[1][0] + t * v[1];
+            lower[DIM - 1][DIM - 1] = s * lower[DIM - 1][0] + t * t * v[1] + v[DIM - 1];
+        }
+        for (int a = 0; a < DIM; ++a) {
+            for (int b = 0; b <= a; ++b)
+                c[axis[a] * DIM + axis[b]] = c[axis[b] * DIM + axis[a]] = lower[a][b];
+            valid = valid && lower[a][a] <= most_variance;
+        }
+        return valid;
+    };
+"""
+_ROUNDED = """
     // The steps of a deviation, from the variance.
     auto to_steps = [&](double variance) {
         Both both;
@@ -81,33 +110,6 @@ _ROUNDING = """
             error[a] = wanted - p.mean[a] * two_to(e);
         }
         return p;
-    };
-    // The component at a place, and whether the place is within bounds.
-    auto restored = [&](const Place& p, double* m, double* c) {
-        const int64_t* axis = orders + p.order * DIM;
-        double v[DIM], lower[DIM][DIM];
-        bool valid = p.steps[0] <= most_steps && p.steps[0] - p.steps[DIM - 1] <= most_ratio;
-        for (int a = 0; a < DIM; ++a) {
-            v[a] = power(2 * p.steps[a]);
-            m[axis[a]] = p.mean[a] * two_to(exponent(p.steps[a]));
-            valid = valid && fabs(m[axis[a]]) <= farthest;
-        }
-        for (int f = 0; f < PAIRS; ++f) valid = valid && fabs(p.slope[f]) <= steepest;
-        lower[0][0] = v[0];
-        lower[1][0] = p.slope[0] * v[0];
-        lower[1][1] = p.slope[0] * lower[1][0] + v[1];
-        if (DIM == 3) {
-            const double s = p.slope[PAIRS / 2], t = p.slope[PAIRS - 1];
-            lower[DIM - 1][0] = s * v[0];
-            lower[DIM - 1][1] = s * lower[1][0] + t * v[1];
-            lower[DIM - 1][DIM - 1] = s * lower[DIM - 1][0] + t * t * v[1] + v[DIM - 1];
-        }
-        for (int a = 0; a < DIM; ++a) {
-            for (int b = 0; b <= a; ++b)
-                c[axis[a] * DIM + axis[b]] = c[axis[b] * DIM + axis[a]] = lower[a][b];
-            valid = valid && lower[a][a] <= most_variance;
-        }
-        return valid;
     };
     // The place that is exactly a component, of the first `n` axis orders; order n if there is none.
     auto exact = [&](const double* m, const double* c, int64_t n) {
@@ -172,20 +174,44 @@ _BODY = """
 """
 
 
-def _kernel(dim: int) -> FusedKernel:
-    body = (_ROUNDING + _BODY).replace("PAIRS", str(dim * (dim - 1) // 2)).replace("DIM", str(dim))
-    return FusedKernel(
-        f"lattice_rounding_{dim}d",
-        "const double* means, const double* covariances, int64 n_orders, const int64* orders,"
-        " const double* roots, const double* bounds, int64 per_octave, int64 precision, int64 least_steps,"
-        " int64 most_steps, int64 most_ratio, double steepest, double farthest, double most_variance,"
-        " int64* axis_order, int64* deviation, int64* shear, int64* mean_steps, bool* beyond",
-        body,
-        rounds_each=True,
+_RESTORING = """
+    Place p;
+    p.order = axis_order[item];
+    for (int a = 0; a < DIM; ++a) {
+        p.steps[a] = deviation[item * DIM + a];
+        p.mean[a] = (double)mean_steps[item * DIM + a];
+    }
+    for (int a = 1, f = 0; a < DIM; ++a)
+        for (int b = 0; b < a; ++b, ++f)
+            p.slope[f] = (double)shear[item * PAIRS + f] * two_to(exponent(p.steps[a] - p.steps[b]));
+    restored(p, means + item * DIM, covariances + item * DIM * DIM);
+"""
+
+
+def _kernels(name: str, parameters: str, body: str) -> dict[int, FusedKernel]:
+    constants = (
+        "int64 n_orders, const int64* orders, const double* roots, const double* bounds, int64 per_octave,"
+        " int64 precision, int64 least_steps, int64 most_steps, int64 most_ratio, double steepest,"
+        " double farthest, double most_variance, "
     )
+    return {
+        dim: FusedKernel(
+            f"lattice_{name}_{dim}d",
+            constants + parameters,
+            body.replace("PAIRS", str(dim * (dim - 1) // 2)).replace("DIM", str(dim)),
+            rounds_each=True,
+        )
+        for dim in DIMENSIONS
+    }
 
 
-_KERNELS = {dim: _kernel(dim) for dim in DIMENSIONS}
+_PLACES = "int64* axis_order, int64* deviation, int64* shear, int64* mean_steps"
+_ROUNDINGS = _kernels(
+    "rounding",
+    f"const double* means, const double* covariances, {_PLACES}, bool* beyond",
+    _RESTORED + _ROUNDED + _BODY,
+)
+_RESTORINGS = _kernels("restoring", f"{_PLACES}, double* means, double* covariances", _RESTORED + _RESTORING)
 
 
 class LatticeConstants(NamedTuple):
@@ -223,7 +249,21 @@ def lattice_rounding(
     deviation, steps = axis_order.new_empty(n, dim), axis_order.new_empty(n, dim)
     shear = axis_order.new_empty(n, dim * (dim - 1) // 2)
     beyond = torch.zeros(1, dtype=torch.bool, device=means.device)
-    given = means.contiguous(), covariances.contiguous(), len(constants.orders), *constants
-    made = axis_order, deviation, shear, steps, beyond
-    _KERNELS[dim](n, *given, *made, device=means.device)
-    return None if bool(beyond) else (axis_order, deviation, shear, steps)
+    given = means.contiguous(), covariances.contiguous()
+    made = axis_order, deviation, shear, steps
+    lattice = len(constants.orders), *constants
+    _ROUNDINGS[dim](n, *lattice, *given, *made, beyond, device=means.device)
+    return None if bool(beyond) else made
+
+
+def lattice_restoring(
+    axis_order: Tensor, deviation: Tensor, shear: Tensor, mean: Tensor, constants: LatticeConstants
+) -> tuple[Tensor, Tensor]:
+    """Means (K, D) and covariances (K, D, D), float64,, of lattice points."""
+    n, dim = mean.shape
+    means = torch.empty(n, dim, dtype=torch.float64, device=mean.device)
+    covariances = means.new_empty(n, dim, dim)
+    places = [part.contiguous() for part in (axis_order, deviation, shear, mean)]
+    lattice = len(constants.orders), *constants
+    _RESTORINGS[dim](n, *lattice, *places, means, covariances, device=mean.device)
+    return means, covariances

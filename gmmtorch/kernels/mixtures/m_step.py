@@ -53,13 +53,17 @@ _NATURAL = """
     w[0] = log_weight - half_log_det - 0.5 * (DIM * 1.8378770664093453 + across);
 """
 _STEP = """
-    const double *s = statistics + item * WIDTH, *m = means + item * DIM, *c = covariances + item * DIM * DIM;
-    // Mass, mean and covariance of sums about m; what was there and no mass, if there are no points.
+    const double* s = statistics + item * WIDTH;
+    // Mass, mean and covariance of sums; what was there and no mass, if there are no points.
     auto maximized = [&](const double* sums, double* mass, double* mean, double* covariance) {
         const double eps = 2.220446049250313e-15, count = sums[0] + eps;
-        const bool alive = sums[0] > eps;
+        const bool alive = !means || sums[0] > eps;
         *mass = alive ? count : 0.0;
-        for (int a = 0; a < DIM; ++a) mean[a] = m[a] + (alive ? sums[1 + a] / count : 0.0);
+        for (int a = 0; a < DIM; ++a) {
+            mean[a] = alive && !about_means ? 0.0 : means[item * DIM + a];
+            if (alive) mean[a] += sums[1 + a] / count;
+        }
+        const double* c = covariances + item * DIM * DIM;
         for (int a = 0, f = 1 + DIM; a < DIM; ++a)
             for (int b = a; b < DIM; ++b, ++f) {
                 double x = sums[f] / count - (sums[1 + a] / count) * (sums[1 + b] / count);
@@ -103,7 +107,7 @@ _STEP = """
     if (!last) return;
     const double* old = last + item * WIDTH;
     double ahead[WIDTH], shift[DIM], before[WIDTH];
-    for (int a = 0; a < DIM; ++a) shift[a] = last_means[item * DIM + a] - m[a];
+    for (int a = 0; a < DIM; ++a) shift[a] = last_means[item * DIM + a] - means[item * DIM + a];
     before[0] = old[0];
     for (int a = 0, f = 1 + DIM; a < DIM; ++a) {
         before[1 + a] = old[1 + a] + old[0] * shift[a];
@@ -139,9 +143,10 @@ _NATURALS = _kernels(
 )
 _STEPS = _kernels(
     "m_step",
-    "const double* statistics, const double* means, const double* covariances, double reg_covar,"
-    " const double* last, const double* last_means, double share, double* em_masses, double* em_means,"
-    " double* em_covariances, double* new_masses, double* new_means, double* new_covariances, bool* trusted",
+    "const double* statistics, const double* means, const double* covariances, bool about_means,"
+    " double reg_covar, const double* last, const double* last_means, double share, double* em_masses,"
+    " double* em_means, double* em_covariances, double* new_masses, double* new_means,"
+    " double* new_covariances, bool* trusted",
     _STEP,
 )
 
@@ -149,10 +154,9 @@ Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""
 
 
-def is_fused_on(*tensors: Tensor) -> bool:
-    """Whether the fused kernels compute with these tensors; the last one has D columns."""
-    fits = tensors[-1].shape[-1] in DIMENSIONS and all(t.dtype == torch.float64 for t in tensors)
-    return fits and is_fused(*tensors)
+def is_fused_on(dim: int, *tensors: Tensor) -> bool:
+    """Whether the fused kernels compute with these tensors in `dim` dimensions."""
+    return dim in DIMENSIONS and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
 
 
 def fused_natural_parameters(weights: Tensor, means: Tensor | None, covariances: Tensor) -> Tensor | None:
@@ -168,6 +172,17 @@ def fused_natural_parameters(weights: Tensor, means: Tensor | None, covariances:
     return None if bool(failed) else natural
 
 
+def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous: Mixture | None) -> Mixture:
+    """M-step from statistics (K, F), in their frame; components without points keep `previous` values."""
+    k = statistics.shape[0]
+    masses, means = statistics.new_empty(k), statistics.new_empty(k, dim)
+    covariances = statistics.new_empty(k, dim, dim)
+    _, *kept = (None, None, None) if previous is None else (part.contiguous() for part in previous)
+    given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
+    _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)
+    return masses / masses.sum(), means, covariances
+
+
 def fused_steps(
     statistics: Tensor, before: Mixture, reg_covar: float, last: tuple[Tensor, Tensor] | None, share: float
 ) -> tuple[Mixture, Mixture | None]:
@@ -180,7 +195,7 @@ def fused_steps(
     _, means, covariances = (part.contiguous() for part in before)
     k, dim = means.shape
     em = means.new_empty(k), torch.empty_like(means), torch.empty_like(covariances)
-    given = statistics.contiguous(), means, covariances, reg_covar
+    given = statistics.contiguous(), means, covariances, True, reg_covar
     if last is None:
         _STEPS[dim](k, *given, None, None, share, *em, *[None] * 4, device=means.device)
         return (em[0] / em[0].sum(), *em[1:]), None

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.lattice_rounding import LatticeConstants, lattice_rounding
+from gmmtorch.kernels.mixtures.lattice_rounding import LatticeConstants, lattice_restoring, lattice_rounding
 from gmmtorch.scan import FARTHEST
 
 PER_OCTAVE = 4
@@ -100,6 +100,9 @@ class Lattice:
 
     def restored(self) -> tuple[Tensor, Tensor]:
         """Means (K, D) and covariances (K, D, D)."""
+        places = self.axis_order, self.deviation, self.shear, self.mean
+        if is_fused(*places):
+            return lattice_restoring(*places, _constants(self.dim))
         variance = power(2 * self.deviation)
         shear = scaled(self.shear, shear_exponents(self.deviation))
         mean = scaled(self.mean, self.mean_exponents())

@@ -64,7 +64,7 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k)."""
     weights, means, covariances = parameters
     dim = means.shape[1]
-    if m_step.is_fused_on(*parameters):
+    if m_step.is_fused_on(dim, *parameters):
         found = m_step.fused_natural_parameters(*parameters)
         if found is not None:
             return found
@@ -92,6 +92,8 @@ def maximization(statistics: Tensor, reg_covar: float, previous: Parameters | No
     A component that lost all its points keeps its `previous` mean and covariance, with weight 0.
     """
     dim = feature_dimension(statistics.shape[1])
+    if m_step.is_fused_on(dim, statistics, *(previous or ())):
+        return Parameters(*m_step.fused_maximization(statistics, dim, reg_covar, previous))
     eps = 10 * torch.finfo(statistics.dtype).eps
     count = statistics[:, 0] + eps
     means = statistics[:, 1 : 1 + dim] / count[:, None]

@@ -267,7 +267,7 @@ def _owner_of_rows(groups: Groups, likeliest: Tensor | None) -> Tensor | None:
 def centered_parameters(parameters: Parameters) -> Tensor:
     """Natural parameters (K, F) of the components about their own means."""
     weights, means, covariances = parameters
-    if m_step.is_fused_on(*parameters):
+    if m_step.is_fused_on(means.shape[1], *parameters):
         found = m_step.fused_natural_parameters(weights, None, covariances)
         if found is not None:
             return found

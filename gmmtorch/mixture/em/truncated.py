@@ -88,7 +88,7 @@ class Momentum:
         self._age += last is not None
         self.is_extrapolated = share > 0
         given = statistics, parameters, self._reg_covar, last if self.is_extrapolated else None, share
-        if is_fused_on(statistics, *parameters):
+        if is_fused_on(parameters.means.shape[1], statistics, *parameters):
             em_step, ahead = fused_steps(*given)
         else:
             em_step, ahead = _steps(*given)

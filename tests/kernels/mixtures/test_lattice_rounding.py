@@ -26,6 +26,10 @@ def rounded_by_both(means: Tensor, covariances: Tensor) -> Lattice:
         twin = lattice.nearest(means, covariances)
     for field in fields(Lattice):
         assert torch.equal(getattr(fused, field.name), getattr(twin, field.name)), field.name
+    with kernels("torch"):
+        expected = twin.restored()
+    with kernels("fused"):
+        assert all(map(torch.equal, fused.restored(), expected))
     return fused
 
 

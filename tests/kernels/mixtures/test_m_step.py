@@ -10,7 +10,7 @@ from kernels.mixtures.test_e_step import mixture
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
-from gmmtorch.mixture.em.exact import Parameters, natural_parameters, quadratic_features
+from gmmtorch.mixture.em.exact import Parameters, maximization, natural_parameters, quadratic_features
 from gmmtorch.mixture.em.grouping import centered_parameters
 from gmmtorch.mixture.em.truncated import Momentum
 
@@ -46,6 +46,17 @@ def test_steps_with_momentum_are_those_of_the_twin(dim, seed, thickness, far):
             found[choice] = [*parameters, *momentum.undo()]
     for fused, twin in zip(found["fused"], found["torch"], strict=True):
         torch.testing.assert_close(fused, twin, rtol=1e-11, atol=1e-11)
+
+
+@given(dim=st.sampled_from([1, 2, 3]), seed=st.integers(0, 10_000), is_first=st.booleans())
+def test_the_m_step_is_that_of_the_twin(dim, seed, is_first):
+    previous = None if is_first else mixture(K, dim, "any")
+    with kernels("torch"):
+        twin = maximization(sums(dim, seed, 1e-3), 1e-6, previous)
+    with kernels("fused"):
+        fused = maximization(sums(dim, seed, 1e-3), 1e-6, previous)
+    for one, other in zip(fused, twin, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
