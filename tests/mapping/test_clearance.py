@@ -176,6 +176,15 @@ def test_an_empty_map_has_infinite_clearance(dim):
         assert collision_probability(nothing, points, 0.3).tolist() == [0.0] * 2
 
 
+def test_components_below_the_least_density_are_no_obstacles():
+    means, covariances, _ = one([4.0, 4.0, 4.0])
+    peak = 1 / math.sqrt((2 * math.pi * 4.0) ** 3)
+    stray = means, covariances, torch.tensor([3.0]).double()
+    at = torch.zeros(1, 3, dtype=torch.float64)
+    assert float(clearance(stray, at, least_density=2.9 * peak)) == pytest.approx(-4.0)
+    assert float(clearance(stray, at, least_density=3.1 * peak)) == math.inf
+
+
 def test_infinite_queries_are_clear_and_empty_queries_give_empty_results():
     c = random_components(4, 3, seed=0)
     far = torch.tensor([[math.inf, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
