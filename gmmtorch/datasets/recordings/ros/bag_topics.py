@@ -36,6 +36,11 @@ class Sensor(NamedTuple):
     kind: str
     field: str = ""
 
+    @property
+    def is_camera(self) -> bool:
+        """Whether its messages are depth images."""
+        return self.kind in (DEPTH, COMPRESSED)
+
 
 def choose_sensor(reader: BagReader, wanted: str | None) -> Sensor:
     """The topic `wanted`, or else the only one of the most preferred kind that the bag has.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,20 +15,15 @@ from gmmtorch.datasets.base import Dataset, Ranges
 from gmmtorch.datasets.recordings.ros import bag_topics, sensor_messages
 from gmmtorch.datasets.recordings.ros.bag_poses import BagSurvey, PoseOptions
 from gmmtorch.datasets.recordings.ros.bag_reader import BagReader, RawMessage
+from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
 from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
 from gmmtorch.datasets.recordings.ros.transform_tree import frame_name, stamp_of
 from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane, increasing
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_choice, check_whole
-from gmmtorch.pinhole import back_project
 from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
-_LEVEL = math.cos(math.radians(10))
 _SHORT_SKIP = 16
-_MIN_PLANAR = 16
-"""Fewer points at one height do not show that a cloud is the scan of a laser."""
-_KNOTS = 1024
-"""Poses per sweep for deskewing: of a sweep of 0.1 s, one for every 0.1 ms."""
 
 
 class _Record(NamedTuple):
@@ -88,7 +82,7 @@ def open_rosbag(
     sensor = bag_topics.choose_sensor(reader, topic)
     options = PoseOptions(poses, frame, extrinsic, max_gap)
     arguments = (reader, sensor, ranges, stride, options, sensor_frame, clock, deskew)
-    if sensor.kind in (bag_topics.DEPTH, bag_topics.COMPRESSED):
+    if sensor.is_camera:
         info = bag_topics.choose_camera_info(reader, sensor.topic.name, camera_info)
         return DepthBag(*arguments, camera_info=info, pixel_stride=pixel_stride)
     return RosBag(*arguments)
@@ -113,6 +107,8 @@ class RosBag(Dataset):
         sensor_frame: str | None,
         clock: str,
         deskew: bool,
+        intrinsics: Tensor | None = None,
+        pixel_stride: int = 1,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._sensor, self._clock = reader, sensor, clock
@@ -124,13 +120,12 @@ class RosBag(Dataset):
         self._received = np.array([time for time, _ in survey.heads])
         records = self._ordered(self._of_frame(self._read_headers(survey.heads), sensor_frame))
         self._source = survey.source(records, self._where)
-        self._deskew = deskew and self._source.can_deskew
-        self._delay = float(np.median([record.time - record.stamp for record in records]))
+        self._conversion = ScanConversion(sensor, ranges, self._source, deskew, intrinsics, pixel_stride)
+        delay = float(np.median([record.time - record.stamp for record in records]))
+        self._delay = None if clock == "received" else delay
         self._records, matrices = self._posed(records)
-        level = bool((np.abs(matrices[:, 2, 2]) > _LEVEL).all())
         self._matrices = matrices
-        first = self._first_reading()
-        self._is_flat = level and (sensor.kind == bag_topics.LASER or _is_planar(first, _MIN_PLANAR))
+        self._is_flat = self._conversion.is_flat(matrices, self._first_reading())
         self._poses = torch.from_numpy(in_plane(matrices) if self._is_flat else matrices)
 
     def _read_headers(self, messages: list[tuple[int, bytes]]) -> list[_Record]:
@@ -218,66 +213,30 @@ class RosBag(Dataset):
         return torch.tensor([record.stamp / NANOSECONDS for record in self._records], dtype=torch.float64)
 
     def _read(self, index: int) -> Scan:
-        dim = 2 if self._is_flat else 3
-        origin = torch.from_numpy(self._matrices[index, :dim, 3].copy())
+        record, matrix = self._records[index], self._matrices[index]
+
+        def skip(reason: str) -> None:
+            self._skip(reason, record.number)
+
         try:
             found = self._reading(index)
         except DataError:
-            self._skip("message that cannot be decoded", self._records[index].number)
-            return Scan(origin.new_empty(0, dim), origin)
-        if len(found.points) == 0:
-            self._skip("message without a valid point", self._records[index].number)
-        elif self._is_flat and not _is_planar(found):
-            self._skip("points of several heights among planar scans", self._records[index].number)
-            return Scan(origin.new_empty(0, dim), origin)
-        ends = self._in_world(index, found)
-        ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
-        return self.ranges.scan(ends[:, :dim].contiguous(), origin, torch.from_numpy(found.no_return))
-
-    def _in_world(self, index: int, found: Reading) -> Tensor:
-        """The points (N, 3) in the world frame, each with the pose of its own time if that is known."""
-        points = torch.from_numpy(found.points)
-        record, matrix = self._records[index], torch.from_numpy(self._matrices[index])
-        if self._deskew and found.offsets is not None and len(points):
-            offsets = self._causal(found.offsets)
-            first, last = int(offsets.min()), int(offsets.max())
-            n_knots = min(_KNOTS, len(points)) if last > first else 1
-            knots = np.linspace(first, last, n_knots).round().astype(np.int64)
-            poses = self._source.at(record.stamp + knots, record.frame)
-            if poses.known.all():
-                nearest = np.round((offsets - first) * ((n_knots - 1) / max(last - first, 1)))
-                own = torch.from_numpy(poses.matrices)[torch.from_numpy(nearest.astype(np.int64))]
-                return (own[:, :3, :3] @ points[:, :, None])[:, :, 0] + own[:, :3, 3]
-            self._skip("points not deskewed: no poses during the sweep", record.number)
-        return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-    def _causal(self, offsets: np.ndarray) -> np.ndarray:
-        """Times of points as ns after the stamp, all before the message was received.
-
-        A message that arrives sooner after its stamp than its sweep lasts has the stamp of the sweep's end,
-        as some drivers write it. If both times are equal, the bag does not state when it was received.
-        """
-        last = int(offsets.max())
-        at_end = self._clock == "received" or 0 < self._delay < last / 2
-        return offsets - last if at_end and last > 0 else offsets
+            skip("message that cannot be decoded")
+            origin = torch.from_numpy(matrix[: 2 if self._is_flat else 3, 3].copy())
+            return Scan(origin.new_empty(0, len(origin)), origin)
+        return self._conversion.scan(
+            found, record.stamp, record.frame, matrix, self._is_flat, self._delay, skip
+        )
 
     def _reading(self, index: int) -> Reading:
         record = self._records[index]
         message = self._message(index)
         try:
-            return self._points(message, record.stamp)
+            return self._conversion.points(message, record.stamp)
         except (DataError, ValueError, KeyError, OverflowError) as error:
             raise DataError(
                 f"{self._where}, frame {record.frame}, stamp {record.stamp / NANOSECONDS:.3f} s: {error}."
             ) from error
-
-    def _points(self, message: dict[str, Any], stamp: int) -> Reading:
-        """The points of a decoded message of a laser or lidar, measured at a stamp in ns."""
-        if self._sensor.kind == bag_topics.CLOUD:
-            return sensor_messages.cloud_points(message, stamp)
-        if self._sensor.kind == bag_topics.LIST:
-            return sensor_messages.listed_points(message, self._sensor.field, stamp)
-        return sensor_messages.laser_points(message)
 
     def _message(self, index: int) -> dict[str, Any]:
         """The decoded message of scan `index` of the source. Reading in order does not search the bag."""
@@ -294,11 +253,6 @@ class RosBag(Dataset):
         )
 
 
-def _is_planar(found: Reading, n_least: int = 1) -> bool:
-    """Whether a reading has at least `n_least` points, all at one height of the sensor's frame."""
-    return len(found.points) >= n_least and bool(np.ptp(found.points[:, 2]) == 0)
-
-
 class DepthBag(RosBag):
     """Scans from depth images of a bag. `intrinsics` is the pinhole matrix (3, 3) in pixels.
 
@@ -310,18 +264,9 @@ class DepthBag(RosBag):
         reader = arguments[0]
         message = next(reader.messages([camera_info]))
         self.intrinsics = sensor_messages.camera_matrix(reader.decode(message))
-        super().__init__(*arguments)
-
-    def _points(self, message: dict[str, Any], stamp: int) -> Reading:
-        points = back_project(self._depth(message), self.intrinsics, self.pixel_stride)
-        return sensor_messages.reading(points.numpy(), None, None)
-
-    def _depth(self, message: dict[str, Any]) -> Tensor:
-        if self._sensor.kind == bag_topics.DEPTH:
-            return sensor_messages.depth_image(message)
-        return sensor_messages.compressed_depth_image(message)
+        super().__init__(*arguments, self.intrinsics, pixel_stride)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
         position = self._position(index)
-        return self._depth(self._message(position)), self._poses[position]
+        return self._conversion.depth(self._message(position)), self._poses[position]
