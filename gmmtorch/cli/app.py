@@ -77,6 +77,25 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)
 
 
+@contextmanager
+def stop_requests() -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C was pressed, or the process was asked to end. A second Ctrl-C interrupts at
+    once."""
+    requests: list[int] = []
+
+    def request(number: int, frame: Any) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    before = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(requests)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def _interrupt() -> None:
     time.sleep(0.01)  # until `__del__` has returned; if it has not, the interrupt is dropped and sent again
     os.kill(os.getpid(), signal.SIGINT)

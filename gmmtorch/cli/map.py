@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
-import signal
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -16,7 +12,7 @@ from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.recordings import map_recordings
 from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.view import serve
+from gmmtorch.cli.view import open_viewer, serve
 
 if TYPE_CHECKING:
     from gmmtorch.live.map_viewer import MapViewer
@@ -52,7 +48,7 @@ def run(config: DictConfig) -> None:
     target = maps.map_factory(config, resolution=config.resolution)()
     builder = MapBuilder(dataset, target, device)
     with ProgressBars(enabled=config.report.progress) as bars:
-        viewer = _viewer(config)
+        viewer = open_viewer() if config.view else None
         _build(config, builder, folder / _CHECKPOINT, bars, viewer)
         target.save(folder / "map.safetensors")
         trajectory = map_outputs.write_trajectory(builder, folder)
@@ -71,19 +67,6 @@ def run(config: DictConfig) -> None:
         serve(viewer)
     if errors:
         raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
-
-
-def _viewer(config: DictConfig) -> MapViewer | None:
-    """The viewer of the growing map, if the options ask for it."""
-    if not config.view:
-        return None
-    from gmmtorch.live.map_viewer import MapViewer
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-
-    logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
-    viewer = MapViewer(GaussianMap())
-    print(f"The map is at {viewer.url}", flush=True)
-    return viewer
 
 
 def _build(
@@ -110,7 +93,7 @@ def _build(
         builder.load(checkpoint, run_facts)
         print(f"continues after scan {builder.record.n_read} of {checkpoint}")
     saved = builder.record.seconds
-    with _stop_requests() as is_stopped:
+    with app.stop_requests() as is_stopped:
         for now in builder.insert_all():
             bars(_STAGE, now.n_read, now.n_total)
             size = f"{now.n_components:,} components, {byte_text(now.nbytes)}"
@@ -132,25 +115,6 @@ def _build(
     builder.finish()
     if viewer is not None:
         viewer.update(*map_outputs.snapshot(builder))
-
-
-@contextlib.contextmanager
-def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Yields whether Ctrl-C was pressed, or the process was asked to end. A second Ctrl-C interrupts at
-    once."""
-    requests: list[int] = []
-
-    def request(number: int, frame: Any) -> None:
-        if requests:
-            raise KeyboardInterrupt
-        requests.append(number)
-
-    before = {number: signal.signal(number, request) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(requests)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

@@ -78,6 +78,17 @@ def run(config: DictConfig) -> None:
         viewer.stop()
 
 
+def open_viewer() -> MapViewer:
+    """The viewer of a map that grows; prints its address."""
+    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.mapping.gaussian_map import GaussianMap
+
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
+    viewer = MapViewer(GaussianMap())
+    print(f"The map is at {viewer.url}", flush=True)
+    return viewer
+
+
 def serve(viewer: MapViewer) -> None:
     """Prints the address and waits until the user interrupts."""
     print(f"The map is at {viewer.url}. Ctrl-C ends.", flush=True)

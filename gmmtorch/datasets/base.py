@@ -135,6 +135,10 @@ class Dataset(Sequence[Scan]):
     def skipped(self) -> dict[str, int]:
         return {reason: len(scans) for reason, scans in self._skipped.items()}
 
+    def can_continue(self, n_read: int) -> bool:
+        """Whether reading can go on after `n_read` scans that were read in an earlier run."""
+        return 0 <= n_read <= len(self)
+
     def _skip(self, reason: str, index: int) -> None:
         """Counts message or file `index` of the source as skipped; once, however often it is read."""
         self._skipped.setdefault(reason, set()).add(index)

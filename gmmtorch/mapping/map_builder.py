@@ -215,7 +215,7 @@ class MapBuilder:
         try:
             state = joined_tensors(facts["tree"], tensors)
             record, poses = BuildRecord(**state["record"]), state["poses"]
-            if not (0 <= record.n_read <= len(self._dataset) and len(record.indices) == len(poses)):
+            if len(record.indices) != len(poses) or not self._dataset.can_continue(record.n_read):
                 raise ValueError("its counts disagree")
             self.map.load_state_dict(state["map"])
             self.map.to(self._device)

@@ -20,7 +20,7 @@ from gmmtorch.cli import common, explore, map, occupancy, robot, team
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 
-COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "view"]
+COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "view", "ros"]
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
 
 COMMANDS = ["occupancy", "fit"]
-CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view"]
+CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view", "ros"]
 MAPS = {
     "incremental": IncrementalRule(),
     "per_scan": WindowedRule(window=1, max_origins=1),

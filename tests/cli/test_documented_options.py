@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 LINES = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").splitlines()
 PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-COMMANDS = ["occupancy", "map", "view", "fit", "export", "explore", "robot", "team"]
+COMMANDS = ["occupancy", "map", "view", "ros", "fit", "export", "explore", "robot", "team"]
 CHOICES = [
     *([command] for command in COMMANDS),
     *(["occupancy", f"dataset={name}"] for name in ("carmen", "depth_frames", "mesh", "mesh_scans")),

@@ -10,8 +10,15 @@ import functools
 
 from hydra.core.config_store import ConfigStore
 
-from gmmtorch.cli.options import dataset_schema, exploration_schema, fit_schema, map_schema, robot_schema
-from gmmtorch.cli.options.structured import schema_of
+from gmmtorch.cli.options import (
+    dataset_schema,
+    exploration_schema,
+    fit_schema,
+    map_schema,
+    robot_schema,
+    ros_schema,
+)
+from gmmtorch.cli.options.structured import read_dataclass, schema_of
 from gmmtorch.evaluation.protocol_options import FitOptions, Protocol
 from gmmtorch.evaluation.studies.study_options import (
     ApproximationErrorStudy,
@@ -48,6 +55,11 @@ def _map_schema(rule: type) -> type:
     return schema_of(*shared, rule, QueryOptions, without=runtime)
 
 
+def _sensor_schema() -> type:
+    """Options of a live sensor."""
+    return schema_of(ros_schema.SensorOptions, read_dataclass("live.mapper.live_scans", "LiveOptions"))
+
+
 def _commands() -> dict[str, type]:
     """The options of each command."""
     mixture = schema_of(FitOptions, PruneOptions, without=("dtype", "compiled"))
@@ -57,6 +69,7 @@ def _commands() -> dict[str, type]:
         "occupancy": schema_of(map_schema.Occupancy, evaluation=schema_of(Protocol)),
         "export": map_schema.Export,
         "view": map_schema.View,
+        "ros": schema_of(ros_schema.Ros, sensor=_sensor_schema()),
         "explore": exploration_schema.Explore,
         "robot": robot_schema.Robot,
     }

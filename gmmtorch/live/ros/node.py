@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice
@@ -30,6 +30,15 @@ _TRANSFORM_SECONDS = 30.0
 Callback = Callable[[dict[str, Any]], None]
 
 
+class Arrival(NamedTuple):
+    """When a message arrived: its number, the time of the node (ns), and of this machine's clock (s)."""
+
+    number: int
+    time: int
+    monotonic: float
+    data: bytes
+
+
 @dataclass
 class Subscription:
     """A subscribed topic, and its messages that wait for `Node.spin_once`.
@@ -42,7 +51,7 @@ class Subscription:
     type: str
     callback: Callback
     depth: int
-    waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
+    waiting: deque[Arrival] = field(default_factory=deque)
     waiting_bytes: int = 0
     n_received: int = 0
     n_dropped: int = 0
@@ -69,6 +78,11 @@ class Node:
         peers: of DDS: addresses of other machines, where multicast does not reach them.
         router: of Zenoh: endpoint of the router.
         use_sim_time: `now` is the time of /clock.
+
+    Attributes:
+        subscriptions: all subscriptions.
+        arrival: when the message arrived whose callback runs.
+        transforms: of the last 30 s, after `listen_to_transforms`.
 
     Raises `InvalidArgumentError` for arguments that cannot be used, and `GmmTorchError` if a package is
     missing.
@@ -99,12 +113,14 @@ class Node:
         self.transforms = TransformTree(keep=_TRANSFORM_SECONDS)
         self._arrived = threading.Condition()
         self._n_arrived = 0
-        self._subscriptions: list[Subscription] = []
+        self.subscriptions: list[Subscription] = []
         self._warned: dict[str, float] = {}
         self._clock: int | None = None
         self._use_sim_time = use_sim_time
+        self._clock_topic: Subscription | None = None
+        self.arrival = Arrival(0, 0, 0.0, b"")
         if use_sim_time:
-            self.subscribe("/clock", CLOCK, self._note_clock)
+            self._clock_topic = self.subscribe("/clock", CLOCK, lambda _: None)
 
     def __enter__(self) -> Node:
         return self
@@ -153,7 +169,7 @@ class Node:
         self.types.check(message_type)
         asked = requested or quality.subscribed(name, message_type)
         made = Subscription(name, message_type, callback, max(asked.depth, 1))
-        self._subscriptions.append(made)
+        self.subscriptions.append(made)
         self._middleware.subscribe(name, message_type, asked, lambda data: self._receive(made, data))
         return made
 
@@ -167,6 +183,10 @@ class Node:
     def publishers(self) -> list[Endpoint]:
         """The publishers of all topics."""
         return [endpoint for endpoint in self._middleware.endpoints() if endpoint.is_publisher]
+
+    def subscribers(self) -> list[Endpoint]:
+        """The subscribers of all topics."""
+        return [endpoint for endpoint in self._middleware.endpoints() if not endpoint.is_publisher]
 
     def explain_silence(self, subscription: Subscription) -> str:
         """Why a subscription receives nothing: no publisher, another type, or a quality that cannot match."""
@@ -199,7 +219,12 @@ class Node:
             ),
         )
 
-    def _note_clock(self, message: dict[str, Any]) -> None:
+    def _note_clock(self, subscription: Subscription, data: bytes) -> None:
+        try:
+            message = self.types.decode(data, CLOCK)
+        except DataError as error:
+            self._note_malformed(subscription, error)
+            return
         self._clock = int(message["clock"]["sec"]) * 1_000_000_000 + int(message["clock"]["nanosec"])
 
     # -- messages -------------------------------------------------------------------------------------
@@ -215,11 +240,13 @@ class Node:
         with self._arrived:
             if not self._arrived.wait_for(self._has_waiting, timeout):
                 return False
-            subscription = min((s for s in self._subscriptions if s.waiting), key=lambda s: s.waiting[0][0])
-            _, data = subscription.waiting.popleft()
-            subscription.waiting_bytes -= len(data)
+            subscription = min(
+                (s for s in self.subscriptions if s.waiting), key=lambda s: s.waiting[0].number
+            )
+            self.arrival = subscription.waiting.popleft()
+            subscription.waiting_bytes -= len(self.arrival.data)
         try:
-            message = self.types.decode(data, subscription.type)
+            message = self.types.decode(self.arrival.data, subscription.type)
         except DataError as error:
             self._note_malformed(subscription, error)
             return True
@@ -241,24 +268,27 @@ class Node:
         """Messages received, dropped and malformed, by topic."""
         return {
             s.topic: Counter(received=s.n_received, dropped=s.n_dropped, malformed=s.n_malformed)
-            for s in self._subscriptions
+            for s in self.subscriptions
         }
 
     def _has_waiting(self) -> bool:
-        return any(subscription.waiting for subscription in self._subscriptions)
+        return any(subscription.waiting for subscription in self.subscriptions)
 
     def _receive(self, subscription: Subscription, data: bytes) -> None:
         """Queues a message; called by threads of the middleware."""
         with self._arrived:
             self._n_arrived += 1
             subscription.n_received += 1
-            subscription.waiting.append((self._n_arrived, data))
+            if subscription is self._clock_topic:  # counts from now on, also for messages that wait
+                self._note_clock(subscription, data)
+                return
+            arrival = Arrival(self._n_arrived, self.now(), time.monotonic(), data)
+            subscription.waiting.append(arrival)
             subscription.waiting_bytes += len(data)
             while (
                 len(subscription.waiting) > subscription.depth or subscription.waiting_bytes > _WAITING_BYTES
             ):
-                _, oldest = subscription.waiting.popleft()
-                subscription.waiting_bytes -= len(oldest)
+                subscription.waiting_bytes -= len(subscription.waiting.popleft().data)
                 subscription.n_dropped += 1
             self._arrived.notify()
 

@@ -18,7 +18,8 @@ class Quality:
     depth: int = 10
 
 
-SENSOR = Quality(reliable=False, depth=50)
+SENSOR = Quality(reliable=False, depth=1000)
+CLOCK = Quality(reliable=False, depth=1)
 TRANSFORMS = Quality(depth=1000)
 LATCHED = Quality(latched=True, depth=1)
 LATCHED_TRANSFORMS = Quality(latched=True, depth=100)
@@ -32,7 +33,9 @@ def subscribed(topic: str, message_type: str) -> Quality:
         return LATCHED_TRANSFORMS
     if topic.endswith("/tf"):
         return TRANSFORMS
-    if message_type.startswith(_SENSOR_PACKAGE) or topic == "/clock":
+    if topic == "/clock":
+        return CLOCK
+    if message_type.startswith(_SENSOR_PACKAGE):
         return SENSOR
     return Quality()
 

@@ -79,6 +79,11 @@ class BagReader:
             counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
         return [Topic(*key, count) for key, count in sorted(counts.items())]
 
+    @property
+    def is_ros1(self) -> bool:
+        """Whether messages have the packed form of ROS 1, not CDR."""
+        return self._is_ros1
+
     def fields(self, message_type: str) -> list[tuple[str, Any]]:
         """Names and kinds of the fields of a message type; empty if its definition is not known."""
         return list(self._decoder.definitions.get(message_type, ((), ()))[1])

@@ -128,12 +128,7 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
     infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
     if wanted is not None and wanted in infos:
         return wanted
-
-    def shared(name: str) -> int:
-        pairs = zip(name.split("/"), image.split("/"), strict=False)
-        return next((i for i, (a, b) in enumerate(pairs) if a != b), 0)
-
-    best = [name for name in infos if shared(name) == max(map(shared, infos))]
+    best = nearest_names(infos, image)
     if wanted is not None or len(best) != 1:
         raise InvalidArgumentError(
             f"{reader.path}: dataset.camera_info={wanted} is not clear for the images of "
@@ -141,3 +136,13 @@ def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str
             f"CameraInfo are {', '.join(infos) or 'none: record the one of the camera'}."
         )
     return best[0]
+
+
+def nearest_names(names: list[str], topic: str) -> list[str]:
+    """The names that share most of a topic's name: its first parts."""
+
+    def shared(name: str) -> int:
+        pairs = zip(name.split("/"), topic.split("/"), strict=False)
+        return next((i for i, (a, b) in enumerate(pairs) if a != b), 0)
+
+    return [name for name in names if shared(name) == max(map(shared, names))]

@@ -264,7 +264,8 @@ class DepthBag(RosBag):
         reader = arguments[0]
         message = next(reader.messages([camera_info]))
         self.intrinsics = sensor_messages.camera_matrix(reader.decode(message))
-        super().__init__(*arguments, self.intrinsics, pixel_stride)
+        arguments = (*arguments, self.intrinsics, pixel_stride)
+        super().__init__(*arguments)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
         """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""

@@ -73,8 +73,13 @@ class ScanConversion:
 
     def is_flat(self, matrices: np.ndarray, first: Reading) -> bool:
         """Whether scans are 2D: the sensor is level at all poses (N, 4, 4), and a laser or a planar lidar."""
-        level = bool((np.abs(matrices[:, 2, 2]) > _LEVEL).all())
-        return level and (self._sensor.kind == bag_topics.LASER or is_planar(first, _MIN_PLANAR))
+        is_planar_sensor = self._sensor.kind == bag_topics.LASER or is_planar(first, _MIN_PLANAR)
+        return is_planar_sensor and self.is_level(matrices)
+
+    @staticmethod
+    def is_level(matrices: np.ndarray) -> bool:
+        """Whether the sensor stands upright, or on its head, at all poses (N, 4, 4)."""
+        return bool((np.abs(matrices[:, 2, 2]) > _LEVEL).all())
 
     def scan(
         self,

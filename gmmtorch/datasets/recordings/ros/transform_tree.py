@@ -120,6 +120,11 @@ class TransformTree:
             matrices, known = step.matrices @ matrices, known & step.known
         return Poses(matrices, known)
 
+    def latest(self, chain: list[str]) -> int | None:
+        """The time (ns) up to which all transforms of a chain are known; None if all are static."""
+        edges = [self._edge(child) for child in chain[:-1] if child in self._samples]
+        return min((int(edge.times[-1]) if len(edge) else 0 for edge in edges), default=None)
+
     def unknown_step(self, chain: list[str], time: int, max_gap: float) -> str:
         """The transform of a chain that is not known at a time, with the times at which it is."""
         for child, parent in itertools.pairwise(chain):

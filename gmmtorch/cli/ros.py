@@ -1,0 +1,220 @@
+"""gmmtorch-ros: maps live ROS 2 topics, or plays a recording."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from gmmtorch.cli import app, common
+from gmmtorch.cli.from_options import maps
+from gmmtorch.cli.options.structured import build
+from gmmtorch.cli.reporting import map_outputs
+from gmmtorch.cli.view import open_viewer
+
+if TYPE_CHECKING:
+    from gmmtorch.live.mapper.live_mapper import LiveMapper
+    from gmmtorch.live.mapper.live_scans import LiveScans
+    from gmmtorch.live.mapper.map_publisher import MapPublisher
+    from gmmtorch.live.ros import Node
+    from gmmtorch.report.progress import ProgressBars
+
+logger = logging.getLogger("gmmtorch")
+_CHECKPOINT = "checkpoint.safetensors"
+_TABLE = "topic n_scans n_dropped n_malformed latency_median latency_p99 n_components nbytes"
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app.start("ros", run)
+
+
+def run(config: DictConfig) -> None:
+    """Run the command until Ctrl-C, or until the recording has been played."""
+    from gmmtorch.errors import check_number
+
+    device = common.set_up(config)
+    check_number("wait", config.wait)
+    check_number("period", config.period)
+    with _node(config) as node:
+        if config.play:
+            _play(config, node)
+        else:
+            _map(config, node, device)
+
+
+def _node(config: DictConfig) -> Node:
+    from gmmtorch.live.ros import Node
+
+    options = common.as_options(config.node)
+    if config.play:  # the player makes the time
+        options["use_sim_time"] = False
+    with common.naming({name: f"node.{name}" for name in options}):
+        return Node("gmmtorch_player" if config.play else "gmmtorch", **options, remap=_remap(config))
+
+
+def _remap(config: DictConfig) -> dict[str, str]:
+    from gmmtorch.errors import InvalidArgumentError
+
+    if config.remap is None:
+        return {}
+    if not isinstance(config.remap, DictConfig):
+        raise InvalidArgumentError(f"remap={config.remap} must be {{/topic: /other_topic}}.")
+    return {str(topic): str(other) for topic, other in config.remap.items()}
+
+
+# -- playing --------------------------------------------------------------------------------------
+
+
+def _play(config: DictConfig, node: Node) -> None:
+    """Publish a recording, once somebody subscribes to it."""
+    from gmmtorch.live.mapper.bag_player import BagPlayer
+    from gmmtorch.report.progress import ProgressBars
+
+    player = BagPlayer(node, config.play, config.rate)
+    for topic in player.unknown:
+        print(f"skipped   {topic.name}: {topic.type} is not a type of ROS 2 Jazzy")
+    if not player.wait_for_subscriber(config.wait):
+        print(f"nobody subscribes to the recording after {config.wait:g} s; it is played all the same")
+    with ProgressBars(enabled=config.report.progress) as bars, app.stop_requests() as is_stopped:
+        for _ in player.play():
+            bars("playing", player.n_played, player.n_messages)
+            if is_stopped():
+                break
+    print(f"played    {player.n_played:,} of {player.n_messages:,} messages of {config.play}")
+
+
+# -- mapping --------------------------------------------------------------------------------------
+
+
+def _map(config: DictConfig, node: Node, device: str) -> None:
+    """Build a map of the sensor's topic, and write it at the end."""
+    from gmmtorch.live.mapper.live_mapper import LiveMapper
+    from gmmtorch.report.progress import ProgressBars
+
+    target = maps.map_factory(config, resolution=config.resolution)()
+    scans = _scans(config, node)
+    mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device)
+    folder = common.run_dir()
+    viewer = open_viewer() if config.view else None
+    checkpoint = _Checkpoint(config, mapper, folder / _CHECKPOINT)
+
+    def after_scan() -> None:
+        checkpoint.save_when_due()
+        if viewer is not None and mapper.builder.map.n_pending == 0:
+            viewer.update(*map_outputs.snapshot(mapper.builder))
+
+    with ProgressBars(enabled=config.report.progress) as bars:
+        _until_stopped(config, node, scans, mapper, bars, after_scan)
+        mapper.finish()
+    _write(config, mapper, scans, folder)
+    (folder / _CHECKPOINT).unlink(missing_ok=True)
+
+
+def _scans(config: DictConfig, node: Node) -> LiveScans:
+    """The scans of the sensor's topic, which is found by itself if it is not given."""
+    from gmmtorch.datasets.base import Ranges
+    from gmmtorch.live.mapper.live_scans import LiveOptions
+    from gmmtorch.live.mapper.sensor_topics import find_sensor, open_scans
+
+    options = common.as_options(config.sensor)
+    live = build(LiveOptions, options, "sensor")
+    with common.naming({name: f"sensor.{name}" for name in ("max_range", "no_return_range")}):
+        ranges = Ranges(config.sensor.max_range, config.sensor.no_return_range)
+    sensor = find_sensor(node, config.sensor.topic, config.wait)
+    print(f"topic     {sensor.topic.name} ({sensor.topic.type})", flush=True)
+    return open_scans(node, sensor, ranges, live, config.sensor.camera_info)
+
+
+def _publisher(config: DictConfig, node: Node) -> MapPublisher:
+    from gmmtorch.live.mapper.map_publisher import MapPublisher
+
+    band = config.z_min, config.z_max
+    return MapPublisher(node, config.resolution, *band, cloud=config.cloud, ellipsoids=config.ellipsoids)
+
+
+class _Checkpoint:
+    """The file from which a killed run goes on."""
+
+    def __init__(self, config: DictConfig, mapper: LiveMapper, path: Path) -> None:
+        import gmmtorch
+        from gmmtorch.errors import check_number
+
+        check_number("checkpoint_seconds", config.checkpoint_seconds)
+        self._builder, self._path, self._period = mapper.builder, path, config.checkpoint_seconds
+        self._facts: dict[str, Any] = {
+            "version": gmmtorch.__version__,
+            "sensor": common.as_options(config.sensor),
+            "map": common.as_options(config.map),
+            "seed": config.seed,
+            "dtype": config.runtime.dtype,
+        }
+        if path.exists():
+            self._builder.load(path, self._facts)
+            print(f"continues after scan {self._builder.record.n_read} of {path}", flush=True)
+        self._saved = self._builder.record.seconds
+
+    def save_when_due(self) -> None:
+        """Writes the file if enough was computed since."""
+        if self._builder.record.seconds - self._saved >= self._period:
+            self._builder.save(self._path, self._facts)
+            self._saved = self._builder.record.seconds
+
+
+def _until_stopped(
+    config: DictConfig,
+    node: Node,
+    scans: LiveScans,
+    mapper: LiveMapper,
+    bars: ProgressBars,
+    after_scan: Callable[[], None],
+) -> None:
+    """Maps until Ctrl-C; says why nothing happens."""
+    import time
+
+    begin = time.monotonic()
+    with app.stop_requests() as is_stopped:
+        while not is_stopped():
+            if mapper.step():
+                now = mapper.builder.progress()
+                bars("mapping", now.n_read, None)
+                bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped")
+                after_scan()
+            elif not mapper.builder.record.indices and time.monotonic() - begin > config.wait:
+                node.warn("silence", f"nothing is mapped: {_trouble(node, scans)}.")
+
+
+def _trouble(node: Node, scans: LiveScans) -> str:
+    """Why no scan was mapped so far."""
+    silent = [s for s in node.subscriptions if s.n_received == 0 and not s.topic.endswith("/tf_static")]
+    if silent:
+        return "; ".join(node.explain_silence(subscription) for subscription in silent)
+    reasons = ", ".join(f"{reason} ({n} scans)" for reason, n in scans.skipped.items())
+    return "; ".join(text for text in (reasons, scans.trouble) if text) or "the scans wait for their poses"
+
+
+def _write(config: DictConfig, mapper: LiveMapper, scans: LiveScans, folder: Path) -> None:
+    """Write the map, the trajectory and results.json, and print a table."""
+    builder = mapper.builder
+    n_scans = len(builder.record.indices)
+    row = {"topic": scans.name, **mapper.diagnostics.numbers(n_scans, 0)}
+    if n_scans:
+        builder.map.save(folder / "map.safetensors")
+        map_outputs.write_trajectory(builder, folder)
+        row |= {"n_components": builder.map.n_components, "nbytes": builder.map.nbytes}
+    row["skipped"] = [{"reason": reason, "n_scans": n} for reason, n in scans.skipped.items()]
+    row = {key: None if value != value else value for key, value in row.items()}
+    results = common.write_results("ros", config, [row], folder)
+    common.print_table([row], _TABLE.split(), f"{scans.name}: {n_scans} scans")
+    for reason, count in scans.skipped.items():
+        print(f"skipped   {count} scans: {reason}")
+    if n_scans:
+        print(f"\nmap       {folder / 'map.safetensors'}")
+    common.print_files(folder, results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""LiveMapper: builds a map from live scans, and publishes it."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict
+
+import torch
+
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS
+from gmmtorch.live.mapper.diagnostics import Diagnostics
+from gmmtorch.live.mapper.live_scans import LiveScans
+from gmmtorch.live.mapper.map_publisher import MapPublisher
+from gmmtorch.live.ros import Node
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.map_builder import MapBuilder
+
+_MESSAGES = 500  # of a flood, before a scan is mapped
+
+
+class LiveMapper:
+    """Inserts the scans of a live topic into a map with a `MapBuilder`, and publishes the map.
+
+    Args:
+        node: receives the messages of `scans`.
+        scans: the scans.
+        target: the map.
+        publisher: publishes the map; None: it is not published.
+        period: seconds between two publications, at least.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        scans: LiveScans,
+        target: GaussianMap,
+        publisher: MapPublisher | None = None,
+        period: float = 1.0,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.builder = MapBuilder(scans, target, device)
+        self.diagnostics = Diagnostics(node, scans)
+        self._node, self._scans, self._publisher, self._period = node, scans, publisher, period
+        self._unpublished: list[int] = []  # stamps of scans, ns
+        self._published: list[int] = []
+        self._thread = ThreadPoolExecutor(1, "publication")
+        self._publication: Future[None] | None = None
+        self._begin = self._next_publication = 0.0
+
+    def step(self, timeout: float = 0.1) -> bool:
+        """Handles the messages that wait, and maps at most one scan; returns whether it did."""
+        handle_messages(self._node, timeout if not self._scans.n_waiting else min(timeout, 0.01))
+        did = self._scans.advance() and self._insert()
+        self._publish_when_due()
+        self._report()
+        return did
+
+    def finish(self) -> None:
+        """Maps the scans that still wait, learns from the unfinished window, and publishes the map."""
+        handle_messages(self._node, 0.0)
+        while self._scans.advance(is_last=True):
+            self._insert()
+        if self.builder.record.indices:
+            self.builder.finish()
+        for _ in range(2):  # the one that goes on, and one with all scans
+            self._end_publication()
+            self._begin_publication()
+        self._end_publication()
+        self._thread.shutdown()
+        self._report(is_last=True)
+
+    def snapshot(self) -> GaussianMap:
+        """A copy of the map that does not grow."""
+        built = self.builder.map
+        options = {**asdict(built.query_options), "resolution": built.resolution, "method": built.method}
+        return GaussianMap.of(built.components(), **options)
+
+    def _insert(self) -> bool:
+        for _ in self.builder.insert_all():
+            newest = self._scans.newest
+            if newest is not None:
+                self._unpublished.append(newest.stamp)
+        return True
+
+    def _publish_when_due(self) -> None:
+        if self._publication is not None and self._publication.done():
+            self._end_publication()
+        is_due = self._unpublished and time.monotonic() >= self._next_publication
+        if is_due and self._publication is None:
+            self._begin_publication()
+
+    def _begin_publication(self) -> None:
+        """Publishes a copy of the map in another thread, while scans are mapped."""
+        self._published, self._unpublished = self._unpublished, []
+        if self._publisher is not None and self._published:
+            arguments = self.snapshot(), self._scans.world_frame, self._published[-1]
+            self._publication = self._thread.submit(self._publisher.publish, *arguments)
+            self._begin = time.monotonic()
+
+    def _end_publication(self) -> None:
+        if self._publication is None:
+            return
+        self._publication.result()
+        self._publication = None
+        now, end = self._node.now(), time.monotonic()
+        for stamp in self._published:
+            self.diagnostics.note_latency((now - stamp) / NANOSECONDS)
+        self._next_publication = max(end, self._begin + self._period)
+
+    def _report(self, is_last: bool = False) -> None:
+        record = self.builder.record
+        if self.diagnostics.is_due() or is_last:
+            built = self.builder.map
+            nbytes = built.nbytes if built.dim is not None and built.n_pending == 0 else None
+            self.diagnostics.publish(
+                len(record.indices), built.n_final if built.dim is not None else 0, nbytes
+            )
+
+
+def handle_messages(node: Node, timeout: float) -> None:
+    """Calls the callbacks of the messages that wait; waits for the first one up to `timeout` (s)."""
+    left = _MESSAGES
+    is_handled = node.spin_once(timeout)
+    while is_handled and left:
+        is_handled, left = node.spin_once(), left - 1

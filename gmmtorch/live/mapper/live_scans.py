@@ -1,0 +1,324 @@
+"""LiveScans: the scans of a live topic as a data set that grows."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset, Ranges
+from gmmtorch.datasets.recordings.ros import sensor_messages
+from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
+from gmmtorch.datasets.recordings.ros.pose_sources import PoseSource, Standing, TfPoses
+from gmmtorch.datasets.recordings.ros.scan_conversion import ScanConversion
+from gmmtorch.datasets.recordings.ros.sensor_messages import Reading
+from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree, frame_name, stamp_of
+from gmmtorch.datasets.recordings.trajectory import NANOSECONDS, in_plane
+from gmmtorch.errors import DataError, check_choice, check_number
+from gmmtorch.scan import FARTHEST, Scan
+
+DROPPED = "dropped, because mapping is slower than the sensor"
+_SETTLING = 0.5  # s without a new frame above the sensor's, after which the root of TF is the world
+_PATIENCE = 10.0  # s that a scan waits for its pose if there is no limit of the latency
+_WAITING_BYTES = 1 << 28
+_BACKWARDS = 30 * NANOSECONDS  # a clock that is set back further starts again
+_DELAYS = 1001  # first messages, whose median delay counts
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How live messages become scans.
+
+    poses: tf, or standing for a sensor that does not move.
+    frame: the fixed frame of TF, such as odom; None: the root of the sensor's tree.
+    max_gap: longest time (s) between two poses that are interpolated.
+    clock: header, stamps of the messages; or received, times of receipt.
+    deskew: each point with a time gets the pose of its own time.
+    stride: use every n-th scan.
+    pixel_stride: every n-th pixel of every n-th row of depth images.
+    max_latency: seconds after which a scan that waits is dropped; None: scans wait.
+    """
+
+    poses: str = "tf"
+    frame: str | None = None
+    max_gap: float = 2.0
+    clock: str = "header"
+    deskew: bool = True
+    stride: int = 1
+    pixel_stride: int = 1
+    max_latency: float | None = 2.0
+
+    def __post_init__(self) -> None:
+        check_choice("poses", self.poses, ("tf", "standing"))
+        check_choice("clock", self.clock, ("header", "received"))
+        check_number("max_gap", self.max_gap)
+        if self.max_latency is not None:
+            check_number("max_latency", self.max_latency)
+
+
+@dataclass
+class _Waiting:
+    """A message that waits for its pose. since: this machine's clock, s. needed: see `_last_needed`."""
+
+    message: dict[str, Any]
+    stamp: int
+    frame: str
+    since: float
+    needed: int | None = None
+
+
+class LiveScan(NamedTuple):
+    """The newest scan. matrix: (4, 4) fixed frame ← sensor. stamp: ns. frame: of the sensor."""
+
+    scan: Scan
+    matrix: np.ndarray
+    stamp: int
+    frame: str
+
+
+class LiveScans(Dataset):
+    """Converts messages to scans as soon as their poses are known.
+
+    `receive` takes a message; `advance` converts the oldest one that is ready. Only the newest scan is kept,
+    `newest`; reading an older one is an error.
+
+    Args:
+        sensor: topic and kind.
+        tree: the transforms that arrive meanwhile.
+        ranges: how range readings are interpreted.
+    """
+
+    def __init__(self, sensor: Sensor, tree: TransformTree, ranges: Ranges, options: LiveOptions) -> None:
+        super().__init__(sensor.topic.name, ranges)
+        self.newest: LiveScan | None = None
+        self.n_dropped = 0
+        self.intrinsics: Tensor | None = None
+        self._sensor, self._tree, self._options = sensor, tree, options
+        self._waiting: deque[_Waiting] = deque()
+        self._waiting_bytes = 0
+        self._counts: Counter[str] = Counter()
+        self._delays: list[int] = []
+        self._conversion: ScanConversion | None = None
+        self._candidate: tuple[list[str], float] = ([], 0.0)
+        self._is_flat: bool | None = None
+        self._last_stamp: int | None = None
+        self._n_posed = 0
+        self._first = 0  # scans of earlier runs
+        self._stamps = array("d")
+        self.trouble = ""
+        """Why the last scan without a pose has none."""
+
+    # -- messages -------------------------------------------------------------------------------------
+
+    def receive(self, message: dict[str, Any], received: int, since: float | None = None) -> None:
+        """Queues a decoded message of the sensor.
+
+        received: ns, on the clock of the node. since: s, on the clock of this machine; None: now.
+        """
+        header = message["header"]
+        since = time.monotonic() if since is None else since
+        stamp = stamp_of(header) if self._options.clock == "header" else received
+        if len(self._delays) < _DELAYS:
+            self._delays.append(received - stamp)
+        self._waiting.append(_Waiting(message, stamp, frame_name(header["frame_id"]), since))
+        self._waiting_bytes += _size(message)
+        while self._waiting_bytes > _WAITING_BYTES:
+            self._pop()
+            self._drop()
+
+    def note_camera(self, message: dict[str, Any]) -> None:
+        """Takes the pinhole matrix of a CameraInfo."""
+        self.intrinsics = sensor_messages.camera_matrix(message)
+        if self._conversion is not None:
+            self._conversion.intrinsics = self.intrinsics
+
+    @property
+    def n_waiting(self) -> int:
+        """Messages that wait for their poses, or to be converted."""
+        return len(self._waiting)
+
+    def advance(self, is_last: bool = False) -> bool:
+        """Converts the oldest message whose poses are known to `newest`; returns whether there is one.
+
+        is_last: no message and no transform will follow.
+        """
+        while self._waiting:
+            oldest = self._waiting[0]
+            age = time.monotonic() - oldest.since
+            limit = self._options.max_latency
+            if not self._is_ready(oldest) and not is_last:
+                if age <= (_PATIENCE if limit is None else limit):
+                    return False
+                self._pop()
+                self._note("no pose at the time of the scan")
+                continue
+            self._pop()
+            if limit is not None and age > limit and not is_last:
+                self._drop()
+            elif self._convert(oldest):
+                return True
+        return False
+
+    def _pop(self) -> None:
+        self._waiting_bytes -= _size(self._waiting.popleft().message)
+
+    def _drop(self) -> None:
+        self.n_dropped += 1
+        self._note(DROPPED)
+
+    def _note(self, reason: str) -> None:
+        self._counts[reason] += 1
+
+    # -- poses ----------------------------------------------------------------------------------------
+
+    def _is_ready(self, item: _Waiting) -> bool:
+        """Whether everything that the conversion of a message needs has arrived, or never will."""
+        if self._sensor.is_camera and self.intrinsics is None:
+            self.trouble = "no CameraInfo has arrived"
+            return False
+        try:
+            if self._conversion is None:
+                source = self._settled(item.frame)
+                if source is None:
+                    return False
+                pixel_stride = self._options.pixel_stride
+                arguments = self._options.deskew, self.intrinsics, pixel_stride
+                self._conversion = ScanConversion(self._sensor, self.ranges, source, *arguments)
+            if not isinstance(self._conversion.source, TfPoses):
+                return True
+            chain = self._conversion.source.chain(item.frame)
+            latest = self._tree.latest(chain)
+            item.needed = self._last_needed(item) if item.needed is None else item.needed
+            is_ready = latest is None or latest >= item.needed
+            if not is_ready:
+                self.trouble = self._tree.unknown_step(chain, item.stamp, self._options.max_gap)
+            return is_ready
+        except DataError as error:
+            self.trouble = str(error)
+            return False
+
+    def _last_needed(self, item: _Waiting) -> int:
+        """The last time (ns) at which a pose is needed."""
+        assert self._conversion is not None
+        try:
+            found = self._conversion.points(item.message, item.stamp)
+        except (DataError, ValueError, KeyError, OverflowError):
+            return item.stamp
+        return self._conversion.times(found, item.stamp, self._delay)[1]
+
+    def _settled(self, frame: str) -> PoseSource | None:
+        """The source of poses once the fixed frame is clear."""
+        if self._options.poses == "standing":
+            return Standing()
+        top = self._options.frame
+        source = TfPoses(self._tree, top, self._options.max_gap, f"topic {self.name}")
+        chain = source.chain(frame)
+        if top is None:
+            if not self._tree.is_moving(chain):
+                self.trouble = (
+                    f"TF has only static transforms from frame {chain[0]} up to {chain[-1]}; choose "
+                    "sensor.poses=standing for a sensor that does not move"
+                )
+                return None
+            if chain != self._candidate[0]:
+                self._candidate = chain, time.monotonic()
+            if time.monotonic() - self._candidate[1] < _SETTLING:
+                return None
+        return source
+
+    @property
+    def world_frame(self) -> str:
+        """The fixed frame of the map; "map" before it is known and for a standing sensor."""
+        if self._conversion is None or not isinstance(self._conversion.source, TfPoses):
+            return "map"
+        return self._options.frame or self._candidate[0][-1]
+
+    @property
+    def _delay(self) -> float | None:
+        return None if self._options.clock == "received" else float(np.median(self._delays))
+
+    # -- scans ----------------------------------------------------------------------------------------
+
+    def _convert(self, item: _Waiting) -> bool:
+        """Makes a message the newest scan, unless it is left out."""
+        conversion = self._conversion
+        if conversion is None or not self._is_in_order(item.stamp):
+            self._note("no pose at the time of the scan" if conversion is None else "stamp out of order")
+            return False
+        try:
+            poses = conversion.source.at(np.array([item.stamp]), item.frame)
+            if not poses.known[0] or (np.abs(poses.matrices[0, :3, 3]) > FARTHEST).any():
+                self._note("no pose at the time of the scan")
+                return False
+            found = conversion.points(item.message, item.stamp)
+        except (DataError, ValueError, KeyError, OverflowError) as error:
+            self.trouble = str(error)
+            self._note("message that cannot be decoded")
+            return False
+        self._n_posed += 1
+        return (self._n_posed - 1) % self._options.stride == 0 and self._keep(item, found, poses.matrices[0])
+
+    def _is_in_order(self, stamp: int) -> bool:
+        last = self._last_stamp
+        if last is not None and last - _BACKWARDS < stamp < last:
+            return False
+        self._last_stamp = stamp
+        return True
+
+    def _keep(self, item: _Waiting, found: Reading, matrix: np.ndarray) -> bool:
+        conversion = self._conversion
+        assert conversion is not None
+        if self._is_flat is None:
+            if not len(found.points):
+                self._note("message without a valid point")
+                return False
+            self._is_flat = conversion.is_flat(matrix[None], found)
+        if self._is_flat and not conversion.is_level(matrix[None]):
+            self._note("tilted sensor among planar scans")
+            return False
+        scan = conversion.scan(found, item.stamp, item.frame, matrix, self._is_flat, self._delay, self._note)
+        if scan.n_beams == 0:
+            return False
+        self.newest = LiveScan(scan, matrix, item.stamp, item.frame)
+        self._stamps.append(item.stamp / NANOSECONDS)
+        return True
+
+    # -- as a data set --------------------------------------------------------------------------------
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        return dict(self._counts)
+
+    def can_continue(self, n_read: int) -> bool:
+        self._first = n_read
+        return not self._stamps
+
+    def _count(self) -> int:
+        return self._first + len(self._stamps)
+
+    def _newest(self, index: int) -> LiveScan:
+        if self.newest is None or index != len(self) - 1:
+            raise IndexError(f"scan {index} of a live topic is gone")
+        return self.newest
+
+    def _read(self, index: int) -> Scan:
+        return self._newest(index).scan
+
+    def _known_pose(self, index: int) -> Tensor | None:
+        newest = self._newest(index)
+        matrix = newest.matrix
+        return torch.from_numpy(in_plane(matrix[None])[0] if newest.scan.dim == 2 else matrix)
+
+    def _known_times(self) -> Tensor | None:
+        return None if self._first else torch.tensor(self._stamps, dtype=torch.float64)
+
+
+def _size(message: dict[str, Any]) -> int:
+    """Bytes of a message's arrays."""
+    return sum(value.nbytes for value in message.values() if isinstance(value, np.ndarray))

@@ -1,0 +1,99 @@
+"""Which live topic is the sensor, and its subscription."""
+
+from __future__ import annotations
+
+import time
+
+from gmmtorch.datasets.base import Ranges
+from gmmtorch.datasets.recordings.ros import bag_topics
+from gmmtorch.datasets.recordings.ros.bag_reader import Topic
+from gmmtorch.datasets.recordings.ros.bag_topics import Sensor, nearest_names
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError
+from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
+from gmmtorch.live.ros import Node
+
+_KINDS = {
+    "sensor_msgs/msg/PointCloud2": bag_topics.CLOUD,
+    "sensor_msgs/msg/LaserScan": bag_topics.LASER,
+    "sensor_msgs/msg/Image": bag_topics.DEPTH,
+    "sensor_msgs/msg/CompressedImage": bag_topics.COMPRESSED,
+}
+_RANKS = list(_KINDS)
+_POLL = 0.2  # s
+
+
+def find_sensor(node: Node, wanted: str | None, wait: float) -> Sensor:
+    """The topic `wanted`, or the only one of a range sensor; it is waited for up to `wait` seconds.
+
+    Clouds come before lasers, and these before depth images, whose names contain "depth". Raises
+    `GmmTorchError`, which lists the topics, if there is none, and `InvalidArgumentError` for another type or
+    several topics.
+    """
+    name = None if wanted is None else node.names.resolve(wanted)
+    end = time.monotonic() + wait
+    while not (found := _sensors(node, name)) and time.monotonic() < end:
+        node.spin_once(_POLL)
+    topics = node.topics()
+    listed = "; ".join(f"{topic} ({', '.join(types)})" for topic, types in topics.items()) or "none"
+    if not found:
+        what = "no topic of a range sensor" if name is None else f"no topic {name}"
+        if name in topics:
+            raise InvalidArgumentError(
+                f"sensor.topic={name} has messages of type {', '.join(topics[name])}; give a topic of a "
+                f"PointCloud2, a LaserScan or a depth Image. Published topics: {listed}."
+            )
+        raise GmmTorchError(
+            f"there is {what} after {wait:g} s. Published topics: {listed}. If it is published, check "
+            "ROS_DOMAIN_ID, node.middleware, and that it is published on node.interface."
+        )
+    best = min(_RANKS.index(sensor.topic.type) for sensor in found)
+    found = [sensor for sensor in found if _RANKS.index(sensor.topic.type) == best]
+    if len(found) > 1:
+        names = ", ".join(sensor.topic.name for sensor in found)
+        raise InvalidArgumentError(
+            f"there are {len(found)} topics of a range sensor: {names}. Choose one: "
+            f"sensor.topic={found[0].topic.name}."
+        )
+    return found[0]
+
+
+def _sensors(node: Node, name: str | None) -> list[Sensor]:
+    return [
+        Sensor(Topic(topic, message_type, 0), _KINDS[message_type])
+        for topic, types in node.topics().items()
+        for message_type in types
+        if message_type in _KINDS and (topic == name if name else not _is_colour(topic, message_type))
+    ]
+
+
+def _is_colour(topic: str, message_type: str) -> bool:
+    return message_type.endswith("Image") and "depth" not in topic.lower()
+
+
+def open_scans(
+    node: Node, sensor: Sensor, ranges: Ranges, options: LiveOptions, camera_info: str | None = None
+) -> LiveScans:
+    """The scans of a sensor, with the subscriptions that they need."""
+    scans = LiveScans(sensor, node.transforms, ranges, options)
+    if options.poses == "tf":
+        node.listen_to_transforms()
+    if sensor.is_camera:
+        info = camera_info or _camera_info(node, sensor.topic.name)
+        node.subscribe(info, bag_topics.INFO_TYPE, scans.note_camera)
+    node.subscribe(
+        sensor.topic.name,
+        sensor.topic.type,
+        lambda message: scans.receive(message, node.arrival.time, node.arrival.monotonic),
+    )
+    return scans
+
+
+def _camera_info(node: Node, image: str) -> str:
+    infos = [topic for topic, types in node.topics().items() if bag_topics.INFO_TYPE in types]
+    best = nearest_names(infos, image) if infos else []
+    if len(best) != 1:
+        raise InvalidArgumentError(
+            f"sensor.camera_info is not clear for the images of {image}; topics of type CameraInfo are "
+            f"{', '.join(infos) or 'none: publish the one of the camera'}."
+        )
+    return best[0]
