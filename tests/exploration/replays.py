@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import functools
+import shutil
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from gmmtorch.datasets import load
+from gmmtorch.datasets.base import DatasetShard, shard_indices
 from gmmtorch.exploration.mission.driver import Drivable, Run, WallClock, drive, never, settle
+from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.mapping.codec.component_batch import quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.scan import Scan
+from gmmtorch.sharing.replica.replica import Replica
+from gmmtorch.sharing.store import Store
 
 RULES = {
     "per_scan": WindowedRule(window=1, max_origins=1),
@@ -114,3 +121,28 @@ def content(*maps: Components) -> Counter[tuple[object, ...]]:
             shape = (*c.means[row].tolist(), *c.covariances[row].flatten().tolist())
             found[(shape, float(c.support[row]), bool(c.max_range[row]), tuple(sorted(seen[row])))] += 1
     return found
+
+
+def part(k: int, n: int, n_scans: int = 24) -> DatasetShard:
+    return DatasetShard(log(n_scans), shard_indices(n_scans, k, n))
+
+
+def robot(number: int, scans: Any, transport: Any, rule: str = "windowed", **options: Any) -> ReplayMission:
+    made = {"rate": 10.0, **options}
+    return ReplayMission(Replica(number), scans, transport, lambda: GaussianMap(RULES[rule]), **made)
+
+
+def stored(folder: Path, scans: Any, transport: Any, rule: str = "windowed", **options: Any) -> ReplayMission:
+    """A robot 0 with a store, which is left open."""
+    replica, store = Replica(0), Store(folder / "robot.sqlite", 0)
+    store.restore(replica)
+    return ReplayMission(
+        replica, scans, transport, lambda: GaussianMap(RULES[rule]), rate=10.0, store=store, **options
+    )
+
+
+def killed(folder: Path) -> Path:
+    """The files that the death of a robot's process leaves."""
+    copy = folder.with_name(f"{folder.name}+")
+    shutil.copytree(folder, copy)
+    return copy

@@ -29,3 +29,9 @@ def given_start(dim: int, k: int = 3, seed: int = 1) -> dict[str, np.ndarray]:
 
 def fitted(dim: int = 2, **options) -> GaussianMixture:
     return GaussianMixture(3, random_state=0, **options).fit(blobs(dim=dim))
+
+
+def random_spd(rng: np.random.Generator, n: int, dim: int, scale: float = 1.0) -> np.ndarray:
+    """Random covariances (n, dim, dim)."""
+    root = rng.normal(size=(n, dim, dim)) * scale
+    return root @ root.transpose(0, 2, 1) + 1e-3 * scale**2 * np.eye(dim)

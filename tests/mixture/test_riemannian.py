@@ -1,10 +1,7 @@
-"""Riemannian ascent against autograd, scipy's matrix functions, dense BFGS, EM and scikit-learn."""
+"""RiemannianGaussianMixture against EM and scikit-learn."""
 
 from __future__ import annotations
 
-import itertools
-import math
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,27 +12,21 @@ from hypothesis import strategies as st
 from mixture.estimator_contract import MixtureContract
 from mixture.fit_contract import FitContract, blobs
 from mixture.test_estimators import BAD_LOOP_PARAMETERS
-from scipy.linalg import expm, sqrtm
-from scipy.optimize import rosen, rosen_der
-from scipy.stats import multivariate_normal
 from sklearn import mixture as sklearn_mixture
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.estimators.ascent import LBFGS, SOLVERS, ascend, search
+from gmmtorch.mixture.estimators.ascent import SOLVERS
 from gmmtorch.mixture.estimators.riemannian import (
     Frames,
     Iterate,
     Likelihood,
     RiemannianGaussianMixture,
-    pack_tangent,
-    unpack_tangent,
 )
 
 solvers = pytest.mark.parametrize("solver", list(SOLVERS))
@@ -55,268 +46,6 @@ class TestRiemannianGaussianMixture(MixtureContract):
 class TestByConjugateGradients(FitContract):
     def make(self, n_components: int = 3, **options: Any) -> RiemannianGaussianMixture:
         return RiemannianGaussianMixture(n_components, **{"random_state": 0, "solver": "cg", **options})
-
-
-def random_iterate(
-    k: int, dim: int, generator: torch.Generator, n: int = 40, blur: float = 0.3, dtype=torch.float64
-) -> Iterate:
-    """A point of the manifold that is not a mixture: s ≠ 1."""
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    weight = torch.rand(n, generator=generator, dtype=torch.float64) + 0.1
-    likelihood = Likelihood(2 * normal(n, dim), weight, blur, dtype)
-    first = Parameters(
-        torch.full((k,), 1 / k).double(), normal(k, dim), torch.eye(dim).double().expand(k, dim, dim)
-    )
-    there = likelihood.at(first)
-    return there.move(0.4 * normal(*there.gradient.shape))
-
-
-def augmented(place: Iterate) -> Tensor:
-    """H (K, D+1, D+1) as one matrix: H [x; 1] = A (x − μ) + b."""
-    linear, means, offset = place.frames
-    return torch.cat([linear, offset[:, :, None] - linear @ means[:, :, None]], 2)
-
-
-def covariance(place: Iterate) -> Tensor:
-    """S = (HᵀH)⁻¹."""
-    frame = augmented(place)
-    return torch.linalg.inv(frame.mT @ frame)
-
-
-def reference(likelihood: Likelihood, S: Tensor, log_weights: Tensor) -> Tensor:
-    """f of S and η as in the docstring of the module."""
-    dim = S.shape[1] - 1
-    y = torch.cat([likelihood.points, likelihood.points.new_ones(len(likelihood.points), 1)], 1)
-    inverse = torch.linalg.inv(S)
-    squared = torch.einsum("ni,kij,nj->nk", y, inverse, y)
-    blur = likelihood.blur * torch.stack([p[:dim, :dim].trace() for p in inverse])
-    log_q = 0.5 - dim / 2 * math.log(2 * math.pi) - 0.5 * (torch.logdet(S) + squared + blur)
-    value = torch.logsumexp(torch.log_softmax(log_weights, 0) + log_q, 1)
-    return (likelihood.weight * value).sum() / likelihood.weight.sum()
-
-
-# -- the objective and its gradient ----------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_value_and_gradient_equal_autograd(dim, generator):
-    place = random_iterate(3, dim, generator)
-    S = covariance(place).requires_grad_()
-    log_weights = place.log_weights.clone().requires_grad_()
-    value = reference(place.likelihood, S, log_weights)
-    assert place.value == pytest.approx(float(value.detach()), rel=1e-12)
-    by_S, by_weights = torch.autograd.grad(value, [S, log_weights])
-    root = torch.linalg.inv(augmented(place))  # S = G Gᵀ, so that df = tr(∂f/∂S G dΞ Gᵀ)
-    expected = pack_tangent(root.mT @ by_S @ root, by_weights)
-    torch.testing.assert_close(place.gradient, expected, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_gradient_is_the_slope_along_geodesics(dim, generator):
-    place = random_iterate(2, dim, generator)
-    for _ in range(3):
-        tangent = torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64)
-        rise = place.move(1e-5 * tangent).value - place.move(-1e-5 * tangent).value
-        assert rise / 2e-5 == pytest.approx(float((place.gradient * tangent).sum()), rel=1e-6)
-
-
-def test_float32_value_and_gradient_are_close(generator):
-    state = generator.get_state()
-    exact = random_iterate(3, 3, generator)
-    generator.set_state(state)
-    with kernels("torch"):  # the fused E-step has float64 exponentials
-        coarse = random_iterate(3, 3, generator, dtype=torch.float32)
-    assert coarse.value != exact.value
-    assert coarse.value == pytest.approx(exact.value, abs=1e-5)
-    torch.testing.assert_close(coarse.gradient, exact.gradient, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_value_of_one_component_is_the_expected_log_density_of_blurred_points(dim, generator):
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(dim, dim))
-    mean, cov, points = rng.normal(size=dim), root @ root.T + np.eye(dim), rng.normal(size=(20, dim))
-    parameters = Parameters(torch.ones(1).double(), *(torch.from_numpy(v[None]) for v in (mean, cov)))
-    place = Likelihood(torch.from_numpy(points), torch.ones(20).double(), 0.3).at(parameters)
-    nodes = np.array(list(itertools.product([-1, 1], repeat=dim)))  # exact for quadratic functions
-    blurred = points[:, None] + math.sqrt(0.3) * nodes
-    assert place.value == pytest.approx(multivariate_normal(mean, cov).logpdf(blurred).mean())
-
-
-def test_objective_is_a_lower_bound_of_the_likelihood(generator):
-    for _ in range(20):
-        place = random_iterate(3, 2, generator)
-        mixture = GaussianMixture.from_parameters(*place.parameters())
-        scores = mixture.score_samples(place.likelihood.points)
-        weight = place.likelihood.weight
-        assert place.value < float((weight * scores).sum() / weight.sum())
-
-
-def test_distant_thin_component_gives_the_value_near_the_centre(generator):
-    """A component 1 mm thick at 10 km, where natural parameters would keep two digits."""
-    flat = torch.randn(60, 3, generator=generator, dtype=torch.float64) * torch.tensor([2.0, 1.0, 1e-3])
-    flat = torch.round(flat * 2**30) / 2**30
-    offset = torch.tensor([8192.0, -4096.0, 2048.0]).double()
-    weight, share = torch.ones(60).double(), torch.ones(1).double()
-    cov = torch.diag(torch.tensor([3.0, 2.0, 2e-6]).double())[None]
-    tangent = 0.3 * torch.randn(1, 11, generator=generator, dtype=torch.float64)
-    places = []
-    for shift in (0 * offset, offset):
-        mean = shift[None] + 1e-3
-        first = Likelihood(flat + shift, weight, 1e-9).at(Parameters(share, mean, cov))
-        places.append((first, first.move(tangent)))
-    assert em.is_ill_conditioned(places[1][0].parameters())
-    for near, far in zip(*places, strict=True):
-        assert far.value == pytest.approx(near.value, rel=1e-6)
-        torch.testing.assert_close(far.gradient, near.gradient, rtol=1e-5, atol=1e-6)
-
-
-# -- the manifold ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [2, 4])
-def test_packed_tangents_keep_the_inner_product(size, generator):
-    matrices = torch.randn(2, 5, size, size, generator=generator, dtype=torch.float64)
-    matrices = matrices + matrices.mT
-    change = torch.randn(2, 5, generator=generator, dtype=torch.float64)
-    a, b = (pack_tangent(m, c) for m, c in zip(matrices, change, strict=True))
-    traces = torch.stack([(x @ y).trace() for x, y in zip(*matrices, strict=True)]).sum()
-    assert float((a * b).sum()) == pytest.approx(float(traces + (change[0] * change[1]).sum()))
-    back, back_change = unpack_tangent(a, size)
-    torch.testing.assert_close(back, matrices[0])
-    assert torch.equal(back_change, change[0])
-
-
-@pytest.mark.parametrize("dim", [1, 3])
-def test_move_is_the_exponential_map_with_parallel_transport(dim, generator):
-    """S½ exp(S^−½ V S^−½) S½, and transport E Z Eᵀ with E = (S' S⁻¹)½, by scipy's expm and sqrtm."""
-    place = random_iterate(2, dim, generator)
-    step, other = (
-        0.5 * torch.randn(place.gradient.shape, generator=generator, dtype=torch.float64) for _ in range(2)
-    )
-    moved = place.move(step)
-    torch.testing.assert_close(
-        moved.log_weights, torch.log_softmax(place.log_weights + step[:, -1], 0), rtol=1e-12, atol=0
-    )
-    for k in range(2):
-        S, S_new = (covariance(p)[k].numpy() for p in (place, moved))
-        root, root_new = (np.linalg.inv(augmented(p)[k].numpy()) for p in (place, moved))
-        V, Z, Z_new = (
-            g @ unpack_tangent(t, dim + 1)[0][k].numpy() @ g.T
-            for g, t in ((root, step), (root, other), (root_new, other))
-        )
-        half = np.real(sqrtm(S))
-        inverse = np.linalg.inv(half)
-        np.testing.assert_allclose(S_new, half @ expm(inverse @ V @ inverse) @ half, rtol=1e-8, atol=1e-10)
-        E = np.real(sqrtm(S_new @ np.linalg.inv(S)))
-        np.testing.assert_allclose(Z_new, E @ Z @ E.T, rtol=1e-8, atol=1e-10)
-
-
-def test_frames_keep_their_decomposition(generator):
-    place = random_iterate(3, 3, generator)
-    linear, means, offset = place.frames
-    assert float((linear.mT @ offset[:, :, None]).abs().max()) < 1e-12
-    S = covariance(place)
-    last = S[:, 3, 3]
-    torch.testing.assert_close(1 / last, offset.square().sum(1))
-    torch.testing.assert_close(S[:, :3, 3] / last[:, None], means)
-    central = S[:, :3, :3] - last[:, None, None] * means[:, :, None] * means[:, None, :]
-    torch.testing.assert_close(place.covariances, central)
-
-
-# -- the ascent on other functions ------------------------------------------------------------------
-
-
-@dataclass
-class Flat:
-    """A point of Rⁿ with the interface of the ascent."""
-
-    at: np.ndarray
-    function: Any
-    slope: Any
-    tried: list[np.ndarray]
-
-    @property
-    def value(self) -> float:
-        return float(self.function(self.at))
-
-    @property
-    def gradient(self) -> Tensor:
-        return torch.from_numpy(self.slope(self.at))
-
-    @property
-    def inverse_hessian(self) -> Tensor:
-        return torch.full((len(self.at),), 0.5).double()
-
-    def bounded(self, direction: Tensor) -> Tensor:
-        return direction
-
-    def move(self, tangent: Tensor) -> Flat:
-        self.tried.append(self.at + tangent.numpy())
-        return Flat(self.tried[-1], self.function, self.slope, self.tried)
-
-
-def hill(start: list[float]) -> Flat:
-    return Flat(np.array(start), lambda x: -rosen(x), lambda x: -rosen_der(x), [])
-
-
-@solvers
-def test_ascend_finds_the_optimum_of_rosenbrock(solver):
-    top, values, converged = ascend(hill([-1.2, 1.0, 0.5]), SOLVERS[solver](5), tol=1e-14, max_iter=500)
-    assert converged
-    np.testing.assert_allclose(top.at, 1, atol=1e-5)
-    assert (np.diff(values) >= 0).all()
-
-
-def test_two_loop_recursion_equals_dense_bfgs():
-    rng = np.random.default_rng(0)
-    solver, dense = LBFGS(9), 0.5 * np.eye(4)
-    for _ in range(4):
-        step, root = rng.normal(size=4), rng.normal(size=(4, 4))
-        fall = (root @ root.T + np.eye(4)) @ step
-        before, after = (Flat(np.zeros(4), None, lambda x, g=g: g, []) for g in (fall, np.zeros(4)))
-        solver.update(before, torch.from_numpy(step / 2), 2.0, after)
-        rho = 1 / (fall @ step)
-        left = np.eye(4) - rho * np.outer(step, fall)
-        dense = left @ dense @ left.T + rho * np.outer(step, step)  # Nocedal & Wright, 6.17
-    gradient = rng.normal(size=4)
-    found = solver.direction(Flat(np.zeros(4), None, lambda x: gradient, []))
-    np.testing.assert_allclose(found.numpy(), dense @ gradient, rtol=1e-10)
-
-
-@pytest.mark.parametrize("slope_left", [0.9, 0.1])
-@pytest.mark.parametrize("size", [1e-4, 1.0, 1e3])
-def test_search_satisfies_the_wolfe_conditions(size, slope_left):
-    place = hill([-1.2, 1.0])
-    direction = size * place.gradient / place.gradient.norm()
-    length, found = search(place, direction, slope_left)
-    slope = float((place.gradient * direction).sum())
-    assert found.value >= place.value + 1e-4 * length * slope
-    assert float((found.gradient * direction).sum()) <= slope_left * slope
-
-
-def test_ascend_stays_if_no_direction_ascends():
-    place = Flat(np.zeros(2), lambda x: -np.abs(x).sum(), lambda x: np.ones(2), [])  # with a wrong gradient
-    for solver in SOLVERS.values():
-        top, values, converged = ascend(place, solver(3), tol=0, max_iter=50)
-        assert (top.at.tolist(), values, converged) == ([0, 0], [0], True)
-    assert len(place.tried) < 100
-
-
-def test_search_rejects_points_that_cannot_be_computed():
-    def function(x: np.ndarray) -> float:
-        if x[0] > 1:
-            raise NumericalError("out of bounds")
-        return math.nan if x[0] > 0.5 else x[0]
-
-    place = Flat(np.zeros(1), function, lambda x: np.ones(1), [])
-    place.move = lambda t: (function(t.numpy()), Flat(t.numpy(), function, place.slope, []))[1]
-    length, found = search(place, torch.tensor([8.0]).double(), 0.9)
-    assert 0.4 < found.value <= 0.5
-    assert length == pytest.approx(found.value / 8)
 
 
 # -- the estimator ---------------------------------------------------------------------------------

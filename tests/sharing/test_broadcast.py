@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, frame_of_components
+from sharing.replica_histories import gossip
 from sharing.replica_model import rows
 
 from gmmtorch.errors import DataError, InvalidArgumentError
@@ -75,12 +76,7 @@ def history(seed: int, codec: str, n_acts: int = 8) -> list[bytes]:
         else:
             chosen = rng.sample(held.ids.tolist(), rng.randint(1, min(4, len(held))))
             robot.count({(key[0], key[1]): rng.uniform(0.0, 500.0) for key in chosen})
-        new = robot.datagrams()
-        said += new
-        for other in robots:
-            if other is not robot and rng.random() < 0.7:
-                for datagram in new:
-                    other.receive(datagram)
+        said += gossip(rng, robot, robots)
     return said
 
 

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping.random_components import random_components
+from sharing.replica_histories import gossip
 from sharing.replica_model import rows
 from sharing.schedules import act, components
 
@@ -83,11 +84,7 @@ def growth(seed: int, n_acts: int = 14) -> list[bytes]:
         else:
             chosen = rng.sample(known, rng.randint(1, min(4, len(known))))
             robot.count({tuple(row): rng.uniform(0.0, 500.0) for row in chosen})
-        for datagram in robot.datagrams():
-            said.append(datagram)
-            for other in robots:
-                if other is not robot and rng.random() < 0.7:
-                    other.receive(datagram)
+        said += gossip(rng, robot, robots)
     return said
 
 
