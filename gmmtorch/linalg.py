@@ -130,10 +130,14 @@ def argsort(keys: Tensor) -> Tensor:
 
 
 def largest_indices(scores: Tensor, k: int) -> Tensor:
-    """Column indices (N, k) of the k largest values in each row of scores (N, M), in no particular order."""
-    if scores.device.type != "cpu":
-        return scores.topk(k, 1, sorted=False).indices
-    return torch.from_numpy(np.argpartition(scores.numpy(), -k, axis=1)[:, -k:].astype(np.int64))
+    """Rising column indices (N, k) of the k largest values in each row of scores (N, M), without NaN.
+
+    Of equal values the first are taken, on any device.
+    """
+    least = scores.topk(k, 1, sorted=False).values.amin(1, keepdim=True)
+    above, equal = scores > least, scores == least
+    taken = above | (equal & (equal.cumsum(1) <= k - above.sum(1, keepdim=True)))
+    return taken.nonzero()[:, 1].view(-1, k)
 
 
 def count_distinct(keys: Tensor) -> int:

@@ -127,6 +127,24 @@ distinct_keys(torch.arange(5), False)"""
     assert compiled == ["wp_gmmtorch_distinct_keys", "wp_gmmtorch_probe"]
 
 
+@pytest.mark.slow
+def test_kernels_with_code_of_their_own_for_cuda_compile_without_a_gpu(tmp_path):
+    from gmmtorch.kernels.mixtures import depth_cells, lattice_rounding, m_step, truncated_e_step
+
+    warp = compiler._warp()
+    chosen = [
+        depth_cells._KERNELS[torch.float32],
+        lattice_rounding._ROUNDINGS[3],
+        m_step._STEPS[3],
+        truncated_e_step._CHOICES[3, torch.float32],
+    ]
+    for kernel in chosen:
+        kernel.load(torch.device("cpu"))
+        folder = tmp_path / kernel.name
+        warp.compile_aot_module(kernel._kernel.module, device=None, arch=80, module_dir=str(folder))
+        assert any(path.stat().st_size for path in folder.iterdir())
+
+
 def test_a_tensor_that_is_not_contiguous_is_refused():
     turned = torch.ones(2, 3).T
     kernel = compiler.FusedKernel("not_compiled", "float* x, float* y", "", strided=("y",))

@@ -147,7 +147,8 @@ _CHOICE = """
         if (n < n_candidates) return;
         worst = first;
         for (int64_t j = first + 1; j < n_candidates; ++j)
-            if (score[j] < score[worst]) worst = j;
+            if (score[j] < score[worst] || (names && score[j] == score[worst] && names[j] > names[worst]))
+                worst = j;
     };
     vec x[WIDTH];
     for (int64_t g = first_group; g < last_group; ++g) {
@@ -219,9 +220,11 @@ _CHOICE = """
         chosen[0] = g;
         for (int64_t j = 0; j < n_found; ++j) {
             const int64_t k = found[j];
-            if (k != g && n_candidates > 1 && k < n_components)
-                if (n_chosen < n_candidates || best[k] > score[worst])
+            if (k != g && n_candidates > 1 && k < n_components) {  // of equal ones, the first is taken
+                const bool first = n_chosen == n_candidates && best[k] == score[worst] && k < chosen[worst];
+                if (n_chosen < n_candidates || best[k] > score[worst] || first)
                     insert(best[k], k, 1, n_chosen, worst, chosen);
+            }
             best[k] = -HUGE_VAL;
         }
     }
