@@ -52,7 +52,8 @@ def _check_options(config: DictConfig) -> None:
     common.set_up(config)
     if config.transport != "in_process":
         raise InvalidArgumentError(
-            f"transport={config.transport!r} is not one of in_process; gmmtorch-team has the others."
+            f"transport={config.transport!r} is not in_process, the only transport of gmmtorch-explore; "
+            "gmmtorch-team has others."
         )
     for name, value in config.checkpoint.items():
         if value is not None:

@@ -129,11 +129,11 @@ def _numbers(lines: list[str], columns: int, where: str) -> np.ndarray:
     try:
         table = np.array([line.split() for line in lines], dtype=np.float64)
     except ValueError as error:
-        raise DataError(f"{where}: expected {columns} numbers a line ({error}).") from error
+        raise DataError(f"{where}: expected {columns} numbers per line ({error}).") from error
     if not lines:
         return np.empty((0, columns))
     if table.ndim != 2 or table.shape[1] != columns:
-        raise DataError(f"{where}: expected {columns} numbers a line, found {table.shape[-1]}.")
+        raise DataError(f"{where}: expected {columns} numbers per line, found {table.shape[-1]}.")
     return table
 
 

@@ -29,7 +29,7 @@ class ScanFolder(Dataset):
         path = require_path(
             path,
             "folder",
-            "scans/*.pcd or scans/*.ply in the sensor frame, and poses.txt (12 numbers a row)",
+            "scans/*.pcd or scans/*.ply in the sensor frame, and poses.txt (12 numbers per row)",
             "KITTI odometry, MulRan and most lidar SLAM systems export this layout.",
         )
         super().__init__(path.name, ranges, stride)
@@ -66,7 +66,7 @@ def _read_poses(path: Path) -> torch.Tensor:
     except ValueError as error:
         raise DataError(f"{path} is not a table of numbers: {error}") from error
     if rows.size and rows.shape[1] != 12:
-        raise DataError(f"{path} has {rows.shape[1]} numbers a row; a KITTI pose has 12.")
+        raise DataError(f"{path} has {rows.shape[1]} numbers per row; a KITTI pose has 12.")
     poses = torch.eye(4, dtype=torch.float64).repeat(rows.shape[0], 1, 1)
     poses[:, :3] = torch.from_numpy(rows.reshape(-1, 3, 4))
     for number, pose in enumerate(poses, 1):

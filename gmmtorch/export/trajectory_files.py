@@ -13,7 +13,7 @@ from gmmtorch.scan import ArrayLike
 
 
 def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
-    """Writes a trajectory atomically, one line a pose: time, x, y, z, and the quaternion qx, qy, qz, qw.
+    """Writes a trajectory atomically, one line per pose: time, x, y, z, and the quaternion qx, qy, qz, qw.
 
     Args:
         times: (S,), seconds.
@@ -38,7 +38,7 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
-    """Writes a trajectory atomically, one line a pose: the 12 numbers of world ← sensor, row by row.
+    """Writes a trajectory atomically, one line per pose: the 12 numbers of world ← sensor, row by row.
 
     The form has no times. Numbers have 17 digits, which float64 needs to be read back without change.
 

@@ -57,7 +57,7 @@ class TileIndex:
 
     @property
     def cutoff(self) -> float:
-        """The cutoff that the support of all components decides."""
+        """The cutoff that follows from the support of all components."""
         return cutoff_of(int(self.n_seen.sum()), int(self.n_many.sum()))
 
     def boxes(self, side: float, cutoff: float) -> tuple[Tensor, Tensor]:

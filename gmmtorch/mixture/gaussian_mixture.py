@@ -55,7 +55,7 @@ class GaussianMixture(MixtureEstimator):
         covariance_type: "full", "tied" (one covariance for all components), "diag" (diagonal) or
             "spherical" (one variance for each component). All but "full" use exact EM.
         noise: standard deviation of the sensor, in the unit of the points (m), for n_components=None.
-        tol: EM stops when the mean log-likelihood changes by less (nats a point).
+        tol: EM stops when the mean log-likelihood changes by less (nats per point).
         reg_covar: added to each variance, in the squared unit of the points (m²).
         max_iter: largest number of EM iterations of each start. 0: the mixture is the start of EM.
         n_init: number of starts; the one with the best lower bound is kept.
@@ -71,7 +71,7 @@ class GaussianMixture(MixtureEstimator):
             `lower_bound_` is a few thousandths of a nat below the mean log-likelihood. "auto": truncated
             from 48 components and 4·10⁶ pairs of point and component on.
         max_cells: if given, EM runs on the moments of at most this number of cells of points (see
-            `cells`; 2D and 3D): much faster for many points a component, at a slightly lower likelihood.
+            `cells`; 2D and 3D): much faster for many points per component, at a slightly lower likelihood.
         dtype: of the exponentials in exact EM, whose products are always float64, and of the whole E-step
             in truncated EM. With "float64" all computation is in float64.
         compiled: run the E-step of truncated EM through torch.compile. The result is the same to rounding.

@@ -214,7 +214,7 @@ IDENTITY = kitti(np.eye(3), [0.0, 0.0, 0.0])
     [
         (IDENTITY * 2, r"2 rows, but there are 1 scans.*one pose for each"),
         ("", "0 rows"),
-        ("1 0 0 0 0 1 0 0\n", "8 numbers a row; a KITTI pose has 12"),
+        ("1 0 0 0 0 1 0 0\n", "8 numbers per row; a KITTI pose has 12"),
         ("one two three\n", "not a table of numbers"),
         (kitti(np.eye(3), [math.nan, 0.0, 0.0]), "row 1 is not a rigid pose"),
         (kitti(2 * np.eye(3), [0.0, 0.0, 0.0]), "row 1 is not a rigid pose"),
@@ -466,9 +466,9 @@ def test_octomap_log_rotation_is_yaw_pitch_roll():
         ("NODE 0 0 0\n1 2 3\n", "NODE line: expected 6 numbers"),
         ("NODE\n1 2 3\n", "NODE line: expected 6 numbers"),
         ("NODE 0 0 0 0 0 nan\n1 2 3\n", "pose.*not finite"),
-        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0: expected 3 numbers a line, found 2"),
-        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0: expected 3 numbers a line"),
-        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers a line"),
+        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0: expected 3 numbers per line, found 2"),
+        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0: expected 3 numbers per line"),
+        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers per line"),
     ],
 )
 def test_octomap_log_rejects_damaged_scans(tmp_path, text, message):

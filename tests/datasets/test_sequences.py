@@ -76,7 +76,7 @@ def test_kitti_takes_a_tum_trajectory_of_the_lidar(sequence, tmp_path):
         ("calib.txt", "Tr: 1 2 3\n", "row Tr is not 12 numbers"),
         ("calib.txt", "Tr: 2 0 0 0 0 1 0 0 0 0 1 0\n", "not a rigid pose"),
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", "3 scans, but only 1 poses"),
-        ("poses.txt", "1 2 3\n", "has 3 numbers a row"),
+        ("poses.txt", "1 2 3\n", "has 3 numbers per row"),
         ("poses.txt", "", "contains no row"),
         ("poses.txt", None, "does not exist"),
         ("times.txt", "0.1\n", "1 rows for 3 scans"),

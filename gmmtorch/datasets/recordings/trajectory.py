@@ -133,7 +133,7 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
         return _tum(path, rows)
     if rows.shape[1] != 12:
         raise DataError(
-            f"{path} has {rows.shape[1]} numbers a row; a TUM trajectory has 8 (time x y z qx qy qz qw), a "
+            f"{path} has {rows.shape[1]} numbers per row; a TUM trajectory has 8 (time x y z qx qy qz qw), a "
             "KITTI trajectory 12."
         )
     if n_scans is not None and len(rows) != n_scans:

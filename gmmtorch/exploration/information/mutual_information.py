@@ -66,7 +66,7 @@ def csqmi(
     if band is None:
         band = needed_band(depths, sigma)
     elif band < 0:
-        raise InvalidArgumentError(f"band={band} must be at least 0, or None to have it chosen.")
+        raise InvalidArgumentError(f"band={band} must be at least 0, or None for an automatic choice.")
     kernel = depth_kernel(depths, sigma, band).to(occupancy.dtype)
     return banded_csqmi(first_block(ended), first_block(sharpened(ended)), kernel)
 

@@ -29,8 +29,8 @@ class TreeRule:
     """When a robot explores locally and when it travels. Values are shares of the largest value seen.
 
     search: tree search while exploring. travel: tree search while travelling. squeeze: tree search by
-    distance only, when `travel` makes no progress. little: information a primitive below which a robot
-    looks for a better place. plenty: information a primitive from which on a travelling robot stays.
+    distance only, when `travel` makes no progress. little: information per primitive below which a robot
+    looks for a better place. plenty: information per primitive from which on a travelling robot stays.
     worthwhile: smallest value of a view in the library. metre: value of a metre of progress, compared with
     information.
     n_added, n_revalued: views of the library added and evaluated again in one plan.

@@ -98,7 +98,7 @@ class Agent:
         return self.robot.mapper.shared.digest()
 
     def keep_in(self, store: RecordStore) -> None:
-        """From now on stores the map's records; enters those that the store has restored into the map."""
+        """Stores the map's records from now on, and adds the records that the store restored to the map."""
         self.radio.store = store
         self.robot.mapper.center_on(self.robot.position)
         self.robot.mapper.receive([])

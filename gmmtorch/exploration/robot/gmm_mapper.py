@@ -204,7 +204,7 @@ class GmmMapper(Mapper):
                 self._gained[key] = total
 
     def _around(self, points: Tensor) -> Components | None:
-        """Components with all their counts, of batches that may explain points (M, 3); None: none may."""
+        """Components, with all counts, of the batches that may explain points (M, 3); None if none may."""
         if not self._by_place or len(points) == 0:
             return None
         first, last = points.aminmax(dim=0)

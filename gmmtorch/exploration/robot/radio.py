@@ -28,7 +28,7 @@ class TokenBucket:
 
     def __init__(self, rate: float) -> None:
         if not 0 < rate < math.inf:
-            raise InvalidArgumentError(f"budget={rate} must be above zero bytes a second, and finite.")
+            raise InvalidArgumentError(f"budget={rate} must be above zero bytes per second, and finite.")
         self.rate = float(rate)
         self._most = max(_BURST * self.rate, _LEAST_BURST)
         self._tokens = self._most

@@ -30,7 +30,7 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
 
     Args:
         n_components: K, at most the number of points.
-        tol: EM stops when the mean log-likelihood changes by less (nats a point). EM is slow if noise
+        tol: EM stops when the mean log-likelihood changes by less (nats per point). EM is slow if noise
             exceeds a component's thickness: after t iterations about R/t of the variance R remains.
         reg_covar: smallest variance of a component in any direction, in the squared unit of the points
             (m²). It is a lower bound, not added as in plain EM: added in every iteration it would

@@ -214,7 +214,7 @@ def variational_step(
 ) -> loop.Step[Posterior]:
     """One iteration for `loop.run_em`: responsibilities given a posterior, and their posterior.
 
-    The bound (nats a point) is that of the returned posterior. Covariances of the points of a component
+    The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
     include `reg_covar` (m²).
     """
     features = em.quadratic_features(points)

@@ -56,7 +56,7 @@ class RiemannianGaussianMixture(MixtureEstimator):
 
     Args:
         n_components: K, at most the number of points.
-        tol: converged if an iteration gains less, and an EM step would gain less too (nats a point).
+        tol: converged if an iteration gains less, and an EM step would gain less too (nats per point).
         reg_covar: ε, the variance of a blur of the points, in their squared unit (m²); EM adds it to
             each variance.
         max_iter: largest number of iterations of each start.

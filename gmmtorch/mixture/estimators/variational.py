@@ -64,7 +64,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         n_components: K, the largest number of components, at most the number of points.
         covariance_type: "full", "tied", "diag" or "spherical". The posterior of each precision matrix is a
             Wishart distribution whose scale matrix has this form.
-        tol: stops when the lower bound changes by less (nats a point).
+        tol: stops when the lower bound changes by less (nats per point).
         reg_covar: added to each variance, in the squared unit of the points (m²).
         max_iter: largest number of iterations of each start. 0: the posterior of the start.
         n_init: number of starts; the one with the best lower bound is kept.
@@ -87,7 +87,7 @@ class VariationalGaussianMixture(MixtureEstimator):
     or for a process a pair of Beta parameters, (K,) each), `mean_precision_` (K,) and
     `degrees_of_freedom_` ((K,), "tied" a number); and of the prior `weight_concentration_prior_`,
     `mean_precision_prior_`, `mean_prior_`, `degrees_of_freedom_prior_`, `covariance_prior_`.
-    `lower_bounds_` are lower bounds of log p(X) with all constants, nats a point, after each iteration.
+    `lower_bounds_` are lower bounds of log p(X) with all constants, nats per point, after each iteration.
     Scikit-learn's bound omits some constants and is not divided by the number of points.
     """
 

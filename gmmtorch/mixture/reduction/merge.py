@@ -273,7 +273,7 @@ def merge(
         a, b: mixtures of equal dimension.
         weight_a, weight_b: number of points that each mixture stands for.
         n_components, max_cost, cost, neighbors: how the union is simplified, see `simplify`. The weights
-            add up to one, so max_cost is in nats a point. The union is not simplified without
+            add up to one, so max_cost is in nats per point. The union is not simplified without
             n_components and max_cost.
         options: constructor options of the resulting `GaussianMixture`.
 

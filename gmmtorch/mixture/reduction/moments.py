@@ -107,7 +107,7 @@ def kullback_leibler_bound(first: Gaussians, second: Gaussians) -> Tensor:
     """Runnalls' bound B = ½ [(w₁+w₂) log|Σ| − w₁ log|Σ₁| − w₂ log|Σ₂|], Σ of the merged pair, (P,).
 
     B is an upper bound of w KL(p‖q), with p the mixture (of total weight w) before the merge and q the
-    mixture after it. The unit is nats a point if weights add up to one, and nats if weights are
+    mixture after it. The unit is nats per point if weights add up to one, and nats if weights are
     supports in points. The bounds of successive merges add up to a bound for all of them.
     Source: Runnalls, IEEE Trans. AES 43(3), 2007.
     """

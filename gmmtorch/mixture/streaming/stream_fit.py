@@ -82,7 +82,7 @@ def fit_stream(
     `loop.guarded_step`).
 
     With `algorithm="truncated"`, which stores the owner of each point, every process keeps its points in
-    memory (about 130 bytes a point in total), and the result depends slightly on how the points are
+    memory (about 130 bytes per point in total), and the result depends slightly on how the points are
     shared. Otherwise EM is exact.
 
     Args:

@@ -45,7 +45,7 @@ def encode_components(
     """Datagrams of components in order, each with the sensor origins that it needs; empty without components.
 
     Args:
-        codec: "quantized": 8 to 10 bytes a component, rounded as `mapping.codec.quantized` does.
+        codec: "quantized": 8 to 10 bytes per component, rounded as `mapping.codec.quantized` does.
             "float": float64, unchanged. "thesis": 57 bytes for each component and sensor origin.
         max_bytes: largest size of a datagram.
 

@@ -117,7 +117,7 @@ def read_views(body: bytes) -> ViewsMessage:
 def encode_plan(
     sender: int, number: int, time: float, step: float, path: Tensor, views: Tensor | None = None
 ) -> list[bytes]:
-    """The datagram of a plan, 1 to 3 bytes a pose of the path, 5 a view.
+    """The datagram of a plan, 1 to 3 bytes per pose of the path, 5 a view.
 
     Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
 

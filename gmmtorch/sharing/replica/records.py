@@ -213,7 +213,7 @@ class Records:
     # -- reading ----------------------------------------------------------------------------------
 
     def of(self, kind: type[_Record]) -> list[_Record]:
-        """The records of a type that count, by key."""
+        """The stored records of a type, by key."""
         found = self._kinds.get(kind, {})
         return [cast(_Record, found[key]) for key in sorted(found)]
 

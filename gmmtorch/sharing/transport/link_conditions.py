@@ -114,7 +114,7 @@ _OPTIONAL = ("bandwidth", "reach")  # None: no limit
 _REQUIREMENTS: dict[str, tuple[Callable[[float], bool], str]] = {
     "latency": (lambda s: 0 <= s < math.inf, "a time of zero seconds or more, and finite"),
     "jitter": (lambda s: 0 <= s < math.inf, "a mean time of zero seconds or more, and finite"),
-    "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes a second, and finite, or None"),
+    "bandwidth": (lambda rate: 0 < rate < math.inf, "above zero bytes per second, and finite, or None"),
     "loss": (lambda share: 0 <= share < 1, "a share of the datagrams in [0, 1)"),
     "duplication": (lambda share: 0 <= share <= 1, "a share of the datagrams in [0, 1]"),
     "reach": (lambda metres: 0 < metres < math.inf, "above zero metres, and finite, or None"),

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from gmmtorch.mixture.estimators.trees.density_limit import DensityLimit
     from gmmtorch.mixture.estimators.trees.hierarchical import HierarchicalGaussianMixture as Rule
 
-_WORST_ROUNDING = 0.02  # nats a point of float32 error above which float64 is used
+_WORST_ROUNDING = 0.02  # nats per point of float32 error above which float64 is used
 _SHORTLIST = 3  # nodes that are fully fitted, per node that the limit of leaves allows to split
 _TRIAL_ITERATIONS = 2
 
@@ -114,7 +114,7 @@ def grow(
     Args:
         points, weight: the cloud.
         rule: an estimator; its parameters say when a node is split, and how children are fitted.
-        on_iteration: called with the EM iteration, from 1, and the lower bound, nats a point.
+        on_iteration: called with the EM iteration, from 1, and the lower bound, nats per point.
         on_level: called with the nodes of each level, starting with the root (level 0), and their members.
         density: removes sparse children before the points are assigned to them.
     """

@@ -35,7 +35,7 @@ class HierarchicalGaussianMixture(MixtureEstimator):
             splits that gain most are made. None: limited by the other parameters only.
         branching: largest number of children of a node.
         max_levels: largest number of levels, so at most branching^max_levels leaves.
-        tol: EM in a node stops when its mean log-likelihood increases by less (nats a point), and a
+        tol: EM in a node stops when its mean log-likelihood increases by less (nats per point), and a
             split that gains less is not made.
         max_iter: largest number of EM iterations on each level.
         reg_covar: added to each variance, in the squared unit of the points (m²).

@@ -127,7 +127,7 @@ def maximization(
 ) -> tuple[Children, float]:
     """The M-step in all nodes, from statistics (G, m, F) of features in `dtype`.
 
-    Also returns the mean error of that dtype in the next E-step, nats a point: ε/2 E[‖x‖²]/λ_min.
+    Also returns the mean error of that dtype in the next E-step, nats per point: ε/2 E[‖x‖²]/λ_min.
     Variances below the rounding error are raised to it.
     """
     n_nodes, m, n_features = statistics.shape
@@ -235,7 +235,7 @@ def run_em(
         mass: (G,) weight of each node.
         reg_covar: added to each variance (m²).
         tol, max_iter: when EM stops.
-        worst_error: EM stops if the error of its dtype is larger (nats a point).
+        worst_error: EM stops if the error of its dtype is larger (nats per point).
         on_values: called with Σ p log Σ_children (G,) before each M-step.
     """
     children = Children(*(value.clone() for value in start))
