@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,6 +50,9 @@ def mapped(scans: Dataset, every: int, rule: gt.IncrementalRule) -> Place:
     for number, scan in enumerate(scans):
         if number % every:
             m.insert(scan)
+    with tempfile.TemporaryDirectory() as folder:  # as a robot has it: rounded by the codec
+        m.save(Path(folder) / "map.safetensors")
+        m = gt.GaussianMap.load(Path(folder) / "map.safetensors")
     return Place(scans, every, m)
 
 

@@ -158,7 +158,7 @@ def write_results(command: str, config: DictConfig, rows: list[Row], folder: Pat
     results = {
         "command": command,
         "version": gmmtorch.__version__,
-        "seed": config.seed,
+        "seed": config.seed if "seed" in config else None,
         "config": OmegaConf.to_container(config, resolve=True),
         "rows": rows,
     }
@@ -214,7 +214,7 @@ def chosen_options(config: DictConfig) -> dict[str, Any]:
     """
     from hydra.core.hydra_config import HydraConfig
 
-    found: dict[str, Any] = {"seed": config.seed}
+    found: dict[str, Any] = {"seed": config.seed} if "seed" in config else {}
     for override in HydraConfig.get().overrides.task:
         name, _, text = str(override).lstrip("+~").partition("=")
         value = OmegaConf.select(config, name, throw_on_missing=False)

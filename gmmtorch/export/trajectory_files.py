@@ -1,7 +1,12 @@
-"""Writes trajectories: poses over time in the text forms of the TUM RGB-D and KITTI odometry benchmarks."""
+"""Writes trajectories: poses over time in the text forms of the TUM RGB-D and KITTI odometry benchmarks, and
+as a table with covariances.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +15,9 @@ import torch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.files import write_bytes
 from gmmtorch.scan import ArrayLike
+
+_POSE = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+_FREE = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 
 
 def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
@@ -21,8 +29,6 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
 
     Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
     """
-    from scipy.spatial.transform import Rotation
-
     matrices = _in_space(poses)
     stamp = torch.as_tensor(times).detach().cpu().double().numpy()
     if stamp.shape != (len(matrices),) or not np.isfinite(stamp).all():
@@ -30,8 +36,7 @@ def write_tum(path: str | Path, times: ArrayLike, poses: ArrayLike) -> Path:
             f"times has shape {stamp.shape} or holds NaN or infinite values; give one time (s) for each of "
             f"{len(matrices)} poses."
         )
-    spin = Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
-    rows = np.column_stack([matrices[:, :3, 3], spin])
+    rows = np.column_stack([matrices[:, :3, 3], _quaternions(matrices)])
     lines = [f"{t:.9f} " + _numbers(row, 9) for t, row in zip(stamp, rows, strict=True)]
     text = "\n".join(["# timestamp x y z qx qy qz qw", *lines]) + "\n"
     return write_bytes(path, text.encode())
@@ -49,6 +54,59 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
     """
     lines = [_numbers(matrix[:3].ravel(), 17) + "\n" for matrix in _in_space(poses)]
     return write_bytes(path, "".join(lines).encode())
+
+
+def write_pose_table(
+    path: str | Path,
+    times: ArrayLike,
+    poses: ArrayLike,
+    covariances: ArrayLike,
+    columns: Mapping[str, Sequence[object]] | None = None,
+) -> Path:
+    """Writes a CSV table atomically, one row a pose: time, x, y, z, qx, qy, qz, qw, further columns, and the
+    upper triangle of the covariance: cov_xx, cov_xy, …, cov_yaw_yaw.
+
+    Args:
+        times: (S,), seconds.
+        poses: (S, D+1, D+1), world ← sensor, metres. Poses in 2D lie at z = 0.
+        covariances: (S, F, F) of a shift (m) and a turn (rad) of the pose: x, y, yaw in 2D; x, y, z, roll,
+            pitch, yaw in 3D, in the axes of the world.
+        columns: further values (S,) by name.
+
+    Raises `InvalidArgumentError` for other shapes, and for values that are not finite.
+    """
+    matrices, stamp = _in_space(poses), torch.as_tensor(times).detach().cpu().double().numpy()
+    spread = torch.as_tensor(covariances).detach().cpu().double().numpy()
+    free = _FREE.get(spread.shape[-1] if spread.ndim == 3 else 0, ())
+    if spread.shape != (len(matrices), len(free), len(free)) or not np.isfinite(spread).all():
+        raise InvalidArgumentError(
+            f"covariances has shape {spread.shape} or holds NaN; expected (S, 3, 3) or (S, 6, 6) of "
+            f"{len(matrices)} poses."
+        )
+    more = dict(columns or {})
+    rows, cols = np.triu_indices(len(free))
+    names = [f"cov_{free[i]}_{free[j]}" for i, j in zip(rows, cols, strict=True)]
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*_POSE, *more, *names])
+    numbers = np.column_stack([matrices[:, :3, 3], _quaternions(matrices)])
+    for at in range(len(matrices)):
+        table.writerow(
+            [
+                f"{stamp[at]:.9f}",
+                *_numbers(numbers[at], 9).split(),
+                *(values[at] for values in more.values()),
+                *_numbers(spread[at][rows, cols], 6).split(),
+            ]
+        )
+    return write_bytes(path, text.getvalue().encode())
+
+
+def _quaternions(matrices: np.ndarray) -> np.ndarray:
+    """qx, qy, qz, qw (S, 4) of poses (S, 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrices[:, :3, :3]).as_quat() if len(matrices) else np.zeros((0, 4))
 
 
 def _in_space(poses: ArrayLike) -> np.ndarray:

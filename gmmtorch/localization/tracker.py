@@ -33,6 +33,7 @@ _TURNED = math.radians(10)  # between the headings of neighbouring starts, for e
 _PLACES = 0.5  # metres between the places of a search of the whole map
 _RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
 _RANKING_POINTS = 150  # of the scan, that rank the starts
+_GLIMPSE_POINTS = 60  # of the scan, that choose a fifth of many starts for the ranking
 _RANKED_AT_ONCE = 256  # starts
 _WIDER = 4  # times the first search
 _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
@@ -43,6 +44,11 @@ _LOOSEST = 0.3  # metres of standard deviation
 _UNSEEN = 10.0  # metres of standard deviation of a direction that no surface fixes
 _ALIKE = 0.98  # of the best score: another pose is as good
 _APART = 0.3  # metres, and radians: poses are different
+_FEWEST = 10  # points of a scan
+_NEAREST = 0.2  # metres from the sensor: nearer points are its own cover, which would fit any wall
+_FREE = 0.2  # occupancy of a cell that the map saw as free,
+_CELL = 0.1  # metres, its side
+_MOST_FREE = 1.5  # times the share that need not be explained: points in free space
 _CORRELATED = 10.0  # points that share one error: that of their component (measured on a hall and an office)
 
 
@@ -108,6 +114,7 @@ class Tracker:
         self.least_explained = least_explained
         self.distance, self.angle, self.n_points = distance, angle, n_points
         self.dim = mixture.means.shape[1]
+        self._map = surfaces if isinstance(surfaces, GaussianMap) else None
         self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
@@ -155,7 +162,7 @@ class Tracker:
         check_positions("points", rows)
         measured = None if motion is None else _rigid(motion, "motion", self._center)
         predicted = self._predicted(measured)
-        rows = self._thinned(rows)
+        rows = self._thinned(rows[rows.norm(dim=1) > _NEAREST])
         best: Location | None = None
         for level, starts, is_enough in self._searches(predicted, measured is not None) if len(rows) else ():
             found = self._climbed(rows, starts, level)
@@ -200,22 +207,28 @@ class Tracker:
                 _best(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
             )
             motions = found.motions
-        return self._location(rows, found)
+        return self._location(rows, found, is_tracked=len(starts.translations) == 1)
 
     def _ranked(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Motions:
         """The best starts that differ from each other, at most `_CLIMBED`."""
+        if len(starts.translations) > 10 * _RANKED:
+            score = self._scores(rows[:_GLIMPSE_POINTS], starts, target)
+            starts = starts.at(score.topk(len(score) // 5).indices)
         n = len(starts.translations)
         if n <= _CLIMBED:
             return starts
-        parts = torch.arange(n, device=rows.device).split(_RANKED_AT_ONCE)
-        score = torch.cat([target.sums(rows[:_RANKING_POINTS], starts.at(part)).score for part in parts])
+        score = self._scores(rows[:_RANKING_POINTS], starts, target)
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
             order = best[_best(starts.at(best), score[best], 1.01 * target.blur)]
         return starts.at(order[:_CLIMBED])
 
-    def _location(self, rows: Tensor, found: Alignment) -> Location:
+    def _scores(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Tensor:
+        parts = torch.arange(len(starts.translations), device=rows.device).split(_RANKED_AT_ONCE)
+        return torch.cat([target.sums(rows, starts.at(part)).score for part in parts])
+
+    def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
         covariance, loosest = _covariance(found.information[0], rows)
         doubts = []
         if not bool(found.converged[0]):
@@ -228,17 +241,35 @@ class Tracker:
         other = _apart(found.motions, found.motions, _APART, _APART)[0] > 1
         if bool((other & (found.score >= _ALIKE * found.score[0])).any()):
             doubts.append("another pose explains the scan as well")
+        if len(rows) < _FEWEST:
+            doubts.append(f"the scan has only {len(rows)} points beyond {_NEAREST} m: is the sensor covered?")
         pose = torch.eye(self.dim + 1).to(rows)
         pose[: self.dim, : self.dim] = found.motions.rotations[0]
         pose[: self.dim, self.dim] = found.motions.translations[0] + self._center
+        in_free_space = 0.0 if doubts or is_tracked else self._in_free_space(rows, pose)
+        if in_free_space > _MOST_FREE * (1 - self.least_explained):
+            doubts.append(f"{in_free_space:.0%} of the points lie where the map saw free space")
         return Location(pose, covariance, share, tuple(doubts))
+
+    def _in_free_space(self, rows: Tensor, pose: Tensor) -> float:
+        """Share of the points that lie in free space of the map; 0 if the surfaces are no map."""
+        if self._map is None:
+            return 0.0
+        few = rows[:_RANKING_POINTS]
+        ends = few @ pose[: self.dim, : self.dim].T + pose[: self.dim, self.dim]
+        return float((torch.as_tensor(self._map.occupancy(ends, _CELL)) < _FREE).double().mean())
 
     def _nothing(self, predicted: Tensor | None) -> Location:
         """The prediction, for a scan without points."""
         pose = torch.eye(self.dim + 1).to(self._center) if predicted is None else predicted.clone()
         pose[: self.dim, self.dim] += self._center
         n_free = self.dim + self.dim * (self.dim - 1) // 2
-        return Location(pose, _UNSEEN**2 * torch.eye(n_free).to(pose), 0.0, ("the scan has no points",))
+        return Location(
+            pose,
+            _UNSEEN**2 * torch.eye(n_free).to(pose),
+            0.0,
+            (f"the scan has no points beyond {_NEAREST} m",),
+        )
 
     def _remember(self, location: Location, predicted: Tensor | None, is_measured: bool) -> None:
         if not location.found:

@@ -20,12 +20,20 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from gmmtorch.cli import common, export, fit, map, occupancy, ros, view
+from gmmtorch.cli import common, export, fit, localize, map, occupancy, ros, view
 from gmmtorch.cli.options import schema
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
-COMMANDS = {"occupancy": occupancy, "fit": fit, "export": export, "map": map, "view": view, "ros": ros}
+COMMANDS = {
+    "occupancy": occupancy,
+    "fit": fit,
+    "export": export,
+    "map": map,
+    "localize": localize,
+    "view": view,
+    "ros": ros,
+}
 QUIET = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
 TINY = {
     "occupancy": ["dataset.n_scans=10", "map.n_samples=20000"],

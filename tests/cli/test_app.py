@@ -20,7 +20,7 @@ from gmmtorch.cli import common, explore, map, occupancy, robot, team
 from gmmtorch.cli.options import command_options, schema
 from gmmtorch.errors import InvalidArgumentError
 
-COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "view", "ros"]
+COMMANDS = ["occupancy", "fit", "export", "explore", "robot", "team", "map", "localize", "view", "ros"]
 
 
 @pytest.fixture
@@ -165,6 +165,8 @@ def test_descriptions_are_read_from_docstrings():
         ("robot", "dataset@log.dataset=ca", "dataset@log.dataset=carmen"),
         ("team", "network.b", "network.budget="),
         ("view", "map.safetensors sh", "shape="),
+        ("localize", "map.", "map.bounds= map.path="),
+        ("localize", "map=a.safetensors tr", "truth="),
     ],
 )
 def test_completion_offers_what_the_command_can_run(command, line, expected, run, monkeypatch):

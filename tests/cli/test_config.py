@@ -20,7 +20,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
 
 from gmmtorch import datasets
-from gmmtorch.cli import common, export
+from gmmtorch.cli import common, export, localize
 from gmmtorch.cli.from_options import maps, missions
 from gmmtorch.cli.options import schema
 from gmmtorch.cli.studies import fit_studies, occupancy_studies
@@ -36,7 +36,7 @@ from gmmtorch.simulation.worlds.tunnels import tunnels
 from gmmtorch.simulation.worlds.warehouse import warehouse
 
 COMMANDS = ["occupancy", "fit"]
-CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view", "ros"]
+CONFIGURED = [*COMMANDS, "map", "explore", "robot", "team", "export", "view", "ros", "localize"]
 MAPS = {
     "incremental": IncrementalRule(),
     "per_scan": WindowedRule(window=1, max_origins=1),
@@ -187,7 +187,7 @@ def test_an_experiment_can_run_on_another_data_set(command, name):
         assert composed(command, f"experiment={name}", f"dataset={dataset}").dataset.name == dataset
 
 
-@pytest.mark.parametrize("command", CONFIGURED[:-2])
+@pytest.mark.parametrize("command", CONFIGURED[: CONFIGURED.index("export")])
 def test_results_go_to_a_folder_in_outputs(command):
     schema.register()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
@@ -422,12 +422,14 @@ def test_the_examples_of_the_help_compose(command):
         overrides = [word for word in words if not word.startswith("-") and word != "job"]
         if "-m" in words:  # of a sweep, the first value of each
             overrides = [re.sub(r"=([^,\[]*),.*", r"=\1", word) for word in overrides]
-        composed(command, *overrides)
+        composed(command, *(localize.overrides(overrides) if command == "localize" else overrides))
 
 
 def test_help_names_every_choice_of_every_group():
     """Each experiment is named by the command that runs it, and by no other."""
-    of_occupancy, of_fit, of_map, of_explore, *of_robots = map(listed, CONFIGURED[:-2])
+    of_occupancy, of_fit, of_map, of_explore, *of_robots = map(
+        listed, CONFIGURED[: CONFIGURED.index("export")]
+    )
     assert of_occupancy.keys() == {"dataset", "map", "experiment"}
     assert of_fit.keys() == {"dataset", "experiment"}
     assert of_map.keys() == {"dataset", "map"}

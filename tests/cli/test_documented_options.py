@@ -14,9 +14,11 @@ import yaml
 from command_runs import CHECKOUT, as_it_was, composed
 from omegaconf import DictConfig, OmegaConf
 
+from gmmtorch.cli import localize
+
 LINES = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").splitlines()
 PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-COMMANDS = ["occupancy", "map", "view", "ros", "fit", "export", "explore", "robot", "team"]
+COMMANDS = ["occupancy", "map", "localize", "view", "ros", "fit", "export", "explore", "robot", "team"]
 CHOICES = [
     *([command] for command in COMMANDS),
     *(["occupancy", f"dataset={name}"] for name in ("carmen", "depth_frames", "mesh", "mesh_scans")),
@@ -239,7 +241,8 @@ def overrides(arguments: str) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_documented_command_lines_compose(page):
     for command, arguments in command_lines(page):
-        composed(command, *overrides(arguments))
+        given = overrides(arguments)
+        composed(command, *(localize.overrides(given) if command == "localize" else given))
 
 
 def test_command_lines_are_found_in_the_pages():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from gmmtorch.datasets.recordings.trajectory import read_trajectory
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.export.trajectory_files import write_kitti, write_tum
+from gmmtorch.export.trajectory_files import write_kitti, write_pose_table, write_tum
 
 
 def test_tum_lines_have_time_position_and_quaternion(tmp_path):
@@ -57,3 +58,22 @@ def test_kitti_rows_of_poses_in_the_plane_and_refused_input(tmp_path):
         with pytest.raises(InvalidArgumentError, match=message):
             write_kitti(tmp_path / "b.txt", poses)
     assert not (tmp_path / "b.txt").exists()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_pose_table_has_poses_columns_and_the_triangle_of_the_covariance(dim, tmp_path):
+    free = dim + dim * (dim - 1) // 2
+    root = torch.randn(2, free, free, generator=torch.Generator().manual_seed(0)).double()
+    poses = torch.eye(dim + 1).double().repeat(2, 1, 1)
+    poses[1, :dim, dim] = torch.arange(1, dim + 1)
+    path = write_pose_table(tmp_path / "a.csv", [0.5, 1e9], poses, root @ root.mT, {"why": ["", "a, b"]})
+    first, second = csv.DictReader(path.open())
+    assert (first["time"], second["time"]) == ("0.500000000", "1000000000.000000000")
+    assert [float(second[name]) for name in ("x", "y", "z", "qw")] == [1, 2, 3 if dim == 3 else 0, 1]
+    assert (first["why"], second["why"]) == ("", "a, b")
+    covariance = (root @ root.mT)[1]
+    assert float(second["cov_x_y"]) == pytest.approx(float(covariance[0, 1]), rel=1e-5)
+    assert float(second["cov_yaw_yaw"]) == pytest.approx(float(covariance[-1, -1]), rel=1e-5)
+    assert sum(name.startswith("cov_") for name in second) == free * (free + 1) // 2
+    with pytest.raises(InvalidArgumentError, match="covariances has shape"):
+        write_pose_table(tmp_path / "a.csv", [0.5, 1e9], poses, root[:1])

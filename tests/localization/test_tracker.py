@@ -92,6 +92,17 @@ def test_a_scan_of_another_place_is_not_found(building):
     assert "another place" in " ".join(found.doubts)
 
 
+def test_points_in_free_space_and_too_few_points_are_doubts(building, monkeypatch):
+    scans, m = building
+    truth = scans.pose(7)
+    points = in_sensor_frame(scans[7], truth)
+    few = Tracker(m, truth).locate(points[:9])
+    assert "only 9 points" in " ".join(few.doubts)
+    monkeypatch.setattr(gt.GaussianMap, "occupancy", lambda *_: torch.zeros(len(points)))
+    found = Tracker(m, truth).locate(points)
+    assert found.doubts == ("100% of the points lie where the map saw free space",)
+
+
 def test_a_corridor_leaves_its_direction_open():
     along = torch.linspace(-15, 15, 61).double()
     means = torch.cat([torch.stack([along, torch.full_like(along, side)], 1) for side in (-1.0, 1.0)])

@@ -1,4 +1,4 @@
-"""The options of gmmtorch-map, gmmtorch-occupancy, gmmtorch-export and gmmtorch-view."""
+"""The options of gmmtorch-map, gmmtorch-localize, gmmtorch-occupancy, gmmtorch-export and gmmtorch-view."""
 
 from __future__ import annotations
 
@@ -51,6 +51,46 @@ class Map:
     cluster: str | None = None
     report: Report = field(default_factory=Report)
     runtime: Runtime = field(default_factory=Runtime)
+
+
+@dataclass
+class SavedMap:
+    """A saved map.
+
+    path: map file, run directory of gmmtorch-map, or folder of tiles.
+    bounds: of a map in tiles, the box [x0,y0,z0,x1,y1,z1] (m), in 2D without z, that is opened.
+    """
+
+    path: str | None = None
+    bounds: list[float] | None = None
+
+
+@dataclass
+class Localize:
+    """Options of gmmtorch-localize.
+
+    pose: first pose, [x,y,yaw], [x,y,z,yaw] or [x,y,z,qx,qy,qz,qw] (m, rad); dataset; null: unknown.
+    distance: metres along the ground by which the first pose may be off.
+    angle: radians by which the heading of the first pose may be off.
+    motion: constant, or dataset: predict with the motion between the poses of the data set.
+    n_points: points of a scan that are used at most.
+    least_explained: share of the points that must lie on surfaces of the map.
+    truth: true poses, for scores: dataset, none, or a TUM or KITTI file.
+    align: before scoring: none, first or rigid.
+    """
+
+    dataset: Any = MISSING
+    map: SavedMap = field(default_factory=SavedMap)
+    pose: Any = None
+    distance: float = 0.5
+    angle: float = 0.175
+    motion: str = "constant"
+    n_points: int = 1000
+    least_explained: float = 0.9
+    truth: str | None = "none"
+    align: str = "none"
+    report: Report = field(default_factory=Report)
+    runtime: ExportRuntime = field(default_factory=ExportRuntime)
 
 
 @dataclass

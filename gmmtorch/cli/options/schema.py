@@ -66,6 +66,7 @@ def _commands() -> dict[str, type]:
     return {
         "fit": schema_of(fit_schema.Fit, mixture=mixture),
         "map": map_schema.Map,
+        "localize": map_schema.Localize,
         "occupancy": schema_of(map_schema.Occupancy, evaluation=schema_of(Protocol)),
         "export": map_schema.Export,
         "view": map_schema.View,

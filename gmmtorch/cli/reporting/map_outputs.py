@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event, Row
+    from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.map_builder import MapBuilder
+    from gmmtorch.report.maps.map_images import MapPanel
 
 EXPORTS = {
     "map_server": ("map_server", "navigation.yaml"),
@@ -30,6 +32,8 @@ EXPORTS = {
 
 _MESH_CELLS = 0.5  # sides of a mesh's cells, relative to the resolution of the map
 _MOST_CELLS = 1600  # along a side of a picture
+OCCUPIED_ABOVE = 0.4
+"""Of pictures: grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces."""
 _STANDING = 1.0  # m of a path, below which bytes a metre say nothing
 
 
@@ -166,33 +170,43 @@ def draw(
         )
 
 
-def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
-    """The map from above, and its components: in 3D in space."""
+def map_panel(built: GaussianMap, trajectories: Sequence[Tensor]) -> MapPanel:
+    """The region of a map around its surfaces and the sensor positions (S, D), for pictures."""
     import torch
 
-    from gmmtorch.report.maps.map_figures import map_figure
     from gmmtorch.report.maps.map_images import MapPanel
     from gmmtorch.report.maps.map_regions import robust_bounds
-    from gmmtorch.report.scenes.ellipsoids import first_viewpoints
-    from gmmtorch.report.scenes.mixture_figures import mixture_figure
-    from gmmtorch.report.scenes.scene import mixture_scene_figure
-    from gmmtorch.report.table import byte_text
 
-    components = built.components()
-    surfaces = components.selected((~components.max_range).nonzero().squeeze(1))
-    surfaces = surfaces if len(surfaces) else components
-    low, high = robust_bounds(surfaces.means.cpu(), torch.cat(list(trajectories)))
+    low, high = robust_bounds(_surfaces(built).means.cpu(), torch.cat(list(trajectories)))
     side = max(b - a for a, b in zip(low[:2], high[:2], strict=True))
     resolution = built.resolution * max(1, math.ceil(side / (_MOST_CELLS * built.resolution)))
 
     def answer(points: Tensor) -> Tensor:
         return built.occupancy(points, resolution)  # type: ignore[return-value]
 
+    return MapPanel("occupancy", answer, resolution, low, high)
+
+
+def _surfaces(built: GaussianMap) -> Components:
+    """The surface components; all components if there are none."""
+    components = built.components()
+    surfaces = components.selected((~components.max_range).nonzero().squeeze(1))
+    return surfaces if len(surfaces) else components
+
+
+def _figures(built: GaussianMap, trajectories: Sequence[Tensor], row: Row) -> dict[str, Any]:
+    """The map from above, and its components: in 3D in space."""
+    from gmmtorch.report.maps.map_figures import map_figure
+    from gmmtorch.report.scenes.ellipsoids import first_viewpoints
+    from gmmtorch.report.scenes.mixture_figures import mixture_figure
+    from gmmtorch.report.scenes.scene import mixture_scene_figure
+    from gmmtorch.report.table import byte_text
+
+    surfaces = _surfaces(built)
     title = f"{row['dataset']}: {row['n_components']:,} components, {byte_text(row['nbytes'])}"
     title += f", {row['metres']:,.0f} m travelled" if row["metres"] >= _STANDING else ""
-    panel = MapPanel("occupancy", answer, resolution, low, high)
-    # Grazing beams count more misses than hits in a surface cell, so ½ would hide thin surfaces.
-    figures = {"above": map_figure([panel], trajectories, title=title, occupied_above=0.4)}
+    panel = map_panel(built, trajectories)
+    figures = {"above": map_figure([panel], trajectories, title=title, occupied_above=OCCUPIED_ABOVE)}
     shown = surfaces.means.cpu(), surfaces.covariances.cpu()
     if surfaces.dim == 3:
         seen_from = first_viewpoints(surfaces).cpu()

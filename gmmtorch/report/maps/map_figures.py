@@ -34,12 +34,15 @@ _GREYS = [(0.0, "#ffffff"), (0.3, "#dedede"), (0.5, "#9c9c9c"), (0.67, "#404040"
 _NONE = "#f1f1f1"  # a column without an occupied cell
 _HEADROOM = 0.5  # metres above the sensor at which a roof is cut off
 _PATH, _START, _END = style.PALETTE[1], style.PALETTE[2], style.PALETTE[0]
+_TRUE, _LOST = style.PALETTE[5], style.PALETTE[3]
 
 
 def map_figure(
     panels: Sequence[MapPanel],
     trajectories: Sequence[ArrayLike] = (),
     *,
+    truth: ArrayLike | None = None,
+    lost: ArrayLike | None = None,
     title: str | None = None,
     ceiling: float | None = None,
     occupied_above: float = 0.5,
@@ -54,6 +57,8 @@ def map_figure(
     Args:
         panels: one or more maps, all 2D or all 3D.
         trajectories: sensor positions (S, D) of each drive in order, world metres.
+        truth: true positions (S, D), drawn beside the trajectories.
+        lost: positions (S, D) near which a scan was not localised.
         title: title of the figure.
         ceiling: height (m) above which cells are left out of the view from above; if None, half a metre above
             the trajectories if most of them lies under a roof, else no limit.
@@ -68,7 +73,8 @@ def map_figure(
         raise InvalidArgumentError("panels is empty; give at least one map to show.")
     dim = panels[0].dim
     paths = [style.as_array(path) for path in trajectories]
-    if any(panel.dim != dim for panel in panels) or any(path.shape[1:] != (dim,) for path in paths):
+    beside = [style.as_array(path) for path in (truth, lost) if path is not None]
+    if any(panel.dim != dim for panel in panels) or any(p.shape[1:] != (dim,) for p in paths + beside):
         raise InvalidArgumentError(
             f"panels are of dimensions {[panel.dim for panel in panels]} and trajectories have shapes "
             f"{[path.shape for path in paths]}; all must be 2D, or all 3D."
@@ -98,7 +104,9 @@ def map_figure(
         axes.set_xlabel("x [m]", fontsize=style.LABEL_SIZE)
     for axes in grid[:, 0]:
         axes.set_ylabel("y [m]", fontsize=style.LABEL_SIZE)
-    style.legend_below(figure, _legend(bool(paths), dim))
+    for axes in grid.flat:
+        _draw_beside(axes, truth, lost)
+    style.legend_below(figure, [*_legend(bool(paths), dim), *_legend_beside(truth, lost)])
     style.figure_title(figure, title)
     return figure
 
@@ -177,6 +185,21 @@ def _draw_paths(axes: Axes, panel: MapPanel, paths: Sequence[np.ndarray]) -> Non
         axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.2, path_effects=style.halo(2.6), zorder=3)
         for (x, y), shape, hue in ((path[0, :2], "o", _START), (path[-1, :2], "s", _END)):
             axes.plot(x, y, shape, color=hue, markersize=size, markeredgecolor="white", zorder=4)
+
+
+def _draw_beside(axes: Axes, truth: ArrayLike | None, lost: ArrayLike | None) -> None:
+    if truth is not None:
+        path = style.as_array(truth)
+        axes.plot(path[:, 0], path[:, 1], color=_TRUE, linewidth=3.0, zorder=2.5)
+    if lost is not None:
+        marks = style.as_array(lost)
+        axes.plot(marks[:, 0], marks[:, 1], "x", color=_LOST, markersize=7, markeredgewidth=2, zorder=5)
+
+
+def _legend_beside(truth: ArrayLike | None, lost: ArrayLike | None) -> list[Artist]:
+    true = Line2D([], [], color=_TRUE, linewidth=3, label="true path")
+    mark = Line2D([], [], color=_LOST, marker="x", linestyle="", markeredgewidth=2, label="scan not found")
+    return [line for line, given in ((true, truth), (mark, lost)) if given is not None]
 
 
 def _ceiling(panel: MapPanel, path: np.ndarray | None, given: float | None, occupied_above: float) -> float:

@@ -1,0 +1,12 @@
+#!/usr/bin/env python
+"""The command gmmtorch-localize, from a checkout."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from gmmtorch.cli.localize import main
+
+if __name__ == "__main__":  # the processes of a study import this file
+    main()
