@@ -56,20 +56,25 @@ def test_paths_without_a_bag_are_refused(tmp_path):
         load("rosbag", tmp_path / "a.mcap")
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [("mcap", b"zstd"), ("bag", b"bz2")])
-def test_an_unknown_compression_is_named(tmp_path, suffix, codec):
+def compressed_bag(path: Path, ros1_codec: str, points: np.ndarray) -> Path:
+    """A drive with one cloud in compressed chunks: by a codec of ROS 1, or by Zstandard."""
     from rosbags.rosbag1 import Writer
     from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-    path = tmp_path / f"a.{suffix}"
     bag = BagWriter(path)
-    if suffix == "bag":
-        bag.writer.set_compression(Writer.CompressionFormat.BZ2)
+    if path.suffix == ".bag":
+        bag.writer.set_compression(Writer.CompressionFormat[ros1_codec])
     else:
         bag.writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with bag:
         drive(bag)
-        bag.cloud("/points", 0.0, "lidar", POINTS)
+        bag.cloud("/points", 0.0, "lidar", points)
+    return path
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("mcap", b"zstd"), ("bag", b"bz2")])
+def test_an_unknown_compression_is_named(tmp_path, suffix, codec):
+    path = compressed_bag(tmp_path / f"a.{suffix}", "BZ2", POINTS)
     assert len(load("rosbag", path)) == 1
     name = b"w" * len(codec)
     path.write_bytes(path.read_bytes().replace(codec, name))
@@ -116,20 +121,9 @@ def test_transforms_whose_definition_is_damaged_are_left_out(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["mcap", "bag"])
 def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypatch):
-    from rosbags.rosbag1 import Writer
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode
-
     from gmmtorch.datasets.recordings.ros import rosbags_access
 
-    path = tmp_path / f"a.{suffix}"
-    bag = BagWriter(path)
-    if suffix == "bag":
-        bag.writer.set_compression(Writer.CompressionFormat.LZ4)
-    else:
-        bag.writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    with bag:
-        drive(bag)
-        bag.cloud("/points", 0.0, "lidar", np.ones((100_000, 3)))
+    path = compressed_bag(tmp_path / f"a.{suffix}", "LZ4", np.ones((100_000, 3)))
     assert path.stat().st_size < 20_000
     monkeypatch.setattr(rosbags_access, "MAX_CHUNK_BYTES", 1 << 20)
     with pytest.raises(DataError, match="unpacks to more than"):
