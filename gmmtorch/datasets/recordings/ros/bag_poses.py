@@ -97,7 +97,7 @@ class BagSurvey:
             if message.type in TF_TYPES:
                 self.tree.add(content, static=message.topic.endswith("tf_static"))
                 return
-            time, matrix, body = pose_sample(content, message.type)
+            time, matrix, body = pose_sample(content)
         except (DataError, ValueError, KeyError, TypeError):  # also a definition in the bag that is damaged
             return  # a transform that is missed leaves a gap, which `max_gap` notices
         self._samples.append((time, matrix))

@@ -121,7 +121,7 @@ class PosesByIndex:
         return "all poses are known"
 
 
-def pose_sample(message: dict[str, Any], message_type: str) -> tuple[int, np.ndarray, str]:
+def pose_sample(message: dict[str, Any]) -> tuple[int, np.ndarray, str]:
     """(time in ns, world ← body (4, 4), body's frame or "") of a message of a pose topic.
 
     Raises `ValueError` if it is not a pose.
