@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.exploration.information.view_evaluator import BLOCK, ViewEvaluator
+from gmmtorch.exploration.information.view_evaluator import BLOCK, ViewEvaluator, ViewValues
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.robot.mapper import LocalMap
 
@@ -20,6 +20,7 @@ class ViewCache:
         self._row: dict[tuple[int, ...], int] = {}
         self._keys: list[Tensor] = []
         n_blocks = len(task.residual)
+        # Rows beyond those of `_row` are spare.
         self._gain, self._left = torch.zeros(0, n_blocks), torch.zeros(0, n_blocks)
 
     def rows(self, poses: Tensor) -> Tensor:
@@ -33,10 +34,19 @@ class ViewCache:
                 new.append(i)
         if new:
             values = self._evaluator.evaluate(self._local_map, keys[new])
-            self._gain = torch.cat([self._gain, values.gain])
-            self._left = torch.cat([self._left, 1 - values.measured])
+            self._store(len(self._row) - len(new), values)
             self._keys.append(keys[new])
         return torch.tensor([self._row[name] for name in names], dtype=torch.int64)
+
+    def _store(self, begin: int, values: ViewValues) -> None:
+        """Store values in the rows from `begin` on."""
+        stop = begin + len(values.gain)
+        if stop > len(self._gain):
+            spare = self._gain.new_empty(max(stop, 2 * begin) - begin, self._gain.shape[1])
+            self._gain = torch.cat([self._gain[:begin], spare])
+            self._left = torch.cat([self._left[:begin], spare])
+        self._gain[begin:stop] = values.gain
+        torch.sub(1, values.measured, out=self._left[begin:stop])
 
     def marginal(self, rows: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gain (V,) of views given residuals (V, G), and the residuals (V, G) after them."""
@@ -50,7 +60,7 @@ class ViewCache:
         """Return all evaluated poses (V, 4) and their values (V,) given `residual` (G,)."""
         if not self._keys:
             return torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
-        return self._evaluator.poses(torch.cat(self._keys)), self._gain @ residual
+        return self._evaluator.poses(torch.cat(self._keys)), self._gain[: len(self._row)] @ residual
 
 
 _EXTENT = 1 << 20  # blocks along each axis that keys can tell apart
