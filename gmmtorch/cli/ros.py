@@ -1,4 +1,4 @@
-"""gmmtorch-ros: maps live ROS 2 topics, or plays a recording."""
+"""gmmtorch-ros: maps live ROS 2 topics, localises in a map, or plays a recording."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.cli.view import open_viewer
 
 if TYPE_CHECKING:
+    from gmmtorch.evaluation.events import Row
+    from gmmtorch.live.mapper.live_localizer import LiveLocalizer
     from gmmtorch.live.mapper.live_mapper import LiveMapper
     from gmmtorch.live.mapper.live_scans import LiveScans
     from gmmtorch.live.mapper.map_publisher import MapPublisher
     from gmmtorch.live.ros import Node
-    from gmmtorch.report.progress import ProgressBars
 
 logger = logging.getLogger("gmmtorch")
 _CHECKPOINT = "checkpoint.safetensors"
@@ -42,6 +43,8 @@ def run(config: DictConfig) -> None:
     with _node(config) as node:
         if config.play:
             _play(config, node)
+        elif config.localize:
+            _localize(config, node, device)
         else:
             _map(config, node, device)
 
@@ -92,10 +95,12 @@ def _play(config: DictConfig, node: Node) -> None:
 
 def _map(config: DictConfig, node: Node, device: str) -> None:
     """Build a map of the sensor's topic, and write it at the end."""
-    from gmmtorch.live.mapper.live_mapper import LiveMapper
+    from gmmtorch.live.mapper.live_mapper import LiveMapper, warm_up
     from gmmtorch.report.progress import ProgressBars
 
-    target = maps.map_factory(config, resolution=config.resolution)()
+    make_map = maps.map_factory(config, resolution=config.resolution)
+    warm_up(make_map(), device)
+    target = make_map()
     scans = _scans(config, node)
     mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device)
     folder = common.run_dir()
@@ -103,15 +108,46 @@ def _map(config: DictConfig, node: Node, device: str) -> None:
     checkpoint = _Checkpoint(config, mapper, folder / _CHECKPOINT)
 
     def after_scan() -> None:
+        now = mapper.builder.progress()
+        bars("mapping", now.n_read, None)
+        bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped")
         checkpoint.save_when_due()
         if viewer is not None and mapper.builder.map.n_pending == 0:
             viewer.update(*map_outputs.snapshot(mapper.builder))
 
     with ProgressBars(enabled=config.report.progress) as bars:
-        _until_stopped(config, node, scans, mapper, bars, after_scan)
+        _until_stopped(config, node, scans, mapper, after_scan)
         mapper.finish()
     _write(config, mapper, scans, folder)
     (folder / _CHECKPOINT).unlink(missing_ok=True)
+
+
+def _localize(config: DictConfig, node: Node, device: str) -> None:
+    """Localise the sensor in a map that stays as it is; write the trajectory at the end."""
+    import torch
+
+    from gmmtorch.export.trajectory_files import write_tum
+    from gmmtorch.live.mapper.live_localizer import MAP, LiveLocalizer
+    from gmmtorch.report.progress import ProgressBars
+
+    known = maps.open_map(Path(config.localize).expanduser(), config.runtime)
+    scans = _scans(config, node)
+    localizer = LiveLocalizer(node, scans, known, config.sensor.poses == "tf", device)
+    _publisher(config, node).publish(known, MAP, node.now())
+    with ProgressBars(enabled=config.report.progress) as bars:
+
+        def after_scan() -> None:
+            bars("localising", localizer.n_scans, None)
+            bars.note("localising", f"{localizer.n_lost:,} lost, {scans.n_dropped:,} dropped")
+
+        _until_stopped(config, node, scans, localizer, after_scan)
+    folder = common.run_dir()
+    if localizer.poses:
+        times = torch.tensor(localizer.times, dtype=torch.float64)
+        write_tum(folder / map_outputs.TRAJECTORY, times, torch.stack(localizer.poses))
+    numbers = localizer.diagnostics.numbers(localizer.n_scans, known.n_components)
+    row = {"topic": scans.name, **numbers, "n_lost": localizer.n_lost, "nbytes": known.nbytes}
+    _write_results(config, row, scans, folder, _TABLE.replace("n_dropped", "n_lost n_dropped"))
 
 
 def _scans(config: DictConfig, node: Node) -> LiveScans:
@@ -168,23 +204,19 @@ def _until_stopped(
     config: DictConfig,
     node: Node,
     scans: LiveScans,
-    mapper: LiveMapper,
-    bars: ProgressBars,
+    worker: LiveMapper | LiveLocalizer,
     after_scan: Callable[[], None],
 ) -> None:
-    """Maps until Ctrl-C; says why nothing happens."""
+    """Handles scans until Ctrl-C; says why there are none."""
     import time
 
     begin = time.monotonic()
     with app.stop_requests() as is_stopped:
         while not is_stopped():
-            if mapper.step():
-                now = mapper.builder.progress()
-                bars("mapping", now.n_read, None)
-                bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped")
+            if worker.step():
                 after_scan()
-            elif not mapper.builder.record.indices and time.monotonic() - begin > config.wait:
-                node.warn("silence", f"nothing is mapped: {_trouble(node, scans)}.")
+            elif not len(scans) and time.monotonic() - begin > config.wait:
+                node.warn("silence", f"no scan can be used: {_trouble(node, scans)}.")
 
 
 def _trouble(node: Node, scans: LiveScans) -> str:
@@ -205,14 +237,19 @@ def _write(config: DictConfig, mapper: LiveMapper, scans: LiveScans, folder: Pat
         builder.map.save(folder / "map.safetensors")
         map_outputs.write_trajectory(builder, folder)
         row |= {"n_components": builder.map.n_components, "nbytes": builder.map.nbytes}
+    _write_results(config, row, scans, folder, _TABLE)
+    if n_scans:
+        print(f"map       {folder / 'map.safetensors'}")
+
+
+def _write_results(config: DictConfig, row: Row, scans: LiveScans, folder: Path, columns: str) -> None:
+    """Write results.json, and print its row and what was left out."""
     row["skipped"] = [{"reason": reason, "n_scans": n} for reason, n in scans.skipped.items()]
-    row = {key: None if value != value else value for key, value in row.items()}
+    row = {key: None if value != value else value for key, value in row.items()}  # JSON has no NaN
     results = common.write_results("ros", config, [row], folder)
-    common.print_table([row], _TABLE.split(), f"{scans.name}: {n_scans} scans")
+    common.print_table([row], columns.split(), f"{scans.name}: {row['n_scans']} scans")
     for reason, count in scans.skipped.items():
         print(f"skipped   {count} scans: {reason}")
-    if n_scans:
-        print(f"\nmap       {folder / 'map.safetensors'}")
     common.print_files(folder, results)
 
 

@@ -54,6 +54,7 @@ class Ros:
 
     seed: seed of all random numbers.
     resolution: side (m) of the cells of the published grid.
+    localize: map file in which the sensor is localised, instead of building a map.
     play: recording to publish, instead of building a map.
     rate: speed of the recording that is played; 2: twice as fast.
     remap: topic → other topic, as in {/points: /velodyne_points}.
@@ -69,6 +70,7 @@ class Ros:
     map: Any = MISSING
     seed: int = 0
     resolution: float = 0.1
+    localize: str | None = None
     play: str | None = None
     rate: float = 1.0
     remap: Any = None

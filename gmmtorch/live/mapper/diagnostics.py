@@ -46,12 +46,12 @@ class Diagnostics:
         """Whether a second has passed since the last publication."""
         return time.monotonic() - self._last >= _PERIOD
 
-    def publish(self, n_scans: int, n_components: int, nbytes: int | None) -> None:
-        """Publishes the numbers; nbytes: of the map, None: as before."""
+    def publish(self, n_scans: int, n_components: int, nbytes: int) -> None:
+        """Publishes the numbers; nbytes: of the map."""
         now = time.monotonic()
         self._rate = (n_scans - self._n_last) / max(now - self._last, 1e-3)
         self._last, self._n_last = now, n_scans
-        self._nbytes = self._nbytes if nbytes is None else nbytes
+        self._nbytes = nbytes
         dropped = self._scans.n_dropped
         is_late, self._n_dropped = dropped > self._n_dropped, dropped
         if is_late:

@@ -15,8 +15,10 @@ from gmmtorch.live.mapper.map_publisher import MapPublisher
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.scan import Scan
 
 _MESSAGES = 500  # of a flood, before a scan is mapped
+_PATIENCE = 3.0  # s that a due publication waits for the end of a window
 
 
 class LiveMapper:
@@ -45,8 +47,9 @@ class LiveMapper:
         self._unpublished: list[int] = []  # stamps of scans, ns
         self._published: list[int] = []
         self._thread = ThreadPoolExecutor(1, "publication")
-        self._publication: Future[None] | None = None
-        self._begin = self._next_publication = 0.0
+        self._publication: Future[int] | None = None
+        self._nbytes = 0
+        self._begin = self._next_publication = time.monotonic()
 
     def step(self, timeout: float = 0.1) -> bool:
         """Handles the messages that wait, and maps at most one scan; returns whether it did."""
@@ -86,8 +89,9 @@ class LiveMapper:
     def _publish_when_due(self) -> None:
         if self._publication is not None and self._publication.done():
             self._end_publication()
-        is_due = self._unpublished and time.monotonic() >= self._next_publication
-        if is_due and self._publication is None:
+        late = time.monotonic() - self._next_publication
+        is_whole = self.builder.map.n_pending == 0  # else the unfinished window would be learned for it
+        if self._unpublished and self._publication is None and (late > _PATIENCE or (late >= 0 and is_whole)):
             self._begin_publication()
 
     def _begin_publication(self) -> None:
@@ -95,13 +99,19 @@ class LiveMapper:
         self._published, self._unpublished = self._unpublished, []
         if self._publisher is not None and self._published:
             arguments = self.snapshot(), self._scans.world_frame, self._published[-1]
-            self._publication = self._thread.submit(self._publisher.publish, *arguments)
+            self._publication = self._thread.submit(self._work, *arguments)
             self._begin = time.monotonic()
+
+    def _work(self, shown: GaussianMap, frame: str, stamp: int) -> int:
+        """Publishes a copy of the map, and returns its bytes."""
+        assert self._publisher is not None
+        self._publisher.publish(shown, frame, stamp)
+        return shown.nbytes
 
     def _end_publication(self) -> None:
         if self._publication is None:
             return
-        self._publication.result()
+        self._nbytes = self._publication.result()
         self._publication = None
         now, end = self._node.now(), time.monotonic()
         for stamp in self._published:
@@ -112,10 +122,8 @@ class LiveMapper:
         record = self.builder.record
         if self.diagnostics.is_due() or is_last:
             built = self.builder.map
-            nbytes = built.nbytes if built.dim is not None and built.n_pending == 0 else None
-            self.diagnostics.publish(
-                len(record.indices), built.n_final if built.dim is not None else 0, nbytes
-            )
+            n_components = built.n_final if built.dim is not None else 0
+            self.diagnostics.publish(len(record.indices), n_components, self._nbytes)
 
 
 def handle_messages(node: Node, timeout: float) -> None:
@@ -124,3 +132,16 @@ def handle_messages(node: Node, timeout: float) -> None:
     is_handled = node.spin_once(timeout)
     while is_handled and left:
         is_handled, left = node.spin_once(), left - 1
+
+
+def warm_up(empty: GaussianMap, device: str | torch.device) -> None:
+    """Loads and compiles what mapping needs, so that the first scans are not late.
+
+    empty: a map with the options of the run, which is used up.
+    """
+    angles = torch.arange(400, dtype=torch.float64) * (2 * torch.pi / 400)
+    circle = torch.stack([angles.cos(), angles.sin()], 1) * 3
+    for shift in (0.0, 0.1):
+        empty.insert(Scan(circle + shift, torch.zeros(2, dtype=torch.float64)).to(device))
+    empty.finish()
+    empty.occupancy(circle.to(device), 0.1)

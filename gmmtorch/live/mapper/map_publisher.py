@@ -24,7 +24,7 @@ from gmmtorch.occupancy.grid import VoxelGrid
 CLOUDS = ("cells", "means", "none")
 _EXTENT = 3.0  # standard deviations around each component that the grid covers
 _FULL_AFTER = 10.0  # s, after which the latched grid is published again
-_MOST_ELLIPSOIDS = 2000
+_MOST_ELLIPSOIDS = 1000
 _SPHERE, _DELETE_ALL = 2, 3
 
 
