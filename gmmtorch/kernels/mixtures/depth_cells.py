@@ -149,7 +149,8 @@ _BODY = """
             const vec mean = first[i] / n + t[i];
             cell[i] = down(mean);
             shift[i] = t[i] - cell[i];
-            beyond = (mean > -REACH) & (mean < REACH) ? beyond : (vec)(1.0);
+            const mask within = (mean > -REACH) & (mean < REACH);
+            beyond = within ? beyond : (vec)(1.0);
             features[1 + i] = first[i] + n * shift[i];
         }
         overflows = overflows || any((beyond > 0.0) & is_whole);
