@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 
@@ -60,6 +61,19 @@ def check_positions(name: str, rows: Tensor) -> None:
     )
 
 
+def as_time(value: float | None) -> float | None:
+    """Seconds as a float, or None. Raises `InvalidArgumentError` unless they are a finite number."""
+    if value is None:
+        return None
+    try:
+        seconds = float(value)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise InvalidArgumentError(f"time={value!r} must be a finite number of seconds, or None.")
+    return seconds
+
+
 def extent(rows: Tensor) -> str:
     """Text of the bounding box of positions (N, D), metres, after a comma; empty if there are none."""
     if not rows.shape[0]:
@@ -78,6 +92,7 @@ class Scan:
         origin: (D,) position of the sensor.
         no_return: (M, D) one row for each beam without return: the point up to which the beam is
             assumed to cross free space. It is never a surface point.
+        time: of the measurement in seconds, on any clock that all scans share; None: not known.
 
     Accepts arrays, lists and tensors. Raises `InvalidArgumentError` for inconsistent shapes, for NaN and
     infinite coordinates, and for coordinates beyond 2²⁷ m. Warns if float32 coordinates are too far from
@@ -87,6 +102,7 @@ class Scan:
     points: Tensor
     origin: Tensor
     no_return: Tensor = None  # type: ignore[assignment]  # None becomes an empty (0, D) tensor
+    time: float | None = None
 
     def __post_init__(self) -> None:
         origin = as_tensor(self.origin, "origin")
@@ -96,6 +112,7 @@ class Scan:
         _as_points("origin", origin[None], dim)
         points = _as_points("points", self.points, dim)
         no_return = _as_points("no_return", self.no_return, dim)
+        object.__setattr__(self, "time", as_time(self.time))
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "origin", origin.to(points.device))
         object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
@@ -135,7 +152,7 @@ class Scan:
         def move(x: Tensor) -> Tensor:
             return (x.double() @ rotation.T + translation).to(x.dtype)
 
-        return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return))
+        return Scan(move(self.points), move(self.origin[None])[0], move(self.no_return), self.time)
 
     def copied(self, device: torch.device | str | None = None) -> Scan:
         """A deep copy, on `device` if given. A reader that reuses its arrays for the next scan needs it."""
@@ -143,8 +160,9 @@ class Scan:
         def copy(x: Tensor) -> Tensor:
             return x.detach().to(device or x.device, copy=True)
 
-        return Scan(copy(self.points), copy(self.origin), copy(self.no_return))
+        return Scan(copy(self.points), copy(self.origin), copy(self.no_return), self.time)
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
-        return Scan(self.points.to(device), self.origin.to(device), self.no_return.to(device))
+        points, origin, no_return = (x.to(device) for x in (self.points, self.origin, self.no_return))
+        return Scan(points, origin, no_return, self.time)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import math
 import re
 import zlib
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
@@ -126,9 +127,13 @@ class Dataset(Sequence[Scan]):
         """
         return self._known_pose(self._position(index))
 
+    @functools.cached_property
+    def _all_times(self) -> Tensor | None:
+        return self._known_times()
+
     @property
     def times(self) -> Tensor | None:
-        times = self._known_times()
+        times = self._all_times
         return None if times is None else times[:: self.stride]
 
     @property
@@ -153,7 +158,9 @@ class Dataset(Sequence[Scan]):
     def __getitem__(self, index: int | slice) -> Scan | list[Scan]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        return self._read(self._position(index))
+        position, times = self._position(index), self._all_times
+        scan = self._read(position)
+        return scan if times is None else replace(scan, time=float(times[position]))
 
     def _position(self, index: int) -> int:
         """Position in the source of scan `index` of the data set; a negative index counts from the end."""

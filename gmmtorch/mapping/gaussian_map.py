@@ -27,7 +27,7 @@ from gmmtorch.mapping.query_options import HitLength, MapOptions, QueryOptions, 
 from gmmtorch.occupancy.evidence import Evidence
 from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
-from gmmtorch.scan import Scan, extent
+from gmmtorch.scan import Scan, as_time, extent
 
 _BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
@@ -299,7 +299,8 @@ class GaussianMap(nn.Module):
     @property
     def settings(self) -> map_file.MapSettings:
         """What the map's file states about it, besides the components and the learning rule."""
-        return map_file.MapSettings(self.resolution, self.method, self.codec, self.robot, self.query_options)
+        options = self.resolution, self.method, self.codec, self.robot, self.query_options
+        return map_file.MapSettings(*options, self._learner.time)
 
     def _commit(self, components: Components) -> None:
         """Replaces all components, those of the unfinished window included."""
@@ -416,10 +417,11 @@ class GaussianMap(nn.Module):
         components, facts = map_file.from_file(path)
         try:
             next_number = check_whole("n_numbered", facts.pop("n_numbered"), 0)
+            time = as_time(facts.pop("time", None))
             made = cls(read_rule(**facts.pop("learning")), **facts)
         except (TypeError, KeyError, ValueError) as error:
             raise DataError(f"{path}: its settings are damaged ({error}).") from error
-        made._learner.next_number = next_number
+        made._learner.resume(next_number, time)
         made._commit(components)
         return made
 

@@ -40,13 +40,17 @@ _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built
 
 @dataclass(frozen=True)
 class MapSettings:
-    """The settings of a map that its file contains, without the learning rule."""
+    """The settings of a map that its file contains, without the learning rule.
+
+    time: of the last scan (s), in a map with a half-life; None otherwise.
+    """
 
     resolution: float
     method: str
     codec: str
     robot: int
     query: QueryOptions
+    time: float | None = None
 
 
 def to_bytes(components: Components, rule: LearningRule, settings: MapSettings, next_number: int) -> bytes:
@@ -106,7 +110,8 @@ def _content(
 
 
 def _facts(rule: LearningRule, settings: MapSettings, next_number: int) -> dict[str, Any]:
-    return {"learning": rule_facts(rule), "n_numbered": next_number, **settings_facts(settings)}
+    facts = {"learning": rule_facts(rule), "n_numbered": next_number, **settings_facts(settings)}
+    return facts if settings.time is None else {**facts, "time": settings.time}
 
 
 def settings_facts(settings: MapSettings) -> dict[str, Any]:

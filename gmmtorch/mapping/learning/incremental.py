@@ -14,6 +14,7 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import count_explained
 from gmmtorch.mapping.learning.depth_frame import DepthFrame, as_scans
 from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_frames, fit_window
+from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
 from gmmtorch.mapping.learning.merging import Size, compact, compact_to_bytes, estimated_bytes
 from gmmtorch.mapping.learning.novelty import novel_beams
 from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
@@ -28,6 +29,7 @@ def absorb(
     rule: IncrementalRule,
     size: Size = estimated_bytes,
     weight: float = 1.0,
+    forgetting: Forgetting | None = None,
 ) -> Components:
     """The components of a map with scans added, merged until they meet the budget.
 
@@ -41,15 +43,17 @@ def absorb(
         rule: if it is not complete, it is fitted to all scans, which are then read at once.
         size: number of bytes of given components, for `rule.max_bytes`.
         weight: number of measured points for which each point of the scans stands.
+        forgetting: drops what is gone, as `rule.forget` says; None: a new one.
 
     Raises `InvalidArgumentError` for scans of another dimension.
     """
     if None in (rule.noise, rule.length, rule.cell, rule.window):
         scans = as_scans(scans)
         rule = rule.fitted(scans)
+    forgetting = Forgetting(rule, Doubts.none()) if forgetting is None else forgetting
     left = iter(scans)
     while window := list(islice(left, rule.window)):
-        components = _absorb_window(components, window, rule, size, weight)
+        components = _absorb_window(components, window, rule, size, weight, forgetting)
     return components
 
 
@@ -81,6 +85,7 @@ def _absorb_window(
     rule: IncrementalRule,
     size: Size,
     weight: float,
+    forgetting: Forgetting,
 ) -> Components:
     for scan in window:
         if scan.dim != components.dim:
@@ -95,15 +100,19 @@ def _absorb_window(
         scans = as_scans(window)
         if rule.novelty is not None:
             components, scans = _explain(components, scans, rule.novelty, weight)
-        if not any(scan.n_beams for scan in scans):
-            return components
-        if rule.noise is None or rule.length is None or rule.cell is None:
-            # Scans without a return still show the scale of the sensor by the ends of their beams.
-            rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
-        learned = fit_window(scans, surface_fit(rule, components.dim), all_origins(weight))
-    if len(learned) == 0:
-        return components
-    return _within_budget(Components.concatenate([components, learned]), rule, size)
+        learned = _learned(scans, rule, weight)
+    joined = forgetting.joined(components, learned, window)
+    return _within_budget(joined, rule, size) if len(learned) else joined
+
+
+def _learned(scans: Sequence[Scan], rule: IncrementalRule, weight: float) -> Components:
+    """The components of a window of scans; none if no scan has a beam."""
+    if not any(scan.n_beams for scan in scans):
+        return Components.empty(scans[0].dim, scans[0].points.device)
+    if rule.noise is None or rule.length is None or rule.cell is None:
+        # Scans without a return still show the scale of the sensor by the ends of their beams.
+        rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
+    return fit_window(scans, surface_fit(rule, scans[0].dim), all_origins(weight))
 
 
 def _explain(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from gmmtorch.mapping.codec.component_batch import numbered
 from gmmtorch.mapping.codec.map_file import FileSize, MapSettings, number_after
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.depth_frame import DepthFrame
+from gmmtorch.mapping.learning.forgetting import Doubts, Forgetting
 from gmmtorch.mapping.learning.rules import LearningRule, read_rule, rule_facts
 from gmmtorch.scan import Scan
 
@@ -31,6 +33,8 @@ class Learner:
         self.pending: list[Scan] = []
         self.n_windows = 0
         self.next_number = 0
+        self.doubts = Doubts.none()
+        self._next_doubts = self.doubts  # after the pending scans, as the last preview found them
         self._random_state = random_state
 
     def add(self, known: Components, scan: Scan, settings: MapSettings) -> Components | None:
@@ -69,6 +73,7 @@ class Learner:
     def commit(self, learned: Components) -> None:
         """Makes these components final, with all pending scans."""
         self.rule = self.rule.fitted(self.pending)
+        self.doubts = self._next_doubts
         self.n_windows += bool(self.pending)
         self.pending = []
         self.next_number = number_after(learned.ids, self.next_number)
@@ -83,8 +88,20 @@ class Learner:
     ) -> Components:
         generator = torch.Generator().manual_seed(hash((self._random_state, self.n_windows)) % 2**63)
         size = FileSize(rule, settings, self.next_number)
-        learned = rule.absorb(known, scans, generator, size, weight)
+        forgetting = Forgetting(rule, self.doubts)
+        learned = rule.absorb(known, scans, generator, size, weight, forgetting)
+        self._next_doubts = forgetting.doubts
         return numbered(learned, settings.robot, self.next_number)
+
+    @property
+    def time(self) -> float | None:
+        """Of the last scan (s), in a map with a half-life; None otherwise."""
+        return self._next_doubts.time
+
+    def resume(self, next_number: int, time: float | None) -> None:
+        """Continues from a file, which holds no doubts."""
+        self.next_number = next_number
+        self.doubts = self._next_doubts = replace(Doubts.none(), time=time)
 
     def state(self) -> dict[str, Any]:
         """All that learning continues from: plain values, and the tensors of the pending scans."""
@@ -93,6 +110,7 @@ class Learner:
             "pending": [dict(vars(scan)) for scan in self.pending],
             "n_windows": self.n_windows,
             "n_numbered": self.next_number,
+            "doubts": dict(vars(self.doubts)),
         }
 
     def restored(self, state: dict[str, Any]) -> Learner:
@@ -101,4 +119,5 @@ class Learner:
         made.pending = [Scan(**scan) for scan in state["pending"]]
         made.n_windows = check_whole("n_windows", state["n_windows"], 0)
         made.next_number = check_whole("n_numbered", state["n_numbered"], 0)
+        made.doubts = made._next_doubts = Doubts.read(state["doubts"]) if "doubts" in state else Doubts.none()
         return made

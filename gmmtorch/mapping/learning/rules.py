@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.learning.depth_frame import DepthFrame
+    from gmmtorch.mapping.learning.forgetting import Forgetting
     from gmmtorch.mapping.learning.merging import Size
     from gmmtorch.scan import Scan
 
@@ -122,13 +123,14 @@ class WindowedRule(MixtureRule):
         generator: torch.Generator,
         size: Size,
         weight: float,
+        forgetting: Forgetting,
     ) -> Components:
         """The components of a map with those of one window added. `size` and `weight` are not used."""
-        from gmmtorch.mapping.components import Components
         from gmmtorch.mapping.learning.depth_frame import as_scans
         from gmmtorch.mapping.learning.windowed import learn_window
 
-        return Components.concatenate([known, learn_window(as_scans(scans), self, generator)])
+        window = as_scans(scans)
+        return forgetting.joined(known, learn_window(window, self, generator), window)
 
 
 @dataclass(frozen=True)
@@ -219,11 +221,12 @@ class IncrementalRule(MixtureRule):
         generator: torch.Generator,
         size: Size,
         weight: float,
+        forgetting: Forgetting,
     ) -> Components:
         """The components of a map with scans added and merged, see `incremental.absorb`."""
         from gmmtorch.mapping.learning.incremental import absorb
 
-        return absorb(known, scans, self, size, weight)
+        return absorb(known, scans, self, size, weight, forgetting)
 
 
 LearningRule = WindowedRule | IncrementalRule

@@ -1,0 +1,183 @@
+"""A simulated hall in which boxes move and people walk: what stays in the map that is no longer there, and
+what is lost that is. Writes its table into BENCHMARKS.md.
+
+    OMP_NUM_THREADS=1 python benchmarks/changing_world.py
+
+A lidar (32 × 160 beams, 10 m, noise 1 cm) walks through the hall twice. Between the passes boxes move; during
+both, people walk. Cells are 0.1 m wide. A *ghost* is a cell in which a person or a box was seen, that is free
+at the end, and through which a later beam passed; it stays if the map calls it occupied (θ > ½). A *surface*
+is a cell on which beams of the second pass end at the end; it is lost if the map does not call it occupied.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from tables import hardware, markdown, publish
+from torch import Tensor
+
+import gmmtorch as gt
+from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
+from gmmtorch.baselines import LogOdds, OccupancyGrid, OctoMapMap
+from gmmtorch.evaluation import metrics
+from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch.simulation import World3D, building_3d, poses_3d, spinning_lidar
+from gmmtorch.simulation.worlds.floor_plan import Footprint, circle
+from gmmtorch.simulation.worlds.furniture import prism
+
+CELL = 0.1  # metres
+SECONDS = 0.4  # between two scans
+HEIGHT = 1.2  # of the lidar, metres
+
+# Places of boxes (x, y, heading, length, width, height) in the first and in the second pass; metres, radians.
+BOXES = (
+    ((3.0, 3.3, 0.2, 0.8, 0.6, 0.9), (5.7, 6.6, 0.7, 0.8, 0.6, 0.9)),
+    ((6.0, 3.4, 0.9, 1.0, 0.5, 1.2), (2.8, 7.5, 0.1, 1.0, 0.5, 1.2)),
+    ((2.9, 5.9, 0.4, 0.6, 0.6, 0.6), (5.9, 4.0, 1.2, 0.6, 0.6, 0.6)),
+    ((12.0, 5.9, 0.5, 0.7, 0.5, 1.0), (11.6, 3.6, 0.3, 0.7, 0.5, 1.0)),
+)
+# Ends of the ways of people, who go to and fro; metres.
+WAYS = (
+    ((1.0, 9.0), (7.9, 7.2)),
+    ((1.2, 0.8), (8.2, 3.9)),
+    ((6.6, 1.0), (5.9, 9.0)),
+    ((10.0, 9.0), (13.0, 0.9)),
+)
+SPEED, STATURE, GIRTH = 1.2, 1.75, 0.25  # of people: m/s, metres, metres
+NEAREST = 0.6  # metres between the lidar and a person, who otherwise is not there
+
+
+LOW, SHAPE = torch.tensor([-10, -10, -10]), (310, 130, 60)  # cells of the hall
+
+
+class Recorded(NamedTuple):
+    """scans: of both passes. ghosts (G, 3), surfaces (S, 3): centres of cells, metres."""
+
+    scans: list[gt.Scan]
+    ghosts: Tensor
+    surfaces: Tensor
+
+
+def boxes(n_pass: int) -> list[Tensor]:
+    """Triangles (T, 3, 3) of the boxes in a pass."""
+    places = [both[n_pass] for both in BOXES]
+    return [prism(Footprint(*place[:5]).corners(), 0.0, place[5]) for place in places]
+
+
+def people(seconds: float, sensor: Tensor) -> list[Tensor]:
+    """Triangles of the people at a time, seen from a position (3,)."""
+    found = []
+    for begin, end in WAYS:
+        here, there = torch.tensor([begin, end], dtype=torch.float64)
+        share = abs(seconds * SPEED / float((there - here).norm()) % 2 - 1)
+        place = there + share * (here - there)
+        if float((place - sensor[:2]).norm()) > NEAREST + GIRTH:
+            found.append(prism(circle(GIRTH, 10) + place, 0.0, STATURE))
+    return found
+
+
+def recorded(n_scans: int, seed: int) -> Recorded:
+    """Two passes of `n_scans` scans; the second one goes back."""
+    generator = torch.Generator().manual_seed(seed)
+    hall, sensor = building_3d(generator), spinning_lidar()
+    poses = poses_3d(hall.path, n_scans, HEIGHT)
+    poses = torch.cat([poses, poses.flip(0)])
+    at_the_end = World3D(torch.cat([hall.triangles, *boxes(1)]), hall.path)
+    n_cells = math.prod(SHAPE)
+    seen, crossed, surface = torch.full((n_cells,), -1), torch.full((n_cells,), -1), torch.zeros(n_cells)
+    scans = []
+    for number, pose in enumerate(poses):
+        origin, rays, seconds = pose[:3, 3], sensor.directions @ pose[:3, :3].T, number * SECONDS
+        moved = [*boxes(number // n_scans), *people(seconds, origin)]
+        now = World3D(torch.cat([hall.triangles, *moved]), hall.path).distances(origin, rays)
+        last = at_the_end.distances(origin, rays)
+        noise = torch.randn(len(rays), generator=generator, dtype=torch.float64) * sensor.range_noise
+        hit = now < sensor.max_range
+        reading = torch.where(hit, now, sensor.max_range)
+        ends = origin + rays * (reading + noise)[:, None]
+        scans.append(gt.Scan(ends[hit], origin, ends[~hit], time=seconds))
+        for visits in traverse((origin / CELL).expand(len(rays), 3), ends / CELL, SHAPE, low=LOW):
+            crossed[visits.voxel] = number
+        moving = hit & ((now - last).abs() > 0.05) & (now < last)
+        seen[cells(origin + rays[moving] * now[moving, None])] = number
+        if number >= n_scans:
+            there = last < sensor.max_range
+            surface[cells(origin + rays[there] * last[there, None])] = 1
+    near = torch.nn.functional.max_pool3d(surface.view(1, *SHAPE), 3, 1, 1).flatten()
+    ghosts = (seen >= 0) & (crossed > seen) & (near == 0)
+    return Recorded(scans, centres(ghosts), centres(surface > 0))
+
+
+def cells(points: Tensor) -> Tensor:
+    """Flat indices (N,) of the cells that contain points (N, 3)."""
+    x, y, z = ((points / CELL).floor().long() - LOW).unbind(1)
+    return (x * SHAPE[1] + y) * SHAPE[2] + z
+
+
+def centres(chosen: Tensor) -> Tensor:
+    """Centres (N, 3) of the chosen cells, metres."""
+    return (chosen.view(SHAPE).nonzero() + LOW + 0.5) * CELL
+
+
+def maps() -> dict[str, Callable[[], Any]]:
+    """Maps by name, with their defaults."""
+    ours = {
+        "off": "off",
+        "contradiction": "contradiction",
+        "half-life 30 s": 30.0,
+    }
+    made: dict[str, Callable[[], Any]] = {}
+    for kind, rule in (
+        ("incremental", IncrementalRule()),
+        ("incremental, 16 kB", IncrementalRule(max_bytes=16_000)),
+        ("windowed", WindowedRule()),
+    ):
+        for name, forget in ours.items():
+            made[f"{kind}, {name}"] = partial(GaussianMap, replace(rule, forget=forget), resolution=CELL)
+    made["count grid"] = partial(OccupancyGrid, CELL)
+    made["log-odds grid, no clamp"] = partial(OccupancyGrid, CELL, log_odds=LogOdds())
+    made["OctoMap (log-odds with clamping)"] = partial(OctoMapMap, CELL)
+    return made
+
+
+def row(name: str, made: Any, world: Recorded) -> list[object]:
+    begin = time.process_time()
+    for scan in world.scans:
+        made.insert(scan)
+    made.finish()
+    seconds = time.process_time() - begin
+    ghosts, surfaces = (torch.as_tensor(made.occupancy(c, CELL)) for c in (world.ghosts, world.surfaces))
+    auc = metrics.roc(surfaces, ghosts).auc
+    stays, lost = float((ghosts > 0.5).double().mean()), float((surfaces <= 0.5).double().mean())
+    size = made.nbytes / 1e3
+    return [name, f"{stays:.1%}", f"{lost:.1%}", f"{auc:.4f}", f"{size:,.0f} kB", f"{seconds:.0f}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scans", type=int, default=100, help="of a pass")
+    parser.add_argument("--names", nargs="+", help="beginnings of the names of maps; all if not given")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    world = recorded(options.scans, seed=0)
+    print(len(world.ghosts), "ghosts", len(world.surfaces), "surfaces", flush=True)
+    rows = []
+    for name, factory in maps().items():
+        if not options.names or name.startswith(tuple(options.names)):
+            rows.append(row(name, factory(), world))
+            print(*rows[-1], sep=" | ", flush=True)
+    if options.names:
+        return
+    header = ["map", "ghosts that stay", "surfaces lost", "AUC", "bytes", "CPU s"]
+    publish("changing-world", f"{markdown(header, rows)}\n\n{hardware()}")
+
+
+if __name__ == "__main__":
+    main()
