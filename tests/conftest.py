@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
+import tempfile
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # k-means has threads of its own
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -71,3 +74,17 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(Mission, "tick", noted)
     return ticks
+
+
+@pytest.fixture
+def ros_domain() -> Iterator[int]:
+    """A ROS domain that no other process of the tests uses meanwhile."""
+    for number in range(1, 100):
+        with open(Path(tempfile.gettempdir()) / f"gmmtorch-test-domain-{number}", "w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield number
+            return
+    pytest.fail("all domains are in use")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -73,8 +72,8 @@ def known() -> GaussianMap:
 
 
 @pytest.fixture
-def node():
-    with Node("test", domain=1 + 17 * os.getpid() % 200) as made:
+def node(ros_domain):
+    with Node("test", domain=ros_domain) as made:
         yield made
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,16 @@ from gmmtorch.live.ros.quality import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.map_builder import MapBuilder
 
-DOMAIN = 1 + 7 * os.getpid() % 200
 LASER_TYPE, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
 
 
-def node(name: str = "test", **options: Any) -> Node:
-    return Node(name, domain=DOMAIN, **options)
+@pytest.fixture
+def node(ros_domain: int) -> Callable[..., Node]:
+    """Makes nodes that hear each other, and no other process."""
+    return lambda name="test", **options: Node(name, domain=ros_domain, **options)
 
 
-def test_a_played_recording_gives_the_map_of_the_recording(tmp_path):
+def test_a_played_recording_gives_the_map_of_the_recording(node, tmp_path):
     path = recorded(tmp_path / "a.bag", LASER)
     expected = MapBuilder(load("rosbag", path), GaussianMap())
     for _ in expected.insert_all():
@@ -127,7 +128,7 @@ def test_the_grid_has_the_layout_of_ros_and_updates_where_it_changed():
     assert len(user.take("map_updates")) == 1  # nothing has changed
 
 
-def test_a_killed_mapper_continues_after_its_checkpoint(tmp_path):
+def test_a_killed_mapper_continues_after_its_checkpoint(node, tmp_path):
     file, run = tmp_path / "checkpoint", {"seed": 0}
     with node() as user:
         sensor_topic = user.publisher("/scan", LASER_TYPE)
@@ -157,7 +158,7 @@ def test_a_killed_mapper_continues_after_its_checkpoint(tmp_path):
     assert second.builder.times.tolist() == [0, 1, 2, 3]  # the stamps before are not in the checkpoint
 
 
-def test_missing_wrong_and_several_topics_are_errors_that_list_the_topics():
+def test_missing_wrong_and_several_topics_are_errors_that_list_the_topics(node):
     with node() as user:
         with pytest.raises(GmmTorchError, match=r"no topic /points after .* Published topics: none"):
             find_sensor(user, "/points", 0.1)
@@ -175,7 +176,7 @@ def test_missing_wrong_and_several_topics_are_errors_that_list_the_topics():
             find_sensor(user, None, 1.0)
 
 
-def test_a_recording_without_the_topics_is_refused(tmp_path):
+def test_a_recording_without_the_topics_is_refused(node, tmp_path):
     path: Path = recorded(tmp_path / "a.mcap", LASER)
     with node() as user:
         with pytest.raises(InvalidArgumentError, match="whose topics are"):

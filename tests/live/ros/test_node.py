@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +16,6 @@ from gmmtorch.live.ros import Node, Quality
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 CLOUD, STRING, GRID = "sensor_msgs/msg/PointCloud2", "std_msgs/msg/String", "nav_msgs/msg/OccupancyGrid"
-_NUMBERS = itertools.count()
 MakeNode = Callable[..., Node]
 
 
@@ -38,12 +35,11 @@ def wait_until(is_done: Callable[[], bool], *nodes: Node, seconds: float = 30.0)
 
 
 @pytest.fixture(params=["dds", "zenoh"])
-def make_node(request) -> Iterator[MakeNode]:
+def make_node(request, ros_domain) -> Iterator[MakeNode]:
     """Makes nodes that hear each other, and no other process."""
     package = {"dds": "cyclonedds", "zenoh": "zenoh"}[request.param]
     pytest.importorskip(package, reason=f"needs the extra [ros]: {package}")
-    domain = 1 + (11 * os.getpid() + next(_NUMBERS)) % 200
-    nodes, router, options = [], None, {"middleware": request.param, "domain": domain}
+    nodes, router, options = [], None, {"middleware": request.param, "domain": ros_domain}
     if request.param == "zenoh":
         from gmmtorch.live.ros.zenoh_middleware import open_router
 
@@ -141,9 +137,9 @@ def test_transforms_are_collected(make_node):
     assert listener.transforms.chain("lidar") == ["lidar", "base", "odom"]
 
 
-def test_damaged_messages_and_floods_are_counted():
+def test_damaged_messages_and_floods_are_counted(ros_domain):
     pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
-    with Node("test", domain=201) as node:
+    with Node("test", domain=ros_domain) as node:
         received = []
         subscription = node.subscribe("/text", STRING, received.append, Quality(depth=3))
         whole = node.types.encode(STRING, {"data": "x" * 10})
@@ -159,9 +155,9 @@ def test_damaged_messages_and_floods_are_counted():
         assert node.counts["/text"] == {"received": 11, "dropped": 5, "malformed": 2}
 
 
-def test_simulated_time_comes_from_the_clock():
+def test_simulated_time_comes_from_the_clock(ros_domain):
     pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
-    with Node("test", domain=201, use_sim_time=True) as node:
+    with Node("test", domain=ros_domain, use_sim_time=True) as node:
         assert node.now() == 0
         clock = node.subscriptions[0]
         node._receive(clock, node.types.encode(clock.type, {"clock": {"sec": 3, "nanosec": 5}}))
