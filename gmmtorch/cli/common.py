@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gmmtorch.scan import Scan
 
 logger = logging.getLogger("gmmtorch")
+_WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
 _ARGUMENT = re.compile(r"(?<![\w.])[\w.]+(?==| is not set)")
 
 
@@ -124,6 +125,7 @@ def use_runtime(runtime: DictConfig) -> str:
 def open_dataset(config: DictConfig) -> Dataset:
     """The data set that the options `dataset.*` describe."""
     from gmmtorch import datasets
+    from gmmtorch.errors import DataError, check_choice
 
     options = {
         str(key): config[key]
@@ -131,7 +133,39 @@ def open_dataset(config: DictConfig) -> Dataset:
         # If a path is missing, the reader raises an error that describes the files it needs.
         if not OmegaConf.is_missing(config, key) and config[key] is not None
     }
-    return datasets.load(options.pop("name"), options.pop("path", None), **options)
+    method, name = options.pop("odometry", "none"), options.pop("name")
+    check_choice("dataset.odometry", method, ("none", "auto", "kiss_icp", "mixture"))
+    try:
+        found = datasets.load(name, options.pop("path", None), **options)
+        if method == "none" or (method == "auto" and found.pose(0) is not None):
+            return found
+        has_truth = options.get("poses") != "standing"
+    except DataError:
+        if method == "none" or name not in _WITHOUT_POSES:
+            raise
+        found = datasets.load(name, config.path, **{**options, "poses": "standing"})
+        has_truth = False
+    return _with_odometry(found, "mixture" if method == "auto" else method, has_truth)
+
+
+def _with_odometry(source: Dataset, method: str, has_truth: bool) -> Dataset:
+    """The data set with estimated poses. Prints the errors against its own poses, if it has some."""
+    from gmmtorch.evaluation.trajectories import absolute_trajectory_error, relative_pose_error
+    from gmmtorch.localization.recorded_poses import with_odometry
+
+    posed, trajectory = with_odometry(source, method)
+    lost = int((~trajectory.found).sum())
+    text = f"odometry  {len(posed)} poses estimated, {lost} scans lost, {trajectory.n_closures} loop closures"
+    if has_truth and len(posed) > 2:
+        import torch
+
+        true = torch.stack([posed.own_pose(index) for index in range(len(posed))])
+        estimate = torch.stack([posed.pose(index) for index in range(len(posed))])
+        # Laid over the first pose: positions on a line determine no other motion.
+        ate, rpe = absolute_trajectory_error(estimate, true, "first"), relative_pose_error(estimate, true)
+        text += f"; ATE {ate.rmse:.3f} m, RPE {rpe.rmse:.3f} m against the poses of the data set"
+    print(text)
+    return posed
 
 
 def all_scans(config: DictConfig, device: str, on_event: Event) -> tuple[str, list[Scan]]:

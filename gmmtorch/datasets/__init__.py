@@ -65,8 +65,8 @@ def load(
             for CARMEN logs, mesh_scans and the synthetic buildings, 0 for the others.
         stride: every n-th scan is read.
         poses: a trajectory file whose poses replace those of the data set: TUM rows (time x y z qx qy qz qw)
-            for scans with times, or KITTI rows (12 numbers), one for each scan. rosbag also takes "tf",
-            "standing" and topics.
+            for scans with times, or KITTI rows (12 numbers), one for each scan. rosbag also takes "tf"
+            and topics. rosbag and scan_folder take "standing": every scan is in the frame of the sensor.
         options: specific to the data set: `pixel_stride`, `depth_scale` and `up` for depth_frames;
             `n_points`, `noise` and `seed` for mesh; `seed`, `n_scans` and, in 3D, `sensor` ("lidar" or
             "depth_camera") for mesh_scans and the synthetic buildings.
@@ -85,6 +85,8 @@ def load(
     known = set(inspect.signature(reader).parameters) - {"path", "ranges", "stride"}
     if poses is not None and "poses" in known:
         options["poses"] = str(poses)
+    elif poses == "standing" and "standing" in known:
+        options["standing"], poses = True, None
     for option, value in options.items():
         if option not in known:
             takes = f"takes {', '.join(sorted(known))}" if known else "takes no further options"

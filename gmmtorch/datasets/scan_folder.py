@@ -22,10 +22,10 @@ class ScanFolder(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
-    invalid and dropped.
+    invalid and dropped. With `standing`, poses.txt is not read, and every scan is in the frame of the sensor.
     """
 
-    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1) -> None:
+    def __init__(self, path: str | Path, ranges: Ranges, stride: int = 1, standing: bool = False) -> None:
         path = require_path(
             path,
             "folder",
@@ -37,6 +37,9 @@ class ScanFolder(Dataset):
         self._files = sorted([*scans.glob("*.pcd"), *scans.glob("*.ply")], key=natural_key)
         if not self._files:
             raise DataError(f"{scans} contains no .pcd and no .ply file; put one file per scan there.")
+        if standing:
+            self._poses = torch.eye(4, dtype=torch.float64).repeat(len(self._files), 1, 1)
+            return
         self._poses = _read_poses(path / "poses.txt")
         if len(self._poses) != len(self._files):
             raise DataError(
@@ -59,7 +62,10 @@ class ScanFolder(Dataset):
 def _read_poses(path: Path) -> torch.Tensor:
     """Poses (S, 4, 4) of a file of KITTI rows."""
     if not path.is_file():
-        raise DataError(f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan.")
+        raise DataError(
+            f"{path} is missing; write one row of 12 numbers (world ← sensor) for each scan, or "
+            "estimate the poses with dataset.odometry=auto."
+        )
     try:
         lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
         rows = np.loadtxt(lines, dtype=np.float64, ndmin=2) if lines else np.empty((0, 12))

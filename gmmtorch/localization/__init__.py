@@ -1,4 +1,5 @@
-"""Where a sensor or a map is: registration of two maps, and the poses of scans in a map.
+"""Where a sensor or a map is: registration of two maps, and the poses of scans in a map, and
+odometry.
 
 Names are imported on first use.
 """
@@ -10,6 +11,9 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from gmmtorch.localization.odometry import Odometry as Odometry
+    from gmmtorch.localization.odometry import Trajectory as Trajectory
+    from gmmtorch.localization.recorded_poses import with_odometry as with_odometry
     from gmmtorch.localization.registration import Registration as Registration
     from gmmtorch.localization.registration import register as register
     from gmmtorch.localization.registration import yaw_starts as yaw_starts
@@ -20,8 +24,11 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Location": "tracker",
+        "Odometry": "odometry",
         "Registration": "registration",
         "Tracker": "tracker",
+        "Trajectory": "odometry",
+        "with_odometry": "recorded_poses",
         "register": "registration",
         "yaw_starts": "registration",
     },

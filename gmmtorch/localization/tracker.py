@@ -118,7 +118,7 @@ class Tracker:
         self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
         centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
-        normals = _normals(seen) if isinstance(seen, Components) else None
+        normals = seen_normals(seen) if isinstance(seen, Components) else None
         normals = torch.zeros_like(centered.means) if normals is None else normals
         self._targets = [
             AlignmentTarget(merged, blur, faces)
@@ -229,7 +229,7 @@ class Tracker:
         return torch.cat([target.sums(rows, starts.at(part)).score for part in parts])
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
-        covariance, loosest = _covariance(found.information[0], rows)
+        covariance, loosest = pose_covariance(found.information[0], rows)
         doubts = []
         if not bool(found.converged[0]):
             doubts.append("the last step was longer than the tolerance")
@@ -298,7 +298,7 @@ def _motions(poses: Tensor, dim: int) -> Motions:
     return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
 
 
-def _normals(surfaces: Components) -> Tensor:
+def seen_normals(surfaces: Components) -> Tensor:
     """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
     the others. In the order of `surface_mixture`.
     """
@@ -382,7 +382,7 @@ def _best(motions: Motions, score: Tensor, distance: float) -> Tensor:
     return order[~is_near.tril(-1).any(1)]
 
 
-def _covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
+def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
     """The covariance (F, F) of a pose, and the largest standard deviation (m) at the median range."""
     dim = rows.shape[1]
     scale = information.new_ones(len(information))

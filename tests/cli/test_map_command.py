@@ -116,3 +116,10 @@ def test_scans_of_a_bag_that_cannot_be_used_are_counted_and_printed(monkeypatch,
         bag.cloud("/points", 0.0, "lidar", room[:0])
     empty = run_here(monkeypatch, "map", tmp_path / "empty", *bag_options, *QUIET)
     assert "a: no scan of 1 can be used: message without a valid point" in refused(empty)
+
+
+def test_odometry_maps_a_recording_without_poses(run):
+    done = run("dataset=synthetic_building_2d", "dataset.n_scans=3", "dataset.odometry=mixture")
+    assert (done.folder / "trajectory.tum").is_file()
+    assert "3 poses estimated" in done.stdout
+    assert "ATE" in done.stdout

@@ -16,6 +16,8 @@ class FileDataset:
     no_return_range: metres of free space along a beam without return; 0: such beams are ignored.
     stride: use every n-th scan.
     poses: trajectory file (TUM or KITTI) whose poses replace those of the data set.
+    odometry: none, the poses of the data set; auto, mixture if it has none; mixture or kiss_icp, poses are
+        estimated from the scans.
     """
 
     name: str = MISSING
@@ -24,6 +26,7 @@ class FileDataset:
     no_return_range: float | None = None
     stride: int = 1
     poses: str | None = None
+    odometry: str = "none"
 
 
 @dataclass
@@ -130,6 +133,7 @@ class SyntheticDataset:
     stride: use every n-th scan.
     seed: seed of the simulation.
     n_scans: number of scans; null: the whole tour.
+    odometry: none, the simulated poses; mixture or kiss_icp, poses are estimated from the scans.
     """
 
     name: str = MISSING
@@ -138,6 +142,7 @@ class SyntheticDataset:
     stride: int = 1
     seed: int = 0
     n_scans: int | None = None
+    odometry: str = "none"
 
 
 @dataclass

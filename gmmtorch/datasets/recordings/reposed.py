@@ -28,46 +28,52 @@ def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
 
     Raises `InvalidArgumentError` if the data set has no poses, or no times for TUM rows, and `DataError`.
     """
+    path = Path(path).expanduser()
+    if len(source) == 0 or source.pose(0) is None:
+        raise InvalidArgumentError(
+            f"dataset.poses={path} cannot be used: the data set does not state its own "
+            "poses, from which its "
+            "points would be moved."
+        )
+    if not path.is_file():
+        raise MissingDataError(f"dataset.poses={path} does not exist; give a TUM or KITTI trajectory file.")
+    if read_rows(path).shape[1] == 12:
+        matrices = read_trajectory(path, len(source)).matrices
+        known = np.ones(len(source), bool)
+    else:
+        if source.times is None:
+            raise InvalidArgumentError(
+                f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
+                "trajectory, one row for each scan."
+            )
+        matrices, known = read_trajectory(path).at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
+        if not known.any():
+            first, last = float(source.times[0]), float(source.times[-1])
+            raise DataError(f"{path} has no pose for the scans, which are from {first:.3f} to {last:.3f} s.")
+    is_flat = source[0].dim == 2
+    poses = torch.from_numpy(in_plane(matrices) if is_flat else matrices)
+    return with_poses(source, poses, torch.from_numpy(known), stride)
+
+
+def with_poses(source: Dataset, poses: Tensor, known: Tensor, stride: int = 1) -> Reposed:
+    """Every `stride`-th scan of a data set, moved to other poses (N, D+1, D+1), world ← sensor.
+
+    known: which of the N scans have such a pose (N,); the others are left out.
+    """
     kind = ReposedDepth if hasattr(source, "image") else Reposed
-    return kind(source, Path(path).expanduser(), stride)
+    return kind(source, poses, known, stride)
 
 
 class Reposed(Dataset):
-    """Scans of another data set with other poses; made by `with_trajectory`."""
+    """Scans of another data set with other poses; made by `with_poses` and `with_trajectory`."""
 
-    def __init__(self, source: Dataset, path: Path, stride: int) -> None:
+    def __init__(self, source: Dataset, poses: Tensor, known: Tensor, stride: int) -> None:
         super().__init__(source.name, source.ranges, stride)
         self._source: Any = source
-        if len(source) == 0 or source.pose(0) is None:
-            raise InvalidArgumentError(
-                f"dataset.poses={path} cannot be used: the data set does not state its own "
-                "poses, from which its "
-                "points would be moved."
-            )
-        if not path.is_file():
-            raise MissingDataError(
-                f"dataset.poses={path} does not exist; give a TUM or KITTI trajectory file."
-            )
-        if read_rows(path).shape[1] == 12:
-            matrices = read_trajectory(path, len(source)).matrices
-            known = np.ones(len(source), bool)
-        else:
-            if source.times is None:
-                raise InvalidArgumentError(
-                    f"dataset.poses={path} has poses at times, but the scans have no times; give a KITTI "
-                    "trajectory, one row for each scan."
-                )
-            matrices, known = read_trajectory(path).at(to_nanoseconds(source.times.numpy()), _MAX_GAP)
-            if not known.any():
-                first, last = float(source.times[0]), float(source.times[-1])
-                raise DataError(
-                    f"{path} has no pose for the scans, which are from {first:.3f} to {last:.3f} s."
-                )
-        self._indices = np.flatnonzero(known).tolist()
-        for index in np.flatnonzero(~known).tolist():
+        self._indices = known.nonzero().squeeze(1).tolist()
+        for index in (~known).nonzero().squeeze(1).tolist():
             self._skip("no pose at the time of the scan", index)
-        is_flat = source[0].dim == 2
-        self._poses = torch.from_numpy(in_plane(matrices) if is_flat else matrices)[self._indices]
+        self._poses = poses[self._indices]
 
     @property
     def skipped(self) -> dict[str, int]:
@@ -78,6 +84,14 @@ class Reposed(Dataset):
 
     def _known_pose(self, index: int) -> Tensor:
         return self._poses[index]
+
+    def own_pose(self, index: int) -> Tensor:
+        """The pose (D+1, D+1) that the source states for scan `index`, world ← sensor."""
+        pose: Tensor = self._source.pose(self._indices[self._position(index)])
+        return pose
+
+    def pose(self, index: int) -> Tensor:
+        return self._known_pose(self._position(index))
 
     def _known_times(self) -> Tensor | None:
         times: Tensor | None = self._source.times

@@ -1,0 +1,102 @@
+"""Poses of a recording that states none, or none that one trusts: odometry over all of its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gmmtorch.datasets.base import Dataset
+from gmmtorch.datasets.recordings.reposed import Reposed, with_poses
+from gmmtorch.errors import DataError, check_choice
+from gmmtorch.localization.odometry import Odometry, Trajectory
+from gmmtorch.optional_packages import needs_extra
+
+METHODS = ("kiss_icp", "mixture")
+
+
+class PosedRecording(NamedTuple):
+    """The scans with the estimated poses, and the trajectory of all scans."""
+
+    dataset: Reposed
+    trajectory: Trajectory
+
+
+def with_odometry(
+    source: Dataset, method: str = "mixture", on_scan: Callable[[int, int], None] = lambda done, total: None
+) -> PosedRecording:
+    """A data set whose poses are estimated from its scans. The frame of the first usable scan is the world.
+
+    Args:
+        source: its own poses move the points into the frame of the sensor, and are not used otherwise.
+        method: mixture, `Odometry`; or kiss_icp, the package of Vizzo et al. (2023), without closures of
+            loops and without covariances (NaN).
+        on_scan: called with the number of scans done and of all.
+
+    Raises `InvalidArgumentError` for another method, `DataError` if no scan can be read.
+    """
+    check_choice("odometry", method, METHODS)
+    odometry: Any = Odometry() if method == "mixture" else _KissIcp()
+    known = torch.zeros(len(source), dtype=torch.bool)
+    times = source.times
+    for index in range(len(source)):
+        points = _sensor_points(source, index)
+        if points is not None:
+            odometry.add(points, None if times is None else float(times[index]))
+            known[index] = True
+        on_scan(index + 1, len(source))
+    if not known.any():
+        raise DataError(f"{source.name}: no scan of {len(source)} can be read, so none has a pose.")
+    trajectory: Trajectory = odometry.trajectory()
+    poses = torch.eye(trajectory.poses.shape[1]).double().repeat(len(source), 1, 1)
+    poses[known] = trajectory.poses
+    return PosedRecording(with_poses(source, poses, known), trajectory)
+
+
+def _sensor_points(source: Dataset, index: int) -> Tensor | None:
+    """Returns (N, D) of a scan in the frame of the sensor; None if it cannot be read."""
+    try:
+        scan, pose = source[index], source.pose(index)
+    except DataError:
+        return None  # the reader counts it in `skipped`
+    if pose is None:
+        raise DataError(
+            f"{source.name} does not state the poses in which its points are, so they cannot be moved into "
+            "the frame of the sensor."
+        )
+    return (scan.points.double() - pose[:-1, -1]) @ pose[:-1, :-1]
+
+
+class _KissIcp:
+    """KISS-ICP behind the methods of `Odometry`. Scans in 2D lie at z = 0."""
+
+    def __init__(self) -> None:
+        with needs_extra("odometry=kiss_icp needs", "kiss-icp", "odometry"):
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.kiss_icp import KissICP
+        config = KISSConfig()
+        config.data.deskew = False  # the readers have deskewed the points
+        config.mapping.voxel_size = config.data.max_range / 100  # its own default
+        self._icp = KissICP(config)
+        self._poses: list[Tensor] = []
+        self._dim = 3
+
+    def add(self, points: Tensor, stamp: float | None = None) -> None:
+        self._dim = points.shape[1]
+        rows = torch.nn.functional.pad(points, (0, 3 - self._dim))
+        if len(rows):
+            self._icp.register_frame(rows.numpy(), rows.new_zeros(0).numpy())
+        self._poses.append(torch.from_numpy(self._icp.last_pose.copy()))
+
+    def trajectory(self) -> Trajectory:
+        poses, dim = torch.stack(self._poses), self._dim
+        if dim == 2:
+            turn = torch.atan2(poses[:, 1, 0], poses[:, 0, 0])
+            poses = poses[:, [0, 1, 3]][:, :, [0, 1, 3]].clone()
+            poses[:, 0, 0], poses[:, 1, 1] = turn.cos(), turn.cos()
+            poses[:, 1, 0], poses[:, 0, 1] = turn.sin(), -turn.sin()
+        free = dim * (dim + 1) // 2
+        unknown = torch.full((len(poses), free, free), torch.nan).double()
+        return Trajectory(poses, unknown, torch.ones(len(poses), dtype=torch.bool), 0)
