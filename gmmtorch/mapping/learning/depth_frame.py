@@ -73,6 +73,17 @@ class DepthFrame:
         points = back_project(torch.where(valid, self.depth, 0.0).double(), self.intrinsics)
         return points @ self.rotation.T + self.origin
 
+    @property
+    def ranges(self) -> Tensor:
+        """Distances (N,) of the points from the camera (m), without computing the points."""
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics.tolist()
+        height, width = (
+            torch.arange(n, dtype=torch.float64, device=self.depth.device) for n in self.depth.shape
+        )
+        lengths = (((width - cx) / fx).square() + ((height - cy) / fy).square()[:, None] + 1).sqrt()
+        valid = (self.depth > 0) & (self.depth < self.max_range) & torch.isfinite(self.depth)
+        return self.depth[valid].double() * lengths[valid]
+
     def scan(self) -> Scan:
         """The frame as a scan."""
         return Scan(self.points, self.origin)

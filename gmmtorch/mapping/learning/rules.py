@@ -196,10 +196,15 @@ class IncrementalRule(MixtureRule):
         """
         import torch
 
+        from gmmtorch.scan import Scan
+
         if None not in (self.noise, self.length, self.cell, self.window):
             return self
-        clouds = [(scan.points, scan.origin) for scan in scans]
-        ranges = [(points - origin).norm(dim=1) for points, origin in clouds if len(points)]
+        found = [
+            (scan.points - scan.origin).norm(dim=1) if isinstance(scan, Scan) else scan.ranges
+            for scan in scans
+        ]
+        ranges = [distances for distances in found if len(distances)]
         if not ranges:
             return self
         scale = _SCALES[scans[0].dim]

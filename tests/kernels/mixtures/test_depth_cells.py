@@ -68,6 +68,11 @@ def test_cells_hold_the_moments_of_all_points(dtype, stride):
     assert float(variance.max()) < SIDE**2
 
 
+def test_ranges_are_the_distances_of_the_points():
+    one = frame(noisy_depth(1), pose(0.3, (0.1, 5.0, -2.0)), max_range=1e6)
+    torch.testing.assert_close(one.ranges, (one.points - one.origin).norm(dim=1))
+
+
 def test_points_on_sides_of_cells_belong_to_the_cell_above():
     # All values are multiples of powers of two, so that many points and patches lie exactly on sides.
     v, u = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
