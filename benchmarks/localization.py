@@ -143,7 +143,9 @@ def main() -> None:
         )
         for name in ("intel", "aces")
     )
-    located(Tracker(intel.map), *intel.scan(0))  # compiles the kernels
+    for place in (hall, intel):  # loads the kernels
+        points, pose = place.scan(0)
+        located(Tracker(place.map, pose), points, pose)
     rows = []
     for name, place in (("hall", hall), ("intel", intel)):
         rows.append(row(f"{name}, from 0.5 m and 10° off", from_a_rough_pose(place)))
