@@ -11,6 +11,7 @@ from gmmtorch.datasets.recordings.ros.bag_topics import Sensor, nearest_names
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
+from gmmtorch.live.ros.node import reading
 
 _KINDS = {
     "sensor_msgs/msg/PointCloud2": bag_topics.CLOUD,
@@ -79,11 +80,11 @@ def open_scans(
         node.listen_to_transforms()
     if sensor.is_camera:
         info = camera_info or _camera_info(node, sensor.topic.name)
-        node.subscribe(info, bag_topics.INFO_TYPE, scans.note_camera)
+        node.subscribe(info, bag_topics.INFO_TYPE, reading(scans.note_camera))
     node.subscribe(
         sensor.topic.name,
         sensor.topic.type,
-        lambda message: scans.receive(message, node.arrival.time, node.arrival.monotonic),
+        reading(lambda message: scans.receive(message, node.arrival.time, node.arrival.monotonic)),
     )
     return scans
 

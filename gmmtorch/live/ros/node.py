@@ -213,9 +213,9 @@ class Node:
     def listen_to_transforms(self) -> tuple[Subscription, Subscription]:
         """Collects /tf and /tf_static in `transforms`, whose last 30 s are kept."""
         return (
-            self.subscribe("/tf", TRANSFORMS, lambda message: self.transforms.add(message, static=False)),
+            self.subscribe("/tf", TRANSFORMS, reading(lambda tf: self.transforms.add(tf, static=False))),
             self.subscribe(
-                "/tf_static", TRANSFORMS, lambda message: self.transforms.add(message, static=True)
+                "/tf_static", TRANSFORMS, reading(lambda tf: self.transforms.add(tf, static=True))
             ),
         )
 
@@ -252,7 +252,7 @@ class Node:
             return True
         try:
             subscription.callback(message)
-        except (DataError, ValueError, KeyError, TypeError, OverflowError) as error:
+        except DataError as error:
             self._note_malformed(subscription, error)
         return True
 
@@ -298,6 +298,21 @@ class Node:
             f"malformed {subscription.topic}",
             f"{subscription.n_malformed} messages of {subscription.topic} cannot be used; the last: {error}",
         )
+
+
+def reading(callback: Callback) -> Callback:
+    """The callback, which raises `DataError` for a message whose contents it cannot use.
+
+    The node counts such messages as malformed. Every other error of a callback ends `spin`.
+    """
+
+    def read(message: dict[str, Any]) -> None:
+        try:
+            callback(message)
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            raise DataError(f"{type(error).__name__}: {error}") from error
+
+    return read
 
 
 def _environment_domain() -> int:

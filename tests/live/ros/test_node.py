@@ -12,6 +12,7 @@ import pytest
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.export.message_fields import cloud_fields, transform_fields
 from gmmtorch.live.ros import Node, Quality
+from gmmtorch.live.ros.node import reading
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
@@ -196,3 +197,18 @@ def test_unknown_types_and_names_are_refused(make_node):
     with pytest.raises(InvalidArgumentError, match="not a name of ROS"):
         node.subscribe("/a b", STRING, lambda _: None)
     assert issubclass(DataError, GmmTorchError)
+
+
+def test_an_error_of_a_callback_is_raised_and_one_of_a_message_is_counted(ros_domain):
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    with Node("test", domain=ros_domain) as node:
+        wrong = node.subscribe("/text", STRING, lambda message: message["no such field"])
+        unusable = node.subscribe("/name", STRING, reading(lambda message: float(message["data"])))
+        whole = node.types.encode(STRING, {"data": "x"})
+        node._receive(unusable, whole)
+        node.spin_once()
+        assert unusable.n_malformed == 1
+        node._receive(wrong, whole)
+        with pytest.raises(KeyError, match="no such field"):
+            node.spin_once()
+        assert wrong.n_malformed == 0
