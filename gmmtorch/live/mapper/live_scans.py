@@ -315,6 +315,9 @@ class LiveScans(Dataset):
         matrix = newest.matrix
         return torch.from_numpy(in_plane(matrix[None])[0] if newest.scan.dim == 2 else matrix)
 
+    def _known_time(self, index: int) -> float:
+        return self._newest(index).stamp / NANOSECONDS
+
     def _known_times(self) -> Tensor | None:
         return None if self._first else torch.tensor(self._stamps, dtype=torch.float64)
 
