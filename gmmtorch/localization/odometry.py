@@ -46,6 +46,8 @@ class Trajectory(NamedTuple):
 class Odometry:
     """Estimates the motion of a sensor, scan by scan, and closes loops.
 
+    Usage::
+
         odometry = Odometry()
         for points in scans:  # (N, D) in the frame of the sensor
             location = odometry.add(points)

@@ -61,6 +61,8 @@ class Subscription:
 class Node:
     """A ROS 2 node over DDS or Zenoh.
 
+    Usage::
+
         with Node("listener") as node:
             node.subscribe("/scan", "sensor_msgs/msg/LaserScan", lambda scan: print(len(scan["ranges"])))
             node.spin(seconds=10)
