@@ -36,9 +36,8 @@ _AT_ONCE = 256  # starts
 _SORTED = 1024  # best starts, of which
 _CLIMBED = 16  # different ones are climbed
 _RANKED = 200  # points of the scan that rank the starts
-_CORRELATED = (
-    3.0  # points that share one error; with 10, the prediction outweighed the surfaces of a corridor
-)
+# Points that share one error: with 10, the prediction outweighed the surfaces where a corridor begins.
+_CORRELATED = 3.0
 _LOOSEST = 0.3  # metres of standard deviation
 _APART = 0.3  # metres, and radians: poses are different
 _INSIDE = 5.0  # nats of a point on a surface, however many components it touches
