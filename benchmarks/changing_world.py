@@ -24,7 +24,7 @@ from tables import hardware, markdown, publish
 from torch import Tensor
 
 import gmmtorch as gt
-from gmmtorch import GaussianMap, IncrementalRule, WindowedRule
+from gmmtorch import GaussianMap, IncrementalRule
 from gmmtorch.baselines import LogOdds, OccupancyGrid, OctoMapMap
 from gmmtorch.evaluation import metrics
 from gmmtorch.kernels.rays.ray_traversal import traverse
@@ -137,7 +137,6 @@ def maps() -> dict[str, Callable[[], Any]]:
     for kind, rule in (
         ("incremental", IncrementalRule()),
         ("incremental, 16 kB", IncrementalRule(max_bytes=16_000)),
-        ("windowed", WindowedRule()),
     ):
         for name, forget in ours.items():
             made[f"{kind}, {name}"] = partial(GaussianMap, replace(rule, forget=forget), resolution=CELL)
