@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -39,6 +39,7 @@ _WIDER = 4  # times the first search
 _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
 
 _USUAL = 0.9  # of the share that the last scan had: less, and the search is wider
+_SURE = 0.95  # of the share that the last scan had: less, and a pose away from the prediction is not accepted
 _FLAT = 0.25  # of the next deviation: thinner components have a face
 _LOOSEST = 0.3  # metres of standard deviation
 _UNSEEN = 10.0  # metres of standard deviation of a direction that no surface fixes
@@ -169,10 +170,24 @@ class Tracker:
             best = found if best is None else _better(best, found)
             if best.found and best.explained >= is_enough:
                 break
-        if best is None:
-            best = self._nothing(predicted)
+        best = self._nothing(predicted) if best is None else self._questioned(best, predicted)
         self._remember(best, predicted, measured is not None)
         return best
+
+    def _questioned(self, location: Location, predicted: Tensor | None) -> Location:
+        """The location; not found if it is away from the prediction and fits worse than the last scan did."""
+        if predicted is None or not location.found or location.explained >= _SURE * self._explained:
+            return location
+        expected, pose = predicted[None], location.pose.clone()[None]
+        pose[:, : self.dim, self.dim] -= self._center
+        away = _apart(_motions(pose, self.dim), _motions(expected, self.dim), self.distance, self.angle)
+        if float(away) <= 1:
+            return location
+        doubt = (
+            f"{location.explained:.0%} of the points lie on surfaces, fewer than in the last scan, and the "
+            "pose is not where it was expected"
+        )
+        return replace(location, doubts=(doubt,))
 
     def _predicted(self, measured: Tensor | None) -> Tensor | None:
         step = self._motion if measured is None else measured
