@@ -507,7 +507,7 @@ def test_ctrl_c_leaves_only_complete_files(tmp_path):
     try:
         deadline = time.monotonic() + 300
         while time.monotonic() < deadline and process.poll() is None:
-            if len(list(maps.glob("*.safetensors"))) >= 2:
+            if len(list(maps.glob("[!.]*.safetensors"))) >= 2:  # a temporary file begins with a dot
                 break
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
