@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from gmmtorch.localization.location import Location as Location
     from gmmtorch.localization.odometry import Odometry as Odometry
     from gmmtorch.localization.odometry import Trajectory as Trajectory
     from gmmtorch.localization.recorded_poses import with_odometry as with_odometry
     from gmmtorch.localization.registration import Registration as Registration
     from gmmtorch.localization.registration import register as register
     from gmmtorch.localization.registration import yaw_starts as yaw_starts
-    from gmmtorch.localization.tracker import Location as Location
     from gmmtorch.localization.tracker import Tracker as Tracker
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "Location": "tracker",
+        "Location": "location",
         "Odometry": "odometry",
         "Registration": "registration",
         "Tracker": "tracker",

@@ -19,8 +19,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
-from gmmtorch.localization.overlap import Motions
+from gmmtorch.localization.motions import Motions
+from gmmtorch.localization.overlap import deviations
+from gmmtorch.mapping.components import Components
 from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture.reduction.moments import merge_components
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.index.cone_index import ConeIndex
 
@@ -33,6 +36,7 @@ _SETTLED = 0.05  # of the blur: steps below this end a climb
 _SADDLE = 0.05  # of EM's information: with less curvature Newton's step is too long
 _ENTRIES = {2: 16, 3: 64}  # of the index, for each component
 _RIDGE = 1e-9
+_FLAT = 0.25  # of the next deviation: thinner components have a face
 
 
 class Alignment(NamedTuple):
@@ -78,6 +82,32 @@ class AlignmentTarget:
         target = self.means, self.precisions, self.normals
         limits = self.blur, CUTOFF**2, _OUTLIERS, _EXPLAINED
         return alignment_sums(points, motions, lists, target, limits)
+
+
+def seen_normals(surfaces: Components) -> Tensor:
+    """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
+    the others. In the order of `surface_mixture`.
+    """
+    solid = ~surfaces.max_range & (surfaces.support > 0)
+    variances, axes = torch.linalg.eigh(surfaces.covariances.double())
+    normals = axes[:, :, 0]
+    views = surfaces.origins.double()[surfaces.seen_from] - surfaces.means.double()[surfaces.seen_by]
+    heights = (views * normals[surfaces.seen_by]).sum(1)
+    sides = [torch.zeros(len(normals)).to(normals).index_add(0, surfaces.seen_by, side.to(normals))
+             for side in (heights > 0, heights < 0)]  # fmt: skip
+    sign = (sides[0] > 0).to(normals) - (sides[1] > 0).to(normals)  # 0 if seen from both sides
+    is_flat = variances[:, 0] < _FLAT**2 * variances[:, 1]
+    return (normals * (sign * is_flat)[:, None])[solid]
+
+
+def merged_below(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Parameters, Tensor]:
+    """The surfaces with those merged that a blur hides: smaller ones of one side in a cell of that size."""
+    small = deviations(surfaces)[:, -1] < blur
+    alone = torch.where(small, -1, torch.arange(len(small)).to(small.device))
+    keys = torch.cat([(surfaces.means / blur).floor(), normals.round(), alone[:, None]], 1)
+    cells, labels = torch.unique(keys, dim=0, return_inverse=True)
+    summed = torch.zeros(len(cells), normals.shape[1]).to(normals).index_add(0, labels, normals)
+    return merge_components(*surfaces, labels, len(cells)), torch.nn.functional.normalize(summed)
 
 
 def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: int) -> Alignment:

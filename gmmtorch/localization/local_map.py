@@ -10,10 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align
-from gmmtorch.localization.overlap import Motions, generators
+from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, seen_normals
+from gmmtorch.localization.location import Location, pose_covariance
+from gmmtorch.localization.motions import Motions, distinct, generators
 from gmmtorch.localization.registration import register
-from gmmtorch.localization.tracker import Location, pose_covariance, seen_normals
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window
@@ -141,7 +141,7 @@ class LocalMap:
         score = torch.cat([target.sums(points, self._motions(part)).score for part in starts.split(_AT_ONCE)])
         total = score / _CORRELATED - self._unlikely(starts, expected)
         best = total.argsort(descending=True, stable=True)[:_SORTED]
-        different = _distinct(starts[best], 1.5 * spacing, 1.5 * turn)
+        different = distinct(self._motions(starts[best]), 1.5 * spacing, 1.5 * turn)
         return torch.cat([expected.poses, starts[best[different]][:_CLIMBED]])
 
     def _climbed(
@@ -152,7 +152,7 @@ class LocalMap:
             found = align(scan.points[: self.n_points], target, motions, _STEPS)
             kept = max(kept // 2, 3)
             order = self._total(found, scan, expected).argsort(descending=True, stable=True)
-            order = order[_distinct(self._poses(found.motions.at(order)), target.blur / 2, target.blur / 2)]
+            order = order[distinct(found.motions.at(order), target.blur / 2, target.blur / 2)]
             found = found.at(order[:kept])
             motions = found.motions
         total = self._total(found, scan, expected)
@@ -199,11 +199,3 @@ class LocalMap:
         poses[:, :-1, :-1] = left @ right
         poses[:, :-1, -1] = motions.translations + self._center
         return poses
-
-
-def _distinct(poses: Tensor, distance: float, angle: float) -> Tensor:
-    """Rows of poses (B, D+1, D+1), best first, without those within both (m, rad) of a better one."""
-    shift = torch.cdist(poses[:, :-1, -1], poses[:, :-1, -1]) / distance
-    turn = torch.linalg.matrix_norm(poses[:, None, :-1, :-1] - poses[:, :-1, :-1]) / (math.sqrt(2) * angle)
-    is_near = torch.maximum(shift, turn) < 1
-    return (~is_near.tril(-1).any(1)).nonzero().squeeze(1)

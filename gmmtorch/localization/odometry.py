@@ -12,9 +12,9 @@ from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
 from gmmtorch.localization.local_map import Expectation, Keyframe, LocalMap
+from gmmtorch.localization.location import Location
 from gmmtorch.localization.loop_closure import closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
-from gmmtorch.localization.tracker import Location
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.rules import WindowedRule
 from gmmtorch.mapping.learning.windowed import learn_window

@@ -1,12 +1,11 @@
-"""The overlap of two mixtures as a function of a rigid motion of one of them, and its ascent.
+"""The overlap of two mixtures as a function of a rigid motion of one of them, and its derivatives.
 
 The overlap of densities f and g is ∫ f g dx, for mixtures a sum over pairs of components:
 
     S(R, t) = Σ_ij π_i π_j N(R μ_i + t | μ_j, R Σ_i Rᵀ + Σ_j)
 
-(Jian & Vemuri 2011; distribution-to-distribution NDT, Stoyanov et al. 2012). A motion is perturbed on its
-left, x → exp([ω]) (x − c) + c + v about the moved origin c = t of the source's frame; [ω] = Σ_k ω_k G_k, so
-that the same formulas hold in 2D (one G) and 3D (three). With d = R μ_i + t − μ_j, A = R Σ_i Rᵀ,
+(Jian & Vemuri 2011; distribution-to-distribution NDT, Stoyanov et al. 2012). A motion is perturbed by a
+shift v and a turn ω as `localization.motions` defines it. With d = R μ_i + t − μ_j, A = R Σ_i Rᵀ,
 C = A + Σ_j, W = C⁻¹, z = W d and lever l = R μ_i, of each pair
 
     ∂ log N/∂v = −z,   ∂ log N/∂ω_k = −zᵀ G_k (l − A z) − tr(G_k A W).
@@ -14,7 +13,6 @@ C = A + Σ_j, W = C⁻¹, z = W d and lever l = R μ_i, of each pair
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -22,42 +20,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
 from gmmtorch.kernels.mixtures.pair_overlap import overlap_sums
-from gmmtorch.linalg import safe_cholesky
-from gmmtorch.mapping.surfaces import touching
+from gmmtorch.localization.motions import Motions, generators
 from gmmtorch.mixture.em.exact import Parameters
 
 _CHUNK = 1 << 14  # pairs processed at a time, so that they stay in a core's cache
-
-CUTOFF = 4.0
-"""Deviations beyond which a pair is left out: its term is below 4e-4 of its maximum."""
-
-_SLACK = 0.5  # of the thickness: components may move this far before pairs are listed again
-_LEAST_CURVATURE = 0.05  # of the information
-_LONGEST = 1.0  # step, as the root mean square of the Mahalanobis distances that pairs move by,
-_THICKNESSES = 4  # and in thicknesses of the components
-
-
-_SMALL_TURN = 1e-8  # rad²
-
-
-class Motions(NamedTuple):
-    """B rigid motions x → R x + t: rotations (B, D, D), translations (B, D)."""
-
-    rotations: Tensor
-    translations: Tensor
-
-    def at(self, rows: Tensor) -> Motions:
-        return Motions(self.rotations[rows], self.translations[rows])
-
-    def joined(self, others: Motions) -> Motions:
-        return Motions(*(torch.cat(both) for both in zip(self, others, strict=True)))
-
-    def moved(self, steps: Tensor) -> Motions:
-        """Perturbed by steps (B, D + D(D−1)/2): translations v, then rotations ω about t."""
-        dim = self.translations.shape[1]
-        return Motions(turns(steps[:, dim:]) @ self.rotations, self.translations + steps[:, :dim])
 
 
 class Pairs(NamedTuple):
@@ -87,27 +54,6 @@ class Overlap(NamedTuple):
 
     def at(self, rows: Tensor) -> Overlap:
         return Overlap(*(value[rows] for value in self))
-
-
-@functools.cache
-def generators(dim: int) -> Tensor:
-    """Skew matrices G_k (D(D−1)/2, D, D): Σ_k ω_k G_k x is ω × x in 3D, ω (−y, x) in 2D."""
-    if dim == 2:
-        return torch.tensor([[[0.0, -1.0], [1.0, 0.0]]], dtype=torch.float64)
-    basis = torch.eye(3, dtype=torch.float64)
-    return torch.stack([torch.linalg.cross(axis.expand(3, 3), basis, dim=1).T for axis in basis])
-
-
-def turns(angles: Tensor) -> Tensor:
-    """Rotations (B, D, D) exp(Σ_k ω_k G_k) by angles ω (B, D(D−1)/2), rad: Rodrigues' formula."""
-    dim = 2 if angles.shape[1] == 1 else 3
-    skew = (angles @ generators(dim).to(angles).flatten(1)).view(-1, dim, dim)
-    square = angles.square().sum(1)[:, None, None]
-    is_small = square < _SMALL_TURN  # a series, so that derivatives exist at zero
-    angle = torch.where(is_small, 1.0, square).sqrt()
-    first = torch.where(is_small, 1 - square / 6, angle.sin() / angle)
-    second = torch.where(is_small, 0.5 - square / 24, 2 * (0.5 * angle).sin().square() / angle.square())
-    return torch.eye(dim).to(angles) + first * skew + second * skew @ skew
 
 
 def overlap(source: Parameters, target: Parameters, motions: Motions, pairs: Pairs) -> Overlap:
@@ -206,125 +152,6 @@ def _times(a: Tensor, b: Tensor) -> Tensor:
     return (a[:, :, None] * b[None]).sum(1)
 
 
-# -- ascent ----------------------------------------------------------------------------------------
-
-
-class Ascent:
-    """Climbs log S from B motions in parallel, with one evaluation of the score for each step.
-
-    Steps are Newton's with the absolute values of the curvatures, cut until the score rises. Except for pairs
-    near the cutoff the score never falls. Pairs are listed again after components have moved by a fraction of
-    their thickness.
-
-    Args:
-        source, target: mixtures near the origin.
-        radius: metres that the source moves when it turns by a radian.
-    """
-
-    def __init__(self, source: Parameters, target: Parameters, radius: float) -> None:
-        self.source, self.target = source, target
-        self.reach = tuple(CUTOFF * deviations(mixture)[:, -1] for mixture in (source, target))
-        dim = source.means.shape[1]
-        self.scale = source.means.new_ones(dim + dim * (dim - 1) // 2)
-        self.scale[dim:] = 1 / radius  # a unit of every degree of freedom moves the source by a metre
-        self.thickness = float(deviations(source)[:, 0].median() + deviations(target)[:, 0].median())
-        self.slack = _SLACK * self.thickness
-        self.n_evaluated = 0
-
-    def run(self, motions: Motions, max_iterations: int, tolerance: float) -> tuple[Motions, Overlap, Tensor]:
-        """The final motions (B), their overlap, and which of them converged (B,)."""
-        listed, pairs = motions, self.pairs(motions)
-        state = self.evaluate(motions, pairs)
-        share = torch.ones_like(state.log_score)  # of the proposed step that is taken
-        active = torch.isfinite(state.log_score)
-        for _ in range(max_iterations):
-            if not bool(active.any()):
-                break
-            steps = torch.where(active[:, None], self._steps(state) * share[:, None], 0.0)
-            trial = motions.moved(steps)
-            if self._strayed(trial, listed):
-                rows = active.nonzero().squeeze(1)
-                listed, pairs = trial, self.pairs(trial.at(rows))
-                pairs = pairs._replace(motion=rows[pairs.motion])
-            tried = self.evaluate(trial, pairs.of(active[pairs.motion]))
-            better = active & (tried.log_score > state.log_score)
-            active &= (steps / self.scale).norm(dim=1) > tolerance
-            motions = Motions(*(_where(better, n, o) for n, o in zip(trial, motions, strict=True)))
-            state = Overlap(*(_where(better, n, o) for n, o in zip(tried, state, strict=True)))
-            share = torch.where(better, (2 * share).clamp_max(1), share / 4)
-        return motions, state, ~active & torch.isfinite(state.log_score)
-
-    def evaluate(self, motions: Motions, pairs: Pairs) -> Overlap:
-        self.n_evaluated += 1
-        return overlap(self.source, self.target, motions, pairs)
-
-    def _steps(self, state: Overlap) -> Tensor:
-        """Ascent steps (B, F).
-
-        In coordinates in which the information is the identity, lengths are the Mahalanobis distances that
-        pairs move by, so their limit lets a wall slide far along itself. There each axis of the Hessian takes
-        Newton's step with the curvature's absolute value, which climbs where the score is convex, too.
-        """
-        outer = self.scale[:, None] * self.scale
-        fisher = state.information * outer
-        ridge = 1e-9 * fisher.diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-12)
-        root = safe_cholesky(fisher + ridge[:, None, None] * torch.eye(len(outer)).to(fisher))
-        scatter = torch.linalg.solve_triangular(root, state.scatter * outer, upper=False)
-        scatter = torch.linalg.solve_triangular(root, scatter.mT, upper=False)
-        missing, axes = torch.linalg.eigh((scatter + scatter.mT) / 2)
-        slope = torch.linalg.solve_triangular(root, (state.gradient * self.scale)[:, :, None], upper=False)
-        parts = (axes.mT @ slope)[:, :, 0] / (1 - missing).abs().clamp_min(_LEAST_CURVATURE)
-        parts = parts * (_LONGEST / parts.norm(dim=1, keepdim=True).clamp_min(_LONGEST))
-        steps = torch.linalg.solve_triangular(root.mT, axes @ parts[:, :, None], upper=True)[:, :, 0]
-        longest = _THICKNESSES * self.thickness
-        length = steps.norm(dim=1, keepdim=True)
-        return steps * (longest / length.clamp_min(longest)) * self.scale
-
-    def pairs(self, motions: Motions) -> Pairs:
-        """Pairs within the cutoff now, or after components have moved by the slack."""
-        k, n = len(self.source.weights), len(motions.translations)
-        moved = torch.einsum("bij,kj->bki", motions.rotations, self.source.means)
-        moved = moved + motions.translations[:, None]
-        shapes = motions.rotations[:, None] @ self.source.covariances @ motions.rotations[:, None].mT
-        # This ellipsoid contains the ellipsoid of the cutoff enlarged by the ball of the slack.
-        scale, wide = 1.2 * CUTOFF**2, 6 * self.slack**2
-        few = n * k * len(self.target.weights) <= MOST_TESTED
-        if few and is_fused(moved, *self.target, *self.source):
-            reaches = self.reach[0] + self.slack, self.reach[1]
-            return Pairs(*near_pairs(moved, shapes, reaches, *self.target[1:], scale, wide))
-        moved, shapes = moved.flatten(0, 1), shapes.flatten(0, 1)
-        reach = (self.reach[0] + self.slack).repeat(n)
-        found = [torch.zeros(2, 0, dtype=torch.int64, device=moved.device)]
-        for point, center in touching(self.target.means, self.reach[1], moved, reach):
-            near = scale * (shapes[point] + self.target.covariances[center])
-            near.diagonal(dim1=1, dim2=2).add_(wide)
-            offset = (moved[point] - self.target.means[center])[:, :, None]
-            inside = (offset.mT @ torch.linalg.solve(near, offset))[:, 0, 0] <= 1
-            found.append(torch.stack([point[inside], center[inside]]))
-        point, center = torch.cat(found, 1)
-        return Pairs(point // k, point % k, center)
-
-    def _strayed(self, motions: Motions, listed: Motions) -> bool:
-        """Whether a component may have moved by more than the slack since pairs were listed."""
-        size = float((self.source.means.norm(dim=1) + self.reach[0]).max())
-        turn = torch.linalg.matrix_norm(motions.rotations - listed.rotations) / math.sqrt(2)
-        shift = (motions.translations - listed.translations).norm(dim=1)
-        return bool((shift + turn * size > self.slack).any())
-
-
-def log_self_overlap(mixture: Parameters) -> float:
-    """log ∫ f² dx of a mixture."""
-    dim = mixture.means.shape[1]
-    still = Motions(torch.eye(dim).to(mixture.means)[None], mixture.means.new_zeros(1, dim))
-    ascent = Ascent(mixture, mixture, 1.0)
-    return float(ascent.evaluate(still, ascent.pairs(still)).log_score[0])
-
-
 def deviations(mixture: Parameters) -> Tensor:
     """Standard deviations (K, D) along the principal axes, in rising order."""
     return torch.linalg.eigvalsh(mixture.covariances).clamp_min(0).sqrt()
-
-
-def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Rows of `new` where `chosen` (B,), else of `old`."""
-    return torch.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import Dataset
 from gmmtorch.errors import DataError
-from gmmtorch.localization.tracker import Location, Tracker
+from gmmtorch.localization.location import Location
+from gmmtorch.localization.tracker import Tracker
 
 _GAP = 10.0  # times the median step: the clock jumps, or scans are missing
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,13 +12,12 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.linalg import check_rigid
-from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align
-from gmmtorch.localization.overlap import Motions, deviations, turns
+from gmmtorch.localization.alignment import Alignment, AlignmentTarget, align, merged_below, seen_normals
+from gmmtorch.localization.location import UNSEEN, Location, pose_covariance
+from gmmtorch.localization.motions import Motions, around, best_distinct, differences, everywhere
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.surfaces import Surfaces, surface_mixture
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction.moments import merge_components
 from gmmtorch.scan import check_positions
 
 _BLURS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # metres, one level after the other
@@ -29,7 +28,6 @@ _COARSE_SHARE = 0.4  # of the points, on all levels but the last one
 _SAME = 0.25  # of the blur: motions that are closer have climbed one peak
 _SECOND_CHANCE = 1  # the level after the first: starts are ranked there once more, by its blur
 _CLIMBED = 6  # starts that the first level climbs; each level after it climbs the better half
-_TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre of blur
 _PLACES = 0.5  # metres between the places of a search of the whole map
 _RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
 _RANKING_POINTS = 150  # of the scan, that rank the starts
@@ -40,9 +38,7 @@ _GLOBAL_AFTER = 1  # lost scans, after which the whole map is searched
 
 _USUAL = 0.9  # of the share that the last scan had: less, and the search is wider
 _SURE = 0.95  # of the share that the last scan had: less, and a pose away from the prediction is not accepted
-_FLAT = 0.25  # of the next deviation: thinner components have a face
 _LOOSEST = 0.3  # metres of standard deviation
-_UNSEEN = 10.0  # metres of standard deviation of a direction that no surface fixes
 _ALIKE = 0.98  # of the best score: another pose is as good
 _APART = 0.3  # metres, and radians: poses are different
 _FEWEST = 10  # points of a scan
@@ -50,28 +46,6 @@ _NEAREST = 0.2  # metres from the sensor: nearer points are its own cover, which
 _FREE = 0.2  # occupancy of a cell that the map saw as free,
 _CELL = 0.1  # metres, its side
 _MOST_FREE = 1.5  # times the share that need not be explained: points in free space
-_CORRELATED = 10.0  # points that share one error: that of their component (measured on a hall and an office)
-
-
-@dataclass(frozen=True, eq=False)
-class Location:
-    """The pose of a scan in a map.
-
-    pose: (D+1, D+1), map ← sensor, float64, metres.
-    covariance: (F, F) of the pose's error, a shift v (m, in the frame of the map) and a turn ω (rad) about
-        the sensor, F = D + D(D−1)/2. No direction has a standard deviation above 10 m.
-    explained: share of the points that lie on surfaces of the map.
-    doubts: reasons against the pose; the sensor is `found` if there are none.
-    """
-
-    pose: Tensor
-    covariance: Tensor
-    explained: float
-    doubts: tuple[str, ...]
-
-    @property
-    def found(self) -> bool:
-        return not self.doubts
 
 
 class Tracker:
@@ -124,7 +98,7 @@ class Tracker:
         self._targets = [
             AlignmentTarget(merged, blur, faces)
             for blur in _BLURS
-            for merged, faces in (_merged(centered, normals, blur),)
+            for merged, faces in (merged_below(centered, normals, blur),)
         ]
         self._places = _places(seen, self._center) if isinstance(seen, Components) else mixture.means[:0]
         self.restart(pose)
@@ -180,7 +154,7 @@ class Tracker:
             return location
         expected, pose = predicted[None], location.pose.clone()[None]
         pose[:, : self.dim, self.dim] -= self._center
-        away = _apart(_motions(pose, self.dim), _motions(expected, self.dim), self.distance, self.angle)
+        away = differences(_motions(pose, self.dim), _motions(expected, self.dim), self.distance, self.angle)
         if float(away) <= 1:
             return location
         doubt = (
@@ -199,11 +173,11 @@ class Tracker:
             start = _motions(predicted[None], self.dim)
             if self.n_lost == 0 and (is_measured or self._motion is not None):
                 yield _FINE, start, _USUAL * self._explained
-            yield _FINE, _around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
+            yield _FINE, around(start, self.distance, self.angle, _BLURS[_FINE]), _USUAL * self._explained
             wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
-            yield 0, _around(start, *wide, _BLURS[0]), 0.0
+            yield 0, around(start, *wide, _BLURS[0]), 0.0
         if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
-            yield _FINE, _everywhere(self._places, _BLURS[_FINE]), 0.0
+            yield _FINE, everywhere(self._places, _BLURS[_FINE]), 0.0
 
     def _thinned(self, rows: Tensor) -> Tensor:
         draw = torch.Generator().manual_seed(0)
@@ -219,7 +193,7 @@ class Tracker:
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
             found = align(used, target, motions, _STEPS if is_last or number == 0 else _BETWEEN_STEPS)
             found = found.at(
-                _best(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
+                best_distinct(found.motions, found.score, target.blur * _SAME)[: max(2, _CLIMBED >> number)]
             )
             motions = found.motions
         return self._location(rows, found, is_tracked=len(starts.translations) == 1)
@@ -236,7 +210,7 @@ class Tracker:
         order = score.argsort(descending=True, stable=True)
         if n > _RANKED:
             best = order[:_RANKED]
-            order = best[_best(starts.at(best), score[best], 1.01 * target.blur)]
+            order = best[best_distinct(starts.at(best), score[best], 1.01 * target.blur)]
         return starts.at(order[:_CLIMBED])
 
     def _scores(self, rows: Tensor, starts: Motions, target: AlignmentTarget) -> Tensor:
@@ -253,7 +227,7 @@ class Tracker:
             doubts.append(f"only {share:.0%} of the points lie on surfaces: another place, or a changed one")
         if loosest > _LOOSEST:
             doubts.append(f"the surfaces leave a direction open: a standard deviation of {loosest:.2g} m")
-        other = _apart(found.motions, found.motions, _APART, _APART)[0] > 1
+        other = differences(found.motions, found.motions, _APART, _APART)[0] > 1
         if bool((other & (found.score >= _ALIKE * found.score[0])).any()):
             doubts.append("another pose explains the scan as well")
         if len(rows) < _FEWEST:
@@ -281,7 +255,7 @@ class Tracker:
         n_free = self.dim + self.dim * (self.dim - 1) // 2
         return Location(
             pose,
-            _UNSEEN**2 * torch.eye(n_free).to(pose),
+            UNSEEN**2 * torch.eye(n_free).to(pose),
             0.0,
             (f"the scan has no points beyond {_NEAREST} m",),
         )
@@ -313,96 +287,9 @@ def _motions(poses: Tensor, dim: int) -> Motions:
     return Motions(poses[:, :dim, :dim], poses[:, :dim, dim])
 
 
-def seen_normals(surfaces: Components) -> Tensor:
-    """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
-    the others. In the order of `surface_mixture`.
-    """
-    solid = ~surfaces.max_range & (surfaces.support > 0)
-    variances, axes = torch.linalg.eigh(surfaces.covariances.double())
-    normals = axes[:, :, 0]
-    views = surfaces.origins.double()[surfaces.seen_from] - surfaces.means.double()[surfaces.seen_by]
-    heights = (views * normals[surfaces.seen_by]).sum(1)
-    sides = [torch.zeros(len(normals)).to(normals).index_add(0, surfaces.seen_by, side.to(normals))
-             for side in (heights > 0, heights < 0)]  # fmt: skip
-    sign = (sides[0] > 0).to(normals) - (sides[1] > 0).to(normals)  # 0 if seen from both sides
-    is_flat = variances[:, 0] < _FLAT**2 * variances[:, 1]
-    return (normals * (sign * is_flat)[:, None])[solid]
-
-
-def _merged(surfaces: Parameters, normals: Tensor, blur: float) -> tuple[Parameters, Tensor]:
-    """The surfaces with those merged that a blur hides: smaller ones of one side in a cell of that size."""
-    small = deviations(surfaces)[:, -1] < blur
-    alone = torch.where(small, -1, torch.arange(len(small)).to(small.device))
-    keys = torch.cat([(surfaces.means / blur).floor(), normals.round(), alone[:, None]], 1)
-    cells, labels = torch.unique(keys, dim=0, return_inverse=True)
-    summed = torch.zeros(len(cells), normals.shape[1]).to(normals).index_add(0, labels, normals)
-    return merge_components(*surfaces, labels, len(cells)), torch.nn.functional.normalize(summed)
-
-
 def _places(surfaces: Components, center: Tensor) -> Tensor:
     """Places (S, D) from which the map was seen, one in each cell of `_PLACES` metres, about `center`."""
     origins = surfaces.origins.to(center) - center
     cells, member = torch.unique((origins / _PLACES).round(), dim=0, return_inverse=True)
     first = torch.full((len(cells),), len(origins), device=center.device)
     return origins[first.scatter_reduce(0, member, torch.arange(len(origins)).to(member), "amin")]
-
-
-def _turns(angles: Tensor, dim: int) -> Tensor:
-    """Rotations (A, D, D) by angles (A,), rad, about the vertical."""
-    axis = torch.eye(dim * (dim - 1) // 2).to(angles)[-1]
-    return turns(angles[:, None] * axis)
-
-
-def _around(start: Motions, distance: float, angle: float, blur: float) -> Motions:
-    """Starts on a lattice of places, `blur` metres apart, up to `distance` metres from one along the ground,
-    and of headings up to `angle` radians; the start itself among them.
-    """
-    dim, like = start.translations.shape[1], start.translations
-    n, m = math.ceil(distance / blur), math.ceil(angle / (_TURNED * blur))
-    side = torch.linspace(-distance, distance, 2 * n + 1).to(like)
-    places = torch.cartesian_prod(side, side)
-    places = places[places.norm(dim=1) <= distance * (1 + 1e-9)]
-    places = torch.nn.functional.pad(places, (0, dim - 2))
-    turned = _turns(torch.linspace(-angle, angle, 2 * m + 1).to(like), dim) @ start.rotations
-    return _crossed(turned, start.translations + places)
-
-
-def _everywhere(places: Tensor, blur: float) -> Motions:
-    """Starts at places (S, D) with all headings; upright in 3D."""
-    n = math.ceil(math.pi / (_TURNED * blur))
-    angles = torch.arange(n).to(places) * (2 * math.pi / n)
-    return _crossed(_turns(angles, places.shape[1]), places)
-
-
-def _crossed(rotations: Tensor, translations: Tensor) -> Motions:
-    """Every pair of a rotation and a translation."""
-    n = len(rotations)
-    return Motions(rotations.repeat(len(translations), 1, 1), translations.repeat_interleave(n, 0))
-
-
-def _apart(some: Motions, others: Motions, distance: float, angle: float) -> Tensor:
-    """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
-    shift = torch.cdist(some.translations, others.translations)
-    turn = torch.linalg.matrix_norm(some.rotations[:, None] - others.rotations) / math.sqrt(2)
-    return torch.maximum(shift / distance, turn / angle)
-
-
-def _best(motions: Motions, score: Tensor, distance: float) -> Tensor:
-    """Rows of motions by falling score, without those close to a better one: by less than `distance` (m) and
-    the turn that belongs to it.
-    """
-    order = score.argsort(descending=True, stable=True)
-    sorted_ = motions.at(order)
-    is_near = _apart(sorted_, sorted_, distance, _TURNED * distance) < 1
-    return order[~is_near.tril(-1).any(1)]
-
-
-def pose_covariance(information: Tensor, rows: Tensor) -> tuple[Tensor, float]:
-    """The covariance (F, F) of a pose, and the largest standard deviation (m) at the median range."""
-    dim = rows.shape[1]
-    scale = information.new_ones(len(information))
-    scale[dim:] = 1 / rows.norm(dim=1).median().clamp_min(1e-3)
-    values, axes = torch.linalg.eigh(information * scale[:, None] * scale)
-    variances = _CORRELATED / values.clamp_min(_CORRELATED / _UNSEEN**2)
-    inner = axes @ (variances[:, None] * axes.mT)
-    return inner * scale[:, None] * scale, float(variances.max().sqrt())

@@ -14,7 +14,9 @@ from mapping.map_cases import some_motion
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.localization.overlap import Ascent, Motions, Pairs, generators, overlap
+from gmmtorch.localization.motions import Motions, generators
+from gmmtorch.localization.overlap import Pairs, overlap
+from gmmtorch.localization.overlap_ascent import Ascent
 from gmmtorch.localization.registration import register, yaw_starts
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap

@@ -13,7 +13,8 @@ from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_mapper import handle_messages
 from gmmtorch.live.mapper.live_scans import LiveScan, LiveScans
 from gmmtorch.live.ros import Node
-from gmmtorch.localization.tracker import Location, Tracker
+from gmmtorch.localization.location import Location
+from gmmtorch.localization.tracker import Tracker
 from gmmtorch.mapping.gaussian_map import GaussianMap
 
 MAP = "map"
