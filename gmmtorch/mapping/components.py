@@ -83,6 +83,30 @@ class Components:
             seen_count=zeros(0),
         )
 
+    @classmethod
+    def given(
+        cls,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        support: ArrayLike,
+        origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]],
+        max_range: ArrayLike | None,
+        robot: int,
+    ) -> Components:
+        """Components for the arguments of `GaussianMap.from_components`, numbered from 0."""
+        mean, weight = as_tensor(means, "means", torch.float64), as_tensor(support, "support", torch.float64)
+        if mean.ndim != 2 or mean.shape[1] not in (2, 3):
+            raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
+        k = mean.shape[0]
+        if weight.shape != (k,):
+            raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
+        flags = as_tensor([False] * k if max_range is None else max_range, "max_range", torch.bool)
+        ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
+        covariance = as_tensor(covariances, "covariances", torch.float64)
+        parts = (covariance, weight, flags, ids, *_viewpoints(origins, weight.cpu(), mean.shape[1]))
+        # Copies: later writes to the given arrays do not change the components.
+        return cls(mean.clone(), *(part.to(mean.device, copy=True) for part in parts))
+
     @property
     def dim(self) -> int:
         return self.means.shape[1]
@@ -212,7 +236,7 @@ class Components:
         return self
 
 
-def viewpoints_of(
+def _viewpoints(
     origins: ArrayLike | Sequence[Sequence[tuple[ArrayLike, float]]], support: Tensor, dim: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The fields origins, seen_by, seen_from and seen_count for the `origins` of `from_components`."""

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Unpack
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, check_choice, check_whole
+from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_whole
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec import map_file
 from gmmtorch.mapping.codec.component_batch import quantized
-from gmmtorch.mapping.components import Components, viewpoints_of
-from gmmtorch.mapping.learning.depth_frame import DepthFrame
+from gmmtorch.mapping.components import Components
+from gmmtorch.mapping.learning.depth_frame import DepthFrame, depth_and_pose
 from gmmtorch.mapping.learning.learner import Learner
 from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule, read_rule
+from gmmtorch.mapping.map_state import MapState
 from gmmtorch.mapping.query import Query
 from gmmtorch.mapping.query_options import HitLength, MapOptions, QueryOptions, Sampling, check_method
 from gmmtorch.occupancy.evidence import Evidence
@@ -29,22 +30,8 @@ from gmmtorch.occupancy.grid import VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries, check_scan
 from gmmtorch.scan import Scan, as_time, extent
 
-_BUFFERS = tuple(f.name for f in fields(Components))
-_STATE = "_extra_state"  # torch's name of it in a state dict
 
-
-def _field(name: str) -> Any:
-    """A property: a field of all components, not rounded, those of the unfinished window included."""
-
-    def read(self: GaussianMap) -> Tensor:
-        if self.dim is None:
-            raise AttributeError(name)  # `__getattr__` explains it
-        return cast(Tensor, getattr(self._with_pending(), name))
-
-    return property(read)
-
-
-class GaussianMap(nn.Module):
+class GaussianMap(MapState):
     """A map that learns Gaussian components from windows of neighbouring scans.
 
     The components are buffers, and attributes: means, covariances, support, max_range, ids, origins, seen_by,
@@ -81,16 +68,6 @@ class GaussianMap(nn.Module):
     settings. `state_dict` holds everything that learning continues from, and loads into any map.
     """
 
-    means = _field("means")
-    covariances = _field("covariances")
-    support = _field("support")
-    max_range = _field("max_range")
-    ids = _field("ids")
-    origins = _field("origins")
-    seen_by = _field("seen_by")
-    seen_from = _field("seen_from")
-    seen_count = _field("seen_count")
-
     any_resolution = True
     suffix = ".safetensors"
 
@@ -112,7 +89,6 @@ class GaussianMap(nn.Module):
         memory_limit: int = 4 << 30,
         compiled: bool = False,
     ) -> None:
-        super().__init__()
         check_method(method)
         check_choice("codec", codec, map_file.CODECS)
         rule = IncrementalRule() if learning is None else learning
@@ -131,15 +107,9 @@ class GaussianMap(nn.Module):
             memory_limit=memory_limit,
             compiled=compiled,
         )
-        self.resolution = check_resolution(resolution)
-        self.method = method
-        self.codec = codec
-        self.robot = check_whole("robot", robot, 0)
-        self.query_options = query
-        self._learner = Learner(rule, random_state)
-        self._learned: Components | None = None
-        self._rounded: Components | None = None
-        self._query: Query | None = None
+        number = check_whole("robot", robot, 0)
+        settings = map_file.MapSettings(check_resolution(resolution), method, codec, number, query)
+        super().__init__(Learner(rule, random_state), settings)
 
     def __repr__(self) -> str:
         scans = f"{self.n_pending} pending scan{'s' if self.n_pending != 1 else ''}"
@@ -152,11 +122,6 @@ class GaussianMap(nn.Module):
             size = f"{len(known)} components in {self.dim}D{extent(known.means)}, {self.nbytes} bytes"
             size += f", {scans}" if self.n_pending else ""
         return f"GaussianMap({size}, {type(self.learning).__name__}, {self._device})"
-
-    def __getattr__(self, name: str) -> Any:
-        if name in _BUFFERS:
-            raise AttributeError(f"{name}: the map is empty; insert a scan first.")
-        return super().__getattr__(name)
 
     @classmethod
     def from_components(
@@ -177,21 +142,8 @@ class GaussianMap(nn.Module):
             max_range: (K,) True for components of no-return beams. None: no component is.
             options: as for `GaussianMap`; the default `codec` is "float".
         """
-        mean, weight = as_tensor(means, "means", torch.float64), as_tensor(support, "support", torch.float64)
-        if mean.ndim != 2 or mean.shape[1] not in (2, 3):
-            raise InvalidArgumentError(f"means has shape {tuple(mean.shape)}; expected (K, 2) or (K, 3).")
-        k = mean.shape[0]
-        if weight.shape != (k,):
-            raise InvalidArgumentError(f"support has shape {tuple(weight.shape)}; expected ({k},).")
-        flags = as_tensor([False] * k if max_range is None else max_range, "max_range", torch.bool)
         robot = check_whole("robot", options.get("robot", 0), 0)
-        ids = torch.stack([torch.full((k,), robot), torch.arange(k)], 1)
-        viewpoints = viewpoints_of(origins, weight.cpu(), mean.shape[1])
-        covariance = as_tensor(covariances, "covariances", torch.float64)
-        parts = (covariance, weight, flags, ids, *viewpoints)
-        # Copies: later writes to the given arrays do not change the map.
-        copies = (part.to(mean.device, copy=True) for part in parts)
-        return cls.of(Components(mean.clone(), *copies), **options)
+        return cls.of(Components.given(means, covariances, support, origins, max_range, robot), **options)
 
     @classmethod
     def of(cls, components: Components, **options: Unpack[MapOptions]) -> GaussianMap:
@@ -241,7 +193,7 @@ class GaussianMap(nn.Module):
             return
 
         def frame_of(index: int) -> DepthFrame:
-            given = _frame(frames, index)
+            given = depth_and_pose(frames, index)
             return DepthFrame.of(*given, intrinsics, pixel_stride, max_range, depth_scale)
 
         first = frame_of(0)
@@ -251,13 +203,6 @@ class GaussianMap(nn.Module):
         self._learner.rule = self.learning.fitted([first])
         taken = (frame_of(index).to(self._device) for index in range(len(frames)))
         self._set(self._learner.absorb(self._final(), taken, self.settings, float(pixel_stride**2)))
-
-    def _prepare(self, dim: int, device: torch.device, what: str) -> None:
-        """Gives an empty map its dimension. Raises if the map has another one."""
-        if self.dim is None:
-            self._set(Components.empty(dim, device))
-        elif dim != self.dim:
-            raise InvalidArgumentError(f"{what} {dim}-dimensional, but the map is {self.dim}-dimensional.")
 
     def finish(self) -> None:
         """Learns from the scans of the unfinished window now instead of at the first query. Changes no
@@ -283,76 +228,9 @@ class GaussianMap(nn.Module):
         check_rigid(matrix, components.dim)
         self._commit(components.transformed(matrix, components.has_id(ids)))
 
-    def _final(self) -> Components:
-        """The components without those of the unfinished window, not rounded."""
-        if self.dim is None:
-            raise InvalidArgumentError("The map is empty; insert a scan first.")
-        buffers = {name: self._buffers[name] for name in _BUFFERS}
-        return Components(**{name: value for name, value in buffers.items() if value is not None})
-
-    def _with_pending(self) -> Components:
-        """All components, not rounded."""
-        if self._learned is None:
-            self._learned = self._learner.preview(self._final(), self.settings)
-        return self._learned
-
-    @property
-    def settings(self) -> map_file.MapSettings:
-        """What the map's file states about it, besides the components and the learning rule."""
-        options = self.resolution, self.method, self.codec, self.robot, self.query_options
-        return map_file.MapSettings(*options, self._learner.time)
-
-    def _commit(self, components: Components) -> None:
-        """Replaces all components, those of the unfinished window included."""
-        self._learner.commit(components)
-        self._set(components)
-
-    def _set(self, components: Components) -> None:
-        for name in _BUFFERS:
-            self._buffers[name] = getattr(components, name)  # properties have the names of the buffers
-        self._forget()
-
-    def _forget(self) -> None:
-        """Drops what was computed from the components."""
-        self._learned, self._rounded, self._query = None, None, None
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> GaussianMap:
-        """Moves the map and its pending scans between devices. Types stay: positions need float64."""
-        super()._apply(lambda tensor: tensor.to(fn(tensor.new_empty(0)).device), recurse)
-        if self.dim is not None:
-            self._learner.pending = [scan.to(self._device) for scan in self._learner.pending]
-        self._forget()
-        return self
-
-    @property
-    def learning(self) -> LearningRule:
-        """The learning rule, with the options that the first windows determined."""
-        return self._learner.rule
-
-    @property
-    def dim(self) -> int | None:
-        """2 or 3; None while the map is empty."""
-        means = self._buffers.get("means")
-        return None if means is None else means.shape[1]
-
-    @property
-    def _device(self) -> torch.device | None:
-        means = self._buffers.get("means")
-        return None if means is None else means.device
-
     @property
     def n_components(self) -> int:
         return len(self.components()) if self.dim is not None else 0
-
-    @property
-    def n_final(self) -> int:
-        """Number of components without those of the unfinished window, which is not learned for it."""
-        return 0 if self.dim is None else len(self._final())
-
-    @property
-    def n_pending(self) -> int:
-        """Number of scans of the unfinished window. If it is 0, all components are final."""
-        return len(self._learner.pending)
 
     # -- queries --------------------------------------------------------------------------------------
 
@@ -424,53 +302,3 @@ class GaussianMap(nn.Module):
         made._learner.resume(next_number, time)
         made._commit(components)
         return made
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The learning rule, the pending scans and the counters, as part of `state_dict`."""
-        return self._learner.state()
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        local_metadata: dict[str, Any],
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        """Takes components of any number, also into an empty map. A state without the extra state gives a
-        map whose components are all final. Raises `DataError` for a damaged state, and changes nothing."""
-        own = {key.removeprefix(prefix): v for key, v in state_dict.items() if key.startswith(prefix)}
-        state = own.pop(_STATE, None)
-        missing = [name for name in _BUFFERS if name not in own]
-        if strict:
-            unexpected_keys += [prefix + name for name in own if name not in _BUFFERS]
-        if missing and (state is None or len(missing) < len(_BUFFERS)):
-            missing_keys += [prefix + name for name in missing]
-            return
-        try:
-            learner = self._learner if state is None else self._learner.restored(state)
-            components = None if missing else Components(**{name: own[name] for name in _BUFFERS}).checked()
-        except (GmmTorchError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise DataError(f"The state of the map is damaged ({error}).") from error
-        device = self._device
-        for name in _BUFFERS:
-            self._buffers.pop(name, None)
-        self._learner = learner
-        if state is None:
-            learner.pending = []
-        if components is not None:
-            self._set(Components(**{n: v.detach().clone().to(device) for n, v in vars(components).items()}))
-            learner.next_number = map_file.number_after(components.ids, learner.next_number)
-        self._forget()
-
-
-def _frame(frames: Sequence[tuple[ArrayLike, ArrayLike]], index: int) -> tuple[ArrayLike, ArrayLike]:
-    """Depth and pose of a frame. Raises `InvalidArgumentError` for anything but a pair."""
-    frame = frames[index]
-    if not isinstance(frame, tuple | list) or len(frame) != 2:
-        raise InvalidArgumentError(
-            f"frames[{index}] is a {type(frame).__name__}; give pairs (depth (H, W), pose (4, 4))."
-        )
-    return frame[0], frame[1]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels.mixtures.depth_cells import DepthCells, DepthView, depth_cells
 from gmmtorch.linalg import check_rigid
 from gmmtorch.mixture.em.cells import coarsest_allowed
@@ -145,3 +146,13 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
 def as_scans(window: Iterable[Scan | DepthFrame]) -> list[Scan]:
     """The scans of frames; scans as they are."""
     return [frame.scan() if isinstance(frame, DepthFrame) else frame for frame in window]
+
+
+def depth_and_pose(frames: Sequence[tuple[ArrayLike, ArrayLike]], index: int) -> tuple[ArrayLike, ArrayLike]:
+    """Depth and pose of frame `index`. Raises `InvalidArgumentError` for anything but a pair."""
+    frame = frames[index]
+    if not isinstance(frame, tuple | list) or len(frame) != 2:
+        raise InvalidArgumentError(
+            f"frames[{index}] is a {type(frame).__name__}; give pairs (depth (H, W), pose (4, 4))."
+        )
+    return frame[0], frame[1]
