@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import open3d as o3d
 import torch
-from tables import hardware, markdown
+from tables import hardware, markdown, publish
 from torch import Tensor
 
 from gmmtorch import WindowedRule, datasets
@@ -59,12 +59,15 @@ class Method(NamedTuple):
     align: Callable[[Any, Any, Tensor], Tensor]
 
 
-def ours() -> Method:
+def ours(coarsest: float | None = None) -> Method:
     def prepare(cloud: Cloud) -> tuple[Any, int]:
         sent = codec.encode(learn_window(cloud.scans, RULE, torch.Generator().manual_seed(0)))
         return codec.decode(sent), len(sent)
 
-    return Method(prepare, lambda source, target, start: register(source, target, start).transform)
+    def align(source: Any, target: Any, start: Tensor) -> Tensor:
+        return register(source, target, start, coarsest=coarsest).transform
+
+    return Method(prepare, align)
 
 
 def icp(voxel: float | None, planes: bool) -> Method:
@@ -95,6 +98,7 @@ def icp(voxel: float | None, planes: bool) -> Method:
 
 METHODS = {
     "mixtures": ours(),
+    "mixtures, `coarsest=0.25`": ours(coarsest=0.25),
     "ICP, point to point": icp(None, False),
     "ICP, point to plane": icp(None, True),
     f"point to point, voxels of {VOXEL:g} m": icp(VOXEL, False),
@@ -148,9 +152,11 @@ def main() -> None:
             "align (s)",
             "bytes",
         ]
-        print(markdown(header, []), flush=True)
+        rows = []
         for label, method in METHODS.items():
-            print(markdown(row(label, method, clouds, options.draws), []).splitlines()[0], flush=True)
+            rows.append(row(label, method, clouds, options.draws))
+            print(*rows[-1], sep=" | ", flush=True)
+        publish(f"registration-{name}", markdown(header, rows))
         print(f"\nmixtures, unknown pose, 12 headings: {unknown(clouds)}")
 
 

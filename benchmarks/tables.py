@@ -1,4 +1,7 @@
-"""Tables of measurements, written between markers into BENCHMARKS.md."""
+"""Tables of measurements, written between markers into BENCHMARKS.md.
+
+If the environment variable GMMTORCH_TABLES names a folder, tables and logs go there and no page changes.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from gmmtorch.files import write_bytes
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "BENCHMARKS.md"
+OUTPUTS = Path(os.environ.get("GMMTORCH_TABLES") or ROOT / "outputs")
 
 
 def hardware() -> str:
@@ -40,7 +44,10 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def publish(name: str, text: str, file: Path = PAGE) -> None:
-    """Put `text` between the markers of `name` in a page, which must have them."""
+    """Put `text` between the markers of `name` in a page, which must have them, or into GMMTORCH_TABLES."""
+    if os.environ.get("GMMTORCH_TABLES"):
+        write_bytes(OUTPUTS / f"{name}.md", f"{text}\n".encode())
+        return
     page = file.read_text()
     begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
     if begin not in page or end not in page:
