@@ -18,7 +18,9 @@ from gmmtorch.live import viewer_scene
 from gmmtorch.live.ros import Node
 from gmmtorch.live.ros.quality import LATCHED
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.query import Query, probability
 from gmmtorch.occupancy.evidence import CellClass, Thresholds
+from gmmtorch.occupancy.forms.kept_evidence import KeptEvidence
 from gmmtorch.occupancy.grid import VoxelGrid
 
 CLOUDS = ("cells", "means", "none")
@@ -59,6 +61,7 @@ class MapPublisher:
         self._node, self._resolution, self._cloud = node, resolution, cloud
         self._band = None if z_min is None and z_max is None else (z_min, z_max)
         self._rule = Thresholds()
+        self._evidence = KeptEvidence(resolution)
         self._last: _Grid | None = None
         self._published_at = 0.0
         self._send_grid = node.publisher("map", "nav_msgs/msg/OccupancyGrid")
@@ -94,8 +97,9 @@ class MapPublisher:
             grid = VoxelGrid.covering(low, high, self._resolution, shown.query_options.memory_limit)
             if shown.method != "point":
                 return grid, shown.evidence(grid).probability(shown.query_options.prior).cpu()
-            theta = shown.occupancy(grid.centers(), self._resolution)
-            return grid, torch.as_tensor(theta).reshape(grid.shape).cpu()
+            query = Query(shown.components().cones(), shown.query_options)
+            evidence = self._evidence.update(query.cones, grid, query.cutoff)
+            return grid, probability(evidence, self._resolution, query.options).cpu()
         except (InvalidArgumentError, MemoryLimitError) as error:  # no floor yet, or too large
             self._node.warn("grid", f"topic map is not published: {error}")
             return None, torch.empty(0)

@@ -129,6 +129,10 @@ class PointForm:
         compiled: use torch.compile. It needs a C++ compiler, and tens of seconds for the first call.
         indexed: True evaluates only cones near a point, found by a `ConeIndex`; False evaluates all cones,
             which is faster for a few points.
+
+    Attributes:
+        rows: (C, n) what the evidence depends on, a row for each cone. Equal rows give equal evidence.
+        index: lists the cones near a point.
     """
 
     def __init__(
@@ -146,7 +150,7 @@ class PointForm:
             raise InvalidArgumentError(f"cutoff={cutoff} must be finite and above zero.")
         self.dim, self.cutoff, self.compiled = cones.dim, float(cutoff), compiled
         self._table = _table_of(cones, self.resolution)
-        self._rows = self._table.rows(self.resolution)
+        self.rows = self._table.rows(self.resolution)
         entries = None if indexed else 0
         self.index = ConeIndex(cones, self.resolution, cutoff, smoothed=True, entries_per_cone=entries)
 
@@ -171,10 +175,10 @@ class PointForm:
 
     def _evaluate(self, points: Tensor, chunk_pairs: int) -> PointEvidence:
         bucket = self.index.buckets(points)
-        if is_fused(points, self._rows):
+        if is_fused(points, self.rows):
             lists = self.index.starts, self.index.entries
             order = self.index.in_space_order(points, bucket)
-            found = listed_evidence(points, order, bucket, lists, self._rows, self.resolution, self.cutoff)
+            found = listed_evidence(points, order, bucket, lists, self.rows, self.resolution, self.cutoff)
             return PointEvidence(*found)
         zeros = torch.zeros_like(points[:, 0])
         if not bool((bucket >= 0).any()):

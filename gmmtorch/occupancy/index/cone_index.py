@@ -7,6 +7,7 @@ does.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -90,13 +91,16 @@ class ConeIndex:
         self.extent = check_resolution(extent)
         cones = cones.checked()
         self.dim = cones.dim
-        hulls = self.hulls = Hulls(cones, self.extent, cutoff, smoothed)
+        self._options = self.extent, cutoff, smoothed
+        self._most_buckets = 1 << (_KEY_BITS[self.dim] - 1)  # along an axis
+        hulls = self.hulls = Hulls(cones, *self._options)
         low, high = hulls.bounds()
         not_empty = len(cones.counts) > 0
         self.origin = low.amin(0) if not_empty else low.new_zeros(self.dim)
+        self._top = high.amax(0) if not_empty else self.origin
         # The finest buckets whose coordinates fit the bits of the key.
-        span = float((high.amax(0) - self.origin).amax()) * (1 + 1e-9) if not_empty else 0.0
-        finest = max(self.extent, span / (1 << (_KEY_BITS[self.dim] - 1)))
+        span = float((self._top - self.origin).amax()) * (1 + 1e-9)
+        finest = max(self.extent, span / self._most_buckets)
         if entries_per_cone == 0:
             every = torch.arange(len(cones.counts), device=low.device)
             cone, cell, self.side = every, torch.zeros(len(every), self.dim).to(every), max(span, finest)
@@ -104,13 +108,49 @@ class ConeIndex:
             budget = (entries_per_cone or _ENTRIES_PER_CONE[self.dim]) * len(cones.counts)
             lattice = _Lattice(low - self.origin, high - self.origin, self.origin, finest)
             cone, cell, self.side = _search(hulls, lattice, budget)
-        key = self._pack(cell)
-        order = argsort(key)
+        self._list(self._pack(cell), cone)
+
+    def _list(self, key: Tensor, cone: Tensor) -> None:
+        """Makes the lists of pairs of a bucket's key (P,) and a cone (P,)."""
+        order = argsort(cone)
+        order = order[argsort(key[order])]
         bucket, n_buckets = dense_ranks(key[order])
         self.entries = cone[order]
         self.starts = torch.zeros(n_buckets + 1, dtype=torch.int64, device=key.device)
         self.starts[1:] = torch.cumsum(torch.bincount(bucket, minlength=n_buckets), 0)
         self.keys = key[order][self.starts[:-1]]
+
+    def replaced(self, cones: Cones, former: Tensor) -> tuple[ConeIndex, Tensor]:
+        """The index of other cones, and the buckets (n_buckets,) of it whose lists changed.
+
+        Only the buckets of new cones are searched. They have the size of those of this index, unless the
+        cones lie too far apart for it.
+
+        Args:
+            cones: C cones; must not change afterwards.
+            former: (C,) the number of each cone in this index, −1 for a new one. The others ascend.
+        """
+        cones = cones.checked()
+        made = copy.copy(self)
+        made.hulls = Hulls(cones, *self._options)
+        added, kept = (former < 0).nonzero().squeeze(1), (former >= 0).nonzero().squeeze(1)
+        hulls = Hulls(Cones(*(part[added] for part in cones)), *self._options)
+        low, high = hulls.bounds()
+        shift = ((self.origin - torch.cat([low, self.origin[None]]).amin(0)) / self.side).ceil().long()
+        made.origin = self.origin - shift * self.side
+        made._top = torch.cat([high, self._top[None]]).amax(0)
+        if float((made._top - made.origin).amax()) > self.side * self._most_buckets:
+            made = ConeIndex(cones, *self._options)
+            return made, torch.ones_like(made.keys, dtype=torch.bool)
+        lattice = _Lattice(low - made.origin, high - made.origin, made.origin, self.side)
+        new, cell, _ = _search(hulls, lattice, math.inf)
+        number = torch.full_like(self.hulls.distance, -1, dtype=torch.int64)
+        number[former[kept]] = kept
+        key = torch.repeat_interleave(self.keys + self._pack(shift[None]), self.list_lengths())
+        cone = number[self.entries]
+        stays, found = cone >= 0, self._pack(cell)
+        made._list(torch.cat([key[stays], found]), torch.cat([cone[stays], added[new]]))
+        return made, torch.isin(made.keys, torch.cat([key[~stays], found]))
 
     @property
     def n_buckets(self) -> int:
@@ -200,7 +240,7 @@ class _Lattice(NamedTuple):
         return cone[row], torch.stack(cells, 1)
 
 
-def _search(hulls: Hulls, lattice: _Lattice, budget: int) -> tuple[Tensor, Tensor, float]:
+def _search(hulls: Hulls, lattice: _Lattice, budget: float) -> tuple[Tensor, Tensor, float]:
     """Entries of the lists, cone (P,) and bucket (P, D), and the side (m) of the buckets.
 
     The search starts with a few large buckets for each cone and halves those that its hull meets. It stops

@@ -18,7 +18,7 @@ from test_live_scans import laser, recorded
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_topics import LASER
+from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LASER
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.mapper.bag_player import BagPlayer
 from gmmtorch.live.mapper.live_mapper import LiveMapper
@@ -126,6 +126,27 @@ def test_the_grid_has_the_layout_of_ros_and_updates_where_it_changed():
     assert np.array_equal(update["data"], changed[1:3, 2])
     publisher._publish_grid(last._replace(cells=changed), {}, 7)
     assert len(user.take("map_updates")) == 1  # nothing has changed
+
+
+@pytest.mark.parametrize("kind", [LASER, CLOUD])
+def test_the_grid_of_a_growing_map_is_that_of_all_its_components(tmp_path, kind):
+    user: Any = Recorder()
+    publisher, target = MapPublisher(user, 0.1, cloud="none", ellipsoids=False), GaussianMap(window=2)
+    for index, scan in enumerate(load("rosbag", recorded(tmp_path / "a.bag", kind))):
+        target.insert(scan)
+        if index % 4:
+            continue
+        publisher.publish(GaussianMap.of(target.components()), "map", 0)
+        alone = MapPublisher(Recorder(), 0.1, cloud="none", ellipsoids=False)  # type: ignore[arg-type]
+        alone.publish(GaussianMap.of(target.components()), "map", 0)
+        assert publisher._last is not None
+        assert alone._last is not None
+        assert publisher._last.grid == alone._last.grid
+        assert np.array_equal(publisher._last.cells, alone._last.cells)
+        band, theta = publisher._probabilities(target)
+        assert band is not None
+        expected = torch.as_tensor(target.occupancy(publisher._evidence.centers(band), 0.1))
+        torch.testing.assert_close(theta.flatten(), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_a_killed_mapper_continues_after_its_checkpoint(node, tmp_path):
