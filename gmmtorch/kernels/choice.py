@@ -64,12 +64,18 @@ def is_fused(*tensors: Tensor | None) -> bool:
     choice = chosen_kernels()
     if choice == "torch":
         return False
-    given = [tensor for tensor in tensors if tensor is not None]
-    if any(type(tensor) not in (torch.Tensor, torch.nn.Parameter) for tensor in given):
-        return False
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
-        return False
-    if len({tensor.device for tensor in given}) != 1 or given[0].device.type not in ("cpu", "cuda"):
+    device = None
+    for tensor in tensors:
+        if tensor is None:
+            continue
+        if type(tensor) is not torch.Tensor and type(tensor) is not torch.nn.Parameter:
+            return False
+        if tensor.requires_grad and torch.is_grad_enabled():
+            return False
+        if device is not None and tensor.device != device:
+            return False
+        device = tensor.device
+    if device is None or device.type not in ("cpu", "cuda"):
         return False
     if choice == "fused":
         _require_compiler()

@@ -6,11 +6,14 @@ result is cached in a folder; without a folder that can be written, in a tempora
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import itertools
+import linecache
 import logging
 import os
 import re
+import struct
 import sys
 import tempfile
 import threading
@@ -19,7 +22,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,6 +32,8 @@ from gmmtorch.errors import GmmTorchError
 logger = logging.getLogger(__name__)
 
 _TYPES = {"int64": "int64", "double": "float64", "float": "float32", "bool": "bool"}
+_PACKED = {"int64": "q", "double": "d", "float": "f4x", "bool": "?7x"}
+"""Formats of `struct` that place each argument of a CPU in eight bytes."""
 _POINTERS = {"int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
 _LEAST_ITEMS = 1 << 10  # of a thread
 _lock = threading.RLock()
@@ -68,29 +73,14 @@ class FusedKernel:
         rounds_each: bool = False,
     ) -> None:
         self.name, self.shares, self._strided, self._rounds_each = name, shares, strided, rounds_each
-        self._labels: list[str] = []
-        casts, names, types = [], [], []
-        for parameter in parameters.split(","):
-            match = re.fullmatch(r"\s*(const\s+)?(\w+)\s*(\*?)\s*(\w+)\s*", parameter)
-            if match is None:
-                raise ValueError(f"parameter {parameter!r} of kernel {name} is not `type name`.")
-            const, kind, star, label = match.groups()
-            self._labels.append(label)
-            names.append(label + "_" if star else label)
-            types.append("uint64" if star else _TYPES[kind])
-            if star:
-                cpp = f"{const or ''}{_POINTERS.get(kind, kind)}*"
-                casts.append(f"{cpp} {label} = ({cpp}){label}_;")
-        signature = ", ".join(f"{n}: wp.{t}" for n, t in zip(names, types, strict=True))
-        self._body = _PRELUDE + "\n".join(casts) + body
-        self._stub = f"def {name}_body(item: wp.int64, {signature}): ...\n"
-        self._entry = (
-            f"def {name}(begin: wp.int64, {signature}):\n"
-            f"    {name}_body(begin + wp.int64(wp.tid()), {', '.join(names)})\n"
+        self._parameters = [_parsed(parameter, name) for parameter in parameters.split(",")]
+        self._packed = struct.Struct(
+            "=" + "".join("Q" if p.pointer else _PACKED[p.type] for p in self._parameters)
         )
-        self._kernel: Any = None
+        self._body = body
+        self._kernels: dict[str, Any] = {}  # of Warp, by type of device
         self._loaded: set[torch.device] = set()
-        self._launches = threading.local()
+        self._threads = threading.local()
 
     def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
         """Run the body for the items 0 … n_items − 1.
@@ -101,48 +91,51 @@ class FusedKernel:
         """
         if n_items == 0:
             return
-        values = [self._value(*pair) for pair in zip(self._labels, arguments, strict=True)]
-        self.load(device)
-        wp = _warp()
+        values = self._values(arguments)
+        if device not in self._loaded:
+            self.load(device)
         if device.type == "cuda":
+            wp = _warp()
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-            wp.launch(self._kernel, dim=n_items, inputs=[0, *values], device=str(device), stream=stream)
+            wp.launch(self._kernels["cuda"], dim=n_items, inputs=values, device=str(device), stream=stream)
             return
+        launch = self._launch_of_thread()
+        self._packed.pack_into(launch.block, 0, *values)
         n_threads = 1 if self.shares else min(torch.get_num_threads(), 1 + n_items // _LEAST_ITEMS)
         if n_threads == 1:
-            self._launch_again(wp, n_items, [0, *values])
+            launch(0, n_items, launch.block)
             return
         bounds = [n_items * part // n_threads for part in range(n_threads + 1)]
         jobs = [
             _threads(n_threads).submit(
-                wp.launch, self._kernel, dim=stop - begin, inputs=[begin, *values], device="cpu"
+                lambda *part: self._launch_of_thread()(*part), begin, stop, launch.block
             )
             for begin, stop in itertools.pairwise(bounds)
         ]
         for job in jobs:
             job.result()  # Warp releases the interpreter's lock during a launch
 
-    def _launch_again(self, wp: Any, n_items: int, values: list[float]) -> None:
-        """Repeat this thread's last launch on the CPU with other values: a new one takes twice as long."""
-        launch = getattr(self._launches, "last", None)
-        if launch is None:
-            launch = wp.launch(self._kernel, dim=n_items, inputs=values, device="cpu", record_cmd=True)
-            self._launches.last = launch
-        else:
-            launch.set_dim(n_items)
-            launch.set_params_from_ctypes(values)
-        launch.launch()
+    def _values(self, arguments: tuple[Tensor | float | None, ...]) -> list[float]:
+        """What is passed for the arguments: the address of a tensor, 0 for None."""
+        values: list[float] = []
+        for parameter, argument in zip(self._parameters, arguments, strict=True):
+            if isinstance(argument, Tensor):
+                if not argument.is_contiguous() and parameter.label not in self._strided:
+                    raise GmmTorchError(
+                        f"{parameter.label} of kernel {self.name} has shape {tuple(argument.shape)} and "
+                        f"strides {argument.stride()}, which are not contiguous; pass tensor.contiguous()."
+                    )
+                values.append(argument.data_ptr())
+            else:
+                values.append(0 if argument is None else argument)
+        return values
 
-    def _value(self, label: str, argument: Tensor | float | None) -> float:
-        """What is passed for an argument: the address of a tensor, 0 for None."""
-        if not isinstance(argument, Tensor):
-            return 0 if argument is None else argument
-        if not argument.is_contiguous() and label not in self._strided:
-            raise GmmTorchError(
-                f"{label} of kernel {self.name} has shape {tuple(argument.shape)} and strides "
-                f"{argument.stride()}, which are not contiguous; pass tensor.contiguous()."
-            )
-        return argument.data_ptr()
+    def _launch_of_thread(self) -> _CpuLaunch:
+        """The launch of this thread, which is repeated with other values: a new one takes much longer."""
+        launch: _CpuLaunch | None = getattr(self._threads, "launch", None)
+        if launch is None:
+            launch = self._threads.launch = _CpuLaunch(self._kernels["cpu"], self._packed.size)
+        return launch
 
     def load(self, device: torch.device) -> None:
         """Compile the kernel for a device, or load it from the cache; nothing if that is done.
@@ -155,9 +148,7 @@ class FusedKernel:
             if device in self._loaded:
                 return
             wp = _warp()
-            if self._kernel is None:
-                self._kernel = self._defined(wp)
-            module, block = self._kernel.module, 1 if device.type == "cpu" else None
+            module, block = self.defined(device.type).module, 1 if device.type == "cpu" else None
             if not (Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block)).is_dir():
                 _announce(str(device), wp.config.kernel_cache_dir)
             begin = time.perf_counter()
@@ -170,21 +161,94 @@ class FusedKernel:
             logger.debug("Kernel %s is ready after %.2f s.", self.name, time.perf_counter() - begin)
             self._loaded.add(device)
 
-    def _defined(self, wp: Any) -> Any:
-        """The kernel of Warp: the body and its entry, in a module of their own."""
-        import linecache
+    def defined(self, kind: str) -> Any:
+        """The kernel of Warp for the type of device "cpu" or "cuda", in a module of its own."""
+        if kind not in self._kernels:
+            wp = _warp()
+            native, stub, entry = self._for_cpu() if kind == "cpu" else self._for_cuda()
+            scope: dict[str, Any] = {
+                "wp": wp,
+                "__name__": f"gmmtorch_{self.name}{'_cuda' * (kind == 'cuda')}",
+            }
+            for part, code in (("stub", stub), ("entry", entry)):
+                path = f"<gmmtorch kernel {self.name} {kind} {part}>"
+                linecache.cache[path] = (len(code), None, code.splitlines(True), path)
+                exec(compile(code, path, "exec"), scope)
+                if part == "stub":
+                    scope["body"] = wp.func_native(_PRELUDE + native)(scope["body"])
+            module = wp.get_module(scope["__name__"])
+            wp.set_module_options({"fuse_fp": not self._rounds_each}, module)
+            self._kernels[kind] = wp.kernel(
+                scope[self.name], enable_backward=False, module=module, grid_stride=False
+            )
+        return self._kernels[kind]
 
-        for part in (self._stub, self._entry):
-            path = f"<gmmtorch kernel {self.name} {'stub' if part is self._stub else 'entry'}>"
-            linecache.cache[path] = (len(part), None, part.splitlines(True), path)
-        scope: dict[str, Any] = {"wp": wp, "__name__": f"gmmtorch_{self.name}"}
-        exec(compile(self._stub, f"<gmmtorch kernel {self.name} stub>", "exec"), scope)
-        body = f"{self.name}_body"
-        scope[body] = wp.func_native(self._body)(scope[body])
-        exec(compile(self._entry, f"<gmmtorch kernel {self.name} entry>", "exec"), scope)
-        module = wp.get_module(scope["__name__"])
-        wp.set_module_options({"fuse_fp": not self._rounds_each}, module)
-        return wp.kernel(scope[self.name], enable_backward=False, module=module, grid_stride=False)
+    def _for_cpu(self) -> tuple[str, str, str]:
+        """C++ of a loop over items, and the stub and the entry in Python. The arguments come in one block of
+        memory, because Warp takes microseconds for each argument."""
+        read = [
+            f"const auto {p.label} = *({'' if p.pointer else 'const '}{p.cpp}*)(gmm_block + {8 * n});"
+            for n, p in enumerate(self._parameters)
+        ]
+        native = [
+            "const char* gmm_block = (const char*)gmm_block_;",
+            *read,
+            "auto gmm_run = [=](const int64_t item) {",
+            self._body,
+            "};",
+            "for (int64_t item = gmm_begin; item < gmm_stop; ++item) gmm_run(item);",
+        ]
+        names = ("gmm_begin", "gmm_stop", "gmm_block_")
+        signature = ", ".join(
+            f"{n}: wp.{t}" for n, t in zip(names, ("int64", "int64", "uint64"), strict=True)
+        )
+        stub = f"def body({signature}): ...\n"
+        return "\n".join(native), stub, f"def {self.name}({signature}):\n    body({', '.join(names)})\n"
+
+    def _for_cuda(self) -> tuple[str, str, str]:
+        """C++ of one item, and the stub and the entry in Python."""
+        names = [p.label + "_" * p.pointer for p in self._parameters]
+        types = ["uint64" if p.pointer else _TYPES[p.type] for p in self._parameters]
+        casts = [f"{p.cpp} {p.label} = ({p.cpp}){p.label}_;" for p in self._parameters if p.pointer]
+        signature = ", ".join(f"{n}: wp.{t}" for n, t in zip(names, types, strict=True))
+        stub = f"def body(item: wp.int64, {signature}): ...\n"
+        entry = f"def {self.name}({signature}):\n    body(wp.int64(wp.tid()), {', '.join(names)})\n"
+        return "\n".join(casts) + self._body, stub, entry
+
+
+class _Parameter(NamedTuple):
+    """A parameter of a kernel: its name, the type of its values, its type in C++, whether it is a pointer."""
+
+    label: str
+    type: str
+    cpp: str
+    pointer: bool
+
+
+def _parsed(parameter: str, kernel: str) -> _Parameter:
+    match = re.fullmatch(r"\s*(const\s+)?(\w+)\s*(\*?)\s*(\w+)\s*", parameter)
+    if match is None:
+        raise ValueError(f"parameter {parameter!r} of kernel {kernel} is not `type name`.")
+    const, kind, star, label = match.groups()
+    cpp = f"{const or ''}{_POINTERS.get(kind, kind)}{star}"
+    return _Parameter(label, kind, cpp, bool(star))
+
+
+class _CpuLaunch:
+    """A launch of a kernel on a CPU that can be repeated: (begin, stop, block of arguments).
+
+    Attributes:
+        block: memory for the arguments of one launch.
+    """
+
+    def __init__(self, kernel: Any, n_bytes: int) -> None:
+        self.block = ctypes.create_string_buffer(n_bytes)
+        values = [0, 0, ctypes.addressof(self.block)]
+        self._launch = _warp().launch(kernel, dim=1, inputs=values, device="cpu", record_cmd=True)
+
+    def __call__(self, begin: int, stop: int, block: ctypes.Array[ctypes.c_char]) -> None:
+        self._launch.set_params_from_ctypes([begin, stop, ctypes.addressof(block)])
+        self._launch.launch()
 
 
 @functools.cache
