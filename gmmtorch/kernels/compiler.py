@@ -187,8 +187,7 @@ class FusedKernel:
         """C++ of a loop over items, and the stub and the entry in Python. The arguments come in one block of
         memory, because Warp takes microseconds for each argument."""
         read = [
-            f"const auto {p.label} = *({'' if p.pointer else 'const '}{p.cpp}*)(gmm_block + {8 * n});"
-            for n, p in enumerate(self._parameters)
+            f"{p.cpp} {p.label} = *({p.cpp}*)(gmm_block + {8 * n});" for n, p in enumerate(self._parameters)
         ]
         native = [
             "const char* gmm_block = (const char*)gmm_block_;",

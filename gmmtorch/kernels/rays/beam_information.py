@@ -111,7 +111,10 @@ _KERNEL = FusedKernel(
         const float* volume = volumes + t * n_columns;
         int64_t first = 0;  // cell that can be hit
         while (first < n && occupancies[base + offset[first]] == 0.0f) ++first;
-        for (int64_t i = first; i < n; ++i) met[i] = occupancies[base + offset[i]];
+        for (int64_t i = first; i < n; ++i) {{
+            met[i] = occupancies[base + offset[i]];
+            if (met[i] == 1.0f) n = i + 1;  // no beam passes
+        }}
         for (int64_t i = first; i < n; ++i) {{
             const float oo = met[i] * met[i], clear = 1.0f - met[i];
             sharpened[i] = oo / (clear * clear + oo);

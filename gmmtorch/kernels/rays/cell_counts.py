@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -10,53 +12,68 @@ from gmmtorch.kernels.compiler import FusedKernel
 
 _RUN = 256  # cells of an item on a CPU
 
+_BLOCK_BITS = 3
+"""Cells are listed by blocks of 8³ cells, as sparse stores keep them: neighbours stay together in memory."""
+
 _LIST = FusedKernel(
     "list_counted_cells",
-    "int64 ny, int64 nz, const double* hits, const double* misses, const int64* low, int64* n_before,"
-    " int64* cells, float* listed_hits, float* listed_misses",
-    """
-    const double *h = hits + item * nz, *m = misses + item * nz;
-    int64_t n = cells ? n_before[item] : 0;
-    for (int64_t z = 0; z < nz; ++z) {
-        if (!(h[z] > 0.0 || m[z] > 0.0)) continue;
-        if (cells) {
-            cells[3 * n] = item / ny + low[0];
-            cells[3 * n + 1] = item % ny + low[1];
-            cells[3 * n + 2] = z + low[2];
-            listed_hits[n] = (float)h[z];
-            listed_misses[n] = (float)m[z];
-        }
-        ++n;
-    }
+    "int64 nx, int64 ny, int64 nz, int64 blocks_y, int64 blocks_z, const double* hits, const double* misses,"
+    " const int64* low, int64* n_before, int64* cells, float* listed_hits, float* listed_misses",
+    f"""
+    constexpr int64_t BITS = {_BLOCK_BITS};
+    const int64_t block[3] = {{item / (blocks_y * blocks_z), item / blocks_z % blocks_y, item % blocks_z}};
+    const int64_t size[3] = {{nx, ny, nz}};
+    int64_t first[3], stop[3], n = cells ? n_before[item] : 0;
+    for (int a = 0; a < 3; ++a) {{
+        const int64_t begin = (((low[a] >> BITS) + block[a]) << BITS) - low[a];
+        first[a] = GMM_MAX(begin, 0);
+        stop[a] = GMM_MIN(begin + (1 << BITS), size[a]);
+    }}
+    for (int64_t x = first[0]; x < stop[0]; ++x)
+        for (int64_t y = first[1]; y < stop[1]; ++y) {{
+            const double *h = hits + (x * ny + y) * nz, *m = misses + (x * ny + y) * nz;
+            for (int64_t z = first[2]; z < stop[2]; ++z) {{
+                if (!(h[z] > 0.0 || m[z] > 0.0)) continue;
+                if (cells) {{
+                    cells[3 * n] = x + low[0];
+                    cells[3 * n + 1] = y + low[1];
+                    cells[3 * n + 2] = z + low[2];
+                    listed_hits[n] = (float)h[z];
+                    listed_misses[n] = (float)m[z];
+                }}
+                ++n;
+            }}
+        }}
     if (!cells) n_before[item] = n;
     """,
 )
 
 
 def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The C cells with hits or misses of a dense block (nx, ny, nz), row-major.
+    """The C cells with hits or misses of a dense array (nx, ny, nz), by blocks; row-major in each.
 
     Args:
         low: (3,) int64, the lowest cell. hits, misses: float64.
 
     Returns cells (C, 3) int64, hits (C,) and misses (C,), float32.
     """
-    nx, ny, nz = hits.shape
     device = hits.device
+    n_blocks = [(n - 1 >> _BLOCK_BITS) + 2 for n in hits.shape]  # one more, because `low` may cut a block
     if not (is_fused(low, hits, misses) and hits.dtype == misses.dtype == torch.float64):
-        flat = ((hits > 0) | (misses > 0)).flatten().nonzero().squeeze(1)
-        column = flat // nz
-        cells = torch.stack([column // ny, column % ny, flat % nz], 1) + low
-        some = [counts.flatten().index_select(0, flat).float() for counts in (hits, misses)]
-        return cells, some[0], some[1]
-    given = ny, nz, hits.contiguous(), misses.contiguous(), low.contiguous()
-    in_column = torch.empty(nx * ny, dtype=torch.int64, device=device)
-    _LIST(nx * ny, *given, in_column, None, None, None, device=device)
-    until = torch.cumsum(in_column, 0)
-    n = int(until[-1]) if len(until) else 0
+        cells = ((hits > 0) | (misses > 0)).nonzero()
+        x, y, z = ((cells + low >> _BLOCK_BITS) - (low >> _BLOCK_BITS)).unbind(1)
+        cells = cells[((x * n_blocks[1] + y) * n_blocks[2] + z).argsort(stable=True)]
+        some = [counts[cells.unbind(1)].float() for counts in (hits, misses)]
+        return cells + low, some[0], some[1]
+    given = *hits.shape, *n_blocks[1:], hits.contiguous(), misses.contiguous(), low.contiguous()
+    n_items = math.prod(n_blocks)
+    in_block = torch.empty(n_items, dtype=torch.int64, device=device)
+    _LIST(n_items, *given, in_block, None, None, None, device=device)
+    until = torch.cumsum(in_block, 0)
+    n = int(until[-1])
     cells = torch.empty(n, 3, dtype=torch.int64, device=device)
     listed = torch.empty(2, n, device=device)
-    _LIST(nx * ny, *given, until - in_column, cells, listed[0], listed[1], device=device)
+    _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1], device=device)
     return cells, listed[0], listed[1]
 
 

@@ -47,11 +47,20 @@ _REMOVED = FusedKernel(
     _ENTROPY
     + """
     const int64_t stop = GMM_MIN(n_cells, (item + 1) * run);
+    const float lowest = (float)clamp, highest = 1.0f - lowest, each = (float)prior;
+    // Most cells are unknown or certain: their entropies need no logarithm.
+    const float of_unknown = entropy(0.0f, 0.0f, each, lowest);
+    const float of_free = entropy(0.0f, 1e30f, each, lowest);
+    const float of_occupied = entropy(1e30f, 0.0f, each, lowest);
+    auto bits_of = [&](float h, float m) {
+        if (h + m == 0.0f) return of_unknown;
+        const float p = (h + each) / (h + m + 2 * each);
+        return p <= lowest ? of_free : p >= highest ? of_occupied : entropy(h, m, each, lowest);
+    };
     double all = 0.0, some = 0.0, n_new = 0.0;
     for (int64_t c = item * run; c < stop; ++c) {
         const float h = hits[c], m = misses[c];
-        const float gone = entropy(h, m, (float)prior, (float)clamp)
-            - entropy(h + more_hits[c], m + more_misses[c], (float)prior, (float)clamp);
+        const float gone = bits_of(h, m) - bits_of(h + more_hits[c], m + more_misses[c]);
         all += gone;
         if (chosen[c]) {
             some += gone;
@@ -103,13 +112,15 @@ _ALONG = FusedKernel(
     _ENTROPY
     + """
     double sum = 0.0;
+    const double of_unknown = entropy(0.0, 0.0, prior, 0.0) - entropy(0.0, 1.0, prior, 0.0);
     """
     + walk(
         """
         double bits = table[voxel];
         if (bits != bits) {
             const double h = hits[voxel], m = misses[voxel];
-            bits = entropy(h, m, prior, 0.0) - entropy(h, m + 1.0, prior, 0.0);
+            bits = of_unknown;
+            if (h + m > 0.0) bits = entropy(h, m, prior, 0.0) - entropy(h, m + 1.0, prior, 0.0);
             if (h + m < observed) bits += mark;
             table[voxel] = bits;
         }

@@ -11,7 +11,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.compiler import FusedKernel
 
-_RUN = 64  # cells of an item on a CPU, which searches again only where the block changes
+_RUN = 1 << 10  # cells of an item on a CPU, which searches again only where the block changes
 
 
 class BlockKeys(NamedTuple):

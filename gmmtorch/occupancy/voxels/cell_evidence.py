@@ -32,7 +32,7 @@ class CellEvidence(NamedTuple):
 
     @classmethod
     def from_dense(cls, low: Tensor, hits: Tensor, misses: Tensor) -> CellEvidence:
-        """The cells with any evidence of a dense block (nx, ny, nz) whose lowest cell is `low` (3,)."""
+        """The cells with any evidence of a dense array (nx, ny, nz) whose lowest cell is `low` (3,)."""
         return cls(*list_counted_cells(low, hits, misses))
 
 
