@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +10,11 @@ from omegaconf import DictConfig
 
 from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import missions
+from gmmtorch.cli.view import open_live_view, serve
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.mission import Mission
+    from gmmtorch.live.live_view import LiveView
     from gmmtorch.report.progress import ProgressBars
 
 TABLE = (
@@ -38,11 +41,15 @@ def run(config: DictConfig) -> float | None:
 
         load_rerun()  # fails before the mission, not after it
     folder = common.run_dir()
+    view = open_live_view(config)
     with ProgressBars(enabled=config.report.progress) as bars:
-        work = _explore if config.study is None else _compare
-        rows = work(config, folder, bars)
+        rows = (
+            _explore(config, folder, bars, view) if config.study is None else _compare(config, folder, bars)
+        )
     _print_rows(rows)
     common.print_files(folder, folder / "results.json")
+    if view is not None:
+        serve(view)
     return float(rows[-1]["entropy_reduction_bits"])
 
 
@@ -55,6 +62,8 @@ def _check_options(config: DictConfig) -> None:
             f"transport={config.transport!r} is not in_process, the only transport of gmmtorch-explore; "
             "gmmtorch-team has others."
         )
+    if config.view and config.study is not None:
+        raise InvalidArgumentError("view=true shows one mission, not those of a study; leave out experiment.")
     for name, value in config.checkpoint.items():
         if value is not None:
             raise InvalidArgumentError(
@@ -64,7 +73,9 @@ def _check_options(config: DictConfig) -> None:
             )
 
 
-def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[str, Any]]:
+def _explore(
+    config: DictConfig, folder: Path, bars: ProgressBars, view: LiveView | None
+) -> list[dict[str, Any]]:
     """One mission, with pictures; it is not run again in the folder of an equal run."""
     from gmmtorch.cli.reporting.explore_pictures import MissionRecorder
     from gmmtorch.exploration.mission.results import compared
@@ -78,6 +89,7 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
         return [row]
     world = missions.open_world(trial.world, trial.team, bars)
     recorder = MissionRecorder(config, folder, world)
+    show = _shower(view)
 
     def on_tick(mission: Mission) -> None:
         if mission.n_ticks:
@@ -86,6 +98,7 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
             bars.note(STAGE, _status(mission))
             bars(STAGE, round(mission.elapsed), round(trial.team.duration))
             recorder.sample(mission)
+        show(mission)
 
     with common.naming(missions.NAMES):
         mission, row = run_mission(trial, world, on_tick)
@@ -95,6 +108,28 @@ def _explore(config: DictConfig, folder: Path, bars: ProgressBars) -> list[dict[
     keep_row(trial, row, report=report)
     warn_of_robots_at_their_start(mission)
     return [row]
+
+
+def _shower(view: LiveView | None) -> Callable[[Mission], None]:
+    """What shows a mission after each tick; without a view it does nothing."""
+    if view is None:
+        return lambda mission: None
+    from gmmtorch.live.moments import MissionMoments
+
+    known: list[MissionMoments] = []
+
+    def show(mission: Mission) -> None:
+        if not known:
+            known.append(MissionMoments(mission))
+        (moments,) = known
+        if mission.has_sampled:
+            moments.note()
+        if mission.is_over:
+            view.finish(moments)
+        else:
+            view.offer(moments)
+
+    return show
 
 
 def warn_of_robots_at_their_start(mission: Mission) -> None:

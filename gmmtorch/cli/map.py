@@ -12,10 +12,10 @@ from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.recordings import map_recordings
 from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.view import open_viewer, serve
+from gmmtorch.cli.view import open_live_view, serve
 
 if TYPE_CHECKING:
-    from gmmtorch.live.map_viewer import MapViewer
+    from gmmtorch.live.live_view import LiveView
     from gmmtorch.mapping.map_builder import MapBuilder
     from gmmtorch.report.progress import ProgressBars
 
@@ -48,8 +48,8 @@ def run(config: DictConfig) -> None:
     target = maps.map_factory(config, resolution=config.resolution)()
     builder = MapBuilder(dataset, target, device)
     with ProgressBars(enabled=config.report.progress) as bars:
-        viewer = open_viewer() if config.view else None
-        _build(config, builder, folder / _CHECKPOINT, bars, viewer)
+        view = open_live_view(config)
+        _build(config, builder, folder / _CHECKPOINT, bars, view)
         target.save(folder / "map.safetensors")
         trajectory = map_outputs.write_trajectory(builder, folder)
         row = map_outputs.result_row(dataset.name, builder, config)
@@ -63,8 +63,8 @@ def run(config: DictConfig) -> None:
     print(f"\nmap       {folder / 'map.safetensors'}")
     print(*exported, sep="\n", end="\n" if exported else "")
     common.print_files(folder, folder / "results.json")
-    if viewer is not None:
-        serve(viewer)
+    if view is not None:
+        serve(view)
     if errors:
         raise GmmTorchError(f"not all of export={list(config.export)} was written: {' '.join(errors)}")
 
@@ -74,7 +74,7 @@ def _build(
     builder: MapBuilder,
     checkpoint: Path,
     bars: ProgressBars,
-    viewer: MapViewer | None,
+    view: LiveView | None,
 ) -> None:
     """Inserts all scans. If the user stops the run, writes the checkpoint and ends the command."""
     import gmmtorch
@@ -93,13 +93,16 @@ def _build(
         builder.load(checkpoint, run_facts)
         print(f"continues after scan {builder.record.n_read} of {checkpoint}")
     saved = builder.record.seconds
+    moments = map_outputs.moments_of(builder) if view is not None else None
     with app.stop_requests() as is_stopped:
         for now in builder.insert_all():
             bars(_STAGE, now.n_read, now.n_total)
             size = f"{now.n_components:,} components, {byte_text(now.nbytes)}"
             bars.note(_STAGE, f"{size}, {now.metres:,.0f} m")
-            if viewer is not None and builder.map.n_pending == 0:
-                viewer.update(*map_outputs.snapshot(builder))
+            if moments is not None and view is not None:
+                moments.note()
+                if builder.map.n_pending == 0:
+                    view.offer(moments)
             is_over = now.n_read == now.n_total
             if is_stopped() or is_over or now.seconds - saved >= config.checkpoint_seconds:
                 builder.save(checkpoint, run_facts)
@@ -113,8 +116,8 @@ def _build(
                 )
                 sys.exit(130)
     builder.finish()
-    if viewer is not None:
-        viewer.update(*map_outputs.snapshot(builder))
+    if moments is not None and view is not None:
+        view.finish(moments)
 
 
 if __name__ == "__main__":

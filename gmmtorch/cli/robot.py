@@ -17,10 +17,12 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import links, maps, missions
 from gmmtorch.cli.reporting.outputs import Outputs, terse
+from gmmtorch.cli.view import open_live_view, serve
 
 if TYPE_CHECKING:
     from gmmtorch.exploration.mission.driver import Drivable
     from gmmtorch.exploration.mission.robot_view import RobotView
+    from gmmtorch.live.live_view import LiveView
     from gmmtorch.sharing.store import Store
     from gmmtorch.sharing.transport.frames import FramedTransport
 
@@ -160,19 +162,13 @@ def _replaying(
         replica,
         DatasetShard(scans, [indices[row] for row in part]),
         transport,
-        maps.map_factory(_map_options(config)),
+        maps.map_factory(missions.log_map_options(config)),
         rate=config.log.rate,
         store=store,
         announce_every=config.network.announce,
         budget=config.network.budget,
     )
     return mission, ReplayingRobotView(mission, transport)
-
-
-def _map_options(config: DictConfig) -> DictConfig:
-    """The options that `maps.map_factory` reads: `log.map`, on the CPU."""
-    runtime = {"memory_limit": config.runtime.memory_limit, "compile": False, "dtype": "float64"}
-    return OmegaConf.create({"map": config.log.map, "runtime": runtime, "seed": config.seed})
 
 
 # -- its store ------------------------------------------------------------------------------------
@@ -238,18 +234,21 @@ def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path)
     from gmmtorch.cli.reporting.robot_report import RobotReport, print_refusals
     from gmmtorch.exploration.mission.driver import WallClock, drive, settle
 
-    outputs = Outputs(folder)
+    outputs, page = Outputs(folder), open_live_view(config)
+    show = _shower(page, mission, view)
     with RobotReport(config, view, folder) as report, _stop_requested() as is_stopped:
         clock = WallClock(config.speed)
 
         def on_step() -> None:
             view.check_id()
             report(clock.now())
+            show(clock.now(), False)
 
         report(0.0)
         done = drive(mission, clock, stop=is_stopped, on_step=on_step)
         settle(mission, clock, config.settle, stop=is_stopped, on_step=on_step)
         report.finish(clock.now())
+        show(clock.now(), True)
         row = {**view.row(), **report.series, "ticks_late": done.late, "stopped": is_stopped()}
     for name, (file, write) in view.files().items():
         path = outputs.written(file, write)
@@ -265,6 +264,33 @@ def _drive(config: DictConfig, mission: Drivable, view: RobotView, folder: Path)
     print_refusals([row])
     outputs.check()
     common.print_files(folder, folder / "results.json")
+    if page is not None and not row["stopped"]:
+        serve(page)
+
+
+def _shower(page: LiveView | None, mission: Drivable, view: RobotView) -> Callable[[float, bool], None]:
+    """What shows a robot and its teammates at a time (s), the last one or not; nothing without a page."""
+    if page is None:
+        return lambda now, is_last: None
+    from gmmtorch.exploration.mission.mission import Mission
+    from gmmtorch.exploration.mission.replay import ReplayMission
+    from gmmtorch.live.moments import SENT, AgentMoments, ReplayMoments
+
+    def sent() -> tuple[str, float]:
+        return SENT, view.scalars()["wire_bytes_sent"] / 1e3
+
+    moments: AgentMoments | ReplayMoments
+    if isinstance(mission, Mission):
+        moments = AgentMoments(mission.agents[0], mission.trajectories[0], sent)
+    else:
+        assert isinstance(mission, ReplayMission)
+        moments = ReplayMoments(mission, sent)
+
+    def show(now: float, is_last: bool) -> None:
+        moments.note(now)
+        (page.finish if is_last else page.offer)(functools.partial(moments, now))
+
+    return show
 
 
 @contextmanager

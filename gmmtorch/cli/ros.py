@@ -13,7 +13,7 @@ from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.options.structured import build
 from gmmtorch.cli.reporting import map_outputs
-from gmmtorch.cli.view import open_viewer
+from gmmtorch.cli.view import open_live_view
 
 if TYPE_CHECKING:
     from gmmtorch.evaluation.events import Row
@@ -96,6 +96,7 @@ def _play(config: DictConfig, node: Node) -> None:
 def _map(config: DictConfig, node: Node, device: str) -> None:
     """Build a map of the sensor's topic, and write it at the end."""
     from gmmtorch.live.mapper.live_mapper import LiveMapper, warm_up
+    from gmmtorch.live.moments import BuildMoments
     from gmmtorch.report.progress import ProgressBars
 
     make_map = maps.map_factory(config, resolution=config.resolution)
@@ -104,7 +105,8 @@ def _map(config: DictConfig, node: Node, device: str) -> None:
     scans = _scans(config, node)
     mapper = LiveMapper(node, scans, target, _publisher(config, node), config.period, device)
     folder = common.run_dir()
-    viewer = open_viewer() if config.view else None
+    view = open_live_view(config)
+    moments = BuildMoments(mapper.builder, lambda: mapper.nbytes)
     checkpoint = _Checkpoint(config, mapper, folder / _CHECKPOINT)
 
     def after_scan() -> None:
@@ -112,8 +114,10 @@ def _map(config: DictConfig, node: Node, device: str) -> None:
         bars("mapping", now.n_read, None)
         bars.note("mapping", f"{now.n_components:,} components, {scans.n_dropped:,} dropped")
         checkpoint.save_when_due()
-        if viewer is not None and mapper.builder.map.n_pending == 0:
-            viewer.update(*map_outputs.snapshot(mapper.builder))
+        if view is not None:
+            moments.note()
+            if mapper.builder.map.n_pending == 0:
+                view.offer(moments)
 
     with ProgressBars(enabled=config.report.progress) as bars:
         _until_stopped(config, node, scans, mapper, after_scan)

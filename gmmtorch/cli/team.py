@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,9 @@ from omegaconf import DictConfig
 from gmmtorch.cli import app, common
 from gmmtorch.cli.from_options import links, missions
 from gmmtorch.cli.reporting.outputs import Outputs, terse
+from gmmtorch.cli.reporting.team_listener import listener
 from gmmtorch.cli.robot import TEAM_VARIABLE, check_options
+from gmmtorch.cli.view import open_live_view, serve
 
 if TYPE_CHECKING:
     from gmmtorch.report.progress import ProgressBars
@@ -118,6 +120,7 @@ TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams path_lengt
 _SUMS = ("bytes_sent", "wire_bytes", "datagrams", "path_length", "collisions")
 _OWN = ("id", "link.listen", "link.peers", "link.listen_endpoints", "link.connect_endpoints")
 """Options that each robot gets from this command."""
+_NOT_OF_ROBOTS = ("clock", "view", "view_host", "view_port")
 _STAGE = "seconds"
 _COMPARED = {True: "all hold the same map", False: "their maps differ", None: "their maps have no digest"}
 _PAUSE = 0.2
@@ -141,8 +144,11 @@ def run(config: DictConfig) -> None:
     folder = common.run_dir()
     with ProgressBars(enabled=config.report.progress) as bars, ExitStack() as stack:
         _prepare(config, bars)
-        robots = _started(config, folder, stack)
-        _wait(robots, bars)
+        view = open_live_view(config)
+        addresses = _addresses(config)
+        listen = listener(config, view, addresses[-1], stack)
+        robots = _started(config, folder, addresses, stack)
+        _wait(robots, bars, listen)
         rows = [robot.row() for robot in robots]
     summary = _summary(rows)
     outputs = Outputs(folder)
@@ -154,6 +160,8 @@ def run(config: DictConfig) -> None:
     common.print_files(folder, folder / "results.json")
     if config.report.tensorboard:
         print(f"browse    tensorboard --logdir {folder}")
+    if view is not None:
+        serve(view)
 
 
 def _prepare(config: DictConfig, bars: ProgressBars) -> None:
@@ -168,9 +176,11 @@ def _prepare(config: DictConfig, bars: ProgressBars) -> None:
 # -- the processes --------------------------------------------------------------------------------
 
 
-def _started(config: DictConfig, folder: Path, stack: ExitStack) -> list[RobotProcess]:
+def _started(
+    config: DictConfig, folder: Path, addresses: list[list[str]], stack: ExitStack
+) -> list[RobotProcess]:
     """The processes of all robots; they end with the stack."""
-    given, addresses = _given_options(), _addresses(config)
+    given = _given_options()
     # SIGTERM ends this process like Ctrl-C, so that the stack ends the robots.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     stack.callback(signal.signal, signal.SIGTERM, before)
@@ -194,12 +204,12 @@ def _given_options() -> list[str]:
             raise InvalidArgumentError(
                 f"{item} is an option of gmmtorch-robot: gmmtorch-team chooses it for each robot."
             )
-    return [item for item in given if not item.startswith("clock=")]
+    return [item for item in given if item.split("=")[0] not in _NOT_OF_ROBOTS]
 
 
 def _addresses(config: DictConfig) -> list[list[str]]:
-    """The options of each robot that say where it listens, and where it sends to."""
-    n = config.team.size
+    """The options of each robot that say where it listens, and where it sends to; of a view, too."""
+    n = config.team.size + (1 if config.view else 0)
     if config.transport == "zenoh":
         free = links.free_addresses(n, socket.SOCK_STREAM)
         # Each connects to those before it: one link between any two.
@@ -219,13 +229,15 @@ def _addresses(config: DictConfig) -> list[list[str]]:
     ]
 
 
-def _wait(robots: list[RobotProcess], bars: ProgressBars) -> None:
+def _wait(robots: list[RobotProcess], bars: ProgressBars, listen: Callable[[bool], None]) -> None:
     """Returns when all robots have ended. Raises `GmmTorchError` if one failed."""
     begin = time.monotonic()
     while running := [robot for robot in robots if robot.is_running()]:
         bars(_STAGE, round(time.monotonic() - begin))
         bars.note(_STAGE, _status(running))
+        listen(False)
         time.sleep(_PAUSE)
+    listen(True)
 
 
 def _status(robots: Sequence[RobotProcess]) -> str:

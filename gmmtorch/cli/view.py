@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import sys
 import threading
@@ -18,6 +19,7 @@ from gmmtorch.cli.reporting import map_outputs
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from gmmtorch.live.live_view import LiveView
     from gmmtorch.live.map_viewer import MapViewer
 
 # Flags of Hydra whose values are words of their own.
@@ -71,28 +73,30 @@ def run(config: DictConfig) -> None:
         written = write_page(config.html, shown, trajectories, **look)
         print(f"{written}  {written.stat().st_size:,} bytes: open it in a browser")
         return
-    viewer = MapViewer(shown, trajectories, **look, host=config.host, port=config.port)
-    try:
-        serve(viewer)
-    finally:
-        viewer.stop()
+    serve(MapViewer(shown, trajectories, **look, host=config.host, port=config.port))
 
 
-def open_viewer() -> MapViewer:
-    """The viewer of a map that grows; prints its address."""
-    from gmmtorch.live.map_viewer import MapViewer
-    from gmmtorch.mapping.gaussian_map import GaussianMap
+def open_live_view(config: DictConfig) -> LiveView | None:
+    """The view of a map that grows, whose address it prints; None without `view`."""
+    if not config.view:
+        return None
+    from gmmtorch.live.live_view import LiveView
 
     logging.getLogger("websockets").setLevel(logging.WARNING)  # it reports every connection
-    viewer = MapViewer(GaussianMap())
-    print(f"The map is at {viewer.url}", flush=True)
-    return viewer
+    with common.naming({"host": "view_host", "port": "view_port"}):
+        view = LiveView(config.view_host, config.view_port)
+    atexit.register(view.stop)  # a thread that computes while Python ends would abort the process
+    print(f"The map is at {view.url}", flush=True)
+    return view
 
 
-def serve(viewer: MapViewer) -> None:
-    """Prints the address and waits until the user interrupts."""
+def serve(viewer: MapViewer | LiveView) -> None:
+    """Prints the address, waits until the user interrupts, and ends the page."""
     print(f"The map is at {viewer.url}. Ctrl-C ends.", flush=True)
-    threading.Event().wait()
+    try:
+        threading.Event().wait()
+    finally:
+        viewer.stop()
 
 
 def _trajectories(config: DictConfig, path: Path, dim: int) -> list[Tensor]:

@@ -99,7 +99,7 @@ def _ellipsoids(components: Components, solid: Solid, frame: Frame) -> dict[str,
     places[:, 0, :3] = balls.positions - frame.shift.numpy()
     places[:, 1] = balls.wxyz[:, [1, 2, 3, 0]]
     places[:, 2, :3] = balls.scales / viewer_scene.N_SIGMA
-    vertices, faces = unit_sphere(viewer_scene.SPHERE_VERTICES)
+    vertices, faces = unit_sphere(viewer_scene.sphere_vertices(len(solid.means)))
     colours = {}
     for by in viewer_scene.COLOURS:
         found = viewer_scene.colours(components, solid, by)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import socket
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,19 +15,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import OutputError, check_choice
+from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.export.mesh import surface_mesh
-from gmmtorch.live import viewer_scene
+from gmmtorch.live import scene_nodes, viewer_scene
+from gmmtorch.live.following_camera import FollowingCamera
 from gmmtorch.live.map_page import write_page
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.optional_packages import load_viser
-from gmmtorch.report.scenes.ellipsoids import unit_sphere
 
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
-_MESH_COLOUR, _BACKGROUND = (205, 205, 210), (240, 242, 245)
-_OPACITY = 0.9  # of a splat
 _FINEST, _COARSEST = 0.02, 1.0  # m, of the slider of the resolution
+_LAST_PORT = 65535
+Rgb = tuple[int, int, int]
 _WELCOME = "Click a place to see what the map knows about it."
 
 
@@ -45,7 +46,8 @@ class MapViewer:
     The page has controls for the shape, the colour, the height above which components are hidden, the paths,
     and the height and resolution of the slice. A click shows occupancy, hits and misses at a place.
 
-    Raises `GmmTorchError` if viser is not installed, and `OutputError` if no port is free.
+    Raises `GmmTorchError` if viser is not installed, and `InvalidArgumentError` for a host that is not of
+    this machine.
     """
 
     def __init__(
@@ -61,17 +63,19 @@ class MapViewer:
         check_choice("shape", shape, viewer_scene.SHAPES)
         check_choice("colour", colour, viewer_scene.COLOURS)
         viser = load_viser()
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with the address
-                self._server = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
-        except OSError as error:
-            raise OutputError(f"host={host}, port={port} cannot be used: {error}; give another.") from error
+        _check_address(host, port)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with the address
+            self._server = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
         self._shift = torch.zeros(3, dtype=torch.float64)
         self._box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._map, self._components = shown, Components.empty(3)
         self._paths: list[Tensor] = []
+        self._path_colours: Sequence[Rgb] = ()
+        self._is_lit = False
+        self._chosen: dict[str, float] = {}  # by control, the value that was set here last
+        self._camera = FollowingCamera(self._server)
         self._add_controls(shape, colour)
         self.update(shown, trajectories)
 
@@ -85,21 +89,54 @@ class MapViewer:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def update(self, shown: GaussianMap, trajectories: Sequence[Tensor] = ()) -> None:
-        """Shows another map and other paths. The map must not change afterwards."""
+    @property
+    def server(self) -> Any:
+        """The viser server."""
+        return self._server
+
+    @property
+    def shift(self) -> Tensor:
+        """The origin (3,) of the scene's frame in the world frame, metres."""
+        return self._shift
+
+    @property
+    def n_viewers(self) -> int:
+        """Number of browsers that show the page now."""
+        return len(self._server.get_clients())
+
+    def update(
+        self, shown: GaussianMap, trajectories: Sequence[Tensor] = (), colours: Sequence[Rgb] = ()
+    ) -> None:
+        """Shows another map and other paths. The map must not change afterwards.
+
+        A camera that the user has not moved follows the map, and so do the controls.
+
+        Args:
+            trajectories: (S, D) sensor positions, world metres. colours: of each; without, all are orange.
+        """
         with self._lock:
             if shown.dim is None:
                 return
-            first = self._box is None
             self._map, self._components = shown, shown.components()
-            self._paths = viewer_scene.in_space(trajectories)
-            view = viewer_scene.frame(self._components, self._paths)
-            self._box = tuple(view.low.tolist()), tuple(view.high.tolist())
-            if first:
-                self._begin(view)
+            self._paths, self._path_colours = viewer_scene.in_space(trajectories), colours
+            self._show(viewer_scene.frame(self._components, self._paths))
             self._draw_components()
             self._draw_paths()
             self._draw_slice()
+
+    def update_cells(
+        self, centres: Tensor, side: float, trajectories: Sequence[Tensor], colours: Sequence[Rgb]
+    ) -> None:
+        """Shows occupied cells, with centres (C, 3) and a side (m), in place of a map; there is no slice."""
+        with self._lock:
+            self._paths, self._path_colours = viewer_scene.in_space(trajectories), colours
+            for folder in self._folders:
+                folder.visible = False
+            self._fit(viewer_scene.frame_of(centres, self._paths), flat=False)
+            shades = viewer_scene.height_shades(centres)
+            moved = (centres - self._shift).numpy()
+            self._nodes["components"] = scene_nodes.add_cells(self._server.scene, moved, side, shades)
+            self._draw_paths()
 
     def save_html(self, path: str | Path) -> Path:
         """Writes the map and the paths as one HTML file; see `map_page.write_page`."""
@@ -110,121 +147,90 @@ class MapViewer:
 
     # -- the scene ------------------------------------------------------------------------------------
 
-    def _begin(self, begin: viewer_scene.Frame) -> None:
-        """Limits of the controls, the camera and the lights, from the first map."""
-        self._shift, away = begin.shift, begin.distance
-        middle = ((begin.low + begin.high) / 2 - begin.shift).numpy()
-        self._server.initial_camera.look_at = tuple(middle)
-        self._add_lights(away)
-        flat = self._map.dim == 2
+    def _fit(self, view: viewer_scene.Frame, flat: bool) -> None:
+        """Fits the camera to a frame; the first one moves the origin. flat: the camera looks from above."""
+        if not self._is_lit:
+            self._is_lit, self._shift = True, view.shift
+            scene_nodes.add_lights(self._server.scene, view.distance)
+        middle = ((view.low + view.high) / 2 - self._shift).numpy()
         offset = np.array([-0.02, -0.1, 1.0]) if flat else np.array([-0.45, -0.65, 0.6])
-        self._server.initial_camera.position = tuple(middle + away * offset)
-        for control, visible in ((self._cut, not flat), (self._height, not flat)):
-            control.visible = visible
+        self._camera.show(middle, middle + view.distance * offset)
+
+    def _show(self, view: viewer_scene.Frame) -> None:
+        """Fits the camera and the limits of the controls to a frame."""
+        flat = self._map.dim == 2
+        self._fit(view, flat)
+        self._box = tuple(view.low.tolist()), tuple(view.high.tolist())
+        low, high = round(float(view.low[2]), 2), round(float(view.high[2]) + 0.1, 2)
         with self._quiet():
             for control in (self._cut, self._height):
-                control.min, control.max = round(float(begin.low[2]), 2), round(float(begin.high[2]) + 0.1, 2)
-            self._height.value = begin.height
-            self._cut.value = min(begin.open_height, self._cut.max)
-            self._resolution.value = max(_FINEST, min(self._map.resolution, _COARSEST))
+                _assign(control, visible=not flat)
+            cut_is_chosen = self._is_chosen(self._cut) and self._cut.value < self._cut.max
+            for control in (self._cut, self._height):
+                _assign(control, min=low, max=high)
+            self._choose(self._height, view.height)
+            self._choose(self._resolution, max(_FINEST, min(self._map.resolution, _COARSEST)))
+            if not cut_is_chosen:
+                _assign(self._cut, value=min(view.open_height, high))
+                self._chosen[self._cut.label] = self._cut.value
 
-    def _add_lights(self, away: float) -> None:
-        """A grey background, light from everywhere, and two lamps: colours stay as saturated as they are."""
-        scene = self._server.scene
-        scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, np.uint8), format="png")
-        scene.configure_environment_map(None)
-        scene.configure_default_lights(enabled=False)
-        scene.add_light_ambient("/lights/everywhere", intensity=0.7)
-        for name, place, strength in (("key", (-0.5, -0.8, 1.0), 1.0), ("fill", (0.9, 0.4, 0.5), 0.4)):
-            scene.add_light_directional(
-                f"/lights/{name}",
-                intensity=strength,
-                cast_shadow=False,
-                position=tuple(10 * away * np.array(place)),
-            )
+    def _is_chosen(self, control: Any) -> bool:
+        """Whether the user has chosen the value of a control."""
+        return control.value != self._chosen.get(control.label, control.value)
+
+    def _choose(self, control: Any, value: float) -> None:
+        """Sets a control that the user has not set."""
+        if not self._is_chosen(control):
+            _assign(control, value=value)
+            self._chosen[control.label] = control.value
 
     def _draw_components(self) -> None:
         below = self._cut.value if self._map.dim == 3 else math.inf
         below = math.inf if below >= self._cut.max else below
         solid = viewer_scene.surfaces(self._components, below)
         shape = self._shape.value
-        self._remove("components")
         if shape == "none" or len(solid.rows) == 0:
+            self._remove("components")
             return
         colours = viewer_scene.colours(self._components, solid, self._colour.value).rgb
         scene = self._server.scene
-        moved = (solid.means - self._shift).float().numpy()
+        solid = solid._replace(means=solid.means - self._shift)
         if shape == "surfaces" and self._map.dim == 3:
-            self._nodes["components"] = self._surface_node(below)
+            mesh = surface_mesh(self._components, self._resolution.value)
+            if below < math.inf:
+                mesh = mesh.inside((-math.inf,) * 3, (math.inf, math.inf, below))
+            self._nodes["components"] = scene_nodes.add_mesh(scene, mesh, self._shift)
         elif shape == "splats":
-            opacity = np.full((len(moved), 1), _OPACITY, np.float32)
-            covariance = solid.covariances.float().numpy()
-            self._nodes["components"] = scene.add_gaussian_splats(
-                "/components", moved, covariance, colours, opacity
-            )
+            self._nodes["components"] = scene_nodes.add_splats(scene, solid, colours)
         else:
-            balls = viewer_scene.instances(solid)
-            vertices, faces = unit_sphere(viewer_scene.SPHERE_VERTICES)
-            self._nodes["components"] = scene.add_batched_meshes_simple(
-                "/components",
-                vertices.float().numpy(),
-                faces.numpy().astype(np.uint32),
-                balls.wxyz.astype(np.float32),
-                moved,
-                batched_scales=balls.scales.astype(np.float32),
-                batched_colors=colours,
-                lod="off",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-
-    def _surface_node(self, below: float) -> Any:
-        """The mesh of the surfaces, with cells of the resolution of the slice."""
-        mesh = surface_mesh(self._components, self._resolution.value)
-        if below < math.inf:
-            mesh = mesh.inside((-math.inf,) * 3, (math.inf, math.inf, below))
-        return self._server.scene.add_mesh_simple(
-            "/components",
-            (mesh.vertices.cpu() - self._shift).float().numpy(),
-            mesh.faces.cpu().numpy().astype(np.uint32),
-            color=_MESH_COLOUR,
-            side="double",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+            self._nodes["components"] = scene_nodes.add_ellipsoids(scene, solid, colours)
 
     def _draw_paths(self) -> None:
-        self._remove("paths")
-        lines = viewer_scene.segments(self._paths) - self._shift
-        if len(lines) == 0 or not self._with_paths.value:
-            return
-        self._nodes["paths"] = self._server.scene.add_line_segments(
-            "/paths",
-            lines.float().numpy(),
-            _PATH_COLOUR,
-            thickness=_PATH_WIDTH,
-            thickness_units="screen",
-        )
+        given = self._path_colours or [_PATH_COLOUR] * len(self._paths)
+        for number, path in enumerate(self._paths):
+            name, lines = f"paths/{number}", viewer_scene.segments([path]) - self._shift
+            if len(lines) == 0 or not self._with_paths.value:
+                self._remove(name)
+                continue
+            self._nodes[name] = self._server.scene.add_line_segments(
+                f"/{name}",
+                lines.float().numpy(),
+                given[number],
+                thickness=_PATH_WIDTH,
+                thickness_units="screen",
+            )
 
     def _draw_slice(self) -> None:
-        self._remove("slice")
         if not self._visible.value or self._box is None:
+            self._remove("slice")
             return
         dim = self._components.dim
         height = self._height.value if dim == 3 else 0.0
         low, high = (corner[:dim] for corner in self._box)
         picture = viewer_scene.occupancy_slice(self._map, self._resolution.value, height, low, high)
         place = torch.tensor([*picture.middle, height if dim == 3 else -0.05], dtype=torch.float64)
-        self._nodes["slice"] = self._server.scene.add_image(
-            "/slice",
-            picture.pixels,
-            *picture.size,
-            format="png",
-            wxyz=(0.0, 1.0, 0.0, 0.0),  # an image's own y points down
-            position=tuple((place - self._shift).tolist()),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        moved = (place - self._shift).tolist()
+        self._nodes["slice"] = scene_nodes.add_slice(self._server.scene, picture, moved)
 
     def _remove(self, name: str) -> None:
         if name in self._nodes:
@@ -236,16 +242,18 @@ class MapViewer:
         gui = self._server.gui
         gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
         self._is_quiet = False
-        with gui.add_folder("Components"):
+        self._folders = [gui.add_folder(name) for name in ("Components", "Occupancy", "Place")]
+        components, occupancy, place = self._folders
+        with components:
             self._shape = gui.add_dropdown("shape", viewer_scene.SHAPES, initial_value=shape)
             self._colour = gui.add_dropdown("colour", viewer_scene.COLOURS, initial_value=colour)
             self._cut = gui.add_slider("hide above [m]", 0.0, 1.0, 0.05, 1.0)
             self._with_paths = gui.add_checkbox("trajectory", True)
-        with gui.add_folder("Occupancy"):
+        with occupancy:
             self._visible = gui.add_checkbox("slice", True)
             self._height = gui.add_slider("height [m]", 0.0, 1.0, 0.05, 0.5)
             self._resolution = gui.add_slider("resolution [m]", _FINEST, _COARSEST, 0.01, 0.1)
-        with gui.add_folder("Place"):
+        with place:
             self._place = gui.add_markdown(_WELCOME)
         for control in (self._shape, self._colour, self._cut):
             control.on_update(lambda _: self._redraw(self._draw_components))
@@ -297,3 +305,23 @@ class MapViewer:
             yield
         finally:
             self._is_quiet = False
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raises an error for an address that cannot be used; viser would wait for ever."""
+    if check_whole("port", port, 1) > _LAST_PORT:
+        raise InvalidArgumentError(f"port={port} must be at most {_LAST_PORT}.")
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, 0), family=family).close()
+    except OSError as error:
+        raise InvalidArgumentError(
+            f"host={host} is not an address of this machine ({error}); use 127.0.0.1, or 0.0.0.0 for all."
+        ) from error
+
+
+def _assign(control: Any, **values: Any) -> None:
+    """Sets properties of a control; those that stay as they are send nothing to the browsers."""
+    for name, value in values.items():
+        if getattr(control, name) != value:
+            setattr(control, name, value)

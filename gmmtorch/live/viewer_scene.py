@@ -33,9 +33,7 @@ SHAPES = ("ellipsoids", "splats", "surfaces", "none")
 COLOURS = ("height", "support", "age")
 """What colours the components: z of the mean; log of the support; order in which they were learned."""
 
-SPHERE_VERTICES = 162
-"""Vertices of a drawn ellipsoid."""
-
+_SPHERES = ((1500, 162), (math.inf, 42))  # number of components, at most, and vertices of each ellipsoid
 _FLATNESS = 0.01  # m, thickness of a 2D component
 _FREE_ALPHA, _OCCUPIED_ALPHA = 90, 240
 _FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
@@ -90,6 +88,11 @@ def surfaces(components: Components, below: float = float("inf")) -> Solid:
     return Solid(mean, covariance, rows.cpu())
 
 
+def sphere_vertices(n_components: int) -> int:
+    """Vertices of each drawn ellipsoid; fewer where there are many components."""
+    return next(vertices for most, vertices in _SPHERES if n_components <= most)
+
+
 def instances(solid: Solid) -> Instances:
     """The 2σ ellipsoids."""
     from scipy.spatial.transform import Rotation
@@ -110,19 +113,20 @@ def colours(components: Components, solid: Solid, by: str) -> Colours:
     """The colours of the components by one of `COLOURS`."""
     check_choice("colour", by, COLOURS)
     if by == "height":
-        value = solid.means[:, 2]
-        scale = height_scale(value)
-        ends = f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"
-        share = np.asarray(scale(value.numpy()))
-    else:
-        chosen = components.support if by == "support" else components.ids[:, 1]
-        value = chosen.cpu()[solid.rows].double()
-        low, high = (float(value.min()), float(value.max())) if len(value) else (0.0, 1.0)
-        ends = (f"{low:.3g} points", f"{high:.3g} points") if by == "support" else ("oldest", "newest")
-        if by == "support":
-            value, low, high = value.clamp_min(1e-9).log(), *np.log(np.maximum([low, high], 1e-9))
-        share = ((value - low) / max(high - low, 1e-9)).numpy()
-    return Colours(_shades(share), ends)
+        scale = height_scale(solid.means[:, 2])
+        return Colours(height_shades(solid.means), (f"{scale.vmin:.2f} m", f"{scale.vmax:.2f} m"))
+    chosen = components.support if by == "support" else components.ids[:, 1]
+    value = chosen.cpu()[solid.rows].double()
+    low, high = (float(value.min()), float(value.max())) if len(value) else (0.0, 1.0)
+    ends = (f"{low:.3g} points", f"{high:.3g} points") if by == "support" else ("oldest", "newest")
+    if by == "support":
+        value, low, high = value.clamp_min(1e-9).log(), *np.log(np.maximum([low, high], 1e-9))
+    return Colours(_shades(((value - low) / max(high - low, 1e-9)).numpy()), ends)
+
+
+def height_shades(places: Tensor) -> np.ndarray:
+    """Colours (K, 3) uint8 of the heights of places (K, 3), metres."""
+    return _shades(np.asarray(height_scale(places[:, 2])(places[:, 2].numpy())))
 
 
 def colour_scale(n_colours: int) -> list[str]:
@@ -167,14 +171,19 @@ def segments(paths: Sequence[Tensor]) -> Tensor:
 def frame(components: Components, paths: Sequence[Tensor]) -> Frame:
     """The first view of components and the sensor's paths (S, 3)."""
     solid = surfaces(components)
-    path = torch.cat([solid.means[:0], *paths])
-    corners = robust_bounds(solid.means, path, margin=0.5)
+    return frame_of(solid.means, paths)._replace(open_height=_open_height(components, solid))
+
+
+def frame_of(places: Tensor, paths: Sequence[Tensor]) -> Frame:
+    """The first view of places (K, 3) of a map and the sensor's paths (S, 3); it has no ceiling."""
+    path = torch.cat([places[:0].double(), *paths])
+    corners = robust_bounds(places, path, margin=0.5)
     low, high = torch.tensor(corners, dtype=torch.float64)
     far = max(float(low.abs().max()), float(high.abs().max())) > _FAR
     shift = ((low + high) / 2).round() if far else torch.zeros(3, dtype=torch.float64)
     distance = 0.6 * float((high - low)[:2].norm()) + 2.0
     height = float(path[:, 2].median()) if len(path) else float(low[2] + high[2]) / 2
-    return Frame(low, high, shift, distance, height, _open_height(components, solid))
+    return Frame(low, high, shift, distance, height, math.inf)
 
 
 def _open_height(components: Components, solid: Solid) -> float:

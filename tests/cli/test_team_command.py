@@ -132,7 +132,7 @@ def test_the_status_is_of_robots_that_run(monkeypatch):
     monkeypatch.setattr(team, "_PAUSE", 0.0)
     monkeypatch.setattr(team.time, "monotonic", lambda: next(times))
     robots: Any = [Done(0, 2), Done(1, 12)]
-    team._wait(robots, Bars())  # type: ignore[arg-type]
+    team._wait(robots, Bars(), lambda _: None)  # type: ignore[arg-type]
     assert set(notes) == {"robot 0 works", "robot 1 works"}
     assert len(notes) == 12
     assert set(notes[2:]) == {"robot 1 works"}

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import pytest
-import torch
 from command_runs import composed, refused, run_here, succeeded
 
-from gmmtorch.cli import map as map_command
 from gmmtorch.cli.from_options import maps
 from gmmtorch.cli.view import overrides
 from gmmtorch.datasets import load
@@ -57,24 +52,3 @@ def test_html_of_a_part_of_a_map_in_tiles(monkeypatch, tmp_path):
     assert (tmp_path / "map.html").stat().st_size > 10_000
     part = maps.open_map(tmp_path, composed("view").runtime, [2, 10, 3, 11])
     assert 0 < part.n_components <= maps.open_map(tmp_path, composed("view").runtime).n_components
-
-
-def test_a_map_is_shown_while_it_is_built(monkeypatch, tmp_path):
-    from gmmtorch.live.map_viewer import MapViewer
-
-    shown: list[int] = []
-    update = MapViewer.update
-
-    def count(self: MapViewer, built: GaussianMap, trajectories: Sequence[torch.Tensor] = ()) -> None:
-        update(self, built, trajectories)
-        shown.append(built.n_components)
-
-    monkeypatch.setattr(MapViewer, "update", count)
-    monkeypatch.setattr(map_command, "serve", lambda viewer: viewer.stop())
-    options = ["dataset=synthetic_building_2d", "dataset.n_scans=5", "map.window=2", "view=true"]
-    quiet = ["report.progress=false", "report.figures=false", "report.tensorboard=false"]
-    succeeded(run_here(monkeypatch, "map", tmp_path, *options, *quiet))
-    n_components = GaussianMap.load(Path(tmp_path) / "map.safetensors").n_components
-    assert shown[0] == 0
-    assert shown[-1] == n_components > shown[1] > 0
-    assert len(shown) == 4  # empty, after two windows, and with the last scan

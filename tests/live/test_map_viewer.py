@@ -136,7 +136,7 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
 
 
 def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, maps):
-    assert {"components", "paths", "slice"} <= viewer._nodes.keys()
+    assert {"components", "paths/0", "slice"} <= viewer._nodes.keys()
     viewer._height.value = 0.8
     viewer._redraw(viewer._draw_slice)
     assert viewer._nodes["slice"].position[2] == pytest.approx(0.8)
@@ -174,7 +174,7 @@ def test_a_growing_map_is_shown_from_its_first_components(maps):
     try:
         assert not made._nodes
         made.update(*maps[2])
-        assert {"components", "paths", "slice"} <= made._nodes.keys()
+        assert {"components", "paths/0", "slice"} <= made._nodes.keys()
         assert not made._height.visible
     finally:
         made.stop()

@@ -175,6 +175,12 @@ def _check_thesis(given: dict[str, Any], options: TeamOptions) -> None:
             )
 
 
+def log_map_options(config: DictConfig) -> DictConfig:
+    """The options that `maps.map_factory` reads: `log.map`, on the CPU."""
+    runtime = {"memory_limit": config.runtime.memory_limit, "compile": False, "dtype": "float64"}
+    return OmegaConf.create({"map": config.log.map, "runtime": runtime, "seed": config.seed})
+
+
 def _of(group: str, make: Callable[..., T], options: dict[str, Any], **others: Any) -> T:
     """The value that `make` builds from the options of a group, and from others; errors name options."""
     with common.naming({name: f"{group}.{name}" for name in options}):

@@ -170,6 +170,9 @@ class Exploration:
     coordination: myopic, greedy, distributed_greedy or random_partition.
     rounds: rounds of distributed_greedy and random_partition.
     codec: code of components: quantized (about 8.7 bytes each), float, or thesis (57 bytes).
+    view: show robots and map in the browser during the mission, and until Ctrl-C.
+    view_host: address of the view; 0.0.0.0: other machines can open it, too.
+    view_port: port of the view; the next free one if it is in use.
     """
 
     world: Any = MISSING
@@ -181,6 +184,9 @@ class Exploration:
     coordination: str = _TEAM["coordination"]
     rounds: int = _TEAM["n_rounds"]
     codec: str = "quantized"
+    view: bool = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
     sensor: _SENSOR = field(default_factory=_SENSOR)  # type: ignore[valid-type]
     robot: _BODY = field(default_factory=_BODY)  # type: ignore[valid-type]
     belief: _BELIEF = field(default_factory=_BELIEF)  # type: ignore[valid-type]

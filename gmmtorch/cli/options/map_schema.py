@@ -26,6 +26,8 @@ class Map:
     resolution: side (m) of the cells of queries, pictures and exports.
     export: list of map_server, octomap, cloud, mesh, distance_field.
     view: show the map in the browser while it is built, and until Ctrl-C.
+    view_host: address of the view; 0.0.0.0: other machines can open it, too.
+    view_port: port of the view; the next free one if it is in use.
     z_min, z_max: height band (m) of map_server in 3D; both null: between floor and ceiling.
     checkpoint_seconds: computing time between two checkpoints.
     inputs: list of paths, globs and URLs of recordings, in place of dataset.path.
@@ -41,6 +43,8 @@ class Map:
     resolution: float = 0.1
     export: list[str] = field(default_factory=list)
     view: bool = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
     z_min: float | None = None
     z_max: float | None = None
     checkpoint_seconds: float = 30.0

@@ -64,6 +64,8 @@ class Ros:
     cloud: published points: cells, means or none.
     ellipsoids: publish the components as markers.
     view: show the map in the browser while it is built.
+    view_host: address of the view; 0.0.0.0: other machines can open it, too.
+    view_port: port of the view; the next free one if it is in use.
     checkpoint_seconds: computing time between two checkpoints.
     """
 
@@ -81,6 +83,8 @@ class Ros:
     cloud: str = "cells"
     ellipsoids: bool = True
     view: bool = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
     checkpoint_seconds: float = 30.0
     node: NodeOptions = field(default_factory=NodeOptions)
     sensor: SensorOptions = field(default_factory=SensorOptions)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gmmtorch.evaluation.events import Event, Row
+    from gmmtorch.live.moments import BuildMoments
     from gmmtorch.mapping.components import Components
     from gmmtorch.mapping.gaussian_map import GaussianMap
     from gmmtorch.mapping.map_builder import MapBuilder
@@ -76,14 +77,11 @@ def positions(trajectory: Path, dim: int) -> Tensor:
     return torch.from_numpy(read_trajectory(trajectory).matrices[:, :dim, 3])
 
 
-def snapshot(builder: MapBuilder) -> tuple[GaussianMap, list[Tensor]]:
-    """A copy of the map for the viewer, and the sensor positions (S, D)."""
-    from dataclasses import asdict
+def moments_of(builder: MapBuilder) -> BuildMoments:
+    """What the live view shows of a map that is built."""
+    from gmmtorch.live.moments import BuildMoments
 
-    from gmmtorch.mapping.gaussian_map import GaussianMap
-
-    options = {**asdict(builder.map.query_options), "resolution": builder.map.resolution}
-    return GaussianMap.of(builder.map.components(), **options), [builder.poses[:, :-1, -1]]
+    return BuildMoments(builder, lambda: builder.progress().nbytes)
 
 
 def write_exports(

@@ -73,6 +73,11 @@ class LiveMapper:
         self._thread.shutdown()
         self._report(is_last=True)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the map that was published last; 0 before."""
+        return self._nbytes
+
     def snapshot(self) -> GaussianMap:
         """A copy of the map that does not grow."""
         built = self.builder.map

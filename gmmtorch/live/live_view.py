@@ -1,0 +1,218 @@
+"""LiveView: a map that grows, its robots and its curves in the browser, drawn by a thread of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gmmtorch.live import viewer_scene
+from gmmtorch.live.map_viewer import MapViewer, Rgb
+from gmmtorch.live.scene_nodes import RobotNodes
+from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.report.style import colour
+
+_PERIOD = 0.5  # s between two pictures, at least
+_SHARE = 0.25  # of the time that the thread draws, at most
+_MOST_POINTS = 400  # of a curve
+_CURVE_HEIGHT = 120  # pixels
+
+_log = logging.getLogger(__name__)
+
+
+class ViewedRobot(NamedTuple):
+    """A robot as the viewer shows it.
+
+    number: its id. path: (S, 3) its positions so far, world metres; the last one is the present one.
+    rotation: (3, 3) world ← camera (x right, y down, z ahead), or world ← sensor without a camera.
+    camera: horizontal and vertical field of view, rad. ahead: (A, 3) positions that it will fly to.
+    """
+
+    number: int
+    path: Tensor
+    rotation: Tensor
+    camera: tuple[float, float] | None = None
+    ahead: Tensor = torch.zeros(0, 3)
+
+
+class ViewedCells(NamedTuple):
+    """Occupied cells: centres (C, 3) and side, metres."""
+
+    centres: Tensor
+    side: float
+
+
+class Moment(NamedTuple):
+    """What the viewer shows at a moment; nothing in it may change afterwards.
+
+    shown: the map: components, or occupied cells.
+    curves: by title, values by name; each has a value for each entry of `times` (s).
+    """
+
+    shown: GaussianMap | ViewedCells
+    robots: Sequence[ViewedRobot] = ()
+    times: Sequence[float] = ()
+    curves: Mapping[str, Mapping[str, Sequence[float]]] = {}
+
+
+class LiveView:
+    """Shows a map that grows in the browser.
+
+        view = LiveView()
+        print(view.url)
+        for scan in scans:
+            built.insert(scan)
+            view.offer(lambda: Moment(GaussianMap.of(built.components())))
+        view.stop()
+
+    A thread draws. Taking and drawing moments takes at most a quarter of the time. Without a browser nothing
+    is drawn, and `offer` does not call its argument. Several browsers see the same. One that goes away stops
+    nothing.
+
+    Args:
+        host, port: where the page is served; another port is taken if this one is in use.
+
+    Raises `GmmTorchError` if viser is not installed, and `InvalidArgumentError` for a host that is not of
+    this machine.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.viewer = MapViewer(GaussianMap(), host=host, port=port)
+        self._robots: dict[int, RobotNodes] = {}
+        self._plots: dict[str, Any] = {}
+        self._changed = threading.Condition()
+        self._waiting: Moment | None = None
+        self._is_busy = self._is_stopped = False
+        self._begin = self._next = 0.0  # of the last picture, and before the next one, s
+        self.n_drawn = 0
+        """Pictures drawn so far."""
+        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return self.viewer.url
+
+    def offer(self, take: Callable[[], Moment]) -> None:
+        """Shows what `take` returns, if a browser is connected and the last picture is old enough."""
+        if self._is_busy or time.monotonic() < self._next or not self.viewer.n_viewers:
+            return
+        self._begin = time.monotonic()
+        with torch.inference_mode():  # missions run in it, and their tensors must not be changed outside
+            moment = take()
+        self._hand_over(moment)
+
+    def finish(self, take: Callable[[], Moment]) -> None:
+        """Draws what `take` returns, for browsers to come as well; returns when it is drawn."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._is_busy)
+        with torch.inference_mode():
+            last = take()
+        self._hand_over(last)
+        with self._changed:
+            self._changed.wait_for(lambda: not self._is_busy)
+
+    def stop(self) -> None:
+        """Ends the thread and the server; does nothing the second time."""
+        if self._is_stopped:
+            return
+        with self._changed:
+            self._is_stopped = True
+            self._changed.notify_all()
+        self._thread.join()
+        self.viewer.stop()
+
+    def _hand_over(self, moment: Moment) -> None:
+        with self._changed:
+            self._waiting, self._is_busy = moment, True
+            self._changed.notify_all()
+
+    # -- the thread -----------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while (moment := self._taken()) is not None:
+            try:
+                with torch.inference_mode():
+                    self._draw(moment)
+                self.n_drawn += 1
+            except Exception:  # the map goes on without its picture
+                _log.exception("The browser viewer could not draw the map.")
+            with self._changed:
+                spent = time.monotonic() - self._begin
+                self._next = self._begin + max(_PERIOD, spent / _SHARE)
+                self._is_busy = False
+                self._changed.notify_all()
+
+    def _taken(self) -> Moment | None:
+        """The next moment to draw; None: the view has been stopped."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting is not None or self._is_stopped)
+            moment, self._waiting = self._waiting, None
+            return None if self._is_stopped else moment
+
+    def _draw(self, moment: Moment) -> None:
+        colours = [robot_colour(robot.number) for robot in moment.robots]
+        paths = [robot.path for robot in moment.robots]
+        if isinstance(moment.shown, GaussianMap):
+            self.viewer.update(moment.shown, paths, colours if len(paths) > 1 else ())
+        else:
+            self.viewer.update_cells(*moment.shown, paths, colours)
+        for robot in moment.robots:
+            if len(robot.path):
+                self._place(robot)
+        for title, series in moment.curves.items():
+            self._plot(title, moment.times, series)
+
+    def _place(self, robot: ViewedRobot) -> None:
+        from scipy.spatial.transform import Rotation
+
+        if robot.number not in self._robots:
+            scene, hue = self.viewer.server.scene, robot_colour(robot.number)
+            self._robots[robot.number] = RobotNodes(scene, robot.number, hue, robot.camera)
+        shift = self.viewer.shift
+        (path,) = viewer_scene.in_space([robot.path[-1:]])
+        (ahead,) = viewer_scene.in_space([robot.ahead])
+        turned = np.eye(3)
+        turned[: len(robot.rotation), : len(robot.rotation)] = robot.rotation.double().cpu().numpy()
+        wxyz = Rotation.from_matrix(turned).as_quat()[[3, 0, 1, 2]]
+        self._robots[robot.number].place(wxyz, (path[0] - shift).numpy(), (ahead - shift).numpy())
+
+    def _plot(self, title: str, times: Sequence[float], series: Mapping[str, Sequence[float]]) -> None:
+        """Draws or extends a plot of curves over time."""
+        step = -(-len(times) // _MOST_POINTS)
+        rows = [np.asarray(row, np.float64)[::-1][:: max(step, 1)][::-1] for row in (times, *series.values())]
+        if len(rows[0]) < 2:
+            return
+        data = tuple(np.ascontiguousarray(row) for row in rows)
+        if title in self._plots:
+            self._plots[title].data = data
+            return
+        from viser import uplot
+
+        lines = [
+            uplot.Series(label=name, stroke="rgb({}, {}, {})".format(*robot_colour(k)), width=2)
+            for k, name in enumerate(series)
+        ]
+        gui = self.viewer.server.gui
+        self._plots[title] = gui.add_uplot(
+            data,
+            (uplot.Series(label="s"), *lines),
+            title=title,
+            height=_CURVE_HEIGHT,
+            order=-1.0,  # above the controls
+            scales={"x": uplot.Scale(time=False)},
+            legend=uplot.Legend(show=len(lines) > 1),
+        )
+
+
+def robot_colour(number: int) -> Rgb:
+    """The colour of a robot, RGB, 0 to 255; the same as in pictures."""
+    red, green, blue = bytes.fromhex(colour(number).removeprefix("#"))
+    return red, green, blue
