@@ -160,9 +160,17 @@ class Scan:
         def copy(x: Tensor) -> Tensor:
             return x.detach().to(device or x.device, copy=True)
 
-        return Scan(copy(self.points), copy(self.origin), copy(self.no_return), self.time)
+        return self._with(copy(self.points), copy(self.origin), copy(self.no_return))
 
     def to(self, device: torch.device | str | None) -> Scan:
         """The scan on another device. None: where it is."""
-        points, origin, no_return = (x.to(device) for x in (self.points, self.origin, self.no_return))
-        return Scan(points, origin, no_return, self.time)
+        return self._with(*(x.to(device) for x in (self.points, self.origin, self.no_return)))
+
+    def _with(self, points: Tensor, origin: Tensor, no_return: Tensor) -> Scan:
+        """The scan with the same numbers in other tensors, which are not checked again."""
+        made = object.__new__(Scan)
+        for name, value in vars(self).items():
+            object.__setattr__(made, name, value)
+        for name, value in (("points", points), ("origin", origin), ("no_return", no_return)):
+            object.__setattr__(made, name, value)
+        return made

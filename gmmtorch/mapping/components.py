@@ -117,6 +117,9 @@ class Components:
     @classmethod
     def concatenate(cls, parts: Sequence[Components]) -> Components:
         """All components and origins of the parts, in order."""
+        parts = [part for part in parts if part.origins.shape[0] or len(part)] or parts[:1]
+        if len(parts) == 1:
+            return parts[0]
         seen_by, seen_from = [], []
         n_components = n_origins = 0
         for part in parts:

@@ -326,3 +326,17 @@ def test_em_stops_at_max_iter(generator):
     step = loop.natural_step(quadratic_features(points), points.new_ones(50), 1e-6, torch.float64)
     found = loop.run_em(step, random_parameters(2, 2, generator), tol=0, max_iter=3)
     assert (found.converged, found.n_iter) == (False, 3)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_step_from_a_flat_covariance_takes_the_checked_natural_parameters(dim, generator):
+    """The fused kernel refuses a covariance of rank D − 1; the bound is then that of the checked form."""
+    points = random_points(80, dim, generator)
+    features, weight = quadratic_features(points), points.new_ones(80)
+    start = random_parameters(3, dim, generator)
+    start.covariances[1, :, -1] = start.covariances[1, -1, :] = 0.0
+    new, bound = loop.natural_step(features, weight, 1e-4, torch.float64)(start)
+    statistics, value = em.expectation(features, weight, em.natural_parameters(start), torch.float64)
+    assert bound == float(value) / 80
+    for part, expected in zip(new, em.maximization(statistics, 1e-4, start), strict=True):
+        assert torch.equal(part, expected)

@@ -198,10 +198,11 @@ def _fused(features: Tensor, weight: Tensor, natural: Tensor) -> tuple[Tensor, T
     n, width = features.shape
     padded, k = _by_four(natural)
     n_parts = _n_parts(features)
-    scratch = features.new_empty(n_parts, k, CPU_LANES)
+    n_scratch = n_parts * k * CPU_LANES
+    work = features.new_empty(n_scratch + 2 * n)
+    scratch, peaks, norms = work[:n_scratch], work[n_scratch : n_scratch + n], work[n_scratch + n :]
     near = torch.empty(n_parts, k, dtype=torch.int64)
     partial = features.new_zeros(n_parts, k, width, CPU_LANES)
-    peaks, norms = features.new_empty(2, n)
     arguments = (weight.contiguous(), scratch, near, partial, peaks, norms)
     rows = features.contiguous(), n, padded, k, n_parts
     _EXPECTATION[_DIMENSIONS[width]](n_parts, *rows, *arguments, device=features.device)

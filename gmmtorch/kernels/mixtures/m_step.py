@@ -28,6 +28,8 @@ _NATURAL = """
         }
     if (!good) {
         *failed = true;
+        natural[item * WIDTH] = -1e300;
+        for (int f = 1; f < WIDTH; ++f) natural[item * WIDTH + f] = 0.0;
         return;
     }
     for (int j = 0; j < DIM; ++j)
@@ -159,24 +161,27 @@ def is_fused_on(dim: int, *tensors: Tensor) -> bool:
     return dim in DIMENSIONS and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
 
 
-def fused_natural_parameters(weights: Tensor, means: Tensor | None, covariances: Tensor) -> Tensor | None:
-    """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k); None for means of zero.
+def fused_natural_parameters(
+    weights: Tensor, means: Tensor | None, covariances: Tensor
+) -> tuple[Tensor, Tensor]:
+    """W (K, F) such that φ(x)·W_k = log π_k + log N(x | μ_k, Σ_k); `means` None: zeros.
 
-    Returns None if a weight or a covariance is not positive, NaN or infinite.
+    Also whether (a scalar) a weight or a covariance is not positive, NaN or infinite: W is not valid then.
     """
     k, dim = covariances.shape[:2]
     natural = weights.new_empty(k, 1 + dim + dim * (dim + 1) // 2)
     failed = torch.zeros(1, dtype=torch.bool, device=weights.device)
     given = weights.contiguous(), None if means is None else means.contiguous(), covariances.contiguous()
     _NATURALS[dim](k, *given, natural, failed, device=weights.device)
-    return None if bool(failed) else natural
+    return natural, failed[0]
 
 
 def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous: Mixture | None) -> Mixture:
     """M-step from statistics (K, F), in their frame; components without points keep `previous` values."""
     k = statistics.shape[0]
-    masses, means = statistics.new_empty(k), statistics.new_empty(k, dim)
-    covariances = statistics.new_empty(k, dim, dim)
+    made = statistics.new_empty(k * (1 + dim + dim * dim))
+    masses, means = made[:k], made[k : k + k * dim].view(k, dim)
+    covariances = made[k + k * dim :].view(k, dim, dim)
     _, *kept = (None, None, None) if previous is None else (part.contiguous() for part in previous)
     given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
     _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)

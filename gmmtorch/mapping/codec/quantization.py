@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec import lattice
+from gmmtorch.mapping.codec.bitstream import Ints
 from gmmtorch.mapping.codec.lattice import PER_OCTAVE, Lattice
 from gmmtorch.mapping.components import Components
 from gmmtorch.scan import FARTHEST
@@ -81,7 +83,7 @@ class Quantized:
         """The components, float64 on the CPU."""
         means, covariances = self.places.restored()
         support = torch.where(self.count == NO_COUNT, 0.0, lattice.power(self.count.clamp_min(LEAST_COUNT)))
-        seen_by = torch.repeat_interleave(self.n_viewpoints)
+        seen_by = torch.from_numpy(np.arange(len(self)).repeat(self.n_viewpoints.numpy()))
         weight = lattice.power(-self.share * (PER_OCTAVE // SHARES_PER_OCTAVE))
         total = support.new_zeros(len(support)).index_add_(0, seen_by, weight)
         return Components(
@@ -108,35 +110,37 @@ def quantize(components: Components) -> Quantized:
     places = lattice.nearest(c.means.double().cpu(), c.covariances.double().cpu())
     count = _count_steps(c.support.double().cpu())
     seen_by, seen_from, seen_count = c.seen_by.cpu(), c.seen_from.cpu(), c.seen_count.double().cpu()
-    largest = _largest(seen_count, seen_by, len(c))
-    kept = ((seen_count > 0) | (largest[seen_by] == 0)).nonzero().squeeze(1)
-    kept = kept[torch.argsort(seen_by[kept], stable=True)]
-    seen_by, seen_from, seen_count = seen_by[kept], seen_from[kept], seen_count[kept]
+    by, seen, counts = seen_by.numpy(), seen_from.numpy(), seen_count.numpy()
+    largest = _largest(seen_count, seen_by, len(c)).numpy()
+    kept = np.flatnonzero((counts > 0) | (largest[by] == 0))
+    kept = kept[np.argsort(by[kept], kind="stable")]
+    by, seen, counts = by[kept], seen[kept], counts[kept]
 
-    steps = _origin_steps(c.origins.double().cpu())
+    steps = _origin_steps(c.origins.double().cpu()).numpy()
     distinct, place = _first_uses(steps)
-    used, seen_from = torch.unique(place[seen_from], return_inverse=True)
+    used, seen = np.unique(place[seen], return_inverse=True)
     origins = steps[distinct[used]]
     # Two origins of a component that round to the same place are one viewpoint.
-    kept, pair = _first_uses(seen_by * len(origins) + seen_from)
-    seen_count = seen_count.new_zeros(len(kept)).index_add_(0, pair, seen_count)
-    seen_by, seen_from = seen_by[kept], seen_from[kept]
+    kept, pair = _first_uses(by * len(origins) + seen)
+    seen_count = torch.from_numpy(np.bincount(pair, counts, len(kept)))
+    seen_by, seen_from = torch.from_numpy(by[kept]), torch.from_numpy(seen[kept])
     return Quantized(
         places=places,
         count=count,
         max_range=c.max_range.cpu(),
         ids=c.ids.cpu(),
-        origins=origins,
-        n_viewpoints=torch.bincount(seen_by, minlength=len(c)),
+        origins=torch.from_numpy(origins),
+        n_viewpoints=torch.from_numpy(np.bincount(by[kept], minlength=len(c))),
         seen_from=seen_from,
         share=_share_steps(seen_count, seen_by, count),
     )
 
 
 def _count_steps(support: Tensor) -> Tensor:
-    bad = ~((support >= 0) & (support <= MOST_POINTS))
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
+    given = support.numpy()
+    bad = ~((given >= 0) & (given <= MOST_POINTS))
+    if bad.any():
+        first = int(bad.argmax())
         raise InvalidArgumentError(
             f"support[{first}]={float(support[first])} cannot be stored; it must be from 0 to "
             f"{MOST_POINTS:g}."
@@ -147,9 +151,9 @@ def _count_steps(support: Tensor) -> Tensor:
 
 
 def _origin_steps(origins: Tensor) -> Tensor:
-    bad = ~(origins.abs() <= FARTHEST).all(1)
-    if bool(bad.any()):
-        first = int(bad.nonzero()[0])
+    bad = ~(np.abs(origins.numpy()) <= FARTHEST).all(1)
+    if bad.any():
+        first = int(bad.argmax())
         raise InvalidArgumentError(
             f"origins[{first}] is {origins[first].tolist()}; coordinates up to {FARTHEST:g} m can be stored."
         )
@@ -169,12 +173,10 @@ def _largest(values: Tensor, owner: Tensor, n: int) -> Tensor:
     return values.new_zeros(n).scatter_reduce_(0, owner, values, "amax")
 
 
-def _first_uses(rows: Tensor) -> tuple[Tensor, Tensor]:
+def _first_uses(rows: Ints) -> tuple[Ints, Ints]:
     """The first row of each distinct value of (N, …), in order; and for each row, the number of its value."""
-    distinct, which = torch.unique(rows, dim=0 if rows.ndim > 1 else None, return_inverse=True)
-    places = torch.arange(len(rows))
-    first = torch.full((len(distinct),), len(rows)).scatter_reduce_(0, which, places, "amin")
-    order = torch.argsort(first)
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order))
-    return first[order], rank[which]
+    _, first, which = np.unique(rows, return_index=True, return_inverse=True, axis=0)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]

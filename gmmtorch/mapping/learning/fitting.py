@@ -67,7 +67,11 @@ def fit_window(
     origins = torch.stack([scan.origin.double() for scan in scans])
     returns = fit_points([scan.points for scan in scans], origins, fit, viewpoints)
     n_free = fit.rule.free_points
-    ends = [torch.cat([scan.no_return, _points_before(scan, n_free)]) for scan in scans]
+    ends = [scan.no_return for scan in scans]
+    if n_free:
+        ends = [torch.cat([scan.no_return, _points_before(scan, n_free)]) for scan in scans]
+    if not any(len(end) for end in ends):
+        return returns
     empty = fit_points(ends, origins, empty_fit or fit, viewpoints, max_range=True)
     return Components.concatenate([returns, empty])
 
@@ -84,15 +88,16 @@ def fit_points(
 
     `max_range`: the points are ends of no-return beams. Components are not numbered.
     """
-    sizes = torch.tensor([cloud.shape[0] for cloud in clouds], device=origins.device)
-    points = torch.cat(list(clouds)).double()
-    n_points, dim = points.shape[0], origins.shape[1]
+    sizes = [cloud.shape[0] for cloud in clouds]
+    n_points, dim = sum(sizes), origins.shape[1]
     if n_points == 0:
         return Components.empty(dim, origins.device)
+    points = torch.cat(list(clouds)).double()
+    scan = torch.repeat_interleave(torch.tensor(sizes, device=origins.device), output_size=n_points)
     center = points.mean(0)
     rule = replace(fit.rule, prune="none") if max_range else fit.rule
     sensor = _measured_sensor(clouds, origins) if rule.prune == "density" else None
-    window = _Window(points.sub_(center), torch.repeat_interleave(sizes), origins.double() - center, sensor)
+    window = _Window(points.sub_(center), scan, origins.double() - center, sensor)
     learn = _LEARNERS[rule.learner]
     found, counts, n_learned = learn(window, replace(fit, rule=rule))
     found = found._replace(means=found.means + center)
@@ -142,7 +147,7 @@ def _components(
 
 def _points_before(scan: Scan, n: int) -> Tensor:
     """n points (n·N, D) at equal distances on each beam with a return."""
-    shares = (torch.arange(n, dtype=torch.float64, device=scan.points.device) + 0.5) / max(n, 1)
+    shares = (torch.arange(n, dtype=torch.float64, device=scan.points.device) + 0.5) / n
     origin = scan.origin.double()
     return (origin + shares[:, None, None] * (scan.points.double() - origin)).flatten(0, 1)
 
@@ -175,7 +180,8 @@ class _Window(NamedTuple):
         """Points (n_groups, S) of each group in each scan; group (N,) of each point."""
         n_scans = self.origins.shape[0]
         pair = group * n_scans + self.scan
-        return torch.bincount(pair, minlength=n_groups * n_scans).view(-1, n_scans).double()
+        counts = torch.zeros(n_groups * n_scans, dtype=torch.float64, device=pair.device)
+        return counts.index_add_(0, pair, counts.new_ones(1).expand(len(pair))).view(-1, n_scans)
 
 
 class _Learned(NamedTuple):

@@ -18,7 +18,7 @@ from gmmtorch.mapping.components import Components
 
 
 class AssignedViewpoints(NamedTuple):
-    """kept (K,) bool: components that keep at least one viewpoint, K′ of them; their support (K′,); and
+    """kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and
     seen_by, seen_from, seen_count (E,) of their viewpoints, as in `Components`."""
 
     kept: Tensor
@@ -42,7 +42,7 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
     """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
-        kept = counts.sum(1) > 0
+        kept = (counts.sum(1) > 0).nonzero().squeeze(1)
         counts, support = counts[kept], weights[kept]
         support = support * (n_points * weight / support.sum())
         counts *= (support / counts.sum(1))[:, None]
@@ -69,9 +69,9 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
             counts = torch.zeros_like(counts).scatter_(1, drawn, counts.gather(1, drawn))
         share = counts * (support / counts.sum(1).clamp_min(1e-12))[:, None]
         seen_by, seen_from = (share > 0).nonzero(as_tuple=True)
-        kept = torch.bincount(seen_by, minlength=len(support)) > 0
-        number = torch.cumsum(kept.long(), 0) - 1
-        seen_count = share[seen_by, seen_from]
+        has_one = (share > 0).any(1)
+        number = torch.cumsum(has_one.long(), 0) - 1
+        kept, seen_count = has_one.nonzero().squeeze(1), share[seen_by, seen_from]
         return AssignedViewpoints(kept, support[kept], number[seen_by], seen_from, seen_count)
 
     return assign
@@ -106,10 +106,12 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
     kept = _kept_viewpoints(components, max_origins, mean_origins)
-    by, count = components.seen_by[kept], components.seen_count[kept]
+    by, count, seen_from = components.seen_by, components.seen_count, components.seen_from
+    if kept is not None:
+        by, count, seen_from = by[kept], count[kept], seen_from[kept]
     total = count.new_zeros(len(components)).index_add_(0, by, count)
     share = components.support / total.clamp_min(torch.finfo(total.dtype).tiny)
-    used, seen_from = torch.unique(components.seen_from[kept], return_inverse=True)
+    used, seen_from = torch.unique(seen_from, return_inverse=True)
     return replace(
         components,
         origins=components.origins[used],
@@ -119,14 +121,18 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     )
 
 
-def _kept_viewpoints(components: Components, max_origins: int, mean_origins: float | None) -> Tensor:
-    """Which viewpoints (E,) `limit_origins` keeps."""
+def _kept_viewpoints(components: Components, max_origins: int, mean_origins: float | None) -> Tensor | None:
+    """The viewpoints (E′,) that `limit_origins` keeps, in rising order; None: all."""
     by, count = components.seen_by, components.seen_count
     n, rows = len(components), torch.arange(components.seen_by.shape[0], device=components.seen_by.device)
     limit = n * max_origins if mean_origins is None else int(n * mean_origins)
     left = count > 0
-    if n == 0 or (int(left.sum()) <= limit and int(torch.bincount(by[left]).max()) <= max_origins):
-        return left
+    if n == 0:
+        return None
+    per_component = by.new_zeros(n).index_add_(0, by, left.long())
+    n_left, most = torch.stack([left.sum(), per_component.max()]).tolist()
+    if n_left <= limit and most <= max_origins:
+        return None if n_left == len(rows) else left.nonzero().squeeze(1)
     worth, position = count.sqrt(), components.origins[components.seen_from]
     nearest = torch.ones_like(count)  # distance to the nearest kept origin of the same component
     gain = torch.full_like(count, -1.0)  # √count · distance at which a viewpoint was chosen
@@ -145,4 +151,4 @@ def _kept_viewpoints(components: Components, max_origins: int, mean_origins: flo
         nearest = distance if step == 0 else torch.minimum(nearest, distance)
     kept = torch.zeros_like(left)
     kept[gain.argsort(descending=True, stable=True)[:limit]] = True
-    return kept & (gain >= 0)
+    return (kept & (gain >= 0)).nonzero().squeeze(1)

@@ -13,6 +13,7 @@ that never decreases (Verbeek, Nunnink & Vlassis, 2006).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -65,8 +66,8 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     weights, means, covariances = parameters
     dim = means.shape[1]
     if m_step.is_fused_on(dim, *parameters):
-        found = m_step.fused_natural_parameters(*parameters)
-        if found is not None:
+        found, failed = m_step.fused_natural_parameters(*parameters)
+        if not bool(failed):
             return found
     factors = safe_cholesky(covariances)
     whiten = inverse_factor(factors)
@@ -79,6 +80,19 @@ def natural_parameters(parameters: Parameters) -> Tensor:
     doubled = means.new_ones(rows.shape[0])
     doubled[rows == cols] = 0.5  # φ has each off-diagonal product once, for two matrix entries
     return torch.cat([constant[:, None], linear, -doubled * precision[:, rows, cols]], 1)
+
+
+def unchecked_expectation(
+    features: Tensor, sample_weight: Tensor, parameters: Parameters, softmax_dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """`expectation` that does not wait for the device: the log-likelihood is NaN where the natural parameters
+    need the checks of `natural_parameters`.
+    """
+    if not m_step.is_fused_on(parameters.means.shape[1], *parameters):
+        return expectation(features, sample_weight, natural_parameters(parameters), softmax_dtype)
+    natural, failed = m_step.fused_natural_parameters(*parameters)
+    statistics, value = expectation(features, sample_weight, natural, softmax_dtype)
+    return statistics, value.masked_fill(failed, math.nan)
 
 
 def most_likely(features: Tensor, parameters: Parameters) -> Tensor:

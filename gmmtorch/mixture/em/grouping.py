@@ -268,8 +268,8 @@ def centered_parameters(parameters: Parameters) -> Tensor:
     """Natural parameters (K, F) of the components about their own means."""
     weights, means, covariances = parameters
     if m_step.is_fused_on(means.shape[1], *parameters):
-        found = m_step.fused_natural_parameters(weights, None, covariances)
-        if found is not None:
+        found, failed = m_step.fused_natural_parameters(weights, None, covariances)
+        if not bool(failed):
             return found
     return natural_parameters(parameters._replace(means=torch.zeros_like(means)))
 

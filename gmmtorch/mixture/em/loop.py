@@ -91,10 +91,24 @@ def natural_step(
     def gather(parameters: Parameters) -> tuple[Tensor, Tensor]:
         return exact.expectation(*rows, exact.natural_parameters(parameters), softmax_dtype)
 
-    direct = None
+    total = float(sample_weight.sum())
     if points is not None:
         direct = functools.partial(exact.direct_step, points, sample_weight, reg_covar=reg_covar)
-    return guarded_step(gather, direct, reg_covar, float(sample_weight.sum()), covariance_type)
+        return guarded_step(gather, direct, reg_covar, total, covariance_type)
+    checked = guarded_step(gather, None, reg_covar, total, covariance_type)
+    unchecked = guarded_step(
+        lambda parameters: exact.unchecked_expectation(*rows, parameters, softmax_dtype),
+        None,
+        reg_covar,
+        total,
+        covariance_type,
+    )
+
+    def step(parameters: Parameters) -> tuple[Parameters, float]:
+        new, bound = unchecked(parameters)
+        return checked(parameters) if math.isnan(bound) else (new, bound)
+
+    return step
 
 
 def guarded_step(
