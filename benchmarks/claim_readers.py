@@ -115,12 +115,18 @@ def result(field: str, scale: float = 1.0, **where: Any) -> Reader:
         rows = json.loads((out / "results.json").read_text(encoding="utf-8"))["rows"]
         choices = [{**where, several[0]: value} for value in where[several[0]]] if several else [where]
         chosen = [
-            [row[field] for row in rows if all(row.get(name) == value for name, value in one.items())]
+            [_value(row, field) for row in rows if all(row.get(name) == value for name, value in one.items())]
             for one in choices
         ]
         return [scale * fmean(value for value in values if value is not None) for values in chosen]
 
     return read
+
+
+def _value(row: dict[str, Any], field: str) -> Any:
+    """Of a row, or of a dictionary in it: `field.key`."""
+    name, _, key = field.partition(".")
+    return row[name][key] if key else row[name]
 
 
 def joined(*readers: Reader) -> Reader:

@@ -193,6 +193,7 @@ RATES = [
 ]
 ALIGNED = {"0.5 m, 10°": within(1), "error (m)": within(0.01), "align (s)": times(2), "bytes": SIZE}
 FLOWN = {"ATE": times(1.5), "median step error": times(1.5), "steps off by over 0.2 m": within(0)}
+HELD = ("ms", "ms with 20,000 components held")
 UNSEEN = [(name, "150", "mixture") for name in ("freiburg-101", "aces")]
 
 # fmt: off
@@ -211,6 +212,11 @@ RUNS = {
         Claim(FIGURES, "The flux form has errors of up to #·10⁻⁴ everywhere",
               largest(*[result("misses_max", 1e4, study="sweep", method="flux", dim=dim) for dim in (2, 3)]),
               at_most(1.1)),
+    ], slow=False),
+    "sharing_costs": Run("python benchmarks/sharing_costs.py", [
+        *of_table("docs/messages.md", "message-sizes", 1, {"bytes": SIZE}),
+        *of_table("docs/replica.md", "replica-costs", 1, dict.fromkeys(HELD, at_most(3))),
+        *of_table("docs/network.md", "frame-costs", 1, {"time": at_most(3)}),
     ], slow=False),
     "map_building": Run("python benchmarks/map_building.py --data $DATA", [
         *of_table(RESULTS, "map-building", 2, BUILT),
@@ -290,6 +296,8 @@ RUNS = {
               joined(saving("bytes_raw_points"), saving("bytes_draco")), times(1.1)),
         Claim("docs/exploration.md", "An octree of the points' cells takes # of E0's bytes",
               saving("bytes_octree"), times(1.1)),
+        Claim("docs/exploration.md", "about # bytes per component",
+              ratio(team("bytes_by_kind.components"), team("n_components")), times(1.1)),
         of_mission("entropy taken away (kbit)", "entropy_reduction_bits", times(1.01), 1e-3),
         of_mission("AUC, all observable cells", "auc", AUC),
         of_mission("cross-entropy (bits a cell)", "cross_entropy_bits", within(0.01)),
