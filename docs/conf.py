@@ -6,6 +6,9 @@ import re
 from importlib.metadata import version as installed
 from typing import Any
 
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
+
 project = "gmmtorch"
 author = "The gmmtorch developers"
 project_copyright = "The gmmtorch developers"
@@ -16,6 +19,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ex
 source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
 exclude_patterns = ["_build"]
 html_theme = "furo"
+html_math_renderer = "mathml"  # browsers draw it without a script from the network
 html_title = f"gmmtorch {release}"
 html_static_path: list[str] = []
 html_copy_source = False
@@ -23,9 +27,11 @@ suppress_warnings = ["ref.python"]  # words of Literal types that are also names
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath", "attrs_block"]
-nb_execution_mode = "cache"
+nb_execution_mode = "force"  # pictures are those of the present code
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
+nb_execution_in_temp = True  # tutorials write files
+nb_merge_streams = True
 
 autodoc_member_order = "groupwise"
 autodoc_typehints = "signature"
@@ -48,8 +54,9 @@ _FIELD = re.compile(r"([a-z_]\w*(?:, [a-z_]\w*)*(?: \([^)]*\))?(?: bool)?): (.+)
 
 def _links(app: Any, name: str, source: list[str]) -> None:
     """Pages link to files of the repository, where people read them too. On the site these are its pages."""
+    docs = "../" * name.count("/")
     for path, page in _TOP.items():
-        source[0] = re.sub(rf"\]\(\.\./{re.escape(path)}(?=[#)])", f"]({page}", source[0])
+        source[0] = re.sub(rf"\]\({re.escape(f'{docs}../{path}')}(?=[#)])", f"]({docs}{page}", source[0])
 
 
 def _included_links(app: Any, path: Any, parent: str, source: list[str]) -> None:
@@ -80,7 +87,18 @@ def _skip(app: Any, what: str, name: str, item: Any, skip: bool, options: Any) -
     return skip or name.endswith(("_request", "_metadata_routing"))
 
 
+def _equation(display: str) -> Any:
+    """Writes a formula as MathML."""
+
+    def visit(writer: Any, node: Any) -> None:
+        writer.body.append(convert(node.astext(), display=display))
+        raise SkipNode
+
+    return visit
+
+
 def setup(app: Any) -> None:
+    app.add_html_math_renderer("mathml", (_equation("inline"), None), (_equation("block"), None))
     app.connect("source-read", _links)
     app.connect("include-read", _included_links)
     app.connect("autodoc-process-docstring", _docstring, priority=400)  # before napoleon

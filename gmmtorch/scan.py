@@ -126,6 +126,7 @@ class Scan:
 
     @property
     def dim(self) -> int:
+        """2 or 3."""
         return self.origin.shape[0]
 
     @property

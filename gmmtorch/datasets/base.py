@@ -138,11 +138,13 @@ class Dataset(Sequence[Scan]):
 
     @property
     def times(self) -> Tensor | None:
+        """Times (N,) of the scans in seconds, float64; None if the source has no usable times."""
         times = self._known_times()
         return None if times is None else times[:: self.stride]
 
     @property
     def skipped(self) -> dict[str, int]:
+        """Number of scans that are left out, by the reason."""
         return {reason: len(scans) for reason, scans in self._skipped.items()}
 
     def can_continue(self, n_read: int) -> bool:

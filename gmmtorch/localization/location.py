@@ -31,6 +31,7 @@ class Location:
 
     @property
     def found(self) -> bool:
+        """Whether there are no doubts."""
         return not self.doubts
 
 

@@ -56,6 +56,7 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
+        """Whether there are no doubts."""
         return not self.doubts
 
 

@@ -109,6 +109,7 @@ class Components:
 
     @property
     def dim(self) -> int:
+        """2 or 3."""
         return self.means.shape[1]
 
     def __len__(self) -> int:

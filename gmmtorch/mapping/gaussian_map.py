@@ -230,6 +230,7 @@ class GaussianMap(MapState):
 
     @property
     def n_components(self) -> int:
+        """Number of components, those of the unfinished window included."""
         return len(self.components()) if self.dim is not None else 0
 
     # -- queries --------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ _BUFFERS = tuple(f.name for f in fields(Components))
 _STATE = "_extra_state"  # torch's name of it in a state dict
 
 
-def _field(name: str) -> Any:
+def _field(name: str, about: str) -> Any:
     """A property: a field of all components, not rounded, those of the unfinished window included."""
 
     def read(self: MapState) -> Tensor:
@@ -28,7 +28,7 @@ def _field(name: str) -> Any:
             raise AttributeError(name)  # `__getattr__` explains it
         return cast(Tensor, getattr(self._with_pending(), name))
 
-    return property(read)
+    return property(read, doc=f"{about} Not rounded; with the components of the unfinished window.")
 
 
 class MapState(nn.Module):
@@ -39,15 +39,15 @@ class MapState(nn.Module):
         settings: what the map's file states; the learner keeps the time.
     """
 
-    means = _field("means")
-    covariances = _field("covariances")
-    support = _field("support")
-    max_range = _field("max_range")
-    ids = _field("ids")
-    origins = _field("origins")
-    seen_by = _field("seen_by")
-    seen_from = _field("seen_from")
-    seen_count = _field("seen_count")
+    means = _field("means", "(K, D) in metres.")
+    covariances = _field("covariances", "(K, D, D) in m².")
+    support = _field("support", "(K,) points that each component stands for.")
+    max_range = _field("max_range", "(K,) bool: components of no-return beams.")
+    ids = _field("ids", "(K, 2): robot, sequence number.")
+    origins = _field("origins", "(S, D) sensor positions, metres.")
+    seen_by = _field("seen_by", "(E,) the component of each viewpoint.")
+    seen_from = _field("seen_from", "(E,) the origin of each viewpoint.")
+    seen_count = _field("seen_count", "(E,) points of each viewpoint.")
 
     def __init__(self, learner: Learner, settings: MapSettings) -> None:
         super().__init__()

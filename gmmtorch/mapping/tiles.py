@@ -86,6 +86,7 @@ class TiledMap:
 
     @property
     def query_options(self) -> QueryOptions:
+        """How queries are answered; the same in all tiles."""
         if self._options.hit_length == AUTO:
             sums = [range_sums(self.components(row).cones()) for row in range(len(self.index))]
             self._options = with_hit_length(self._options, sum(sums, torch.zeros(2, dtype=torch.float64)))
@@ -97,6 +98,7 @@ class TiledMap:
 
     @property
     def n_components(self) -> int:
+        """Number of components in all tiles."""
         return int(self.index.n_components.sum())
 
     @property

@@ -36,6 +36,7 @@ class Cones(NamedTuple):
 
     @property
     def dim(self) -> int:
+        """2 or 3."""
         return self.means.shape[1]
 
     def checked(self) -> Cones:

@@ -107,6 +107,7 @@ class Evidence:
 
     @classmethod
     def empty(cls, grid: VoxelGrid, device: torch.device | str | None = None) -> Evidence:
+        """No evidence in any cell of a grid."""
         zeros = torch.zeros(grid.shape, dtype=torch.float64, device=device)
         return cls(grid, zeros, zeros.clone())
 

@@ -64,10 +64,12 @@ class VoxelGrid:
 
     @property
     def dim(self) -> int:
+        """2 or 3."""
         return len(self.shape)
 
     @property
     def n_cells(self) -> int:
+        """Number of all cells."""
         return math.prod(self.shape)
 
     @classmethod

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from gmmtorch.cli import localize
 
 LINES = (CHECKOUT / "docs" / "commands.md").read_text(encoding="utf-8").splitlines()
-PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
+PAGES = [CHECKOUT / "README.md", CHECKOUT / "BENCHMARKS.md", *sorted((CHECKOUT / "docs").rglob("*.md"))]
 COMMANDS = ["occupancy", "map", "localize", "view", "ros", "fit", "export", "explore", "robot", "team"]
 CHOICES = [
     *([command] for command in COMMANDS),

@@ -154,6 +154,7 @@ class ConeIndex:
 
     @property
     def n_buckets(self) -> int:
+        """Number of cells of the index that list a cone."""
         return self.keys.shape[0]
 
     def _pack(self, cell: Tensor) -> Tensor:

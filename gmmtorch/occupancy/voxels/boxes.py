@@ -21,6 +21,7 @@ class Box(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Cells along each axis."""
         return tuple((self.high - self.low).tolist())
 
 

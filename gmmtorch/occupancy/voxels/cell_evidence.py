@@ -27,6 +27,7 @@ class CellEvidence(NamedTuple):
 
     @classmethod
     def empty(cls, device: torch.device | str | None = None) -> CellEvidence:
+        """Evidence of no cell, in 3D."""
         zero = torch.zeros(0, device=device)
         return cls(torch.zeros(0, 3, dtype=torch.int64, device=device), zero, zero)
 

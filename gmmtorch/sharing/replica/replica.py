@@ -299,6 +299,7 @@ class Replica:
 
     @property
     def n_components(self) -> int:
+        """Number of components that are held."""
         return len(self._records.table)
 
     # -- storing ----------------------------------------------------------------------------------
