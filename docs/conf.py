@@ -21,7 +21,8 @@ exclude_patterns = ["_build"]
 html_theme = "furo"
 html_math_renderer = "mathml"  # browsers draw it without a script from the network
 html_title = f"gmmtorch {release}"
-html_static_path: list[str] = []
+html_static_path = ["style"]
+html_css_files = ["wide_formulas.css"]
 html_copy_source = False
 suppress_warnings = ["ref.python"]  # words of Literal types that are also names of attributes
 
@@ -91,7 +92,8 @@ def _equation(display: str) -> Any:
     """Writes a formula as MathML."""
 
     def visit(writer: Any, node: Any) -> None:
-        writer.body.append(convert(node.astext(), display=display))
+        formula = convert(node.astext(), display=display)
+        writer.body.append(f'<div class="scrolls">{formula}</div>' if display == "block" else formula)
         raise SkipNode
 
     return visit
