@@ -1,6 +1,7 @@
 """Plays a recording to gmmtorch-ros at its own speed, over DDS and Zenoh. Writes the table of BENCHMARKS.md.
 
     OMP_NUM_THREADS=1 python benchmarks/ros.py --data $GMMTORCH_DATA
+    OMP_NUM_THREADS=1 python benchmarks/ros.py --data $GMMTORCH_DATA --minutes 10   # one map of 16 kB
 
 The player, the mapper and Zenoh's router are processes of their own on loopback. The map is compared with the
 one that gmmtorch-map makes of the same recording.
@@ -52,14 +53,22 @@ class Usage:
         return ticks / os.sysconf("SC_CLK_TCK") / (time.monotonic() - self._begin)
 
 
-def played(middleware: str, bag: Path, folder: Path, more: list[str]) -> tuple[dict[str, Any], Usage, float]:
-    """The row of results.json of the mapper, its usage, and its share of a core."""
+def played(
+    middleware: str, bag: Path, folder: Path, more: list[str], seconds: float = 0.0
+) -> tuple[dict[str, Any], Usage, float]:
+    """The row of results.json of the mapper, its usage, and its share of a core.
+
+    The recording is played again until `seconds` have passed.
+    """
     node = [f"node.middleware={middleware}", "node.domain=91", "wait=60"]
-    receive = [*node, "node.use_sim_time=true", "sensor.max_latency=5", *more]
+    receive = [*node, "node.use_sim_time=true", *more]
     mapper = subprocess.Popen(command("ros", folder / "mapper", *receive))
-    player = subprocess.Popen(command("ros", folder / "player", *node, f"play={bag}"))
+    play = command("ros", folder / "player", *node, f"play={bag}")
+    player, end = subprocess.Popen(play), time.monotonic() + seconds
     usage: Usage | None = None
-    while player.poll() is None:
+    while player.poll() is None or time.monotonic() < end:
+        if player.poll() is not None:
+            player = subprocess.Popen(play)
         time.sleep(0.5)
         started = any((folder / "mapper").glob("ros.log"))
         usage = Usage(mapper) if usage is None and started else usage
@@ -77,7 +86,35 @@ def played(middleware: str, bag: Path, folder: Path, more: list[str]) -> tuple[d
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    bag = parser.parse_args().data / "bags" / "turtlebot4" / "bag"
+    parser.add_argument("--minutes", type=float, help="play the recording again and again to one map")
+    given = parser.parse_args()
+    bag = given.data / "bags" / "turtlebot4" / "bag"
+    if given.minutes:
+        long_run(bag, given.minutes)
+    else:
+        one_play(bag)
+
+
+def long_run(bag: Path, minutes: float) -> None:
+    """The row of a map with a budget to which the recording is played again and again over DDS."""
+    with tempfile.TemporaryDirectory() as name:
+        row, usage, share = played("dds", bag, Path(name), ["map.max_bytes=16000"], 60 * minutes)
+    n = len(usage.memory)
+    header = ["minutes", "scans", "dropped", "median latency", "99 %", "of a core"]
+    cells = [
+        f"{minutes:g}",
+        row["n_scans"],
+        row["n_dropped"],
+        f"{row['latency_median']:.2f} s",
+        f"{row['latency_p99']:.2f} s",
+        f"{100 * share:.0f} %",
+        ", ".join(f"{usage.memory[min(n - 1, n * k // 5)] / _MEGABYTE:.0f}" for k in range(1, 6)) + " MB",
+    ]
+    publish("ros-long", markdown([*header, "memory after each fifth"], [cells]) + f"\n\n{hardware()}")
+
+
+def one_play(bag: Path) -> None:
+    """The table of maps with and without a budget, over both middlewares."""
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

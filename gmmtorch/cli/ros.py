@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -195,13 +196,13 @@ class _Checkpoint:
         if path.exists():
             self._builder.load(path, self._facts)
             print(f"continues after scan {self._builder.record.n_read} of {path}", flush=True)
-        self._saved = self._builder.record.seconds
+        self._saved = time.monotonic()
 
     def save_when_due(self) -> None:
-        """Writes the file if enough was computed since."""
-        if self._builder.record.seconds - self._saved >= self._period:
+        """Writes the file if enough time has passed since the last one."""
+        if time.monotonic() - self._saved >= self._period:
             self._builder.save(self._path, self._facts)
-            self._saved = self._builder.record.seconds
+            self._saved = time.monotonic()
 
 
 def _until_stopped(
@@ -212,8 +213,6 @@ def _until_stopped(
     after_scan: Callable[[], None],
 ) -> None:
     """Handles scans until Ctrl-C; says why there are none."""
-    import time
-
     begin = time.monotonic()
     with app.stop_requests() as is_stopped:
         while not is_stopped():

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
-from command_runs import refused, run_here, run_script, succeeded
+import torch
+from command_runs import CHECKOUT, environment, refused, run_here, run_script, succeeded
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
+from gmmtorch.datasets.base import Ranges
+from gmmtorch.datasets.recordings.ros.bag_reader import Topic
+from gmmtorch.datasets.recordings.ros.bag_topics import LASER as LASERS
+from gmmtorch.datasets.recordings.ros.bag_topics import Sensor
+from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.export.bag import BagWriter
+from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping.map_builder import MapBuilder
 
 LASER = "sensor_msgs/msg/LaserScan"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def test_a_missing_topic_is_an_error_that_lists_what_is_there(monkeypatch, tmp_path, ros_domain):
@@ -75,3 +90,92 @@ def test_ctrl_c_saves_the_map_of_a_played_recording(monkeypatch, tmp_path, ros_d
     assert GaussianMap.load(done.folder / "map.safetensors").n_components == row["n_components"]
     assert "trajectory.tum" in done.files()
     assert LASER in done.stdout
+
+
+def until(is_done: Callable[[], bool], what: str, seconds: float = 50.0) -> None:
+    end = time.monotonic() + seconds
+    while not is_done():
+        assert time.monotonic() < end, f"{what} did not happen"
+        time.sleep(0.05)
+
+
+def sweep(index: int) -> dict[str, Any]:
+    """A laser scan of a room whose walls seem to move."""
+    ranges = (2.0 + np.arange(60) / 50 + index / 100).astype(np.float32)
+    stamp = {"sec": 100 + index // 10, "nanosec": index % 10 * 100_000_000}
+    angles = {"angle_min": -1.5, "angle_increment": 0.05, "time_increment": 0.0}
+    about = {**angles, "range_min": 0.0, "range_max": 9.0, "ranges": ranges}
+    return {"header": {"frame_id": "laser", "stamp": stamp}, **about}
+
+
+def n_scans(message: dict[str, Any]) -> int:
+    (values,) = [status["values"] for status in message["status"]]
+    return next(int(pair["value"]) for pair in values if pair["key"] == "n_scans")
+
+
+def mapped(sweeps: list[int]) -> GaussianMap:
+    """The map of these sweeps without a network."""
+    sensor, options = Sensor(Topic("/scan", LASER, 0), LASERS), LiveOptions(poses="standing")
+    scans = LiveScans(sensor, TransformTree(), Ranges(), options)
+    builder = MapBuilder(scans, GaussianMap())
+    for index in sweeps:
+        scans.receive(sweep(index), 0)
+        assert scans.advance()
+        list(builder.insert_all())
+    builder.finish()
+    return builder.map
+
+
+@pytest.mark.slow
+def test_a_killed_mapper_goes_on_after_its_last_checkpoint(tmp_path, ros_domain):
+    folder = tmp_path / "run"
+    options = [
+        f"hydra.run.dir={folder}",
+        f"node.domain={ros_domain}",
+        "wait=50",
+        "sensor.poses=standing",
+        "sensor.max_latency=null",
+        "checkpoint_seconds=0",
+        "report.progress=false",
+    ]
+
+    def mapper() -> subprocess.Popen[str]:
+        arguments = [sys.executable, str(CHECKOUT / "scripts" / "ros.py"), *options]
+        made = subprocess.Popen(arguments, env=environment(), stdout=subprocess.PIPE, text=True)
+        until(lambda: any(end.topic == "/scan" for end in sensor.subscribers()), "a subscription")
+        time.sleep(1.0)
+        return made
+
+    with Node("sensor", domain=ros_domain) as sensor:
+        send = sensor.publisher("/scan", LASER)
+        first = mapper()
+        for index in range(60):
+            send(sweep(index))
+            time.sleep(0.02)
+            if index > 30 and (folder / "checkpoint.safetensors").exists():
+                break
+        first.kill()
+        first.wait()
+        until(lambda: not any(end.topic == "/scan" for end in sensor.subscribers()), "the end of the first")
+        second = mapper()
+        assert second.stdout is not None
+        line = next(line for line in second.stdout if line.startswith("continues after scan "))
+        n_before, counts = int(line.split()[3]), [0]
+        sensor.subscribe("/diagnostics", DIAGNOSTICS, lambda message: counts.append(n_scans(message)))
+        later = list(range(70, 90))
+        for index in later:
+            send(sweep(index))
+            time.sleep(0.02)
+
+        def is_mapped() -> bool:
+            sensor.spin_once(0.1)
+            return counts[-1] == n_before + len(later)
+
+        until(is_mapped, "the mapping of the later scans")
+        second.send_signal(signal.SIGINT)
+        assert second.communicate(timeout=50)
+    assert 0 < n_before <= index + 1
+    (row,) = json.loads((folder / "results.json").read_text())["rows"]
+    assert row["n_scans"] == n_before + len(later)
+    found = GaussianMap.load(folder / "map.safetensors").components()
+    assert torch.equal(found.means, mapped([*range(n_before), *later]).components().means)

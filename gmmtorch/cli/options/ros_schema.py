@@ -66,7 +66,7 @@ class Ros:
     view: show the map in the browser while it is built.
     view_host: address of the view; 0.0.0.0: other machines can open it, too.
     view_port: port of the view; the next free one if it is in use.
-    checkpoint_seconds: computing time between two checkpoints.
+    checkpoint_seconds: between two checkpoints; a kill loses the scans since the last one.
     """
 
     map: Any = MISSING

@@ -109,7 +109,9 @@ class DdsMiddleware:
         found = []
         for reader, is_publisher in self._known:
             for sample in reader.read(N=10 * _MOST_SAMPLES):
-                name, kind = getattr(sample, "topic_name", ""), ros_type(getattr(sample, "type_name", ""))
+                # Both are None for an endpoint of a process that was killed.
+                name = getattr(sample, "topic_name", None) or ""
+                kind = ros_type(getattr(sample, "type_name", None) or "")
                 if name.startswith(f"{_TOPIC_PREFIX}/") and kind is not None and _is_alive(sample):
                     quality = _quality(sample.qos)
                     found.append(Endpoint(name[len(_TOPIC_PREFIX) :], kind, quality, is_publisher))
