@@ -1,6 +1,6 @@
 """The replicated map of a team, its store on disk, and the networks that carry its messages.
 
-`Replica` and `Store` are imported when they are first used, so that `import gmmtorch.sharing` stays light.
+Names are imported when they are first used, so that `import gmmtorch.sharing` stays light.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING
 from gmmtorch.lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from gmmtorch.sharing.frame_joiner import FrameJoiner as FrameJoiner
     from gmmtorch.sharing.replica.replica import Replica as Replica
     from gmmtorch.sharing.store import Store as Store
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, {"Replica": "replica.replica", "Store": "store"})
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__, {"FrameJoiner": "frame_joiner", "Replica": "replica.replica", "Store": "store"}
+)

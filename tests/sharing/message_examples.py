@@ -23,14 +23,15 @@ from gmmtorch.sharing.messages.message_registry import (
     encode_views,
     quantized_poses,
 )
+from gmmtorch.sharing.messages.motions import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     CorrectionMessage,
+    FrameMessage,
     RecordMessage,
     SupersessionMessage,
     counters_message,
     encode_announcements,
     encode_record,
-    pose_of,
 )
 from gmmtorch.sharing.replica.record_keys import Intervals, first_key
 
@@ -81,6 +82,7 @@ def records() -> list[RecordMessage]:
         SupersessionMessage(first_key(2, 5), span(2, 0, 3) | span(2, 7, 8), span(2, 30, 32)),
         counters_message(first_key(1, 9), {1: 5.0, 2: 0.0, first_key(4) + 3: 800.0}),
         CorrectionMessage(first_key(2, 9), 3, 1, span(2, 4, 6), pose_of(torch.eye(4))),
+        FrameMessage(first_key(2, 9) + 1, 2 << 24 | 9, 2, 1 << 24 | 5, pose_of(torch.eye(3))),
     ]
 
 

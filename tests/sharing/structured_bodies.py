@@ -316,6 +316,22 @@ def _correction(rng: Random) -> bytes:
     _key(writer, rng)
     _number(writer, rng, 3)
     _number(writer, rng, 1)
+    _motion(writer, rng)
+    _intervals(writer, rng)
+    return writer.to_bytes()
+
+
+def _frame(rng: Random) -> bytes:
+    writer = BitWriter()
+    _key(writer, rng)
+    for usual in (5, 1, rng.choice([0, 9])):
+        _number(writer, rng, usual)
+    if rng.random() < 0.9:
+        _motion(writer, rng)
+    return writer.to_bytes()
+
+
+def _motion(writer: BitWriter, rng: Random) -> None:
     dim = rng.choice([2, 3])
     writer.one(dim - 2, 1)
     turn = np.array([1.0, *(rng.uniform(-2, 2) for _ in range(1 if dim == 2 else 3))])
@@ -323,8 +339,6 @@ def _correction(rng: Random) -> bytes:
     if rng.random() < 3 * _ODD:
         pose[rng.randrange(len(pose))] = rng.choice(_REAL)
     writer.fixed(pose.astype("<f8").view("<u4").astype(np.int64), 32)
-    _intervals(writer, rng)
-    return writer.to_bytes()
 
 
 _BODIES: dict[Kind, Callable[[Random], bytes]] = {
@@ -341,4 +355,5 @@ _BODIES: dict[Kind, Callable[[Random], bytes]] = {
     Kind.SUPERSESSION: _supersession,
     Kind.COUNTERS: _totals,
     Kind.CORRECTION: _correction,
+    Kind.FRAME: _frame,
 }

@@ -17,6 +17,7 @@ from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
 from gmmtorch.sharing.messages.fields import write_intervals, write_keys
 from gmmtorch.sharing.messages.message_registry import MAX_BYTES, decode
+from gmmtorch.sharing.messages.motions import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,
@@ -25,7 +26,6 @@ from gmmtorch.sharing.messages.record_messages import (
     counters_message,
     encode_announcements,
     encode_record,
-    pose_of,
 )
 from gmmtorch.sharing.replica.anti_entropy import MOST_PEERS, Backlog
 from gmmtorch.sharing.replica.record_keys import END, Intervals, first_key, keys_in, keys_of

@@ -34,6 +34,7 @@ from gmmtorch.sharing.messages.message_registry import (
     CorrectionMessage,
     CountersMessage,
     CountsMessage,
+    FrameMessage,
     Message,
     PlanMessage,
     PointsMessage,
@@ -57,9 +58,9 @@ def sound() -> list[bytes]:
 
 def test_every_kind_decodes_to_its_message(sound):
     kinds = [ComponentsMessage] * 3 + [CountsMessage] * 3 + [PointsMessage, ViewsMessage, PlanMessage]
-    kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage]
+    kinds += [AnnouncementMessage, SupersessionMessage, CountersMessage, CorrectionMessage, FrameMessage]
     assert [type(decode(datagram)) for datagram in sound] == kinds
-    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in range(1, 14)]
+    assert [datagram[0] for datagram in sound] == [0x10 | kind for kind in [*range(1, 14), 15]]
 
 
 def test_every_damage_of_a_datagram_is_detected(sound):
@@ -79,8 +80,8 @@ def test_every_damage_of_a_datagram_is_detected(sound):
 def test_other_versions_kinds_and_sizes_are_refused_by_name():
     with pytest.raises(DataError, match="version 2"):
         decode(sealed(b"\x24" + bytes(9)))
-    with pytest.raises(DataError, match="kind 15"):
-        decode(sealed(b"\x1f" + bytes(9)))
+    with pytest.raises(DataError, match="kind 14"):
+        decode(sealed(b"\x1e" + bytes(9)))
     with pytest.raises(DataError, match="1201 bytes"):
         decode(bytes(1201))
     with pytest.raises(DataError, match="empty"):
@@ -116,7 +117,9 @@ def places_of(message: Message) -> list[torch.Tensor]:
         return [message.poses[:, :3]]
     if isinstance(message, PlanMessage):
         return [message.path[:, :3], message.views[:, :3]]
-    return [message.pose[: message.dim]] if isinstance(message, CorrectionMessage) else []
+    if isinstance(message, CorrectionMessage | FrameMessage) and message.pose is not None:
+        return [message.pose[: message.dim]]
+    return []
 
 
 def encoded_again(message: Message, kind: Kind) -> list[bytes]:

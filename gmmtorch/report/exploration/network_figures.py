@@ -180,6 +180,7 @@ _HUES = {
     "counts": PALETTE[5],
     "supersessions": PALETTE[4],
     "corrections": PALETTE[1],
+    "frames": "#8a6d3b",
     "points": PALETTE[6],
     "views": PALETTE[2],
     "plans": PALETTE[3],

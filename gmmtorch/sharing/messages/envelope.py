@@ -22,7 +22,7 @@ _CHECKSUM_BYTES = 4
 
 
 class Kind(IntEnum):
-    """The low half of a datagram's first byte; the high half is the version. 14 is reserved."""
+    """The low half of a datagram's first byte; the high half is the version. 14 is retired."""
 
     COMPONENTS = 1
     FLOAT_COMPONENTS = 2
@@ -37,6 +37,7 @@ class Kind(IntEnum):
     SUPERSESSION = 11
     COUNTERS = 12
     CORRECTION = 13
+    FRAME = 15
 
 
 OWN_CHECKSUM = frozenset({Kind.COMPONENTS})

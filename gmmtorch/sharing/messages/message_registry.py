@@ -25,6 +25,7 @@ from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,
     CountersMessage,
+    FrameMessage,
     SupersessionMessage,
 )
 from gmmtorch.sharing.messages.view_messages import PlanMessage, ViewsMessage, encode_plan, encode_views
@@ -37,6 +38,7 @@ __all__ = [
     "CorrectionMessage",
     "CountersMessage",
     "CountsMessage",
+    "FrameMessage",
     "Message",
     "PlanMessage",
     "PointsMessage",
@@ -62,6 +64,7 @@ Message = (
     | SupersessionMessage
     | CountersMessage
     | CorrectionMessage
+    | FrameMessage
 )
 
 _READERS: dict[Kind, Callable[[bytes], Message]] = {
@@ -78,6 +81,7 @@ _READERS: dict[Kind, Callable[[bytes], Message]] = {
     Kind.SUPERSESSION: record_messages.read_supersession,
     Kind.COUNTERS: record_messages.read_counters,
     Kind.CORRECTION: record_messages.read_correction,
+    Kind.FRAME: record_messages.read_frame,
 }
 
 
@@ -95,6 +99,7 @@ _NAMES: dict[Kind, str] = {
     Kind.ANNOUNCEMENT: "announcements",
     Kind.SUPERSESSION: "supersessions",
     Kind.CORRECTION: "corrections",
+    Kind.FRAME: "frames",
 }
 
 

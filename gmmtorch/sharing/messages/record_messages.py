@@ -1,4 +1,5 @@
-"""Datagrams of records other than components: supersessions, counters, corrections; and announcements.
+"""Datagrams of records other than components: supersessions, counters, corrections, frames; and
+announcements.
 
 docs/messages.md describes the formats.
 """
@@ -13,7 +14,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
-from gmmtorch.linalg import check_rigid
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.quantization import LARGEST_COUNT, NO_COUNT
 from gmmtorch.sharing.messages.count_messages import count_steps, counts_of
@@ -26,12 +26,16 @@ from gmmtorch.sharing.messages.fields import (
     write_keys,
     write_number,
 )
+from gmmtorch.sharing.messages.motions import is_motion, matrix_of, motion_dim, read_motion, write_motion
 from gmmtorch.sharing.replica.record_keys import (
     END,
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
+    NUMBER_BITS,
+    WORLD,
     Intervals,
     Ints,
+    author_of,
     first_key,
     keys_of_robot,
     robot_of,
@@ -39,8 +43,6 @@ from gmmtorch.sharing.replica.record_keys import (
 
 RECORD_BYTES = 1000
 """Longest record. A datagram of 1200 bytes has room for it and for encryption."""
-_POSE_NUMBERS = {2: 4, 3: 7}  # a position, and cos and sin of the yaw or a unit quaternion
-_UNIT = 1e-9
 
 
 def check_size(max_bytes: int) -> None:
@@ -94,24 +96,35 @@ class CorrectionMessage:
 
     @property
     def dim(self) -> int:
-        return {n: dim for dim, n in _POSE_NUMBERS.items()}[len(self.pose)]
+        return motion_dim(self.pose)
 
     def transform(self) -> Tensor:
         """The motion (D+1, D+1)."""
-        matrix = torch.eye(self.dim + 1, dtype=torch.float64)
-        matrix[:-1, -1] = self.pose[: self.dim]
-        if self.dim == 2:
-            cos, sin = self.pose[2:].tolist()
-            turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-        else:
-            from scipy.spatial.transform import Rotation
-
-            turn = torch.from_numpy(Rotation.from_quat(self.pose[3:].numpy()).as_matrix())
-        matrix[:-1, :-1] = turn
-        return matrix
+        return matrix_of(self.pose)
 
 
-RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage
+@dataclass(frozen=True, eq=False)
+class FrameMessage:
+    """Record `key`: the pose of a frame of the robot in another frame. A frame is named by the author whose
+    records are in it, robot · 2²⁴ + incarnation.
+
+    anchor: the frame in which `pose` is; `WORLD`; or `frame` itself while no other is known.
+    pose: anchor ← frame, as in `CorrectionMessage`; None if the anchor is the frame itself. Of two records of
+    one frame the one with the higher version counts, then the one with the higher key.
+    """
+
+    key: int
+    frame: int
+    version: int
+    anchor: int
+    pose: Tensor | None
+
+    @property
+    def dim(self) -> int | None:
+        return None if self.pose is None else motion_dim(self.pose)
+
+
+RecordMessage = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage
 _Record = TypeVar("_Record", bound=RecordMessage)
 
 
@@ -133,10 +146,15 @@ def encode_record(record: RecordMessage) -> bytes:
         write_keys(writer, record.components[order])
         writer.column(record.steps[order])
         return make_datagram(Kind.COUNTERS, writer.to_bytes())
+    if isinstance(record, FrameMessage):
+        for value in (record.frame & LARGEST_INCARNATION, record.version, record.anchor + 1):
+            write_number(writer, "version", value)
+        if record.pose is not None:
+            write_motion(writer, record.pose)
+        return make_datagram(Kind.FRAME, writer.to_bytes())
     write_number(writer, "scan", record.scan)
     write_number(writer, "version", record.version)
-    writer.one(int(record.dim == 3), 1)
-    writer.fixed(record.pose.numpy().astype("<f8").view("<u4").astype(np.int64), 32)
+    write_motion(writer, record.pose)
     write_intervals(writer, record.moved, base)
     return make_datagram(Kind.CORRECTION, writer.to_bytes())
 
@@ -162,12 +180,22 @@ def read_correction(body: bytes) -> CorrectionMessage:
     reader = BitReader(body)
     key, keys = _read_key(reader)
     scan, version = read_number(reader), read_number(reader)
-    dim = 2 + reader.one(1)
-    halves = reader.fixed(2 * _POSE_NUMBERS[dim], 32)
+    pose = read_motion(reader)
     moved = read_intervals(reader, *keys.pairs()[0])
     reader.finish()
-    pose = torch.from_numpy(halves.astype("<u4").view("<f8").astype(np.float64))
     return _checked(CorrectionMessage(key, scan, version, moved, pose))
+
+
+def read_frame(body: bytes) -> FrameMessage:
+    reader = BitReader(body)
+    key, _ = _read_key(reader)
+    incarnation, version, anchor = (read_number(reader) for _ in range(3))
+    if incarnation > LARGEST_INCARNATION:
+        raise DataError(f"Record {key} is of incarnation {incarnation}: it is damaged.")
+    frame = author_of(first_key(robot_of(key), incarnation))
+    pose = None if anchor - 1 == frame else read_motion(reader)
+    reader.finish()
+    return _checked(FrameMessage(key, frame, version, anchor - 1, pose))
 
 
 def _read_key(reader: BitReader) -> tuple[int, Intervals]:
@@ -203,7 +231,9 @@ def _checked(record: _Record) -> _Record:
             )
         if len(keys) and not NO_COUNT <= int(steps.min()) <= int(steps.max()) <= LARGEST_COUNT:
             raise InvalidArgumentError(f"Record {key} counts from {steps.min()} to {steps.max()} steps.")
-    elif not (_is_motion(record.pose) and mine.covers(record.moved)):
+    elif isinstance(record, FrameMessage):
+        _check_frame(record)
+    elif not (is_motion(record.pose) and mine.covers(record.moved)):
         raise InvalidArgumentError(
             f"Record {key} corrects {record.moved!r} by {record.pose.tolist()}: it must move components "
             f"of its robot, by up to {FARTHEST:g} m on each axis and a rotation of unit length."
@@ -211,13 +241,21 @@ def _checked(record: _Record) -> _Record:
     return record
 
 
-def _is_motion(pose: Tensor) -> bool:
-    """Whether it is a valid pose of a `CorrectionMessage`."""
-    for dim, n in _POSE_NUMBERS.items():
-        if pose.shape == (n,):
-            near = bool((pose[:dim].abs() <= FARTHEST).all())
-            return near and abs(float(pose[dim:].norm()) - 1) <= _UNIT
-    return False
+def _check_frame(record: FrameMessage) -> None:
+    """Raise `InvalidArgumentError` unless the frame is one of the robot, and the pose is in another one."""
+    key, pose = record.key, record.pose
+    is_own = robot_of(record.frame << NUMBER_BITS) == robot_of(key)
+    is_known = WORLD <= record.anchor < END >> NUMBER_BITS
+    if not (is_own and is_known and (pose is None) == (record.anchor == record.frame)):
+        raise InvalidArgumentError(
+            f"Record {key} puts frame {record.frame} into frame {record.anchor}: it must put a frame of its "
+            "robot into another one, or have no pose."
+        )
+    if pose is not None and not is_motion(pose):
+        raise InvalidArgumentError(
+            f"Record {key} has the pose {pose.tolist()}: it must be up to {FARTHEST:g} m from the origin on "
+            "each axis, with a rotation of unit length."
+        )
 
 
 def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
@@ -225,25 +263,6 @@ def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
     components = np.array(sorted(points), np.int64)
     counts = torch.tensor([points[int(component)] for component in components], dtype=torch.float64)
     return CountersMessage(key, components, count_steps(counts))
-
-
-def pose_of(transform: Tensor) -> Tensor:
-    """The pose of a `CorrectionMessage` of a rigid motion (3, 3) or (4, 4).
-
-    Raises `InvalidArgumentError` if it is not rigid or moves too far.
-    """
-    if transform.shape not in ((3, 3), (4, 4)):
-        raise InvalidArgumentError(f"transform has shape {tuple(transform.shape)}; give (3, 3) or (4, 4).")
-    rotation, translation = check_rigid(transform.detach().cpu().double(), len(transform) - 1)
-    if not bool((translation.abs() <= FARTHEST).all()):
-        raise InvalidArgumentError(f"transform moves by {translation.tolist()}; {FARTHEST:g} m is the most.")
-    if len(rotation) == 2:
-        turn = rotation[:, 0] / rotation[:, 0].norm()
-    else:
-        from scipy.spatial.transform import Rotation
-
-        turn = torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_quat(canonical=True))
-    return torch.cat([translation, turn]) + 0.0  # no −0
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,15 +17,16 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.component_messages import fitted
 from gmmtorch.sharing.messages.envelope import split
 from gmmtorch.sharing.messages.message_registry import decode
+from gmmtorch.sharing.messages.motions import pose_of
 from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
     CountersMessage,
+    FrameMessage,
     RecordMessage,
     SupersessionMessage,
     counters_message,
     encode_record,
-    pose_of,
 )
 from gmmtorch.sharing.replica.anti_entropy import Packet
 from gmmtorch.sharing.replica.component_table import fingerprints, most_viewpoints
@@ -193,6 +194,18 @@ class Author:
             )
         self._numbers(1)
         written = self._records.add_record(record, bounded=False)
+        old = Intervals.of(np.array([r.key for r in before], np.int64))
+        return written | self._supersede(old, written)
+
+    def place_frame(self, frame: int, anchor: int, transform: Tensor | None) -> Intervals:
+        """Write where a frame of this robot is; returns the new records.
+
+        transform: anchor ← frame; None: the frame has no other anchor than itself.
+        """
+        before = [record for record in self._records.of(FrameMessage) if record.frame == frame]
+        version = 1 + max((record.version for record in before), default=0)
+        pose = None if transform is None else pose_of(transform)
+        written = self._write(FrameMessage(self._first + self._n, frame, version, anchor, pose))
         old = Intervals.of(np.array([r.key for r in before], np.int64))
         return written | self._supersede(old, written)
 

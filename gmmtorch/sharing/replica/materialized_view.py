@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,8 @@ from torch import Tensor
 from gmmtorch.mapping.components import Components
 from gmmtorch.sharing.messages.record_messages import CorrectionMessage
 from gmmtorch.sharing.replica.component_table import ComponentTable, Counters
-from gmmtorch.sharing.replica.record_keys import Ints, robot_of
+from gmmtorch.sharing.replica.frames import moved
+from gmmtorch.sharing.replica.record_keys import Ints, keys_of, robot_of
 
 
 def gains(components: Components, gain: Tensor) -> Components:
@@ -58,20 +59,7 @@ def corrected(components: Components, keys: Ints, records: Sequence[CorrectionMe
         return components
     identity = torch.eye(components.dim + 1, dtype=torch.float64)
     motion = torch.stack([*(record.transform() for record in motions), identity])[which]  # (K, D+1, D+1)
-    means, seen_at = components.means, components.origins[components.seen_from]
-    turn = motion[:, :-1, :-1]
-    covariances = turn @ components.covariances @ turn.transpose(1, 2)
-    origins, seen_from = torch.unique(_moved(motion[components.seen_by], seen_at), dim=0, return_inverse=True)
-    moves = torch.from_numpy(which >= 0)
-    return replace(
-        components,
-        means=torch.where(moves[:, None], _moved(motion, means), means),
-        covariances=torch.where(
-            moves[:, None, None], (covariances + covariances.transpose(1, 2)) / 2, components.covariances
-        ),
-        origins=origins,
-        seen_from=seen_from,
-    )
+    return moved(components, motion, torch.from_numpy(which >= 0))
 
 
 def information(components: Components) -> Tensor:
@@ -86,11 +74,6 @@ def information(components: Components) -> Tensor:
     return face * reach
 
 
-def _moved(motion: Tensor, points: Tensor) -> Tensor:
-    """Points (N, D) transformed by motions (N, D+1, D+1)."""
-    return (motion[:, :-1, :-1] @ points[:, :, None]).squeeze(2) + motion[:, :-1, -1]
-
-
 _MOST_KEYS = 1 << 16
 """Keys of components with new counters that are remembered between two calls; of more, all counters are
 read."""
@@ -101,12 +84,12 @@ _NO_KEYS = np.zeros(0, np.int64)
 class Changes:
     """What a replica added to its map.
 
-    added: batches of new components, this robot's own included, one for each datagram in the order of
-    arrival, with their own counts.
+    added: batches of new components in frames of this robot's root, its own included, one for each datagram
+    in the order of arrival, with their own counts.
     gained: components whose counters rose, by id; support and counts are the rise. Points that were
     assigned to a component before it arrived are included when it arrives.
-    rebuilt: components were superseded or corrected, so that everything must be derived from `components()`
-    again. `added` and `gained` are empty then; later changes continue from there.
+    rebuilt: components were superseded or corrected, or frames were placed, so that everything must be
+    derived from `components()` again. `added` and `gained` are empty then; later changes continue from there.
     """
 
     added: list[Components]
@@ -138,9 +121,11 @@ class ChangeLog:
         self._rebuilt = self._reported is not None
 
     def read(
-        self, table: ComponentTable, counters: Counters, corrections: Sequence[CorrectionMessage]
+        self, table: ComponentTable, counters: Counters, placed: Callable[[Components, Ints], Components]
     ) -> Changes:
-        """The changes since the last call."""
+        """The changes since the last call. placed: the components with these keys that are in the map, where
+        they are in it.
+        """
         before = {} if self._rebuilt or self._reported is None else self._reported
         batches = table.since(self._batch)
         if self._touched is None or self._rebuilt:
@@ -156,9 +141,8 @@ class ChangeLog:
         self._touched, self._n_touched = [], 0
         if rebuilt:
             return Changes([], Components.empty(table.dim), True)
-        added = [corrected(batch, keys, corrections) for keys, batch in batches]
+        added = [there for keys, batch in batches if len(there := placed(batch, keys))]
         risen = keys[rise > 0]
-        if not len(risen):
-            return Changes(added, Components.empty(table.dim), False)
-        held = corrected(table.selected(risen), risen, corrections)
-        return Changes(added, gains(held, torch.from_numpy(rise[rise > 0])), False)
+        held = placed(table.selected(risen), risen) if len(risen) else Components.empty(table.dim)
+        is_held = np.isin(risen, keys_of(held.ids))
+        return Changes(added, gains(held, torch.from_numpy(rise[rise > 0][is_held])), False)

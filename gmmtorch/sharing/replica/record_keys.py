@@ -188,7 +188,10 @@ MOST_RECORDS = 1 << NUMBER_BITS
 """Records of one author."""
 END = 1 << (ROBOT_BITS + SEQUENCE_BITS)
 """Keys are below it."""
-RECORD_KINDS = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION})
+WORLD = -1
+"""The frame of records of authors that have no frame of their own; other frames have the number of their
+author."""
+RECORD_KINDS = frozenset({Kind.COMPONENTS, Kind.SUPERSESSION, Kind.COUNTERS, Kind.CORRECTION, Kind.FRAME})
 """Kinds of datagrams that contain records."""
 
 

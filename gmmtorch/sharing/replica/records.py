@@ -16,13 +16,15 @@ from gmmtorch.sharing.messages.record_messages import (
     RECORD_BYTES,
     CorrectionMessage,
     CountersMessage,
+    FrameMessage,
     RecordMessage,
     SupersessionMessage,
     encode_record,
 )
 from gmmtorch.sharing.replica.component_table import ComponentTable, Counters, fingerprints, most_viewpoints
+from gmmtorch.sharing.replica.frames import Frames
 from gmmtorch.sharing.replica.materialized_view import ChangeLog, Changes, corrected, with_gains
-from gmmtorch.sharing.replica.record_keys import Intervals, Ints, keys_of, robot_of
+from gmmtorch.sharing.replica.record_keys import WORLD, Intervals, Ints, authors, keys_of, robot_of
 
 MOST_VIEWPOINTS = 48
 """Viewpoints of a component. One component then fits into `RECORD_BYTES`, so that every robot can send it."""
@@ -62,16 +64,21 @@ class Records:
 
     Args:
         dim: 2 or 3; None: that of the first components.
+        author: number of the author from whose frame the map is seen.
 
     Attributes:
         held: keys that are or were here, and keys that are superseded: they need not be sent here.
         dead: keys of `held` whose records no longer count.
+        frames: where the frames of the authors are.
         others, datagrams: records other than components that count, decoded and encoded, by key.
         version: rises with every change.
     """
 
-    def __init__(self, dim: int | None = None, most_components: int = MOST_COMPONENTS) -> None:
+    def __init__(
+        self, dim: int | None = None, most_components: int = MOST_COMPONENTS, author: int = WORLD
+    ) -> None:
         self.dim = dim
+        self._author = author
         self._most = most_components
         self.held = Intervals.empty()
         self.dead = Intervals.empty()
@@ -83,6 +90,7 @@ class Records:
         self._kinds: dict[type, dict[int, RecordMessage]] = {}  # `others` by type
         self._n_entries = 0  # see `MOST_ENTRIES`
         self._waiting: dict[int, SupersessionMessage] = {}  # some of their successors are not held
+        self.frames = Frames([], dim or 3)
         self._log = ChangeLog()
         self._view: tuple[int, Components] | None = None
 
@@ -128,7 +136,8 @@ class Records:
             if key in self.table or self.datagrams.get(key, datagram) != datagram:
                 raise _duplicate_id(key)
             return span
-        unfit = isinstance(record, CorrectionMessage) and record.dim != (self.dim or record.dim)
+        dim = record.dim if isinstance(record, CorrectionMessage | FrameMessage) else None
+        unfit = None not in (dim, self.dim) and dim != self.dim
         if unfit or len(datagram) > RECORD_BYTES:
             raise RefusedError(
                 "unfit", robot, f"Record {key} is too long, or has another dimension than this map."
@@ -144,8 +153,10 @@ class Records:
         elif isinstance(record, CountersMessage):
             self.counters.add(record)
             self._log.counted(record.components)
-        else:
+        elif isinstance(record, CorrectionMessage):
             self._moved(record)
+        else:
+            self._place_frames()
         self._hold(held)
         return span
 
@@ -192,7 +203,7 @@ class Records:
         if is_component.any():
             self.table.drop(keys[is_component])
             self._log.invalidate()
-        counters = []
+        counters, n_frames = [], len(self.of(FrameMessage))
         for key in keys[~is_component].tolist():
             record = self.others.pop(key)
             del self.datagrams[key], self._kinds[type(record)][key]
@@ -204,10 +215,19 @@ class Records:
             elif isinstance(record, CorrectionMessage):
                 self._moved(record)
         self.counters.drop(counters)
+        if len(self.of(FrameMessage)) < n_frames:
+            self._place_frames()
 
     def _moved(self, correction: CorrectionMessage) -> None:
         """A correction was added or dropped."""
         if (correction.moved & self.held) - self.dead:
+            self._log.invalidate()
+
+    def _place_frames(self) -> None:
+        """Records of frames were added or dropped."""
+        before, self.frames = self.frames, Frames(self.of(FrameMessage), self.dim or 3)
+        reported = {self._author, *np.unique(authors(self.table.keys())).tolist()}
+        if not all(before.place(one).equals(self.frames.place(one)) for one in reported):
             self._log.invalidate()
 
     # -- reading ----------------------------------------------------------------------------------
@@ -225,20 +245,42 @@ class Records:
         """Keys of the records that count."""
         return self.held - self.dead
 
-    def components(self) -> Components:
-        """All components that count, by key, with the points of all counters, moved by the corrections."""
+    @property
+    def root(self) -> int:
+        """The root of the author's frame."""
+        return self.frames.place(self._author).root
+
+    def components(self, root: int | None = None) -> Components:
+        """The components that count and are in frames of a root, by key, with the points of all counters,
+        moved by the corrections, in the root frame. None: that of the author.
+        """
+        if root is not None and root != self.root:
+            return self._seen_in(root)
         if self._view is None or self._view[0] != self.version:
-            keys = self.table.keys()
-            if not len(keys):
-                return Components.empty(self.dim or 3)
-            gain = torch.from_numpy(self.counters.sums(keys))
-            plain = with_gains(self.table.selected(keys), gain)
-            self._view = self.version, corrected(plain, keys, self.of(CorrectionMessage))
+            self._view = self.version, self._seen_in(self.root)
         return self._view[1]
+
+    def _seen_in(self, root: int) -> Components:
+        keys = self.table.keys()
+        keys = keys[self.frames.are_in(keys, root)]
+        if not len(keys):
+            return Components.empty(self.dim or 3)
+        gain = torch.from_numpy(self.counters.sums(keys))
+        return self._placed(with_gains(self.table.selected(keys), gain), keys)
+
+    def _placed(self, components: Components, keys: Ints) -> Components:
+        return self.frames.placed(corrected(components, keys, self.of(CorrectionMessage)), keys)
 
     def changes(self) -> Changes:
         """The changes since the last call."""
-        return self._log.read(self.table, self.counters, self.of(CorrectionMessage))
+
+        def placed(components: Components, keys: Ints) -> Components:
+            inside = self.frames.are_in(keys, self.root)
+            if not inside.all():
+                components = components.selected(torch.from_numpy(np.flatnonzero(inside)))
+            return self._placed(components, keys[inside])
+
+        return self._log.read(self.table, self.counters, placed)
 
     def digest(self) -> bytes:
         """16 bytes, equal if and only if the held keys and the records that count are equal to the bit."""
@@ -280,7 +322,7 @@ def _n_entries(record: RecordMessage) -> int:
         return len(record.components)
     if isinstance(record, SupersessionMessage):
         return len(record.old) + len(record.new)
-    return len(record.moved)
+    return len(record.moved) if isinstance(record, CorrectionMessage) else 1
 
 
 def _duplicate_id(key: int) -> RefusedError:

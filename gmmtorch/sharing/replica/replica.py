@@ -21,19 +21,26 @@ from gmmtorch.sharing.messages.record_messages import (
     AnnouncementMessage,
     CorrectionMessage,
     CountersMessage,
+    FrameMessage,
     SupersessionMessage,
     check_size,
     encode_announcements,
 )
 from gmmtorch.sharing.replica.anti_entropy import Backlog, packets
 from gmmtorch.sharing.replica.authorship import Author, Published
+from gmmtorch.sharing.replica.frames import Placement, robot_of_frame
 from gmmtorch.sharing.replica.materialized_view import Changes
 from gmmtorch.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
     LARGEST_ROBOT,
+    NUMBER_BITS,
+    WORLD,
     Intervals,
     Ints,
+    author_of,
+    authors,
     drawn_incarnation,
+    first_key,
     ids_of,
     keys_of,
     robot_of,
@@ -67,6 +74,7 @@ class Replica:
         dim: int | None = None,
         incarnation: int | None = None,
         most_components: int = MOST_COMPONENTS,
+        own_frame: bool = False,
     ) -> None:
         """Args:
         robot: id of the robot, up to 1023; unique in the team.
@@ -74,6 +82,7 @@ class Replica:
         incarnation: number of this start of the robot, up to 2²⁴ − 1, which must not be used twice. None:
             drawn.
         most_components: limit on the components; this robot's own are always added.
+        own_frame: whether positions are in a frame of this robot, which `join` places, and not in `WORLD`.
         """
         if check_whole("robot", robot, 0) > LARGEST_ROBOT:
             raise InvalidArgumentError(f"robot={robot} must be at most {LARGEST_ROBOT}.")
@@ -83,12 +92,15 @@ class Replica:
         if dim not in (None, 2, 3):
             raise InvalidArgumentError(f"dim={dim} must be 2 or 3, or None.")
         self.robot, self.incarnation = int(robot), int(number)
-        self._records = Records(dim, check_whole("most_components", most_components, 1))
+        self._own = author_of(first_key(self.robot, self.incarnation))
+        self._records = Records(dim, check_whole("most_components", most_components, 1), self._own)
         self._author = Author(self._records, self.robot, self.incarnation)
         self._backlog = Backlog(self.robot)
         self._max_bytes = MAX_BYTES  # of the last call of `datagrams`
         self.refused: Counter[str] = Counter()
         self.duplicates: Counter[int] = Counter()
+        if own_frame:
+            self._backlog.add(self._author.place_frame(self._own, self._own, None))
 
     # -- writing ----------------------------------------------------------------------------------
 
@@ -147,6 +159,39 @@ class Replica:
                 f"transform has shape {tuple(matrix.shape)}; the map is {self._records.dim}-dimensional."
             )
         self._backlog.add(self._author.correct(scan, matrix, Intervals.of(_keys("ids", ids))))
+
+    def join(self, frame: int, transform: ArrayLike) -> None:
+        """Place the frame of this robot in another frame; its components, also later ones, move with it.
+
+        Of several calls the last one counts. A robot joins frames of robots with a lower id, `WORLD`, or its
+        own of an earlier start, so that chains of frames end without an agreement between robots.
+
+        Args:
+            frame: one of `other_frames`, or the one that was joined before.
+            transform: (D+1, D+1), rigid, frame ← the frame in which this robot adds components.
+
+        Raises `InvalidArgumentError` for another robot's frame, or a transform that is not rigid.
+        """
+        frames, base = self._records.frames, self._own
+        while (anchor := frames.anchor(base)) is not None and robot_of_frame(anchor) == self.robot:
+            base = anchor  # an earlier start of this robot, whose records move, too
+        is_earlier = robot_of_frame(frame) == self.robot and frame != base
+        if not (frame >= WORLD and (robot_of_frame(frame) < self.robot or is_earlier)):
+            raise InvalidArgumentError(
+                f"frame={frame} is of robot {robot_of_frame(frame)}; robot {self.robot} joins frames of "
+                "robots with a lower id only, so that two robots never join each other."
+            )
+        matrix = torch.as_tensor(transform, dtype=torch.float64)
+        before = self._chain(base, len(matrix))
+        self._backlog.add(self._author.place_frame(base, frame, matrix @ torch.linalg.inv(before)))
+
+    def _chain(self, base: int, size: int) -> Tensor:
+        """The motion (size, size), base ← this robot's frame."""
+        if base == self._own:
+            return torch.eye(size, dtype=torch.float64)
+        whole, rest = (self._records.frames.place(frame).transform for frame in (self._own, base))
+        assert whole is not None  # its frame has an anchor
+        return whole if rest is None else torch.linalg.inv(rest) @ whole
 
     def _due(self, made: Published) -> Tensor:
         self._backlog.add(made.written, made.packets)
@@ -222,7 +267,7 @@ class Replica:
         elif isinstance(message, ComponentsMessage) and datagram[:1] == _QUANTIZED:
             self._check_keys(keys_of(message.components.ids))
             self._backlog.received(self._records.add_components(message.components))
-        elif isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
+        elif isinstance(message, _RECORDS):
             self._check_keys(np.array([message.key]))
             if isinstance(message, SupersessionMessage) and message.key not in self._author.written:
                 self._check_supersession(message)
@@ -261,9 +306,32 @@ class Replica:
         """16 bytes, equal for equal contents in any order of arrival."""
         return self._records.digest()
 
-    def components(self) -> Components:
-        """All components that count, by id, with the points of all counters, moved by the corrections."""
-        return self._records.components()
+    def components(self, frame: int | None = None) -> Components:
+        """The components that count, by id, with the points of all counters, moved by the corrections.
+
+        frame: of `other_frames`: the components that are placed in it. None: those that are placed relative
+        to this robot's own, in the frame `placement.root`.
+        """
+        return self._records.components(frame)
+
+    @property
+    def placement(self) -> Placement:
+        """Where the frame is in which this robot adds components."""
+        return self._records.frames.place(self._own)
+
+    @property
+    def other_frames(self) -> list[int]:
+        """Frames with components that this robot may join; first the one that all robots prefer.
+
+        Left out are authors whose first record is not here: it says whether they have a frame of their own.
+        """
+        records = self._records
+        keys = records.table.keys()
+        keys = keys[records.held.contains(authors(keys) << NUMBER_BITS)]
+        mine = robot_of_frame(records.root)
+        limit = mine + (records.root != WORLD and mine == self.robot)
+        roots = records.frames.roots(keys) - {records.root}
+        return sorted(root for root in roots if robot_of_frame(root) < limit)
 
     def changes(self) -> Changes:
         """What was added since the last call, by this robot or others.
@@ -326,7 +394,7 @@ class Replica:
             self._records.load_batch(datagram[1:], self.robot)
             return
         message = decode(datagram)
-        if not isinstance(message, SupersessionMessage | CountersMessage | CorrectionMessage):
+        if not isinstance(message, _RECORDS):
             raise DataError(f"{type(message).__name__} is no record.")
         self._records.add_record(message, bounded=robot_of(message.key) != self.robot)
 
@@ -339,6 +407,7 @@ class Replica:
         return components
 
 
+_RECORDS = SupersessionMessage | CountersMessage | CorrectionMessage | FrameMessage
 _QUANTIZED = b"\x11"
 """First byte of a datagram of components that every robot encodes equally."""
 

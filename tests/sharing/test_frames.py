@@ -1,0 +1,281 @@
+"""Frames: robots without a common frame join the frames of others; the order of datagrams does not matter."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping.random_components import random_components
+from sharing.message_examples import sealed
+from sharing.replica_histories import exchange, gossip, replica_of
+from sharing.replica_model import rows
+from sharing.schedules import components
+from sharing.test_changes import Follower
+
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.sharing.messages.message_registry import FrameMessage, decode, kind_of
+from gmmtorch.sharing.messages.motions import pose_of
+from gmmtorch.sharing.messages.record_messages import encode_record
+from gmmtorch.sharing.replica.record_keys import WORLD, first_key
+from gmmtorch.sharing.replica.replica import Replica
+
+seeds = st.integers(0, 10**6)
+
+
+def motion(x: float, yaw: float = 0.0) -> torch.Tensor:
+    made = torch.eye(4, dtype=torch.float64)
+    made[0, 3] = x
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    made[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+    return made
+
+
+def team(n: int) -> list[Replica]:
+    return [Replica(robot, incarnation=7, own_frame=True) for robot in range(n)]
+
+
+def means(replica: Replica, robot: int, frame: int | None = None) -> torch.Tensor:
+    """Of the components of a robot, by number."""
+    found = replica.components(frame)
+    return found.means[found.ids[:, 0] == robot]
+
+
+def joined_history(
+    seed: int, kinds: Sequence[str] = ("add", "join", "join", "correct"), n_acts: int = 16
+) -> list[bytes]:
+    """All datagrams of robots that add, correct and join each other at random."""
+    rng = random.Random(seed)
+    robots, said = team(3), []
+    for _ in range(n_acts):
+        robot = rng.choice(robots)
+        own = robot.components().ids
+        own = own[own[:, 0] == robot.robot]
+        kind = rng.choice(kinds)
+        if kind == "join" and robot.other_frames:
+            robot.join(rng.choice(robot.other_frames), motion(rng.uniform(-9, 9), rng.uniform(-3, 3)))
+        elif kind == "correct" and len(own):
+            robot.correct(rng.randrange(2), motion(rng.uniform(-1, 1)), own[:2])
+        else:
+            robot.add(components(rng, 2))
+        said += gossip(rng, robot, robots)
+    return said
+
+
+class Model:
+    """Where frames are, by plain dictionaries."""
+
+    def __init__(self, said: list[bytes]) -> None:
+        self.records: dict[int, FrameMessage] = {}
+        frames = [message for one in said if isinstance(message := decode(one), FrameMessage)]
+        for message in sorted(frames, key=lambda m: m.version):
+            self.records[message.frame] = message
+
+    def placed(self, frame: int) -> tuple[int, torch.Tensor]:
+        record = self.records[frame]
+        if record.anchor == frame:
+            return frame, torch.eye(4, dtype=torch.float64)
+        root, before = self.placed(record.anchor)
+        shift, (z, w) = record.pose[:3], record.pose[5:].tolist()
+        step = motion(0.0, 2 * math.atan2(z, w))
+        step[:3, 3] = shift
+        return root, before @ step
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=seeds, order=st.randoms(use_true_random=False))
+def test_order_and_repetition_do_not_matter(seed, order):
+    said = joined_history(seed)
+    again = [*said, *order.sample(said, len(said) // 2)]
+    order.shuffle(again)
+    one, other = replica_of(said), replica_of(again)
+    assert one.digest() == other.digest()
+    frames = {one.placement.root, *(7 | robot << 24 for robot in range(3))}
+    for frame in frames:
+        for name, value in vars(one.components(frame)).items():
+            assert torch.equal(value, getattr(other.components(frame), name)), name
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=seeds)
+def test_components_are_where_a_plain_model_puts_them(seed):
+    said = joined_history(seed, ("add", "join"))
+    replica, model = replica_of(said), Model(said)
+    plain = replica_of([one for one in said if kind_of(one) == "components"])
+    raw = rows(plain.components())
+    seen = 0
+    for frame in (robot << 24 | 7 for robot in range(3)):
+        for key, (mean, *_) in rows(replica.components(frame)).items():
+            root, pose = model.placed(key >> 28)
+            assert root == frame
+            expected = pose[:3, :3] @ torch.tensor(raw[key][0], dtype=torch.float64) + pose[:3, 3]
+            assert mean == pytest.approx(expected.tolist(), abs=1e-9)
+            seen += 1
+    assert seen == len(raw)  # each component is in one frame
+
+
+@settings(max_examples=4, deadline=None)
+@given(seed=seeds, order=st.randoms(use_true_random=False))
+def test_a_follower_of_the_changes_has_the_map(seed, order):
+    said = joined_history(seed)
+    order.shuffle(said)
+    replica, follower = Replica(2, incarnation=7), Follower()  # in the frame of robot 2
+    for datagram in said:
+        replica.load([], [datagram])
+        if order.random() < 0.3:
+            follower.follow(replica)
+            assert follower.agrees(replica)
+    follower.follow(replica)
+    assert follower.agrees(replica)
+
+
+def test_frames_without_a_place_are_apart():
+    one, other = team(2)
+    one.add(random_components(3, k=5))
+    other.add(random_components(3, k=4))
+    exchange([one, other])
+    assert len(one.components()) == 5
+    assert len(other.components()) == 4
+    assert one.other_frames == []  # the lowest id waits for the others
+    assert other.other_frames == [7]
+    assert len(other.components(7)) == 5
+    assert one.digest() == other.digest()
+
+
+def test_a_chain_of_frames_follows_its_root_without_sending_components_again():
+    robots = team(3)
+    for robot in robots:
+        robot.add(random_components(3, k=50, seed=robot.robot))
+    raw = [means(robot, robot.robot) for robot in robots]
+    exchange(robots)
+    robots[2].join(1 << 24 | 7, motion(5.0))
+    exchange(robots)
+    assert robots[1].components().ids[:, 0].unique().tolist() == [1, 2]
+    robots[1].join(7, motion(1.0, math.pi / 2))
+    sent = robots[1].datagrams()
+    assert {kind_of(datagram) for datagram in sent} == {"frames", "supersessions"}
+    assert sum(map(len, sent)) < 200
+    for robot in (robots[0], robots[2]):
+        for datagram in sent:
+            robot.receive(datagram)
+    for robot in robots:
+        assert robot.placement.root == 7
+        assert torch.equal(means(robot, 0), raw[0])
+        turned = motion(1.0, math.pi / 2)
+        assert torch.allclose(means(robot, 1), raw[1] @ turned[:3, :3].T + turned[:3, 3])
+        both = turned @ motion(5.0)
+        assert torch.allclose(means(robot, 2), raw[2] @ both[:3, :3].T + both[:3, 3])
+    # Components that are added later move, too.
+    robots[2].add(random_components(3, k=3, seed=9))
+    exchange(robots)
+    assert len({robot.digest() for robot in robots}) == 1
+    assert {len(robot.components()) for robot in robots} == {153}
+    one, *others = (robot.components() for robot in robots)
+    for other in others:
+        assert all(torch.equal(value, getattr(other, name)) for name, value in vars(one).items())
+
+
+def test_corrections_apply_in_the_frame_of_their_robot():
+    one, other = team(2)
+    one.add(random_components(3, k=1))
+    ids = other.add(random_components(3, k=2))
+    raw = means(other, 1)
+    exchange([one, other])
+    other.join(7, motion(0.0, math.pi / 2))
+    other.correct(0, motion(2.0), ids[ids[:, 1].argsort()][:1])
+    exchange([one, other])
+    turned = motion(0.0, math.pi / 2)[:3, :3]
+    shifted = raw + torch.tensor([[2.0, 0, 0], [0, 0, 0]])
+    assert torch.allclose(means(one, 1), shifted @ turned.T)
+
+
+def test_robots_without_own_frames_are_in_the_world_which_others_join():
+    known, unknown = Replica(5), Replica(3, own_frame=True)
+    known.add(random_components(3, k=2))
+    unknown.add(random_components(3, k=3))
+    exchange([known, unknown])
+    assert unknown.other_frames == [WORLD]
+    assert known.other_frames == []
+    unknown.join(WORLD, motion(4.0))
+    exchange([known, unknown])
+    assert known.placement.root == unknown.placement.root == WORLD
+    assert len(known.components()) == len(unknown.components()) == 5
+
+
+def test_a_restarted_robot_goes_on_in_its_earlier_frame():
+    zero, before = team(2)
+    zero.add(random_components(3, k=1))
+    before.add(random_components(3, k=2))
+    old = means(before, 1)
+    exchange([zero, before])
+    again = Replica(1, incarnation=3, own_frame=True)
+    exchange([zero, again])
+    earlier = 1 << 24 | 7
+    assert again.other_frames == [7, earlier]
+    again.join(earlier, torch.eye(4))
+    again.add(random_components(3, k=1, seed=5))
+    again.join(7, motion(1.0))  # moves the records of both starts
+    exchange([zero, again])
+    new = means(zero, 1)
+    assert len(new) == 3
+    assert torch.allclose(new[new[:, 0].argsort()].sum(0), (means(again, 1)).sum(0))
+    found = zero.components()
+    is_old = (found.ids[:, 0] == 1) & (found.ids[:, 1] >> 28 == 7)
+    assert torch.allclose(found.means[is_old], old + torch.tensor([1.0, 0, 0]).double())
+
+
+def test_robots_join_lower_ids_only():
+    robots = team(2)
+    robots[1].add(random_components(3, k=1))
+    exchange(robots)
+    for frame in (1 << 24 | 7, 7, -2):
+        with pytest.raises(InvalidArgumentError, match=f"frame={frame}"):
+            robots[0].join(frame, torch.eye(4))
+    with pytest.raises(InvalidArgumentError, match="rigid"):
+        robots[1].join(7, 2 * torch.eye(4))
+
+
+def test_a_circle_of_frames_places_nothing():
+    """No sound robot writes it."""
+    replica, pose = Replica(9), pose_of(torch.eye(4))
+    frames = [robot << 24 for robot in range(3)]
+    for robot, frame in enumerate(frames):
+        record = FrameMessage(first_key(robot), frame, 1, frames[(robot + 1) % 3], pose)
+        assert replica.receive(encode_record(record))
+    for robot in range(3):
+        made = random_components(3, k=1)
+        source = Replica(robot, incarnation=0)
+        source.count({(0, 0): 1.0})  # takes number 0
+        source.add(made)
+        for datagram in source.datagrams():
+            if kind_of(datagram) == "components":
+                assert replica.receive(datagram)
+    assert len(replica.components()) == 0
+    assert [len(replica.components(frame)) for frame in frames] == [1, 1, 1]
+
+
+def test_records_of_frames_survive_their_datagram():
+    record = FrameMessage(first_key(2, 9), 2 << 24 | 9, 3, WORLD, pose_of(motion(2.0, 0.3)))
+    found = decode(encode_record(record))
+    assert isinstance(found, FrameMessage)
+    assert (found.key, found.frame, found.version, found.anchor) == (record.key, record.frame, 3, WORLD)
+    assert torch.equal(found.pose, record.pose)
+    free = replace(record, anchor=record.frame, pose=None)
+    assert decode(encode_record(free)).pose is None
+    for bad in (
+        replace(record, frame=3 << 24),  # of another robot
+        replace(record, anchor=-2),
+        replace(record, anchor=record.frame),
+        replace(record, pose=None),
+        replace(record, pose=2 * record.pose),
+        replace(record, anchor=1 << 34),
+    ):
+        with pytest.raises(InvalidArgumentError, match="Record"):
+            encode_record(bad)
+    with pytest.raises(DataError, match="truncated"):
+        decode(sealed(b"\x1f" + bytes(5)))
