@@ -66,7 +66,7 @@ class Body:
         """
         balls = self._placed(poses).detach()
         expected = torch.zeros(len(balls), dtype=torch.float64, device=balls.device)
-        for radius in self.radii.unique().tolist():  # few: balls of one size are asked at once
+        for radius in self.radii.unique().tolist():  # balls of one size are queried together
             places = balls[:, (self.radii == radius).to(balls.device)]
             returns = expected_returns(surfaces, places.flatten(0, 1), radius)
             expected = expected + returns.unflatten(0, places.shape[:2]).sum(1)

@@ -30,7 +30,8 @@ def clearance(
 
     The surface of a component is {x : (x − μ)ᵀ Σ⁻¹ (x − μ) = q²}, q = `deviations`; it encloses 74 % (q = 2)
     or 97 % (q = 3) of the returns in 3D. Outside all ellipsoids the distance is exact. Inside it is negative:
-    the largest depth in an ellipsoid, a lower bound on the way out. It is infinite if there is no component.
+    the largest depth in an ellipsoid, a lower bound of the distance to free space. It is infinite if there is
+    no component.
     A body of radius r is free if clearance ≥ r; a path is free if all of its points are.
 
     A compact map merges stray returns into a few large ellipsoids, which can enclose free space. Components

@@ -27,10 +27,10 @@ _N_ROWS = 20  # rows of the history of a complete run, at most; each encodes the
 class BuildProgress:
     """The state of a map while it is built.
 
-    n_read, n_total: scans that were read, of all. n_skipped: scans of these that could not be used.
+    n_read: scans read so far. n_total: all scans. n_skipped: scans that were read and could not be used.
     n_points: returns in the map. n_components: final components. metres: length of the sensor's path.
-    seconds: computing time of all runs so far. nbytes: of the map at the last row of the history, because
-    every count encodes the map; 0 before.
+    seconds: computing time of all runs so far. nbytes: size of the map at the last row of the history, 0
+    before the first one. It is not computed more often, because this encodes the map.
     """
 
     n_read: int
@@ -45,7 +45,7 @@ class BuildProgress:
 
 @dataclass
 class BuildRecord:
-    """What a builder knows besides its map.
+    """The state of a builder, besides its map.
 
     n_read: scans that were read. indices: of the scans in the map. n_points: their returns. metres: length of
     the path through their origins. skipped: number of scans left out while reading, by the reason. history:

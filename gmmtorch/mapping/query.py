@@ -34,12 +34,12 @@ def count_many(cones: Cones) -> tuple[int, int]:
 
 
 def cutoff_of(n_seen: int, n_many: int) -> float:
-    """`cutoff_by_support` of cones of which `n_seen` have a count and `n_many` one of at least 50 points."""
+    """`cutoff_by_support` of `n_seen` cones with a count, `n_many` of them with at least 50 points."""
     return _SHARP_CUTOFF if n_seen - n_many <= (n_seen - 1) // 2 else CUTOFF
 
 
 def range_sums(cones: Cones) -> Tensor:
-    """Sum (m) of the ranges of all beams with a return, to the means of their components; their number."""
+    """Sum (m) of the ranges of the beams with a return, to their components' means; number of these beams."""
     weight = cones.counts * ~cones.max_range
     return torch.stack([(weight * (cones.means - cones.origins).norm(dim=1)).sum(), weight.sum()])
 

@@ -98,7 +98,7 @@ def _columns(dim: int) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
 def index_row(
     tile: Sequence[int], components: Components, cutoff: float | None, n_bytes: int, crc32: int
 ) -> dict[str, Any]:
-    """The row of a tile with these components; `cutoff` None: the one that their support will decide."""
+    """The row of a tile with these components; `cutoff` None: the one that follows from their support."""
     cones = components.cones()
     low, high = cone_bounds(cones, CUTOFF if cutoff is None else cutoff)
     low, high = (torch.cat([corner, components.means]) for corner in (low, high))

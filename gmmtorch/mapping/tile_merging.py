@@ -86,7 +86,7 @@ def merge(
     for part in parts:
         for number, tile in enumerate(part.index.tiles.tolist()):
             owners.setdefault(tuple(tile), []).append((part, number))
-    (folder / INDEX).unlink(missing_ok=True)  # if the merge is stopped, there is no index and not a wrong one
+    (folder / INDEX).unlink(missing_ok=True)  # a merge that is stopped leaves no index, not a wrong one
     for path in {*folder.glob("tile_*.safetensors")} - {folder / tile_name(tile) for tile in owners}:
         path.unlink()
     rows = []
@@ -134,12 +134,12 @@ def canonical(components: Components) -> Components:
 def _order(components: Components) -> Tensor:
     """An order (K,) by place, and then by all values. Only equal components keep their order."""
     c = components
-    columns = [*c.means.T, *c.covariances.flatten(1).T, c.support, c.max_range, _sightings(c)]
+    columns = [*c.means.T, *c.covariances.flatten(1).T, c.support, c.max_range, _viewpoint_hashes(c)]
     by_value = torch.from_numpy(np.lexsort([column.numpy() for column in columns[::-1]]))
     return by_value[spatial_order(c.selected(by_value))]  # a stable sort
 
 
-def _sightings(components: Components) -> Tensor:
+def _viewpoint_hashes(components: Components) -> Tensor:
     """A hash (K,) int64 of the viewpoints of each component, which does not depend on their order."""
     c = components
     values = torch.cat([c.origins[c.seen_from], c.seen_count[:, None]], 1).contiguous().view(torch.int64)

@@ -1,4 +1,4 @@
-"""TiledMap: a map in files of square tiles, of which a query opens those that it needs.
+"""TiledMap: a map in files of square tiles. A query opens only the tiles that it needs.
 
 A component belongs to the tile that contains its mean. Its evidence reaches into other tiles, because its
 rays start at the sensor. The index therefore states for each tile a box outside which its components give
@@ -199,7 +199,7 @@ class TiledMap:
         return found
 
     def _query(self, row: int) -> Query:
-        """The query of a tile. The one that was not used for longest is dropped if too many are open."""
+        """The query of a tile. If too many are open, the least recently used one is dropped."""
         if row not in self._open:
             parts = vars(self.components(row))
             placed = Components(**{name: value.to(self.device) for name, value in parts.items()})

@@ -1,4 +1,4 @@
-"""E-step of exact EM: responsibilities of all components for all rows, summed into sufficient statistics.
+"""E-step of exact EM (2.3): responsibilities of all components, summed over rows into sufficient statistics.
 
 The fused kernel runs on the CPU. It works on eight rows at a time, in float64, and skips responsibilities
 below e⁻³⁷ of the row's largest term: a far component costs its log-density and nothing more. Statistics

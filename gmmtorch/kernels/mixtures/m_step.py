@@ -1,4 +1,4 @@
-"""M-step of EM with its extrapolation, and natural parameters; the twins are in `mixture.em`.
+"""M-step of EM (2.4)-(2.6) with its extrapolation, and natural parameters; the twins are in `mixture.em`.
 
 One item is one component. The results differ from the twins' by rounding: by at most 10⁻¹² of the largest
 entry of a component, and for natural parameters by this times the condition number of its covariance.

@@ -12,10 +12,10 @@ Then, with p = `PRECISION`:
   rounded axes before it: a mean that moves along a sheet stays on the sheet.
 
 So, in the rounded component's deviations, a mean is off by at most 2⁻ᵖ⁻¹ along each of D axes
-(`MEAN_ERROR`), and so is L below its diagonal (`SHEAR_ERROR`; L₃₁ by up to 2⁻²ᵖ⁻² more). The deviation in
-any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, for any shape of the component.
-Restored covariances are positive definite by construction. The lattice is fixed in the world frame: the
-result depends on the component only, and rounding again changes nothing.
+(`MEAN_ERROR`), and an entry of L below the diagonal by as much (`SHEAR_ERROR`; L₃₁ by up to 2⁻²ᵖ⁻² more).
+The deviation in any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, for any shape of
+the component. Restored covariances are positive definite by construction. The lattice is fixed in the world
+frame: the result depends on the component only, and rounding again changes nothing.
 """
 
 from __future__ import annotations
@@ -125,8 +125,9 @@ class Lattice:
 def nearest(means: Tensor, covariances: Tensor) -> Lattice:
     """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU.
 
-    Covariances that are not quite positive definite become so. Raises `InvalidArgumentError` beyond
-    `FARTHEST` and `LARGEST_DEVIATION`, or where rounding leads there: what is returned `is_valid`.
+    Covariances that are not positive definite become so. Raises `InvalidArgumentError`
+    for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding is: the result
+    `is_valid`.
     """
     if is_fused(means, covariances):
         found = lattice_rounding(means, covariances, _constants(means.shape[1]))

@@ -1,4 +1,4 @@
-"""Association: points that a map explains are counted to the components that explain them (thesis 4.1.3)."""
+"""Association: adds the points that a map explains to the counts of components (thesis 4.1.3)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def count_explained(
     weight: float = 1.0,
     frees: Tensor | None = None,
 ) -> Explained:
-    """Counts points (N, D), observed from `origin` (D,), to the components that explain them.
+    """Adds points (N, D), observed from `origin` (D,), to the counts of the components that explain them.
 
     A component explains a point if d = (z − μ)ᵀ Σ⁻¹ (z − μ) < `explained`, and if one of its origins is
     within `distance` (m) of the sensor: then it also explains the free space before the point. The components
@@ -49,8 +49,8 @@ def count_explained(
         explained: squared Mahalanobis distance; None: the 95 % quantile of χ² with D degrees of freedom.
         max_range: the points are ends of no-return beams, which only `max_range` components explain.
         weight: number of measured points for which each point stands.
-        frees: (N,) bool, points whose beams contribute free space. Only these ask for an origin within
-            `distance`, as in the thesis. None: all points ask for it.
+        frees: (N,) bool, points whose beams contribute free space. Only these need an origin within
+            `distance`, as in the thesis. None: all points need it.
     """
     n, k = points.shape[0], len(components)
     found = torch.zeros(n, dtype=torch.bool, device=points.device)

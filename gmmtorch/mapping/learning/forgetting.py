@@ -7,10 +7,10 @@ between them, so that its q and ε are lower. A scan of which `passed` beams wen
 
     w (passed · log((1 − ε)/(1 − q)) + returned · log(ε/q)),
 
-with w such that the beams of a scan, which share the errors of its pose, count as a few independent ones at
-most. The log-odds start at 0 and stay between 0 and log(_CERTAIN). A component that ends a window at the
-upper limit is dropped: Page's cumulative sum test (Biometrika 41, 1954), in which returns outweigh all that
-came before them.
+where w lets the beams of a scan count as at most a few independent ones, because they share the error of its
+pose. The log-odds start at 0 and stay between 0 and log(_CERTAIN). A component that ends a window at the
+upper limit is dropped (Page's cumulative sum test, Biometrika 41, 1954). Because of the lower limit, many
+early returns do not delay the removal of a surface that is gone later.
 
 Half-life. Counts of all components are halved for every half-life between the times of two windows.
 """
@@ -40,14 +40,14 @@ _FLAT_STOPS, _THICK_STOPS = (0.5, 0.05), (0.3, 0.02)  # q and ε
 _CERTAIN = 1000.0  # odds that the surface is gone
 _INDEPENDENT = 4.0  # beams of a scan
 _MOST_BEAMS = 4096  # of a scan that are counted
-_LEAST_SUPPORT = 0.5  # points: less, and a component says nothing
+_LEAST_SUPPORT = 0.5  # points: a component with fewer is dropped
 _MARGIN = 20.0  # times the noise
 _LIMITS = {"through": 1.0, "reach": 3.0, "grazing": 4.0}  # see `PassLimits`; 4: about 14°
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What forgetting knows besides the components.
+    """The state of forgetting, besides the components.
 
     ids: (J, 2) of the components in doubt. log_odds: (J,) that their surfaces are gone, above 0.
     time: of the last scan (s); None: not known.
@@ -86,7 +86,7 @@ class Forgetting:
     """Adds components to those of a map, and drops what is gone. One object serves one call of a rule.
 
     Args:
-        rule: with its noise, unless no scan has a return.
+        rule: its noise must be set if a scan has a return.
         doubts: before the first window. Attribute `doubts`: after the last one; components without a number
             are not in it, so that their test begins with the next window.
     """
@@ -137,9 +137,9 @@ class Forgetting:
 
 
 def gone_log_odds(components: Components, scans: Sequence[Scan], noise: float, log_odds: Tensor) -> Tensor:
-    """Log-odds (K,) that the surfaces of K components are gone after scans, from those before them.
+    """Log-odds (K,) after the scans that the surfaces of K components are gone; `log_odds` (K,): before them.
 
-    Components of no-return beams must not be among them. noise: of the sensor, metres.
+    Components of no-return beams must not be among the components. noise: of the sensor, metres.
     """
     if len(components) == 0:
         return log_odds

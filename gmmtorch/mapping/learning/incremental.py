@@ -138,7 +138,7 @@ def _explain(
 
 
 def _contribute_free_space(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor | None:
-    """Which returns (N,) of a scan are novel by their way alone; None if all count as such."""
+    """Which returns (N,) of a scan are novel by the cells before their ends alone; None: all."""
     if rule.distance_for == "all":
         return None
     return novel_beams(components, Scan(scan.points[:0], scan.origin, scan.points), rule)

@@ -62,7 +62,7 @@ class Learner:
     def absorb(
         self, known: Components, scans: Iterable[DepthFrame], settings: MapSettings, weight: float
     ) -> Components:
-        """All components, with those of frames of which each point stands for `weight` points.
+        """All components, with those of frames. Each point of a frame stands for `weight` points.
 
         There must be no unfinished window, and the rule must be fitted.
         """

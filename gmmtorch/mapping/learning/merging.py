@@ -19,7 +19,7 @@ Size = Callable[[Components], int]
 """Number of bytes of the file of given components."""
 
 _GROWTH = 1.08
-"""Exponent of the number of components that fit in a share of the bytes; merged components take more each."""
+"""A share s of the bytes holds about s^_GROWTH of the components, because merged ones take more bytes."""
 
 
 def estimated_bytes(components: Components) -> int:

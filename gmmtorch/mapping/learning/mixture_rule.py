@@ -37,7 +37,7 @@ class MixtureRule(PruneOptions):
         if self.planarity is not None:
             check_number("planarity", self.planarity, largest=1.0, above=True)
         check_whole("free_points", self.free_points, 0)
-        if self.forget is False:  # as YAML reads off
+        if self.forget is False:  # YAML reads `off` as False
             object.__setattr__(self, "forget", FORGET_OFF)
         if isinstance(self.forget, str | bool):
             check_choice("forget", self.forget, (FORGET_OFF, CONTRADICTION, "a half-life in seconds"))
@@ -46,5 +46,5 @@ class MixtureRule(PruneOptions):
 
     @property
     def needs_points(self) -> bool:
-        """Whether the sums of depth images over cells are not enough."""
+        """Whether learning needs the points of depth images, and not only their sums over cells."""
         return self.learner != "flat_pieces" or self.prune != "none" or self.free_points > 0

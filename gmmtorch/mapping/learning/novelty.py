@@ -102,7 +102,7 @@ def beam_novelty(
     short: float = 0.0,
     within: Box | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Bits (N,) float64 by which each beam reduces the entropy of a window of cells, and whether it is
+    """Bits (N,) float64 by which each beam reduces the entropy of a window of cells, and whether the beam is
     unobserved.
 
     The reduction is Σ h(p) − h(p′) over the cells that a beam passes through, and the cell that a hit ends
@@ -133,7 +133,7 @@ def beam_novelty(
     if rays is None:
         return bits, torch.zeros_like(bits, dtype=torch.bool)
     # A beam reduces the entropy by at most one bit for each cell that it crosses. So one sum can hold both
-    # the bits and the number of unobserved cells, as multiples of a mark that is more than twice that.
+    # the bits and the unobserved cells: each of these adds a mark, more than twice the largest sum of bits.
     mark = 2.0 * (sum(window.shape) + 3)
     hits, misses = window.evidence(rays.window)
     along = reduction_along_rays(

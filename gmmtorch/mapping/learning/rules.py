@@ -40,8 +40,8 @@ class NoveltyRule:
         None: the 95 % quantile of χ² with D degrees of freedom.
     distance: a component explains the free space of a beam only if one of its sensor origins is within
         this distance (m) of the sensor (d_s of the thesis).
-    distance_for: beams that ask for `distance`: all, or free_space: only those whose way before the end is
-        novel, and no-return beams, as in the thesis.
+    distance_for: beams to which `distance` applies. all: every beam. free_space: no-return beams, and beams
+        that are novel by the cells before their ends, as in the thesis.
     """
 
     resolution: float = 0.1

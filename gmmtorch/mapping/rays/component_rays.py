@@ -153,7 +153,7 @@ def _fused(
     hits_per_ray: int,
     thinned: bool,
 ) -> CellEvidence | None:
-    """`component_evidence` by the fused kernel; None where the twin repairs, refuses or saves memory."""
+    """`component_evidence` by the fused kernel; None for input that the twin corrects, refuses or splits."""
     if len(seen) == 0:
         return CellEvidence.empty(seen.device)
     density, of_empty = densities

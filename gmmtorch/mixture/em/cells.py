@@ -61,10 +61,7 @@ def pool_into_cells(points: Tensor, max_cells: int, finest: float, weight: Tenso
 
 
 def coarsest_allowed(pooled: Callable[[int], T | None], enough: int) -> tuple[int, T]:
-    """The least step after 0, which has too many cells, that has a result; at most `enough`. And that result.
-
-    By bisection.
-    """
+    """The least step from 1 to `enough` that has a result, and the result, by bisection. Step 0 has none."""
     too_fine, best = 0, None
     while enough - too_fine > 1:
         middle = (too_fine + enough) // 2

@@ -157,7 +157,7 @@ def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | Non
         return cut
     order = torch.where(cut, priority, -torch.inf).argsort(descending=True, stable=True)
     chosen = torch.zeros_like(cut)
-    # While there are few pieces, the limit allows to halve all of them.
+    # While there are few pieces, the limit allows halving all of them.
     at_once = n_pieces if 4 * n_pieces <= limit else (n_pieces + 1) // 2
     chosen[order[: max(0, min(limit - n_pieces, at_once))]] = True
     return chosen & cut

@@ -2,7 +2,7 @@
 
 EM may place a component across several surfaces, through free space. Such a component has few points,
 absolutely or for its size: a sensor samples a surface at range r with a known density σ(r), and a
-component with much fewer points than that is not a surface.
+component with far fewer points is not a surface.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class KeptEvidence:
         return first.long()
 
     def _next_index(self, form: PointForm, cones: Cones, cutoff: float) -> tuple[ConeIndex, Tensor]:
-        """The index of the cones, and which of its buckets (n_buckets,) are not as before."""
+        """The index of the cones, and which of its buckets (n_buckets,) have changed."""
         entries = _ENTRIES_PER_CONE[form.dim]
         if self._rows is not None and self._cutoff == cutoff and self._rows.shape[1] == form.rows.shape[1]:
             former = _former(self._rows, form.rows)
@@ -99,7 +99,7 @@ class KeptEvidence:
 
 
 def _former(old: Tensor, new: Tensor) -> Tensor:
-    """The number (C,) among the rows `old` of an equal row for each row of `new`; they ascend. −1: none."""
+    """For each row of `new` the number (C,) of an equal row of `old`, in rising order; −1: there is none."""
     mixer = torch.arange(1, new.shape[1] + 1, device=new.device) * _MIXER
     keys = []
     for rows in (old, new):

@@ -128,7 +128,7 @@ class ConeIndex:
 
         Args:
             cones: C cones; must not change afterwards.
-            former: (C,) the number of each cone in this index, −1 for a new one. The others ascend.
+            former: (C,) the number of each cone in this index, −1 for a new one. The other numbers ascend.
         """
         cones = cones.checked()
         made = copy.copy(self)

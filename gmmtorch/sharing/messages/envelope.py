@@ -1,4 +1,4 @@
-"""The format that all datagrams share: a first byte with version and kind, at most 1200 bytes, a checksum."""
+"""The header of all datagrams: a first byte with version and kind. At most 1200 bytes, and a checksum."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""EM in every node of a level as one batch: each node has a mixture of m children about its own centre.
+"""Nested mixtures: EM in every node of a level as one batch, and the assignment of points to children (2.7).
 
-The points of a node are its members. A point may be a member of several nodes, with a share of its
-weight in each. Members are packed in blocks of one node, so that all nodes are one batch of small
-matrix products, for any numbers of members. Coordinates relative to the node's centre keep
-enough digits in float32.
+Each node has a mixture of m children about its own centre. The points of a node are its members. A point
+may be a member of several nodes, with a share of its weight in each. Members are packed in blocks of one
+node, so that all nodes are one batch of small matrix products, for any numbers of members. Coordinates
+relative to the node's centre keep enough digits in float32.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def integrate(patches: Patches, like: Tensor, tolerance: float = TOLERANCE) -> T
 def _pass(
     patches: Patches, panels: _Panels, limits: tuple[float, ...], part: slice
 ) -> tuple[Tensor, Tensor, _Panels | None]:
-    """Of some panels: patches and integrals of those that are fine enough, and the others cut further."""
+    """Patches and integrals of the panels that are fine enough, and the other panels, cut further."""
     panels = _Panels(*(field[..., part] for field in panels))
     geometry = patches.take(panels.patch).cut(panels.base, panels.scale)
     with torch.no_grad():
