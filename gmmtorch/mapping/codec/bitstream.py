@@ -74,7 +74,7 @@ def best_code(values: Ints) -> Coding:
 
 def _path_length(values: Ints) -> float:
     """|first number| plus all absolute differences: the reader limits this sum."""
-    return float(np.abs(np.diff(values, prepend=0).astype(np.float64)).sum())
+    return abs(float(values[0])) + float(np.abs(np.diff(values).astype(np.float64)).sum())
 
 
 def fewest_bits(rows: Ints) -> NDArray[np.float64]:
@@ -224,8 +224,12 @@ class BitReader:
 
     def fixed(self, n: int, widths: Ints | int) -> Ints:
         """Reads n numbers of these widths."""
-        if n and not 0 <= np.min(widths) <= np.max(widths) <= MAX_WIDTH:
-            raise DataError(f"Numbers of {np.max(widths)} bits; at most {MAX_WIDTH} are read.")
+        if isinstance(widths, int):
+            least = most = widths
+        else:
+            least, most = (int(widths.min()), int(widths.max())) if n else (0, 0)
+        if n and not 0 <= least <= most <= MAX_WIDTH:
+            raise DataError(f"Numbers of {most} bits; at most {MAX_WIDTH} are read.")
         self.require(n * widths if isinstance(widths, int) else int(widths.sum()))
         values = np.zeros(n, np.int64)
         for begin in range(0, n, _BLOCK):
@@ -275,7 +279,8 @@ class BitReader:
             raise DataError(f"{n:,} numbers are announced, {len(ones):,} are present: it is truncated.")
         if n == 0:
             return np.zeros(0, np.int64)
-        high = np.diff(ones, prepend=-1) - 1
+        high = ones.copy()  # the number of zeros before each one
+        high[1:] -= ones[:-1] + 1
         self._at += int(ones[-1]) + 1
         widest = int(np.max(low)) + int(high.max()).bit_length()
         if widest > MAX_WIDTH:

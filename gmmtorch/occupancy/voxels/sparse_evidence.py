@@ -137,7 +137,8 @@ class SparseEvidence(SparseLattice):
         if len(index) and bool(index.min() < 0):
             missing = (index < 0).nonzero().squeeze(1)
             cells = evidence.cells.index_select(0, missing)
-            self._allocate(self.block_keys(self.columns(cells)).unique())
+            # Neighbouring cells mostly share a block.
+            self._allocate(self.block_keys(self.columns(cells)).unique_consecutive().unique())
             index[missing] = self._index_of(cells)
         # Index 0, of cells outside, is in the empty block, which stays empty.
         return add_counts(self.counts, index, evidence.hits, evidence.misses)

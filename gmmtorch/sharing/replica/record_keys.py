@@ -97,14 +97,14 @@ class Intervals:
 
     def contains(self, numbers: Ints) -> NDArray[np.bool_]:
         """Which of the numbers (N,) are in the set: those with an odd number of edges at or below them."""
-        return np.searchsorted(self.edges, numbers, side="right") % 2 == 1
+        return _inside(self.edges, numbers)
 
     def covers(self, other: Intervals) -> bool:
         """Whether the other set is a subset of this one."""
         return not (other - self)
 
     def __contains__(self, number: int) -> bool:
-        return bool(self.contains(np.array([number], np.int64))[0])
+        return bool(self.edges.searchsorted(number, "right") % 2)
 
     def numbers(self) -> Ints:
         """All numbers (N,), rising."""
@@ -119,22 +119,22 @@ class Intervals:
         if not small:
             return large
         begin, end = large._range_near(small)
-        places, in_large, in_small = large._part(begin, end)._membership(small)
-        joined = _where(places, in_large | in_small).edges
+        places, in_large, in_small = _membership(large.edges[begin:end], small.edges)
+        joined = _where(places, in_large | in_small)
         return Intervals(np.concatenate([large.edges[:begin], joined, large.edges[end:]]))
 
     def __and__(self, other: Intervals) -> Intervals:
         if not (self and other):
             return Intervals.empty()
-        places, in_self, in_other = self._near(other)._membership(other._near(self))
-        return _where(places, in_self & in_other)
+        places, in_self, in_other = _membership(self._near(other), other._near(self))
+        return Intervals(_where(places, in_self & in_other))
 
     def __sub__(self, other: Intervals) -> Intervals:
         if not (self and other):
             return self
         begin, end = self._range_near(other)
-        places, in_self, in_other = self._part(begin, end)._membership(other._near(self))
-        left = _where(places, in_self & ~in_other).edges
+        places, in_self, in_other = _membership(self.edges[begin:end], other._near(self))
+        left = _where(places, in_self & ~in_other)
         return Intervals(np.concatenate([self.edges[:begin], left, self.edges[end:]]))
 
     def __eq__(self, other: object) -> bool:
@@ -147,21 +147,14 @@ class Intervals:
 
     def _range_near(self, other: Intervals) -> tuple[int, int]:
         """The range of edges of the intervals that may meet or touch the other set, which is not empty."""
-        begin = int(np.searchsorted(self.edges, other.edges[0], side="left"))
-        end = int(np.searchsorted(self.edges, other.edges[-1], side="right"))
+        begin = int(self.edges.searchsorted(other.edges[0], "left"))
+        end = int(self.edges.searchsorted(other.edges[-1], "right"))
         return begin - begin % 2, end + end % 2
 
-    def _part(self, begin: int, end: int) -> Intervals:
-        return Intervals(self.edges[begin:end])
-
-    def _near(self, other: Intervals) -> Intervals:
-        """The intervals that may meet the other set."""
-        return self._part(*self._range_near(other))
-
-    def _membership(self, other: Intervals) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
-        """All edges of both sets, and whether the numbers from each edge to the next are in each set."""
-        places = np.unique(np.concatenate([self.edges, other.edges]))
-        return places, self.contains(places), other.contains(places)
+    def _near(self, other: Intervals) -> Ints:
+        """The edges of the intervals that may meet the other set."""
+        begin, end = self._range_near(other)
+        return self.edges[begin:end]
 
 
 def evict(sets: Mapping[int, Intervals], most: int) -> list[int]:
@@ -175,9 +168,23 @@ def evict(sets: Mapping[int, Intervals], most: int) -> list[int]:
     return removed
 
 
-def _where(places: Ints, inside: NDArray[np.bool_]) -> Intervals:
-    """The set of the numbers from each place to the next where `inside`; none after the last place."""
-    return Intervals(places[np.diff(inside, prepend=False)])
+def _inside(edges: Ints, numbers: Ints) -> NDArray[np.bool_]:
+    """Which of the numbers (N,) are in the set with these edges."""
+    return edges.searchsorted(numbers, "right") % 2 == 1
+
+
+def _membership(one: Ints, other: Ints) -> tuple[Ints, NDArray[np.bool_], NDArray[np.bool_]]:
+    """The edges of two sets, rising, and whether the numbers from each edge to the next are in each set."""
+    places = np.concatenate([one, other])
+    places.sort()  # equal edges do no harm: no number is between them
+    return places, _inside(one, places), _inside(other, places)
+
+
+def _where(places: Ints, inside: NDArray[np.bool_]) -> Ints:
+    """The edges of the set of the numbers from each place to the next where `inside`, none after the last."""
+    is_edge = inside.copy()
+    is_edge[1:] ^= inside[:-1]
+    return places[is_edge]
 
 
 NUMBER_BITS, INCARNATION_BITS, ROBOT_BITS = 28, 24, 10
