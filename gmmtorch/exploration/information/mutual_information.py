@@ -147,7 +147,8 @@ def check_occupancy(occupancy: Tensor) -> Tensor:
         raise InvalidArgumentError(
             f"occupancy of shape {tuple(occupancy.shape)} and {occupancy.dtype} must be (..., C) of floats."
         )
-    if not bool(((occupancy >= 0) & (occupancy <= 1)).all()):
+    lowest, highest = occupancy.aminmax() if occupancy.numel() else (0.0, 1.0)
+    if not (lowest >= 0 and highest <= 1):  # also NaN
         raise InvalidArgumentError("occupancy must lie in [0, 1] everywhere; give unknown cells their prior.")
     return occupancy
 

@@ -11,6 +11,9 @@ from gmmtorch.exploration.information.view_evaluator import BLOCK, ViewEvaluator
 from gmmtorch.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.exploration.robot.mapper import LocalMap
 
+_LEAST_ROWS = 128
+"""Rows of a table; few plans evaluate more views, so that tables seldom grow."""
+
 
 class ViewCache:
     """Values of lattice poses during one plan."""
@@ -42,7 +45,7 @@ class ViewCache:
         """Store values in the rows from `begin` on."""
         stop = begin + len(values.gain)
         if stop > len(self._gain):
-            spare = self._gain.new_empty(max(stop, 2 * begin) - begin, self._gain.shape[1])
+            spare = self._gain.new_empty(max(stop, 2 * begin, _LEAST_ROWS) - begin, self._gain.shape[1])
             self._gain = torch.cat([self._gain[:begin], spare])
             self._left = torch.cat([self._left[:begin], spare])
         self._gain[begin:stop] = values.gain

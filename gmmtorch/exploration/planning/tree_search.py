@@ -238,10 +238,10 @@ class _Tree:
     # -- values of nodes and their continuations ---------------------------------------------------
 
     def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
-        """Set the states and values of new nodes, and find the primitives that can follow them."""
-        rows = [node.number for node in nodes]
-        parents = [node.above.number for node in nodes]
-        actions = [node.action for node in nodes]
+        """Set the states and values of the newest nodes, and find the primitives that can follow them."""
+        rows = slice(nodes[0].number, nodes[-1].number + 1)  # new nodes have consecutive numbers
+        parents = torch.tensor([node.above.number for node in nodes])
+        actions = torch.tensor([node.action for node in nodes])
         self._states[rows] = self._ends[parents, actions]
         self._metres[rows] = self._metres_after[parents, actions]
         gains = [0.0] * len(nodes)
@@ -261,12 +261,12 @@ class _Tree:
             node.closed = is_last or node.depth == self._rule.depth
         for depth in sorted({node.depth for node in nodes if not node.closed}):
             some = [node for node in nodes if node.depth == depth]
-            states = self._states[[node.number for node in some]]
+            states = self._states[torch.tensor([node.number for node in some])]
             self._open(some, *continuations(self._primitives, states, self._task, depth))
 
     def _open(self, nodes: list[_Node], ends: Tensor, feasible: Tensor) -> None:
         """Store the primitives that can follow N nodes: ends (N, P, 7), and which are feasible (N, P)."""
-        rows = [node.number for node in nodes]
+        rows = torch.tensor([node.number for node in nodes])
         self._ends[rows] = ends
         order = torch.rand(ends.shape[:2], generator=self._task.generator, dtype=torch.float64)
         if self._goal is not None:  # primitives that lead towards it come first

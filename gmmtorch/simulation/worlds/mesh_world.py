@@ -91,8 +91,9 @@ class MeshWorld:
             threads: number of threads; 0 uses all cores.
         """
         directions = as_tensor(directions, "directions", torch.float64, "cpu")
-        starts = (as_tensor(origin, "origin", torch.float64, "cpu") - self._middle).expand_as(directions)
-        rays = torch.cat([starts, directions], 1).float().contiguous()
+        rays = torch.empty(len(directions), 6, dtype=torch.float32)
+        rays[:, :3] = as_tensor(origin, "origin", torch.float64, "cpu") - self._middle
+        rays[:, 3:] = directions
         cast = self._scene.cast_rays(self._tensor(rays.numpy()), nthreads=threads)
         return torch.from_numpy(cast["t_hit"].numpy()).double()
 
