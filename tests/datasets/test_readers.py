@@ -6,19 +6,16 @@ import gzip
 import importlib.util
 import math
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from gmmtorch.datasets import Dataset, load
+from gmmtorch.datasets import load
 from gmmtorch.datasets.carmen import beam_angles
-from gmmtorch.datasets.octomap_log import rotation
 from gmmtorch.datasets.point_files.cloud_files import read_cloud
-from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.errors import DataError
 
 TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 NAN_POINT = (math.nan,) * 3
@@ -71,16 +68,6 @@ def scan_folder(path: Path, clouds: dict[str, bytes], poses: str) -> Path:
     for name, content in clouds.items():
         (path / "scans" / name).write_bytes(content)
     (path / "poses.txt").write_text(poses)
-    return path
-
-
-def depth_folder(path: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    height, width = frames[0][0].shape[:2]
-    center = (width - 1) / 2, (height - 1) / 2
-    (path / "camera-intrinsics.txt").write_text(f"100 0 {center[0]}\n0 200 {center[1]}\n0 0 1\n")
-    for number, (depth, pose) in enumerate(frames):
-        Image.fromarray(depth).save(path / f"frame-{number:06d}.depth.png")
-        np.savetxt(path / f"frame-{number:06d}.pose.txt", pose)
     return path
 
 
@@ -283,204 +270,3 @@ def test_pcd_viewpoint_rejects_a_viewpoint_without_position(tmp_path, viewpoint)
 def test_pcd_viewpoint_rejects_an_empty_folder(tmp_path):
     with pytest.raises(DataError, match=r"contains no \.pcd file"):
         load("pcd_viewpoint", tmp_path)
-
-
-# Depth frames
-
-
-def test_depth_frames_back_project_and_transform_pixels(tmp_path):
-    depth = np.array([[1000, 0, 65535], [0, 2000, 0], [0, 0, 4000]], dtype=np.uint16)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
-    dataset = load("depth_frames", depth_folder(tmp_path, [(depth, np.eye(4)), (depth, pose)]))
-    first, second = dataset
-    expected = torch.tensor([[-0.01, -0.005, 1.0], [0.0, 0.0, 2.0], [0.04, 0.02, 4.0]], dtype=torch.float64)
-    torch.testing.assert_close(first.points, expected)
-    assert second.origin.tolist() == [1.0, 2.0, 3.0]
-    moved = expected @ torch.from_numpy(TURN_LEFT).T + second.origin
-    torch.testing.assert_close(second.points, moved)
-
-
-def test_depth_frames_apply_max_range_and_pixel_stride(tmp_path):
-    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
-    assert load("depth_frames", folder, pixel_stride=2)[0].points.shape == (6, 3)
-    scan = load("depth_frames", folder, max_range=3.0, no_return_range=2.0)[0]
-    assert scan.points.shape == (0, 3)
-    assert scan.no_return.shape == (24, 3)
-    with pytest.raises(InvalidArgumentError, match="pixel_stride=0"):
-        load("depth_frames", folder, pixel_stride=0)
-
-
-@pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
-def test_depth_frames_are_turned_so_that_up_is_z(tmp_path, up):
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
-    folder = depth_folder(tmp_path, [(np.full((4, 6), 2000, dtype=np.uint16), pose)])
-    axis = torch.zeros(3, dtype=torch.float64)
-    axis["xyz".index(up[-1])] = -1.0 if up[0] == "-" else 1.0
-    given, turned = load("depth_frames", folder), load("depth_frames", folder, up=up)
-    torch.testing.assert_close(turned[0].points[:, 2], given[0].points @ axis)
-    motion = turned.image(0)[1] @ torch.linalg.inv(given.image(0)[1])
-    assert float(torch.linalg.det(motion[:3, :3])) == pytest.approx(1)
-    torch.testing.assert_close(given[0].transformed(motion).points, turned[0].points)
-    with pytest.raises(InvalidArgumentError, match=r"dataset\.up='w' is not one of z, -z"):
-        load("depth_frames", folder, up="w")
-
-
-def test_depth_frames_scale_their_units(tmp_path):
-    folder = depth_folder(tmp_path, [(np.full((4, 6), 5000, dtype=np.uint16), np.eye(4))])
-    assert load("depth_frames", folder).image(0)[0].unique().tolist() == [5.0]
-    assert load("depth_frames", folder, depth_scale=0.0002).image(0)[0].unique().tolist() == [1.0]
-    with pytest.raises(InvalidArgumentError, match="depth_scale=0"):
-        load("depth_frames", folder, depth_scale=0)
-
-
-@pytest.mark.parametrize("factor", [0.5, 2])
-def test_depth_frames_refuse_images_of_another_size_than_the_intrinsics(tmp_path, factor):
-    folder = depth_folder(tmp_path, [(np.full((48, 64), 3000, dtype=np.uint16), np.eye(4))])
-    assert load("depth_frames", folder)[0].n_beams == 48 * 64
-    other = np.full((int(48 * factor), int(64 * factor)), 3000, dtype=np.uint16)
-    Image.fromarray(other).save(folder / "frame-000000.depth.png")
-    for read in (load("depth_frames", folder).__getitem__, load("depth_frames", folder).image):
-        with pytest.raises(DataError, match=r"depth\.png has .* pixels, but camera-intrinsics\.txt is for"):
-            read(0)
-
-
-def test_depth_frames_refuse_transposed_intrinsics(tmp_path):
-    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
-    np.savetxt(folder / "camera-intrinsics.txt", np.loadtxt(folder / "camera-intrinsics.txt").T)
-    with pytest.raises(
-        DataError, match=r"camera-intrinsics\.txt: .*last row must be 0 0 1\. It looks transp"
-    ):
-        load("depth_frames", folder)
-
-
-def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):
-    folder = depth_folder(tmp_path, [(np.zeros((4, 6), dtype=np.uint16), np.eye(4))])
-    assert load("depth_frames", folder)[0].n_beams == 0
-
-
-def _truncated_png(folder: Path) -> None:
-    path = folder / "frame-000000.depth.png"
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def _text_png(folder: Path) -> None:
-    (folder / "frame-000000.depth.png").write_text("not an image")
-
-
-def _color_png(folder: Path) -> None:
-    Image.fromarray(np.zeros((4, 6, 3), dtype=np.uint8)).save(folder / "frame-000000.depth.png")
-
-
-def _pose(value: np.ndarray | str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        path = folder / "frame-000000.pose.txt"
-        path.write_text(value) if isinstance(value, str) else np.savetxt(path, value)
-
-    return write
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (_truncated_png, r"000000\.depth\.png is not a complete PNG"),
-        (_text_png, r"000000\.depth\.png is not a complete PNG"),
-        (_color_png, r"000000\.depth\.png is uint8.*expected one 16-bit channel"),
-        (_pose(np.full((4, 4), math.nan)), r"000000\.pose\.txt.*finite 4×4"),
-        (_pose(np.eye(3)), r"000000\.pose\.txt.*finite 4×4"),
-        (_pose(3 * np.eye(4)), r"000000\.pose\.txt is not a rigid pose"),
-        (_pose("lost"), r"000000\.pose\.txt is not a matrix of numbers"),
-    ],
-)
-def test_depth_frames_reject_damaged_files(tmp_path, damage, message):
-    noise = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
-    dataset = load("depth_frames", depth_folder(tmp_path, [(noise, np.eye(4))]))
-    damage(tmp_path)
-    with pytest.raises(DataError, match=message):
-        dataset[0]
-
-
-def test_depth_frames_report_missing_files(tmp_path):
-    with pytest.raises(DataError, match="holds no frame-"):
-        load("depth_frames", tmp_path)
-    depth_folder(tmp_path, [(np.ones((2, 2), dtype=np.uint16), np.eye(4))] * 2)
-    (tmp_path / "frame-000001.pose.txt").unlink()
-    with pytest.raises(DataError, match="2 depth images, but 1 poses"):
-        load("depth_frames", tmp_path)
-    np.savetxt(tmp_path / "frame-000007.pose.txt", np.eye(4))
-    with pytest.raises(DataError, match=r"000001\.pose\.txt is missing"):
-        load("depth_frames", tmp_path)[1]
-    (tmp_path / "camera-intrinsics.txt").unlink()
-    with pytest.raises(DataError, match=r"camera-intrinsics\.txt is missing"):
-        load("depth_frames", tmp_path)
-
-
-# OctoMap logs
-
-OCTOMAP = """NODE 1 2 3 0 0 0
-1 0 0
-0 1 0
-
-NODE 0 0 0 0 0 1.5707963267948966
-1 0 0
-nan 0 0
-0 0 0
-0 30 0
-NODE 5 5 5 0 0 0
-"""
-
-
-def octomap(path: Path, text: str, compressed: bool = False) -> Dataset:
-    path.write_bytes(gzip.compress(text.encode()) if compressed else text.encode())
-    return load("octomap_log", path, max_range=20.0, no_return_range=5.0)
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_octomap_log_transforms_points_by_the_pose(tmp_path, compressed, newline):
-    first, second, third = octomap(tmp_path / "campus.graph", OCTOMAP.replace("\n", newline), compressed)
-    assert first.origin.tolist() == [1.0, 2.0, 3.0]
-    assert first.points.tolist() == [[2.0, 2.0, 3.0], [1.0, 3.0, 3.0]]
-    torch.testing.assert_close(second.points, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
-    torch.testing.assert_close(second.no_return, torch.tensor([[-5.0, 0.0, 0.0]], dtype=torch.float64))
-    assert third.n_beams == 0
-
-
-def test_octomap_log_rotation_is_yaw_pitch_roll():
-    roll, pitch, yaw = 0.1, -0.2, 0.3
-
-    def about(axis: int, angle: float) -> torch.Tensor:
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        matrix = torch.eye(3, dtype=torch.float64)
-        matrix[i, i] = matrix[j, j] = math.cos(angle)
-        matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
-        return matrix
-
-    torch.testing.assert_close(rotation(roll, pitch, yaw), about(2, yaw) @ about(1, pitch) @ about(0, roll))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("NODE 0 0 0\n1 2 3\n", "NODE line: expected 6 numbers"),
-        ("NODE\n1 2 3\n", "NODE line: expected 6 numbers"),
-        ("NODE 0 0 0 0 0 nan\n1 2 3\n", "pose.*not finite"),
-        ("NODE 0 0 0 0 0 0\n1 2\n", "scan 0: expected 3 numbers per line, found 2"),
-        ("NODE 0 0 0 0 0 0\n1 2 3\n1 2\n", "scan 0: expected 3 numbers per line"),
-        ("NODE 0 0 0 0 0 0\nx y z\n", "scan 0: expected 3 numbers per line"),
-    ],
-)
-def test_octomap_log_rejects_damaged_scans(tmp_path, text, message):
-    dataset = octomap(tmp_path / "bad.graph", text)
-    with pytest.raises(DataError, match=rf"bad\.graph.*{message}"):
-        dataset[0]
-
-
-def test_octomap_log_rejects_other_and_truncated_files(tmp_path):
-    with pytest.raises(DataError, match="no NODE line"):
-        octomap(tmp_path / "a.graph", "hello\n")
-    path = tmp_path / "b.graph"
-    path.write_bytes(gzip.compress(OCTOMAP.encode() * 20)[:-15])
-    with pytest.raises(DataError, match=r"b\.graph is not a complete gzip file"):
-        load("octomap_log", path)

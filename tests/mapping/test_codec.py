@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import zlib
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,13 +11,13 @@ import scipy.linalg
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components, rotations
 
 from gmmtorch.datasets import load
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.evaluation import metrics, queries
 from gmmtorch.mapping.codec import batch_stream
-from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, Code, best_code, unzigzag, zigzag
 from gmmtorch.mapping.codec.component_batch import decode, encode, lattice, quantized, spatial_order
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP
 from gmmtorch.mapping.components import Components
@@ -46,11 +45,6 @@ drawn = st.builds(
     n_origins=st.integers(3, 40),
     max_sightings=st.integers(1, 3),
 )
-
-
-def assert_same(one: Components, other: Components) -> None:
-    for field in fields(Components):
-        assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
 
 
 def part(components: Components, begin: int, end: int) -> Components:
@@ -81,8 +75,8 @@ def sightings(components: Components) -> list[dict[tuple[float, ...], float]]:
 @given(components=drawn)
 def test_decoded_components_equal_quantized_ones_and_quantization_is_idempotent(components):
     once = quantized(components)
-    assert_same(decode(encode(components)), once)
-    assert_same(quantized(once), once)
+    assert_same_components(decode(encode(components)), once)
+    assert_same_components(quantized(once), once)
     assert encode(once) == encode(components)
 
 
@@ -150,7 +144,7 @@ def test_nearly_singular_covariances_are_decoded_positive_definite(seed, dim, ra
     found = quantized(replace(components, covariances=(flat + flat.transpose(1, 2)) / 2))
     assert int(torch.linalg.cholesky_ex(found.covariances).info.max()) == 0
     assert bool(torch.isfinite(found.means).all())
-    assert_same(quantized(found), found)
+    assert_same_components(quantized(found), found)
 
 
 @dims
@@ -198,7 +192,7 @@ def test_zero_counts_stay_zero():
     found = quantized(nothing)
     assert found.support.tolist()[:2] == [0.0, 0.0]
     assert found.support[2] == pytest.approx(0.01, rel=COUNT_ERROR)
-    assert_same(decode(encode(nothing)), found)
+    assert_same_components(decode(encode(nothing)), found)
     assert encode(found) == encode(nothing)
 
 
@@ -221,7 +215,7 @@ def test_a_component_without_origins_is_kept():
     c = random_components(2, k=2)
     seen = c.seen_by == 0
     c = replace(c, seen_by=c.seen_by[seen], seen_from=c.seen_from[seen], seen_count=c.seen_count[seen])
-    assert_same(decode(encode(c)), quantized(c))
+    assert_same_components(decode(encode(c)), quantized(c))
     assert len(quantized(c)) == 2
 
 
@@ -244,8 +238,8 @@ def test_encoded_components_at_the_coordinate_limit_are_decoded(dim, center, ext
     except InvalidArgumentError:
         assert center or extent > 1e6 or deviations[1] > 2.0**19
         return
-    assert_same(decode(batch), quantized(components))
-    assert_same(quantized(decode(batch)), decode(batch))
+    assert_same_components(decode(batch), quantized(components))
+    assert_same_components(quantized(decode(batch)), decode(batch))
 
 
 @pytest.mark.parametrize("exponent", [9, 10, 15, 20, 29, 30])  # 2⁹ m: smaller cells exceed the cell numbers
@@ -255,7 +249,7 @@ def test_cells_as_large_as_the_coordinate_range_are_decoded(monkeypatch, exponen
     wide = random_components(3, k=2, deviations=(2.0**18, 2.0**19))
     components = quantized(replace(wide, means=corners, origins=wide.origins * 0))
     monkeypatch.setattr(batch_stream, "_cell_exponent", lambda places, in_order: exponent)
-    assert_same(decode(encode(components)), components)
+    assert_same_components(decode(encode(components)), components)
 
 
 def test_nearly_equal_deviations_are_encoded_in_descending_order():
@@ -264,7 +258,7 @@ def test_nearly_equal_deviations_are_encoded_in_descending_order():
     for deviation in 2.0 ** ((torch.arange(8) + 0.5) / lattice.PER_OCTAVE):
         covariances = turns @ (deviation.double() ** 2 * torch.eye(3, dtype=torch.float64)) @ turns.mT
         components = replace(random_components(3, k=300), covariances=(covariances + covariances.mT) / 2)
-        assert_same(decode(encode(components)), quantized(components))
+        assert_same_components(decode(encode(components)), quantized(components))
 
 
 @pytest.mark.parametrize(
@@ -332,164 +326,6 @@ def test_spatial_order_is_a_permutation():
     assert torch.equal(order.sort().values, torch.arange(len(components)))
 
 
-# -- damaged batches -------------------------------------------------------------------------------------
-
-
-def sealed(body: bytes) -> bytes:
-    """The body with a valid checksum."""
-    return body + zlib.crc32(body).to_bytes(4, "little")
-
-
-@pytest.fixture(scope="module")
-def sound() -> bytes:
-    return encode(random_components(3, k=12))
-
-
-def test_every_cut_and_every_flipped_bit_is_refused(sound):
-    for length in range(len(sound)):
-        with pytest.raises(DataError):
-            decode(sound[:length])
-    for bit in range(8 * len(sound)):
-        damaged = bytearray(sound)
-        damaged[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(DataError):
-            decode(bytes(damaged))
-
-
-def test_bytes_after_a_batch_are_refused(sound):
-    for longer in (sound + b"\0", sealed(sound[:-4] + b"\0"), sealed(sound[:-4] + b"\1\2\3")):
-        with pytest.raises(DataError):
-            decode(longer)
-
-
-def test_another_version_is_refused_by_name(sound):
-    with pytest.raises(DataError, match="version 9"):
-        decode(sealed(b"\x09" + sound[1:-4]))
-
-
-@settings(max_examples=120)
-@given(
-    changes=st.lists(
-        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=4
-    ),
-    cut=st.sampled_from([0, 0, 1, 8]),
-)
-def test_forged_batches_are_refused_or_decode_to_valid_components(sound, changes, cut):
-    body = bytearray(sound[:-4])
-    for place, value in changes:
-        body[1 + int(place * (len(body) - 1))] = value
-    try:
-        found = decode(sealed(bytes(body[: len(body) - cut])))
-    except DataError:
-        return
-    found.checked()
-    assert bool((found.seen_count >= 0).all())
-    assert_same(decode(encode(found)), quantized(found))
-
-
-@pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
-@pytest.mark.parametrize("what", ["components", "origins"])
-def test_forged_array_lengths_allocate_no_memory(k, what):
-    writer = BitWriter()
-    for number in (3, k, 1) if what == "components" else (3, 1, k):
-        writer.number(number)
-    with pytest.raises(DataError, match="announced"):
-        decode(sealed(b"\x01" + writer.to_bytes() + bytes(2000)))
-
-
-def test_codec_errors_are_data_errors():
-    assert issubclass(DataError, GmmTorchError)
-    with pytest.raises(DataError, match="too few"):
-        decode(b"")
-
-
-# -- bits ------------------------------------------------------------------------------------------------
-
-whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
-
-
-@settings(max_examples=100)
-@given(values=whole_numbers)
-def test_integer_columns_are_decoded_exactly(values):
-    column = np.array(values, np.int64)
-    writer = BitWriter()
-    writer.column(column)
-    reader = BitReader(writer.to_bytes())
-    assert reader.column(len(column)).tolist() == values
-    reader.finish()
-
-
-@given(values=st.lists(st.integers(-(2**40), 2**40)), scales=st.data())
-def test_scaled_and_single_numbers_are_decoded(values, scales):
-    scale = np.array(
-        [max(abs(v).bit_length() + scales.draw(st.integers(-3, 3)), 0) for v in values], np.int64
-    )
-    writer = BitWriter()
-    writer.scaled(np.array(values, np.int64), scale)
-    small = zigzag(np.array(values, np.int64)) % 1000
-    writer.rice_column(small)
-    for value in values:
-        writer.number(value)
-    reader = BitReader(writer.to_bytes())
-    assert reader.scaled(scale).tolist() == values
-    assert reader.rice_column(len(values)).tolist() == [
-        int(v) for v in zigzag(np.array(values, np.int64)) % 1000
-    ]
-    assert [reader.number() for _ in values] == values
-    reader.finish()
-
-
-def test_rice_codes_equal_those_by_hand():
-    """With 2 low bits, 5 = 1·4 + 01 is 0 1 01 and 2 = 0·4 + 10 is 1 10."""
-    writer = BitWriter()
-    writer.rice(np.array([5, 2]), 2)
-    assert writer.to_bytes() == bytes([0b011_01_10_0])
-
-
-@pytest.mark.parametrize(
-    ("values", "code"),
-    [
-        ([7] * 50, Code.FIXED),
-        (list(range(1000, 1050)), Code.DIFFERENCES),
-        ([0] * 40 + [1, 2, 0, 30], Code.RICE),
-        ([3, 0, 2, 1] * 12, Code.FIXED),
-    ],
-)
-def test_the_shortest_column_code_is_chosen(values, code):
-    column = np.array(values, np.int64)
-    coding = best_code(column)
-    assert coding.code is code
-    writer = BitWriter()
-    writer.column(column)
-    assert len(writer.to_bytes()) <= math.ceil((8 + 70 + coding.n_bits) / 8)
-
-
-@given(
-    ends=st.tuples(*[st.sampled_from([0, 1 << 53, 1 << 60, (1 << 61) - 1, -(1 << 61), -(1 << 62) + 1])] * 2),
-    n=st.integers(1, 40),
-    rises=st.booleans(),
-)
-def test_every_encodable_column_is_decoded(ends, n, rises):
-    """Alternating extreme values overflow the sum of differences, however few bits they take."""
-    column = np.array([ends[number % 2] for number in range(n)], np.int64)
-    column = np.sort(column) if rises else column
-    writer = BitWriter()
-    try:
-        writer.column(column)
-    except InvalidArgumentError:
-        assert max(map(abs, ends)) >= 1 << 60
-        return
-    reader = BitReader(writer.to_bytes())
-    assert reader.column(n).tolist() == column.tolist()
-    reader.finish()
-
-
-def test_unzigzag_inverts_zigzag():
-    values = np.array([0, -1, 1, -2, 2, 2**60, -(2**60)], np.int64)
-    assert zigzag(values).tolist()[:5] == [0, 1, 2, 3, 4]
-    assert unzigzag(zigzag(values)).tolist() == values.tolist()
-
-
 # -- a real map ------------------------------------------------------------------------------------------
 
 
@@ -520,4 +356,4 @@ def test_quantization_of_a_real_map_keeps_its_occupancy(real_data):
         losses.append(auc(learned, asked, 0.05) - auc(back, asked, 0.05))
     assert abs(float(np.mean(losses))) < 1e-3
     assert len(encode(learned)) <= 11 * len(learned)
-    assert_same(decode(encode(learned)), quantized(learned))
+    assert_same_components(decode(encode(learned)), quantized(learned))

@@ -1,0 +1,155 @@
+"""Depth frames: points, units, size and orientation of images, and error messages for damaged folders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gmmtorch.datasets import load
+from gmmtorch.errors import DataError, InvalidArgumentError
+
+TURN_LEFT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def depth_folder(path: Path, frames: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    height, width = frames[0][0].shape[:2]
+    center = (width - 1) / 2, (height - 1) / 2
+    (path / "camera-intrinsics.txt").write_text(f"100 0 {center[0]}\n0 200 {center[1]}\n0 0 1\n")
+    for number, (depth, pose) in enumerate(frames):
+        Image.fromarray(depth).save(path / f"frame-{number:06d}.depth.png")
+        np.savetxt(path / f"frame-{number:06d}.pose.txt", pose)
+    return path
+
+
+def test_depth_frames_back_project_and_transform_pixels(tmp_path):
+    depth = np.array([[1000, 0, 65535], [0, 2000, 0], [0, 0, 4000]], dtype=np.uint16)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
+    dataset = load("depth_frames", depth_folder(tmp_path, [(depth, np.eye(4)), (depth, pose)]))
+    first, second = dataset
+    expected = torch.tensor([[-0.01, -0.005, 1.0], [0.0, 0.0, 2.0], [0.04, 0.02, 4.0]], dtype=torch.float64)
+    torch.testing.assert_close(first.points, expected)
+    assert second.origin.tolist() == [1.0, 2.0, 3.0]
+    moved = expected @ torch.from_numpy(TURN_LEFT).T + second.origin
+    torch.testing.assert_close(second.points, moved)
+
+
+def test_depth_frames_apply_max_range_and_pixel_stride(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder, pixel_stride=2)[0].points.shape == (6, 3)
+    scan = load("depth_frames", folder, max_range=3.0, no_return_range=2.0)[0]
+    assert scan.points.shape == (0, 3)
+    assert scan.no_return.shape == (24, 3)
+    with pytest.raises(InvalidArgumentError, match="pixel_stride=0"):
+        load("depth_frames", folder, pixel_stride=0)
+
+
+@pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
+def test_depth_frames_are_turned_so_that_up_is_z(tmp_path, up):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = TURN_LEFT, [1.0, 2.0, 3.0]
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 2000, dtype=np.uint16), pose)])
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis["xyz".index(up[-1])] = -1.0 if up[0] == "-" else 1.0
+    given, turned = load("depth_frames", folder), load("depth_frames", folder, up=up)
+    torch.testing.assert_close(turned[0].points[:, 2], given[0].points @ axis)
+    motion = turned.image(0)[1] @ torch.linalg.inv(given.image(0)[1])
+    assert float(torch.linalg.det(motion[:3, :3])) == pytest.approx(1)
+    torch.testing.assert_close(given[0].transformed(motion).points, turned[0].points)
+    with pytest.raises(InvalidArgumentError, match=r"dataset\.up='w' is not one of z, -z"):
+        load("depth_frames", folder, up="w")
+
+
+def test_depth_frames_scale_their_units(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 5000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder).image(0)[0].unique().tolist() == [5.0]
+    assert load("depth_frames", folder, depth_scale=0.0002).image(0)[0].unique().tolist() == [1.0]
+    with pytest.raises(InvalidArgumentError, match="depth_scale=0"):
+        load("depth_frames", folder, depth_scale=0)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_depth_frames_refuse_images_of_another_size_than_the_intrinsics(tmp_path, factor):
+    folder = depth_folder(tmp_path, [(np.full((48, 64), 3000, dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder)[0].n_beams == 48 * 64
+    other = np.full((int(48 * factor), int(64 * factor)), 3000, dtype=np.uint16)
+    Image.fromarray(other).save(folder / "frame-000000.depth.png")
+    for read in (load("depth_frames", folder).__getitem__, load("depth_frames", folder).image):
+        with pytest.raises(DataError, match=r"depth\.png has .* pixels, but camera-intrinsics\.txt is for"):
+            read(0)
+
+
+def test_depth_frames_refuse_transposed_intrinsics(tmp_path):
+    folder = depth_folder(tmp_path, [(np.full((4, 6), 3000, dtype=np.uint16), np.eye(4))])
+    np.savetxt(folder / "camera-intrinsics.txt", np.loadtxt(folder / "camera-intrinsics.txt").T)
+    with pytest.raises(
+        DataError, match=r"camera-intrinsics\.txt: .*last row must be 0 0 1\. It looks transp"
+    ):
+        load("depth_frames", folder)
+
+
+def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):
+    folder = depth_folder(tmp_path, [(np.zeros((4, 6), dtype=np.uint16), np.eye(4))])
+    assert load("depth_frames", folder)[0].n_beams == 0
+
+
+def _truncated_png(folder: Path) -> None:
+    path = folder / "frame-000000.depth.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def _text_png(folder: Path) -> None:
+    (folder / "frame-000000.depth.png").write_text("not an image")
+
+
+def _color_png(folder: Path) -> None:
+    Image.fromarray(np.zeros((4, 6, 3), dtype=np.uint8)).save(folder / "frame-000000.depth.png")
+
+
+def _pose(value: np.ndarray | str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        path = folder / "frame-000000.pose.txt"
+        path.write_text(value) if isinstance(value, str) else np.savetxt(path, value)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_truncated_png, r"000000\.depth\.png is not a complete PNG"),
+        (_text_png, r"000000\.depth\.png is not a complete PNG"),
+        (_color_png, r"000000\.depth\.png is uint8.*expected one 16-bit channel"),
+        (_pose(np.full((4, 4), math.nan)), r"000000\.pose\.txt.*finite 4×4"),
+        (_pose(np.eye(3)), r"000000\.pose\.txt.*finite 4×4"),
+        (_pose(3 * np.eye(4)), r"000000\.pose\.txt is not a rigid pose"),
+        (_pose("lost"), r"000000\.pose\.txt is not a matrix of numbers"),
+    ],
+)
+def test_depth_frames_reject_damaged_files(tmp_path, damage, message):
+    noise = np.random.default_rng(0).integers(1, 9999, (40, 60)).astype(np.uint16)
+    dataset = load("depth_frames", depth_folder(tmp_path, [(noise, np.eye(4))]))
+    damage(tmp_path)
+    with pytest.raises(DataError, match=message):
+        dataset[0]
+
+
+def test_depth_frames_report_missing_files(tmp_path):
+    with pytest.raises(DataError, match="holds no frame-"):
+        load("depth_frames", tmp_path)
+    depth_folder(tmp_path, [(np.ones((2, 2), dtype=np.uint16), np.eye(4))] * 2)
+    (tmp_path / "frame-000001.pose.txt").unlink()
+    with pytest.raises(DataError, match="2 depth images, but 1 poses"):
+        load("depth_frames", tmp_path)
+    np.savetxt(tmp_path / "frame-000007.pose.txt", np.eye(4))
+    with pytest.raises(DataError, match=r"000001\.pose\.txt is missing"):
+        load("depth_frames", tmp_path)[1]
+    (tmp_path / "camera-intrinsics.txt").unlink()
+    with pytest.raises(DataError, match=r"camera-intrinsics\.txt is missing"):
+        load("depth_frames", tmp_path)
