@@ -11,7 +11,7 @@ from xml.sax.saxutils import quoteattr
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.ros.idl_types import IdlTypes
 from gmmtorch.live.ros.message_types import MessageTypes, dds_type, ros_type
-from gmmtorch.live.ros.middleware import MAX_MESSAGE_BYTES, Endpoint
+from gmmtorch.live.ros.middleware import Endpoint
 from gmmtorch.live.ros.quality import Quality
 from gmmtorch.optional_packages import needs_extra
 
@@ -93,7 +93,7 @@ class DdsMiddleware:
         def receive() -> None:
             for sample in reader.take(N=_MOST_SAMPLES):
                 cdr = getattr(sample, "cdr", None)  # absent if a publisher has ended
-                if cdr is not None and len(cdr) <= MAX_MESSAGE_BYTES:
+                if cdr is not None:
                     on_message(cdr)
 
         class Receiver(Listener):

@@ -284,6 +284,10 @@ class Node:
             if subscription is self._clock_topic:  # counts from now on, also for messages that wait
                 self._note_clock(subscription, data)
                 return
+            if len(data) > MAX_MESSAGE_BYTES:
+                size = f"{len(data):,} bytes are more than {MAX_MESSAGE_BYTES:,}, the most of a message"
+                self._note_malformed(subscription, DataError(size))
+                return
             arrival = Arrival(self._n_arrived, self.now(), time.monotonic(), data)
             subscription.waiting.append(arrival)
             subscription.waiting_bytes += len(data)

@@ -18,11 +18,14 @@ from test_live_scans import laser, recorded
 
 from gmmtorch.datasets import load
 from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LASER
+from gmmtorch.datasets.recordings.ros.bag_reader import Topic
+from gmmtorch.datasets.recordings.ros.bag_topics import CLOUD, LASER, Sensor
+from gmmtorch.datasets.recordings.ros.transform_tree import TransformTree
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live.mapper.bag_player import BagPlayer
+from gmmtorch.live.mapper.diagnostics import Diagnostics
 from gmmtorch.live.mapper.live_mapper import LiveMapper
-from gmmtorch.live.mapper.live_scans import LiveOptions
+from gmmtorch.live.mapper.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.mapper.map_publisher import MapPublisher
 from gmmtorch.live.mapper.sensor_topics import find_sensor, open_scans
 from gmmtorch.live.ros import Node, Quality
@@ -88,6 +91,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, Any]] = []
+        self.counts: dict[str, Any] = {}
 
     def publisher(self, topic: str, message_type: str, offered: Quality | None = None) -> Any:
         return lambda message, stamp=None: self.sent.append((topic, message))
@@ -195,6 +199,19 @@ def test_missing_wrong_and_several_topics_are_errors_that_list_the_topics(node):
         user.publisher("/b", LASER_TYPE)
         with pytest.raises(InvalidArgumentError, match=r"sensor.topic=/a"):
             find_sensor(user, None, 1.0)
+
+
+def test_stamps_of_another_clock_are_said_and_do_not_count_as_latency():
+    user: Any = Recorder()
+    scans = LiveScans(Sensor(Topic("/scan", LASER_TYPE, 0), LASER), TransformTree(), Ranges(), LiveOptions())
+    diagnostics = Diagnostics(user, scans)
+    for seconds in (0.5, -1.7e9, 3600.0, 0.7):
+        diagnostics.note_latency(seconds)
+    warnings = user.take("warning")
+    assert len(warnings) == 2
+    assert all("node.use_sim_time=true" in text and "sensor.clock=received" in text for text in warnings)
+    assert "3600 s away" in warnings[1]
+    assert diagnostics.numbers(4, 0)["latency_median"] == pytest.approx(0.6)
 
 
 def test_a_recording_without_the_topics_is_refused(node, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.export.message_fields import cloud_fields, transform_fields
 from gmmtorch.live.ros import Node, Quality
+from gmmtorch.live.ros.dds import _settings
 from gmmtorch.live.ros.node import reading
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
@@ -154,6 +156,28 @@ def test_damaged_messages_and_floods_are_counted(ros_domain):
             node._receive(subscription, whole)
         assert (len(subscription.waiting), subscription.n_dropped) == (3, 5)
         assert node.counts["/text"] == {"received": 11, "dropped": 5, "malformed": 2}
+
+
+def test_messages_that_are_too_large_are_counted(ros_domain, monkeypatch, caplog):
+    pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
+    monkeypatch.setattr("gmmtorch.live.ros.node.MAX_MESSAGE_BYTES", 20)
+    with Node("test", domain=ros_domain) as node:
+        subscription = node.subscribe("/text", STRING, lambda _: None)
+        for text in ("x" * 40, "x"):
+            node._receive(subscription, node.types.encode(STRING, {"data": text}))
+        assert (subscription.n_malformed, len(subscription.waiting)) == (1, 1)
+        assert "49 bytes are more than 20" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("interface", "multicast", "peers"), [("127.0.0.1", "false", ["127.0.0.1"]), ("eth0", "default", [])]
+)
+def test_only_this_machine_is_spoken_to_unless_an_interface_is_named(interface, multicast, peers):
+    settings = ElementTree.fromstring(_settings(interface, []))
+    assert settings.findtext(".//AllowMulticast") == multicast
+    assert [peer.get("address") for peer in settings.iter("Peer")] == peers
+    (found,) = settings.iter("NetworkInterface")
+    assert interface in found.attrib.values()
 
 
 def test_simulated_time_comes_from_the_clock(ros_domain):
