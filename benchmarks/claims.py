@@ -33,6 +33,7 @@ from claim_readers import (
     difference,
     joined,
     numbers,
+    printed,
     published,
     ratio,
     reduced,
@@ -167,6 +168,13 @@ KINECT = "dataset=depth_frames dataset.path=$DATA/kinect dataset.pixel_stride=2 
 COMPACT = (
     OCCUPANCY + "evaluation.test_every=5 evaluation.max_beams=50000 'method=[occupancy_grid,point,flux]' "
 )
+PEAK = (
+    'python -c "import numpy as np; made = np.random.default_rng(0).random((10**7, 3), np.float32); '
+    "np.save('$OUT/cloud.npy', made)\" && python -c \"import resource, subprocess as s; "
+    "s.run('gmmtorch-fit points=$OUT/cloud.npy mixture.n_components=50 mixture.max_iter=2 "
+    "hydra.run.dir=$OUT', shell=True, check=True); "
+    "print('peak', resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024, 'MiB')\""
+)
 SEEDS = "gmmtorch-explore hydra.run.dir=$OUT experiment=fig4_4_entropy 'study.seeds=[0,1,2,3,4]' "
 ALONE = "team.size=3 duration=1600 evaluation.every=10 'study.variants=[{team:gmm_shared}]' "
 
@@ -217,6 +225,18 @@ RUNS = {
         *of_table("docs/messages.md", "message-sizes", 1, {"bytes": SIZE}),
         *of_table("docs/replica.md", "replica-costs", 1, dict.fromkeys(HELD, at_most(3))),
         *of_table("docs/network.md", "frame-costs", 1, {"time": at_most(3)}),
+    ], slow=False),
+    "viewing": Run("gmmtorch-map dataset=synthetic_building hydra.run.dir=$OUT && "
+                   "gmmtorch-view $OUT --html $OUT/map.html", [
+        Claim("docs/viewing.md", "The simulated hall: # components, # kB",
+              joined(result("n_components"), result("nbytes", 1e-3)), SIZE),
+        Claim("docs/viewing.md", "one file to send to a colleague: # kB for this map",
+              ratio(printed("map.html  # bytes"), lambda out: [1000.0]), SIZE),
+    ], slow=False),
+    "deskewing": Run("python benchmarks/deskewing.py --data $DATA",
+                     of_table("docs/recordings.md", "deskewing", 1, {"distance": within(0.3)}), slow=False),
+    "large_cloud": Run(PEAK, [
+        Claim("docs/large_clouds.md", "120 MB) needs # MiB of memory", printed("peak # MiB"), at_most(1.25)),
     ], slow=False),
     "map_building": Run("python benchmarks/map_building.py --data $DATA", [
         *of_table(RESULTS, "map-building", 2, BUILT),

@@ -59,13 +59,13 @@ class Method(NamedTuple):
     align: Callable[[Any, Any, Tensor], Tensor]
 
 
-def ours(coarsest: float | None = None) -> Method:
+def ours(**options: Any) -> Method:
     def prepare(cloud: Cloud) -> tuple[Any, int]:
         sent = codec.encode(learn_window(cloud.scans, RULE, torch.Generator().manual_seed(0)))
         return codec.decode(sent), len(sent)
 
     def align(source: Any, target: Any, start: Tensor) -> Tensor:
-        return register(source, target, start, coarsest=coarsest).transform
+        return register(source, target, start, **options).transform
 
     return Method(prepare, align)
 
@@ -99,6 +99,7 @@ def icp(voxel: float | None, planes: bool) -> Method:
 METHODS = {
     "mixtures": ours(),
     "mixtures, `coarsest=0.25`": ours(coarsest=0.25),
+    "mixtures, `weighting=support`": ours(weighting="support"),
     "ICP, point to point": icp(None, False),
     "ICP, point to plane": icp(None, True),
     f"point to point, voxels of {VOXEL:g} m": icp(VOXEL, False),
