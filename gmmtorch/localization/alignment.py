@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.mixtures.point_alignment import AlignmentSums, alignment_sums
-from gmmtorch.localization.motions import Motions
+from gmmtorch.localization.motions import Motions, chosen_rows
 from gmmtorch.localization.overlap import deviations
 from gmmtorch.mapping.components import Components
 from gmmtorch.mixture.em.exact import Parameters
@@ -128,8 +128,8 @@ def align(points: Tensor, target: AlignmentTarget, motions: Motions, max_steps: 
         trial = motions.moved(step)
         tried = target.sums(points, trial)
         better = tried.score >= sums.score
-        motions = Motions(*_chosen(better, trial, motions))
-        sums = AlignmentSums(*_chosen(better, tried, sums))
+        motions = Motions(*chosen_rows(better, trial, motions))
+        sums = AlignmentSums(*chosen_rows(better, tried, sums))
         share = torch.where(better, (2 * share).clamp_max(1), share / 4)
         settled = (step / scale).norm(dim=1) < _SETTLED * target.blur
         if bool(settled.all()):
@@ -150,8 +150,3 @@ def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
     step = torch.linalg.solve(curvature, sums.gradient * scale)
     length = step.norm(dim=1, keepdim=True)
     return step * (longest / length.clamp_min(longest)) * scale
-
-
-def _chosen(better: Tensor, new: tuple[Tensor, ...], old: tuple[Tensor, ...]) -> list[Tensor]:
-    """Rows of `new` where `better` (B,), else of `old`."""
-    return [torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(new, old, strict=True)]

@@ -108,3 +108,8 @@ def _crossed(rotations: Tensor, translations: Tensor) -> Motions:
     """Every pair of a rotation and a translation."""
     n = len(rotations)
     return Motions(rotations.repeat(len(translations), 1, 1), translations.repeat_interleave(n, 0))
+
+
+def chosen_rows(better: Tensor, new: tuple[Tensor, ...], old: tuple[Tensor, ...]) -> list[Tensor]:
+    """Rows of `new` where `better` (B,), else of `old`."""
+    return [torch.where(better.view(-1, *[1] * (n.ndim - 1)), n, o) for n, o in zip(new, old, strict=True)]

@@ -10,7 +10,7 @@ from torch import Tensor
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.mixtures.near_pairs import MOST_TESTED, near_pairs
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.localization.motions import Motions
+from gmmtorch.localization.motions import Motions, chosen_rows
 from gmmtorch.localization.overlap import Overlap, Pairs, deviations, overlap
 from gmmtorch.mapping.surfaces import touching
 from gmmtorch.mixture.em.exact import Parameters
@@ -64,8 +64,8 @@ class Ascent:
             tried = self.evaluate(trial, pairs.of(active[pairs.motion]))
             better = active & (tried.log_score > state.log_score)
             active &= (steps / self.scale).norm(dim=1) > tolerance
-            motions = Motions(*(_where(better, n, o) for n, o in zip(trial, motions, strict=True)))
-            state = Overlap(*(_where(better, n, o) for n, o in zip(tried, state, strict=True)))
+            motions = Motions(*chosen_rows(better, trial, motions))
+            state = Overlap(*chosen_rows(better, tried, state))
             share = torch.where(better, (2 * share).clamp_max(1), share / 4)
         return motions, state, ~active & torch.isfinite(state.log_score)
 
@@ -133,8 +133,3 @@ def log_self_overlap(mixture: Parameters) -> float:
     still = Motions(torch.eye(dim).to(mixture.means)[None], mixture.means.new_zeros(1, dim))
     ascent = Ascent(mixture, mixture, 1.0)
     return float(ascent.evaluate(still, ascent.pairs(still)).log_score[0])
-
-
-def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Rows of `new` where `chosen` (B,), else of `old`."""
-    return torch.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -13,8 +13,9 @@ from scipy import stats
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays import component_rays as module
-from gmmtorch.mapping.rays.component_rays import component_evidence, component_rays
+from gmmtorch.mapping.rays import component_evidence as module
+from gmmtorch.mapping.rays.component_evidence import component_evidence
+from gmmtorch.mapping.rays.component_rays import component_rays
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
@@ -211,14 +212,14 @@ def test_evidence_does_not_depend_on_the_portion_size(monkeypatch, most):
     box = Box(torch.tensor([-30, -30, -30]), torch.tensor([30, 30, 30]))
     options = {"shell": 1.0, "hits_per_ray": 3, "thinned": True}
     expected = component_evidence(components, 0.2, box, **options)
-    sizes, sightings, draw = [], [], module._rays
+    sizes, sightings, draw = [], [], module.drawn_rays
 
     def watched(*args):
         sizes.append(int((args[-2] * args[-1]).sum()))
         sightings.append(len(args[1]))
         return draw(*args)
 
-    monkeypatch.setattr(module, "_rays", watched)
+    monkeypatch.setattr(module, "drawn_rays", watched)
     monkeypatch.setattr(module, "_MOST_DRAWS", most)
     found = component_evidence(components, 0.2, box, **options)
     assert len(sizes) > 3

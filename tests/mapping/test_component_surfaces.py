@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.association import summed
-from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence, sum_evidence
 

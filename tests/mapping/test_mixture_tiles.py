@@ -10,7 +10,7 @@ from mapping.random_components import random_components
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow

@@ -27,7 +27,7 @@ from gmmtorch.mapping.learning.fitting import SurfaceFit, fit_window
 from gmmtorch.mapping.learning.incremental import cell_fit
 from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.mapping.learning.viewpoints import all_origins
-from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.mapping.rays.mixture_tiles import MixtureTiles, regenerate
 from gmmtorch.occupancy.voxels.boxes import Box, intersection
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence

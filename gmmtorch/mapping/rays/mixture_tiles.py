@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.rays.component_rays import component_evidence
+from gmmtorch.mapping.rays.component_evidence import component_evidence
 from gmmtorch.occupancy.cones import cone_bounds
 from gmmtorch.occupancy.voxels.boxes import Box
 from gmmtorch.occupancy.voxels.cell_evidence import CellEvidence
