@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import tempfile
@@ -79,6 +78,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.fixture
 def ros_domain() -> Iterator[int]:
     """A ROS domain that no other process of the tests uses meanwhile."""
+    fcntl = pytest.importorskip("fcntl", reason="needs locks of files, which Windows has not")
     for number in range(1, 100):
         with open(Path(tempfile.gettempdir()) / f"gmmtorch-test-domain-{number}", "w") as lock:
             try:
