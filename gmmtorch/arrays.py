@@ -33,15 +33,21 @@ def as_tensor(
     Raises `InvalidArgumentError` for masked arrays, whose mask would be lost, for complex numbers, objects,
     strings, sparse tensors, and lists whose rows have different lengths.
     """
+    if type(value) is Tensor and value.dtype is dtype and device is None and _is_plain(value):
+        return value
     tensor = _tensor(value, name)
     if dtype is None:
         dtype = tensor.dtype if tensor.dtype in _KEPT_DTYPES else torch.float64
     return tensor.to(device or tensor.device, dtype)
 
 
+def _is_plain(value: Tensor) -> bool:
+    return value.layout is torch.strided and not value.is_quantized and not value.is_nested
+
+
 def _tensor(value: Any, name: str) -> Tensor:
     if isinstance(value, Tensor):
-        if value.layout != torch.strided or value.is_quantized or value.is_nested:
+        if not _is_plain(value):
             raise InvalidArgumentError(f"{name} is a {value.layout} tensor; give {name}.to_dense().")
         if value.is_complex():
             raise _complex(name, value.dtype)

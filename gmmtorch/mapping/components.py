@@ -52,9 +52,10 @@ class Components:
     seen_count: Tensor
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            dtype = _DTYPES.get(field.name, torch.float64)
-            object.__setattr__(self, field.name, as_tensor(getattr(self, field.name), field.name, dtype))
+        for name, given in list(vars(self).items()):
+            value = as_tensor(given, name, _DTYPES.get(name, torch.float64))
+            if value is not given:
+                object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         n_bytes = sum(getattr(self, field.name).nbytes for field in fields(self))

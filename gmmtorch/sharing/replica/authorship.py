@@ -94,6 +94,8 @@ class Author:
             )
         if not self._keys_of_robot.covers(old):
             raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")
+        if not len(components) and not old:
+            return Published(np.zeros(0, np.int64), Intervals.empty(), [])
         values = quantize(components)
         order = order_of(values.places)
         first = self._numbers(len(order))

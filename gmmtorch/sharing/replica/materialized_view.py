@@ -126,6 +126,8 @@ class ChangeLog:
         """The changes since the last call. placed: the components with these keys that are in the map, where
         they are in it.
         """
+        if self._touched == [] and self._batch == table.end and not self._rebuilt:
+            return Changes([], Components.empty(table.dim), False)
         before = {} if self._rebuilt or self._reported is None else self._reported
         batches = table.since(self._batch)
         if self._touched is None or self._rebuilt:
