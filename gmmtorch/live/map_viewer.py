@@ -27,6 +27,7 @@ from gmmtorch.optional_packages import load_viser
 _PATH_COLOUR, _PATH_WIDTH = (213, 94, 0), 4.0
 _FINEST, _COARSEST = 0.02, 1.0  # m, of the slider of the resolution
 _LAST_PORT = 65535
+_ROOM = 1.2  # the controls cover a part of the page
 Rgb = tuple[int, int, int]
 _WELCOME = "Click a place to see what the map knows about it."
 
@@ -154,7 +155,7 @@ class MapViewer:
             scene_nodes.add_lights(self._server.scene, view.distance)
         middle = ((view.low + view.high) / 2 - self._shift).numpy()
         offset = np.array([-0.02, -0.1, 1.0]) if flat else np.array([-0.45, -0.65, 0.6])
-        self._camera.show(middle, middle + view.distance * offset)
+        self._camera.show(middle, middle + _ROOM * view.distance * offset)
 
     def _show(self, view: viewer_scene.Frame) -> None:
         """Fits the camera and the limits of the controls to a frame."""
