@@ -31,6 +31,7 @@ TEAM_VARIABLE = "GMMTORCH_TEAM_PROCESS"
 TABLE = "robot n_components n_records bytes_sent wire_bytes datagrams digest"
 _SOURCES = ("world", "log")
 _SYNCS = ("snapshot", "always")
+_STARTS = ("known", "unknown")
 _NO_RESTART = (
     "A robot with team=%s codec=%s cannot be restarted while its team runs: it would number its messages "
     "from 0 again, and its teammates would ignore them as repetitions. Use team=gmm_shared codec=quantized "
@@ -91,6 +92,8 @@ def check_options(config: DictConfig) -> None:
             raise InvalidArgumentError(f"{name}={config[name]!r} is not one of {', '.join(values)}.")
     if config.journal.sync not in _SYNCS:
         raise InvalidArgumentError(f"journal.sync={config.journal.sync!r} is not one of {', '.join(_SYNCS)}.")
+    if config.log.start not in _STARTS:
+        raise InvalidArgumentError(f"log.start={config.log.start!r} is not one of {', '.join(_STARTS)}.")
     size = check_whole("team.size", config.team.size, 1)
     if check_whole("id", config.id, 0) >= size:
         raise InvalidArgumentError(f"id={config.id} must be below team.size={size}: robot ids start at 0.")
@@ -145,28 +148,37 @@ def _replaying(
     config: DictConfig, folder: Path, transport: FramedTransport, stack: ExitStack
 ) -> tuple[Drivable, RobotView]:
     """A robot that maps a recorded log, or its part of one."""
-    from gmmtorch.datasets.base import DatasetShard, shard_indices
+    import torch
+
+    from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
     from gmmtorch.errors import check_whole
     from gmmtorch.exploration.mission.replay import ReplayMission
     from gmmtorch.exploration.mission.robot_view import ReplayingRobotView
+    from gmmtorch.sharing.frame_joiner import FrameJoiner
     from gmmtorch.sharing.replica.replica import Replica
 
     store = _opened_store(config, folder, transport, stack)
     scans = common.open_dataset(config.log.dataset)
     indices = range(0, len(scans), check_whole("log.every", config.log.every, 1))
     part = shard_indices(len(indices), config.id, config.team.size, config.log.part)
-    replica = Replica(config.id)
+    chosen = [indices[row] for row in part]
+    is_free = config.log.start == "unknown" and bool(chosen)
+    frame = start_frame(scans, chosen[0]) if is_free else None
+    replica = Replica(config.id, own_frame=is_free)
     if store is not None:
         store.restore(replica)
+        if frame is not None and replica.earlier_frames:  # the log begins where it began before
+            replica.join(replica.earlier_frames[0], torch.eye(len(frame)))
     mission = ReplayMission(
         replica,
-        DatasetShard(scans, [indices[row] for row in part]),
+        DatasetShard(scans, chosen, None if frame is None else torch.linalg.inv(frame)),
         transport,
         maps.map_factory(missions.log_map_options(config)),
         rate=config.log.rate,
         store=store,
         announce_every=config.network.announce,
         budget=config.network.budget,
+        joiner=FrameJoiner(replica) if is_free else None,
     )
     return mission, ReplayingRobotView(mission, transport)
 
@@ -222,6 +234,7 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
         "source": "log",
         **{f"log.dataset.{name}": value for name, value in dataset.items()},
         **{f"log.{name}": config.log[name] for name in ("every", "part")},
+        **({"log.start": "unknown"} if config.log.start == "unknown" else {}),
         "team.size": config.team.size,
     }
 

@@ -263,10 +263,13 @@ class DatasetShard(Sequence[Scan]):
     Args:
         scans: the data set.
         indices: of the selected scans, in order, for example `shard_indices(len(scans), k, n)`.
+        transform: (D+1, D+1) rigid motion of each scan; None: none.
     """
 
-    def __init__(self, scans: Sequence[Scan], indices: Sequence[int]) -> None:
-        self._scans, self._indices = scans, indices
+    def __init__(
+        self, scans: Sequence[Scan], indices: Sequence[int], transform: Tensor | None = None
+    ) -> None:
+        self._scans, self._indices, self._transform = scans, indices, transform
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -277,5 +280,19 @@ class DatasetShard(Sequence[Scan]):
     def __getitem__(self, index: slice) -> DatasetShard: ...
     def __getitem__(self, index: int | slice) -> Scan | DatasetShard:
         if isinstance(index, slice):
-            return DatasetShard(self._scans, self._indices[index])
-        return self._scans[self._indices[index]]
+            return DatasetShard(self._scans, self._indices[index], self._transform)
+        scan = self._scans[self._indices[index]]
+        return scan if self._transform is None else scan.transformed(self._transform)
+
+
+def start_frame(scans: Dataset, index: int) -> Tensor:
+    """The frame (D+1, D+1), world ← frame, of a robot that starts with a scan: its origin is the sensor's,
+    and x points ahead. In 3D it is upright. Without poses it has the axes of the world.
+    """
+    pose, origin = scans.pose(index), scans[index].origin.double()
+    frame = torch.eye(len(origin) + 1, dtype=torch.float64)
+    frame[:-1, -1] = origin
+    if pose is not None and float(pose[:2, 0].norm()) > 0:
+        (cos, sin) = (pose[:2, 0] / pose[:2, 0].norm()).tolist()
+        frame[:2, :2] = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+    return frame

@@ -431,6 +431,7 @@ def test_paces_are_checked_before_anything_is_opened(options, words, run, monkey
         ("log.map.prior=-1", "log.map.prior=-1.0"),
         ("log.map.noise=-1", "log.map.noise=-1.0"),
         ("log.part=odd", "log.part='odd'"),
+        ("log.start=here", "log.start='here'"),
         ("network.announce=0", "network.announce=0.0"),
         ("journal.sync=never", "journal.sync='never'"),
     ],

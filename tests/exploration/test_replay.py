@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import random
 import resource
 
 import pytest
+import torch
 from exploration.replays import RULES, content, killed, log, mapped, part, robot, run, stored
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.base import DatasetShard, shard_indices
+from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.exploration.mission.replay import ReplayMission
 from gmmtorch.exploration.mission.robot_view import ReplayingRobotView
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.rules import IncrementalRule
 from gmmtorch.scan import Scan
+from gmmtorch.sharing.frame_joiner import FrameJoiner
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.link_conditions import LinkConditions
 from gmmtorch.sharing.transport.simulated_network import Network
@@ -53,6 +56,27 @@ def test_losses_of_the_network_are_repaired(budget):
     assert len({mission.replica.digest() for mission in team}) == 1
     alone = [mapped("incremental", one).components() for one in parts]
     assert content(team[0].replica.components()) == content(*alone)
+
+
+@pytest.mark.slow
+def test_robots_without_known_starts_share_a_map_in_one_frame():
+    scans, network = load("synthetic_building_2d", n_scans=60), Network(2)
+    team, frames = [], []
+    for number, chosen in enumerate((range(40), range(20, 60))):
+        frames.append(start_frame(scans, chosen[0]))
+        replica = Replica(number, own_frame=True)
+        own = DatasetShard(scans, chosen, torch.linalg.inv(frames[-1]))
+        make_map = functools.partial(GaussianMap, window=10, robot=number)
+        joiner = FrameJoiner(replica)
+        team.append(ReplayMission(replica, own, network, make_map, rate=10.0, joiner=joiner))
+    run(*team, quiet=20.0)
+    one, two = (mission.replica for mission in team)
+    assert one.digest() == two.digest()
+    found = ReplayingRobotView(team[1], network).row()["frame"]
+    assert found["of_robot"] == 0
+    truth = torch.linalg.inv(frames[0]) @ frames[1]
+    assert torch.allclose(torch.tensor(found["transform"], dtype=torch.float64), truth, atol=0.05)
+    assert len(one.components()) == one.n_components == len(two.components())
 
 
 def test_a_window_is_published_once_its_components_are_final():

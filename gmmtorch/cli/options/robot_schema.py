@@ -62,6 +62,7 @@ class LogOptions:
     rate: scans per second.
     every: use every n-th scan of the log.
     part: consecutive or interleaved part of the log for each robot.
+    start: known, the poses of the log; or unknown, each robot maps in a frame of its own, and joins one.
     """
 
     dataset: Any = None
@@ -69,6 +70,7 @@ class LogOptions:
     rate: float = 1.0
     every: int = 1
     part: str = "consecutive"
+    start: str = "known"
 
 
 @dataclass

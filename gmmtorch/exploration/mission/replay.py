@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import logging
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from typing import Any, Protocol
 
@@ -13,10 +14,13 @@ from gmmtorch.exploration.mission.driver import Stopwatch, check_pace
 from gmmtorch.exploration.robot.radio import Radio, RecordStore
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.scan import Scan
+from gmmtorch.sharing.frame_joiner import FrameJoiner
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.simulated_network import Transport
 
 _log = logging.getLogger(__name__)
+_SEARCHING = 0.2
+"""Share of the processor's time in which a robot without a known start pose searches for its place."""
 
 
 class ReplayStore(RecordStore, Protocol):
@@ -57,6 +61,7 @@ class ReplayMission:
         store: has restored the replica. Raises `DataError` if its progress is of other options or scans.
         announce_every: seconds between announcements while there is news.
         budget: bytes per second for records; None: no limit.
+        joiner: of a replica with a frame of its own; it is given the scans, and joins a teammate's frame.
 
     Attributes:
         map: the robot's own map. n_scans: of the log; None while unknown.
@@ -76,6 +81,7 @@ class ReplayMission:
         announce_every: float = 1.0,
         budget: float | None = None,
         keep_every: int = 10,
+        joiner: FrameJoiner | None = None,
     ) -> None:
         check_pace(rate=rate)
         self.replica, self.map, self.tick_seconds = replica, make_map(), 1 / rate
@@ -86,7 +92,8 @@ class ReplayMission:
         self.n_unread = 0
         self.is_over = False
         """Whether the log is over and all of it is published."""
-        self._scans, self._store = scans, store
+        self._scans, self._store, self._joiner = scans, store, joiner
+        self._search_at = 0.0  # seconds
         self._keep_every = check_whole("keep_every", keep_every, 1)
         self._covered_at: int | None = None
         """Position from which the map has all that earlier sessions published; None: there were none."""
@@ -119,6 +126,17 @@ class ReplayMission:
             if radio.announcements.due(now, (replica.version,), urgent=bool(replica.missing)):
                 datagrams += replica.announcements()
             radio.send(datagrams, now)
+        self._search(now)
+
+    def _search(self, now: float) -> None:
+        """Searches for the robot's place in a teammate's map, if it is time."""
+        if self._joiner is None or now < self._search_at:
+            return
+        begin = time.process_time()
+        with self.watch("joining"):
+            if self._joiner.search():
+                _log.info("Robot %d has joined the frame of a teammate.", self.replica.robot)
+        self._search_at = now + (time.process_time() - begin) / _SEARCHING
 
     def content(self) -> int:
         """Changes whenever records are added to the team's map."""
@@ -165,6 +183,8 @@ class ReplayMission:
                 self.n_scans = self.position
                 return False
             self.map.insert(scan)
+            if self._joiner is not None:
+                self._joiner.add(scan)
         self.position += 1
         return self.position != self.n_scans
 

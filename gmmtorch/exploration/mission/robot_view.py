@@ -17,6 +17,7 @@ from gmmtorch.exploration.robot.gmm_mapper import GmmMapper
 from gmmtorch.exploration.robot.radio import Radio
 from gmmtorch.files import write_npz
 from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.sharing.replica.frames import robot_of_frame
 from gmmtorch.sharing.replica.replica import Replica
 from gmmtorch.sharing.transport.frames import FramedTransport
 from gmmtorch.sharing.transport.simulated_network import Network
@@ -172,6 +173,7 @@ class ReplayingRobotView:
             "robot": self.robot,
             "digest": replica.digest().hex(),
             "incarnation": replica.incarnation,
+            "frame": _placement(replica),
             "scans": mission.position,
             "n_scans": mission.n_scans,
             "resumed_at": mission.resumed_at,
@@ -191,6 +193,16 @@ class ReplayingRobotView:
         """The team's map as this robot holds it, and the robot's own map."""
         maps = {"map": self._replica.map(codec="quantized"), "own_map": self._mission.map}
         return {name: (f"{name}{made.suffix}", made.save) for name, made in maps.items() if made.n_components}
+
+
+def _placement(replica: Replica) -> dict[str, Any]:
+    """The robot in whose frame the map is (None: the world), and the pose of this robot's frame in it."""
+    root, transform = replica.placement
+    robot = robot_of_frame(root)
+    return {
+        "of_robot": None if robot < 0 else robot,
+        "transform": None if transform is None else transform.tolist(),
+    }
 
 
 def _check_id(radio: Radio, n_conflicts: int) -> None:

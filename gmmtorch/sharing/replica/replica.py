@@ -320,6 +320,12 @@ class Replica:
         return self._records.frames.place(self._own)
 
     @property
+    def earlier_frames(self) -> list[int]:
+        """Frames of earlier starts of this robot. A robot that goes on in one of them joins it."""
+        frames = (record.frame for record in self._records.of(FrameMessage))
+        return sorted({f for f in frames if robot_of_frame(f) == self.robot} - {self._own})
+
+    @property
     def other_frames(self) -> list[int]:
         """Frames with components that this robot may join; first the one that all robots prefer.
 

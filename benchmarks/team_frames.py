@@ -1,0 +1,201 @@
+"""Two robots that map two parts of one log, each in a frame of its own, and join one frame; and robots whose
+teammate is in another place. Writes the tables of BENCHMARKS.md and docs/images/team_frames.png.
+
+    OMP_NUM_THREADS=1 python benchmarks/team_frames.py --data $GMMTORCH_DATA
+
+A robot's frame begins at its first sensor position, with its heading, upright. The robots exchange all
+datagrams every five scans; robot 1 then searches for one scan. When both logs are over, it goes on while
+places are left. Errors are those of the places of robot 1's components in the frame of robot 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tables import ROOT, hardware, markdown, publish
+from torch import Tensor
+
+import gmmtorch as gt
+from gmmtorch.datasets import Dataset
+from gmmtorch.datasets.base import start_frame
+from gmmtorch.mapping.components import Components
+from gmmtorch.report.style import PALETTE, save_figure
+from gmmtorch.sharing import FrameJoiner, Replica
+from gmmtorch.sharing.messages.message_registry import kind_of
+
+EVERY = 5  # scans between two exchanges
+PARTS = (
+    ("freiburg-101", "halves"),
+    ("courtyard", "halves"),
+    ("hall", "halves"),
+    ("hall", "every second scan"),
+)
+FLAT, DEEP = ("intel", "aces", "freiburg-101"), ("hall", "courtyard", "street")
+PLACES = 40  # scans of a foreign log that are searched for
+
+
+def opened(data: Path, name: str) -> Dataset:
+    if name in FLAT:
+        return gt.datasets.load("carmen", path=data / f"laser2d/{name}.log.gz")
+    return gt.datasets.load("scan_folder", path=data / name)
+
+
+class Robot:
+    """One of two robots with its part of a log."""
+
+    def __init__(self, number: int, scans: Dataset, part: Sequence[int]) -> None:
+        self.replica = Replica(number, incarnation=number, own_frame=True)
+        self.map = gt.GaussianMap(gt.IncrementalRule(), robot=number)
+        self.frame = start_frame(scans, part[0])
+        self.joiner = FrameJoiner(self.replica)
+        self.scans, self.part, self.n_read = scans, part, 0
+        self.sent = {"all": 0, "frames": 0}
+
+    @property
+    def is_over(self) -> bool:
+        return self.n_read == len(self.part)
+
+    def read(self, n: int) -> None:
+        """Maps the next scans, and publishes the components of full windows."""
+        for number in self.part[self.n_read : self.n_read + n]:
+            scan = self.scans[number].transformed(torch.linalg.inv(self.frame))
+            self.map.insert(scan)
+            self.joiner.add(scan)
+            self.n_read += 1
+        if self.is_over:
+            self.map.finish()
+        if self.is_over or not self.map.n_pending:
+            self.replica.publish(self.map.components(), whole=False)
+
+    def send(self, other: Robot) -> None:
+        for datagram in self.replica.datagrams():
+            self.sent["all"] += len(datagram)
+            self.sent["frames"] += len(datagram) * (kind_of(datagram) == "frames")
+            other.replica.receive(datagram)
+
+
+def joined(scans: Dataset, split: str) -> tuple[Robot, Robot, str, float]:
+    """Both robots, the scan of robot 1 at which it joined, and the seconds of a search."""
+    n = len(scans)
+    parts = [range(n // 2), range(n // 2, n)] if split == "halves" else [range(0, n, 2), range(1, n, 2)]
+    one, two = (Robot(number, scans, part) for number, part in enumerate(parts))
+    seconds, when = 0.0, "never"
+    while not (one.is_over and two.is_over):
+        for robot, other in ((one, two), (two, one)):
+            robot.read(EVERY)
+            robot.send(other)
+        begin = time.process_time()
+        if two.joiner.search():
+            when = f"{two.n_read} of {len(two.part)}"
+        seconds += time.process_time() - begin
+    before, begin = -1, time.process_time()
+    while two.joiner.n_searches > before:
+        before = two.joiner.n_searches
+        if two.joiner.search():
+            when = "afterwards"
+    seconds += time.process_time() - begin
+    two.send(one)
+    return one, two, when, seconds / max(1, two.joiner.n_searches)
+
+
+def row(name: str, split: str, one: Robot, two: Robot, when: str, seconds: float) -> list[object]:
+    placement = two.replica.placement
+    places = two.map.components().means
+    transform = placement.transform
+    if transform is None:
+        rms = turn = worst = "–"
+    else:
+        error = torch.linalg.inv(two.frame) @ one.frame @ transform
+        dim = len(error) - 1
+        off = (places @ error[:dim, :dim].T + error[:dim, dim] - places).norm(dim=1)
+        angle = torch.linalg.matrix_norm(error[:dim, :dim] - torch.eye(dim)) / math.sqrt(2)
+        rms, worst = f"{float(off.square().mean().sqrt()):.3f}", f"{float(off.max()):.3f}"
+        turn = f"{math.degrees(float(angle)):.2f}"
+    located = f"{two.joiner.n_located} of {two.joiner.n_searches}"
+    components, frames = (one.sent[kind] + two.sent[kind] for kind in ("all", "frames"))
+    return [name, split, when, located, rms, worst, turn, f"{components:,}", frames, f"{seconds:.2f}"]
+
+
+def foreign(source: Dataset, target: Dataset) -> tuple[int, int, int]:
+    """Scans of one place in the map of another: searched for, located, and frames joined."""
+    theirs = Robot(0, target, range(len(target)))
+    theirs.read(len(target))
+    ours = Robot(1, source, range(len(source)))
+    theirs.send(ours)
+    step = max(1, len(source) // PLACES)
+    n_joined = 0
+    for number in range(0, len(source), step):
+        ours.joiner.add(source[number])
+        n_joined += ours.joiner.search()
+    return ours.joiner.n_searches, ours.joiner.n_located, n_joined
+
+
+def picture(one: Robot, two: Robot) -> None:
+    """Both maps in their own frames, laid over each other as they are, and after joining."""
+    import matplotlib.pyplot as plt
+
+    own = [one.map.components(), two.map.components()]
+    shared = one.replica.components()
+    after = [shared.selected((shared.ids[:, 0] == number).nonzero().squeeze(1)) for number in (0, 1)]
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2))
+    for axis, maps, title in zip(
+        axes, (own, after), ("each in its own frame", "robot 1 joined the frame of robot 0"), strict=True
+    ):
+        for number, m in enumerate(maps):
+            axis.plot(*drawn(m).T, ",", color=PALETTE[number], alpha=0.6)
+            axis.plot([], [], "s", color=PALETTE[number], label=f"robot {number}")
+        axis.set_aspect("equal")
+        axis.set_title(title)
+        axis.set_xlabel("x (m)")
+        axis.set_ylabel("y (m)")
+    axes[0].legend(loc="best")
+    save_figure(figure, ROOT / "docs/images/team_frames.png")
+
+
+def drawn(components: Components) -> Tensor:
+    """Points (N, 2) of the surfaces."""
+    solid = components.selected((~components.max_range).nonzero().squeeze(1))
+    draw = torch.Generator().manual_seed(0)
+    noise = torch.randn(len(solid), 12, 2, 1, generator=draw, dtype=torch.float64)
+    roots = torch.linalg.cholesky(solid.covariances)[:, None]
+    return (solid.means[:, None, :, None] + roots @ noise).reshape(-1, 2)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--only", choices=("joined", "foreign"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    if options.only != "foreign":
+        rows = []
+        for name, split in PARTS:
+            outcome = joined(opened(options.data, name), split)
+            rows.append(row(name, split, *outcome))
+            print(*rows[-1], sep=" | ", flush=True)
+            if name == "freiburg-101":
+                picture(*outcome[:2])
+        header = ["log", "parts", "joined at scan", "scans located", "error (m)", "at most (m)", "turn (°)"]
+        header += ["bytes", "of frames", "CPU s a search"]
+        publish("team-frames", f"{markdown(header, rows)}\n\n{hardware()}")
+    if options.only != "joined":
+        rows = []
+        for names in (DEEP, FLAT):
+            logs = {name: opened(options.data, name) for name in names}
+            for source in names:
+                for target in names:
+                    if source != target:
+                        found = foreign(logs[source], logs[target])
+                        rows.append([f"{source} in {target}", *found])
+                        print(*rows[-1], sep=" | ", flush=True)
+        table = markdown(["scans of … in the map of …", "searched", "located", "frames joined"], rows)
+        publish("foreign-frames", f"{table}\n\n{hardware()}")
+
+
+if __name__ == "__main__":
+    main()
